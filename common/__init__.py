@@ -1,0 +1,1 @@
+"""What every room shares: the joints' names, the errors users see, and how files are written."""

@@ -1,0 +1,229 @@
+"""DelayedPD: a late, force-limited, speed-limited PD servo with dry friction, as MuJoCo steps it.
+
+One servo holds one joint whose inertia is `armature`. The goal reaches it `delay_s` late, its
+set-point moves at `velocity_limit` at most, and the torque
+
+    tau = clip(stiffness * (setpoint - position) - damping * velocity, ±effort_limit)
+
+works against a dry friction of `friction_loss`. This module is the same arithmetic as MuJoCo's
+native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with `armature` and
+`frictionloss`, integrated with `implicitfast` (`tests/test_delayed_pd.py` holds the two together):
+
+* delay: the command of the past, linearly interpolated between time steps. For a command that
+  changes on time steps this is the mean of the held command over the step, so the trajectory is a
+  continuous function of the delay;
+* speed limit: `slewmax`, a limit on the set-point's rate (a servo's goal speed);
+* friction: a constraint that removes the whole velocity in one time step if `friction_loss`
+  allows it (`FRICTION_SOLREF`, `FRICTION_SOLIMP`). MuJoCo's default friction is far softer than
+  a servo's gears: it would still creep at 1 rad/s;
+* damping is integrated implicitly, except while the torque is clipped.
+
+Free-air positions cannot tell the torques from the inertia: scaling stiffness, damping,
+friction_loss, effort_limit and armature together changes nothing (`per_inertia`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from common.errors import InputError
+
+TIME_STEP_S = 0.002
+"""Physics step of fitting and of training [s]: 500 Hz."""
+
+FRICTION_IMPEDANCE = 0.9999
+FRICTION_SOLIMP = (FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
+
+
+def friction_solref(time_step_s: float) -> tuple[float, float]:
+    """MuJoCo `solreffriction` in its direct form: stop within one time step, no spring."""
+    return 0.0, -1.0 / time_step_s
+
+
+@dataclass(frozen=True)
+class DelayedPDParameters:
+    """Numbers of a DelayedPD servo; floats or arrays that broadcast against each other.
+
+    Attributes
+    ----------
+    stiffness : N·m/rad
+    damping : N·m·s/rad
+    friction_loss : N·m, dry (Coulomb) friction
+    armature : kg·m², all inertia the servo feels, its own included
+    effort_limit : N·m
+    velocity_limit : rad/s, rate limit of the set-point
+    delay_s : s, from a command's arrival to its first effect on the torque
+    """
+
+    stiffness: ArrayLike
+    damping: ArrayLike
+    friction_loss: ArrayLike
+    armature: ArrayLike
+    effort_limit: ArrayLike
+    velocity_limit: ArrayLike
+    delay_s: ArrayLike
+
+    def per_inertia(self) -> DelayedPDParameters:
+        """The same motion with an armature of 1: the ratios that free-air data identify."""
+        j = np.asarray(self.armature, float)
+        return replace(
+            self,
+            stiffness=np.asarray(self.stiffness) / j,
+            damping=np.asarray(self.damping) / j,
+            friction_loss=np.asarray(self.friction_loss) / j,
+            effort_limit=np.asarray(self.effort_limit) / j,
+            armature=np.ones_like(j),
+        )
+
+    def scaled(self, armature: ArrayLike) -> DelayedPDParameters:
+        """The same motion with another armature."""
+        one, j = self.per_inertia(), np.asarray(armature, float)
+        return replace(
+            one,
+            stiffness=one.stiffness * j,
+            damping=one.damping * j,
+            friction_loss=one.friction_loss * j,
+            effort_limit=one.effort_limit * j,
+            armature=j,
+        )
+
+
+class DelayedPD:
+    """The servo model that is fitted, and that training simulates. See the module's text.
+
+    Parameters
+    ----------
+    parameters : DelayedPDParameters
+        Their broadcast shape is the model's batch.
+    time_step_s : float
+        Time step [s]; commands and positions are at this step.
+
+    Raises
+    ------
+    InputError
+        If a parameter is not finite, negative, or the armature or time step is zero.
+    """
+
+    def __init__(self, parameters: DelayedPDParameters, time_step_s: float = TIME_STEP_S):
+        if not (np.isfinite(time_step_s) and time_step_s > 0):
+            raise InputError(f"DelayedPD: time_step_s is {time_step_s}; it must be positive.")
+        values = {f.name: np.asarray(getattr(parameters, f.name), float) for f in fields(parameters)}
+        for name, value in values.items():
+            lowest = np.min(value)
+            # an infinite limit is a way to say "none"; everything else must be a number
+            if np.isnan(value).any() or lowest < 0 or (name == "armature" and lowest == 0):
+                raise InputError(f"DelayedPD: {name} is {lowest}; it must be a positive number.")
+        self.parameters = parameters
+        self.time_step_s = float(time_step_s)
+        self._values = values
+        self.batch = np.broadcast_shapes(*(v.shape for v in values.values()))
+        self._nsample = int(np.floor(np.max(values["delay_s"]) / time_step_s)) + 2
+        self.reset(np.zeros(self.batch))
+
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], which has been the command for as long as the delay."""
+        position = np.broadcast_to(np.asarray(position, float), self.batch)
+        self._position = position.copy()
+        self._velocity = np.zeros(self.batch)
+        self._setpoint = position.copy()
+        self._past = np.broadcast_to(position, (self._nsample, *self.batch)).copy()
+
+    def step(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Advance one time step under `command` [rad]; returns the position after it."""
+        command = np.broadcast_to(np.asarray(command, float), self.batch)
+        return self.rollout(command[None])[0]
+
+    def rollout(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
+        commands = np.asarray(commands, float)
+        commands = np.broadcast_to(commands, (len(commands), *self.batch))
+        history = np.concatenate([self._past, commands])
+        self._past = history[len(history) - self._nsample :].copy()
+        delayed = _delayed(history, len(commands), self._values["delay_s"] / self.time_step_s)
+        state = (self._position, self._velocity, self._setpoint)
+        positions, state = integrate(delayed, state, self._values, self.time_step_s)
+        self._position, self._velocity, self._setpoint = state
+        return positions
+
+
+def _delayed(history: NDArray, steps: int, delay_steps: NDArray) -> NDArray[np.float64]:
+    """Last `steps` rows of `history` as they arrive after `delay_steps` (fractional)."""
+    shape = history.shape[1:]
+    whole = np.floor(delay_steps).astype(int)
+    fraction = np.broadcast_to(delay_steps - whole, shape)
+    row = np.arange(len(history) - steps, len(history)).reshape(-1, *[1] * len(shape))
+    index = row - np.broadcast_to(whole, shape)
+    late = np.take_along_axis(history, index, axis=0)
+    later = np.take_along_axis(history, index - 1, axis=0)
+    return late + fraction * (later - late)
+
+
+def integrate(
+    delayed: NDArray[np.float64],
+    state: tuple[NDArray, NDArray, NDArray],
+    values: dict[str, NDArray],
+    time_step_s: float,
+) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:
+    """Step the servo through commands that have already been delayed: the inner loop of fitting.
+
+    Parameters
+    ----------
+    delayed : ndarray, shape (steps, *batch)
+        Goal positions as the servo receives them [rad].
+    state : (position, velocity, setpoint), each of shape batch
+    values : dict
+        Fields of `DelayedPDParameters` but the delay, each broadcastable to batch.
+    time_step_s : float
+
+    Returns
+    -------
+    positions : ndarray, shape (steps, *batch)
+    state : the state after the last step
+    """
+    h, batch = time_step_s, delayed.shape[1:]
+
+    def flat(value):  # one contiguous axis: the fastest shape for the small steps below
+        return np.ascontiguousarray(np.broadcast_to(value, batch), dtype=float).reshape(-1)
+
+    kp, kd, friction, effort = (
+        flat(values[name] / values["armature"])
+        for name in ("stiffness", "damping", "friction_loss", "effort_limit")
+    )
+    delayed = delayed.reshape(len(delayed), -1)
+    low_effort, low_friction, stop = -effort, -friction, -FRICTION_IMPEDANCE
+    slew = flat(values["velocity_limit"] * h)
+    low_slew = -slew
+    inverse = h / (1.0 + h * kd)
+    position, velocity, setpoint = (flat(x).copy() for x in state)
+    positions = np.empty_like(delayed)
+    force, wanted, change = (np.empty_like(position) for _ in range(3))
+    # numpy.clip costs five times minimum + maximum on small arrays, hence the pairs below
+    for k in range(len(delayed)):
+        np.subtract(delayed[k], setpoint, out=change)
+        np.minimum(change, slew, out=change)
+        np.maximum(change, low_slew, out=change)
+        setpoint += change
+        np.subtract(setpoint, position, out=wanted)
+        wanted *= kp
+        np.multiply(kd, velocity, out=change)
+        wanted -= change
+        np.minimum(wanted, effort, out=force)
+        np.maximum(force, low_effort, out=force)
+        # explicit where the torque is clipped: MuJoCo drops the damping's derivative there
+        gain = np.where(force == wanted, inverse, h)
+        np.multiply(velocity, 1.0 / h, out=change)
+        change += force
+        change *= stop
+        np.minimum(change, friction, out=change)
+        np.maximum(change, low_friction, out=change)
+        force += change
+        force *= gain
+        velocity += force
+        np.multiply(velocity, h, out=change)
+        position += change
+        positions[k] = position
+    final = tuple(x.reshape(batch) for x in (position, velocity, setpoint))
+    return positions.reshape(-1, *batch), final

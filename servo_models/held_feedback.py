@@ -1,0 +1,77 @@
+"""HeldFeedback: why a reading of a cheap servo bus is old, coarse and off, and does not say so.
+
+The bus polls each servo once per `poll_period_s`. A poll fails with probability `loss` and then
+leaves the previous value in place. The host reads whatever is there. So a reading is the position
+at the last successful poll, rounded to `quantum_rad`, plus `offset_rad`; its age is between zero
+and many periods, on average `mean_age_s = poll_period_s * (1/2 + loss / (1 - loss))`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import InputError
+
+
+@dataclass(frozen=True)
+class HeldFeedback:
+    """Feedback of one joint.
+
+    Attributes
+    ----------
+    poll_period_s : float
+        Time between polls [s]; 0 if every read is a fresh one.
+    loss : float
+        Probability that a poll fails silently, 0 <= loss < 1.
+    quantum_rad : float
+        Size of one count [rad]; 0 if readings are continuous.
+    offset_rad : float
+        Reading minus position, constant [rad].
+    """
+
+    poll_period_s: float = 0.0
+    loss: float = 0.0
+    quantum_rad: float = 0.0
+    offset_rad: float = 0.0
+
+    def __post_init__(self):
+        if not self.poll_period_s >= 0 or not np.isfinite(self.poll_period_s):
+            raise InputError(f"HeldFeedback: poll_period_s is {self.poll_period_s}; it must be ≥ 0.")
+        if not 0 <= self.loss < 1:
+            raise InputError(f"HeldFeedback: loss is {self.loss}; it must be in [0, 1).")
+        if not self.quantum_rad >= 0:
+            raise InputError(f"HeldFeedback: quantum_rad is {self.quantum_rad}; it must be ≥ 0.")
+
+    @property
+    def mean_age_s(self) -> float:
+        """Mean age of a reading at a random instant [s]."""
+        return self.poll_period_s * (0.5 + self.loss / (1.0 - self.loss))
+
+    def poll_times(
+        self, start_s: float, stop_s: float, phase_s: float, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Poll instants in [start_s, stop_s) and whether each succeeded.
+
+        Parameters
+        ----------
+        phase_s : float
+            One poll instant of the lattice.
+        rng : numpy.random.Generator
+            Decides which polls fail.
+        """
+        if self.poll_period_s == 0:
+            raise InputError("HeldFeedback: poll_period_s is 0, so there are no poll instants.")
+        first = np.ceil((start_s - phase_s) / self.poll_period_s)
+        last = np.ceil((stop_s - phase_s) / self.poll_period_s)
+        times = phase_s + self.poll_period_s * np.arange(first, last)
+        return times, rng.random(len(times)) >= self.loss
+
+    def quantise(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`position_rad` as the encoder reports it [rad]."""
+        reported = np.asarray(position_rad, float) + self.offset_rad
+        if self.quantum_rad == 0:
+            return reported
+        return np.round(reported / self.quantum_rad) * self.quantum_rad
