@@ -142,23 +142,43 @@ class DelayedPD:
         commands = np.broadcast_to(commands, (len(commands), *self.batch))
         history = np.concatenate([self._past, commands])
         self._past = history[len(history) - self._nsample :].copy()
-        delayed = _delayed(history, len(commands), self._values["delay_s"] / self.time_step_s)
+        delay = np.broadcast_to(self._values["delay_s"] / self.time_step_s, self.batch).reshape(-1)
+        delayed = fractional_shift(history.reshape(len(history), -1), len(commands), delay)
+        delayed = delayed.reshape(commands.shape)
         state = (self._position, self._velocity, self._setpoint)
         positions, state = integrate(delayed, state, self._values, self.time_step_s)
         self._position, self._velocity, self._setpoint = state
         return positions
 
 
-def _delayed(history: NDArray, steps: int, delay_steps: NDArray) -> NDArray[np.float64]:
-    """Last `steps` rows of `history` as they arrive after `delay_steps` (fractional)."""
-    shape = history.shape[1:]
+def fractional_shift(
+    history: NDArray, steps: int, delay_steps: NDArray, column: NDArray | None = None
+) -> NDArray[np.float64]:
+    """Last `steps` rows of `history` as they arrive after fractional delays.
+
+    Parameters
+    ----------
+    history : ndarray, shape (rows, series)
+        Rows before the last `steps` are the past; there must be at least `max(delay_steps) + 1`.
+    steps : int
+    delay_steps : ndarray, shape (n,)
+    column : ndarray of int, shape (n,), optional
+        Which series each delay applies to; by default one each, in order.
+
+    Returns
+    -------
+    ndarray, shape (steps, n)
+    """
+    series = history.shape[1]
+    column = np.arange(series) if column is None else column
     whole = np.floor(delay_steps).astype(int)
-    fraction = np.broadcast_to(delay_steps - whole, shape)
-    row = np.arange(len(history) - steps, len(history)).reshape(-1, *[1] * len(shape))
-    index = row - np.broadcast_to(whole, shape)
-    late = np.take_along_axis(history, index, axis=0)
-    later = np.take_along_axis(history, index - 1, axis=0)
-    return late + fraction * (later - late)
+    # one row more than asked for: each row's successor is the other end of its interpolation
+    row = np.arange(len(history) - steps - 1, len(history))[:, None]
+    taken = np.take(history.reshape(-1), row * series + (column - whole * series))
+    out = np.subtract(taken[:-1], taken[1:])
+    out *= delay_steps - whole
+    out += taken[1:]
+    return out
 
 
 def integrate(
@@ -166,6 +186,7 @@ def integrate(
     state: tuple[NDArray, NDArray, NDArray],
     values: dict[str, NDArray],
     time_step_s: float,
+    out: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:
     """Step the servo through commands that have already been delayed: the inner loop of fitting.
 
@@ -177,6 +198,8 @@ def integrate(
     values : dict
         Fields of `DelayedPDParameters` but the delay, each broadcastable to batch.
     time_step_s : float
+    out : ndarray, optional
+        Where the positions go; may be `delayed` itself.
 
     Returns
     -------
@@ -192,13 +215,14 @@ def integrate(
         flat(values[name] / values["armature"])
         for name in ("stiffness", "damping", "friction_loss", "effort_limit")
     )
+    positions = np.empty(delayed.shape) if out is None else out
+    flat_positions = positions.reshape(len(delayed), -1)  # a view: splitting or merging one axis
     delayed = delayed.reshape(len(delayed), -1)
     low_effort, low_friction, stop = -effort, -friction, -FRICTION_IMPEDANCE
     slew = flat(values["velocity_limit"] * h)
     low_slew = -slew
     inverse = h / (1.0 + h * kd)
     position, velocity, setpoint = (flat(x).copy() for x in state)
-    positions = np.empty_like(delayed)
     force, wanted, change = (np.empty_like(position) for _ in range(3))
     # numpy.clip costs five times minimum + maximum on small arrays, hence the pairs below
     for k in range(len(delayed)):
@@ -224,6 +248,6 @@ def integrate(
         velocity += force
         np.multiply(velocity, h, out=change)
         position += change
-        positions[k] = position
+        flat_positions[k] = position
     final = tuple(x.reshape(batch) for x in (position, velocity, setpoint))
-    return positions.reshape(-1, *batch), final
+    return positions, final

@@ -1,0 +1,485 @@
+"""From recordings to a servo model per joint: fit the ladder, choose, and say what is known.
+
+For each joint the rungs of `sysid.ladder` are fitted to fresh readings by output error, from seeded
+global starts, and judged by leaving one frequency out: the model that predicts tones it has not
+seen is chosen (`DelayedPD` where it is within 5 % of the best, because that is the model training
+runs). The dead time's interval is a profile likelihood: how much worse does the best fit become
+when the delay is held elsewhere? Residuals of a real servo are not white, so the likelihood is
+counted in effective, not in nominal, samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from common.joints import JOINT_NAMES
+from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from sysid.delay import LEVEL, Interval, LagBudget, lag_budget
+from sysid.ladder import LADDER, Rung, rung
+from sysid.output_error import Fit, Problem, TrialData, fit, global_starts, look_up, positions, prepare
+from sysid.poll_lattice import find_poll_lattice, quantum, readings
+from sysid.recording import Recording, Trial
+
+PREFERRED = "delayed_pd"
+_PREFERENCE = 1.05
+_MOST_FOLDS = 12
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How far a model is from the readings, RMS [rad], and in percent of their spread.
+
+    Attributes
+    ----------
+    fresh, held, naive : float
+        Free run against fresh rows when they were measured; all rows when their value was
+        measured; all rows at their own send time.
+    one_step : float
+        Model's move from one fresh row to the next, against the readings' move.
+    leave_one_out : float
+        Free run on fresh rows of frequencies the fit has not seen; NaN with one frequency.
+    leave_one_out_by_frequency : dict of float to float
+        The same per frequency (per trial number where there are no tones).
+    fit_percent : float
+        100 (1 - RMS / standard deviation of the fresh readings).
+    """
+
+    fresh: float
+    held: float
+    naive: float
+    one_step: float
+    leave_one_out: float
+    leave_one_out_by_frequency: dict[float, float]
+    fit_percent: float
+
+
+@dataclass(frozen=True)
+class RungResult:
+    """One model of the ladder, fitted to one joint."""
+
+    name: str
+    values: dict[str, float]
+    intervals: dict[str, Interval]
+    undecided: dict[str, str]
+    """Parameters the data do not settle, each with the reason."""
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class JointCalibrationResult:
+    """Everything found about one joint.
+
+    Attributes
+    ----------
+    chosen : str
+        Name of the rung that predicts unseen frequencies best.
+    rungs : dict of str to RungResult
+    dead_time : Interval
+        Delay of DelayedPD with its profile-likelihood interval [s].
+    budget : LagBudget
+    quantum_rad, offset_rad : float
+    presets : dict of str to Scores
+        Published settings, scored the same way.
+    trials : tuple of TrialData
+        What the fit saw; for pictures.
+    """
+
+    joint: str
+    chosen: str
+    rungs: dict[str, RungResult]
+    dead_time: Interval
+    budget: LagBudget
+    quantum_rad: float
+    offset_rad: Interval
+    presets: dict[str, Scores]
+    trials: tuple[TrialData, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def delay_steps(self) -> tuple[int, int]:
+        """Dead-time interval in whole physics steps, rounded outward."""
+        low = int(np.floor(self.dead_time.low / TIME_STEP_S + 1e-9))
+        return low, int(np.ceil(self.dead_time.high / TIME_STEP_S - 1e-9))
+
+
+@dataclass(frozen=True)
+class _Task:
+    joint: str
+    trials: tuple[Trial, ...]
+    quantum_rad: float
+    rounding: str | None
+    seed: int
+    presets: dict[str, DelayedPDParameters]
+
+
+def calibrate(
+    recordings: Sequence[Recording],
+    joints: Sequence[str] | None = None,
+    seed: int = 0,
+    presets: dict[str, dict[str, DelayedPDParameters]] | None = None,
+    workers: int = 2,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, JointCalibrationResult]:
+    """Calibrate every joint of the recordings.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Trials of one joint are pooled over all of them.
+    joints : sequence of str, optional
+        Which joints; by default all that were recorded.
+    seed : int
+        Results of a joint depend on the seed and its name alone, not on the other joints.
+    presets : dict of str to (dict of joint to DelayedPDParameters), optional
+        Published settings to score beside the fit.
+    workers : int
+        Processes; joints are independent.
+    progress : callable, optional
+        Called with a joint's name when it is done.
+
+    Raises
+    ------
+    InputError
+        If a joint has too little motion to say anything.
+    """
+    chosen = [j for j in JOINT_NAMES if any(j in r.joints for r in recordings)]
+    chosen = [j for j in chosen if joints is None or j in joints]
+    tasks = []
+    for joint in chosen:
+        trials, command_quantum, rounding = joint_trials(recordings, joint)
+        own = {name: table[joint] for name, table in (presets or {}).items() if joint in table}
+        tasks.append(_Task(joint, trials, command_quantum, rounding, seed, own))
+    found: dict[str, JointCalibrationResult] = {}
+    if workers <= 1 or len(tasks) <= 1:
+        for task in tasks:
+            found[task.joint] = _calibrate_joint(task)
+            if progress:
+                progress(task.joint)
+    else:
+        with ProcessPoolExecutor(min(workers, len(tasks))) as pool:
+            futures = {pool.submit(_calibrate_joint, task): task.joint for task in tasks}
+            for future in as_completed(futures):
+                found[futures[future]] = future.result()
+                if progress:
+                    progress(futures[future])
+    return {joint: found[joint] for joint in chosen}
+
+
+def joint_trials(
+    recordings: Sequence[Recording], joint: str
+) -> tuple[tuple[Trial, ...], float, str | None]:
+    """All trials of `joint`, renumbered, and how the bus truncated its commands.
+
+    Returns
+    -------
+    trials : tuple of Trial
+    command_quantum_rad : float
+        0 if the recordings do not say.
+    rounding : {"up", "down"} or None
+    """
+    trials: list[Trial] = []
+    command_quantum, rounding = 0.0, None
+    for recording in recordings:
+        if joint not in recording.joints:
+            continue
+        bus = recording.metadata.get("bus") or {}
+        command_quantum = float(bus.get("command_quantum_rad") or 0.0)
+        rounding = (bus.get("command_rounding") or {}).get(joint)
+        for trial in recording.trials(joint):
+            trials.append(replace(trial, number=len(trials)))
+    return tuple(trials), command_quantum, rounding
+
+
+def joint_rng(seed: int, joint: str) -> np.random.Generator:
+    """Generator of one joint: repeatable whatever other joints are computed."""
+    return np.random.default_rng([seed, JOINT_NAMES.index(joint)])
+
+
+def _calibrate_joint(task: _Task) -> JointCalibrationResult:
+    rng = joint_rng(task.seed, task.joint)
+    lattice = find_poll_lattice(task.trials)
+    budget = lag_budget(task.joint, task.trials, rng, lattice)
+    data = tuple(
+        prepare(t, readings(t, lattice), task.quantum_rad, task.rounding) for t in task.trials
+    )
+    data = tuple(d for d in data if len(d.sample_step))
+    step = quantum(task.trials)
+    # fits of a noise-free servo still meet rounding: a third of a count
+    noise = max(budget.noise_rad, step / 3, 1e-4) if np.isfinite(budget.noise_rad) else 0.012
+    folds = _folds(data)
+    rungs: dict[str, RungResult] = {}
+    best: dict[str, list[Fit]] = {}
+    for model in LADDER:
+        best[model.name] = _fit_with_folds(model, data, folds, noise, rng, best)
+        if model.name == PREFERRED:
+            dead_time, improved = _profile(model, data, noise, best[PREFERRED][0])
+            best[PREFERRED][0] = improved
+        rungs[model.name] = _result(model, best[model.name], data, folds, noise)
+    chosen = _choose(rungs)
+    pd = rungs[PREFERRED]
+    presets = {
+        name: _score_preset(p, data, pd.values["offset_rad"]) for name, p in task.presets.items()
+    }
+    warnings = [*budget.warnings, *_warnings(task.joint, rungs, chosen, data)]
+    return JointCalibrationResult(
+        task.joint, chosen, rungs, dead_time, budget, step, pd.intervals["offset_rad"], presets,
+        data, tuple(warnings),
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------------------- fitting
+
+
+def _folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
+    """Which trials remain when each frequency is left out; by trial where there are no tones."""
+    labels = [
+        round(d.frequency_hz, 2) if d.frequency_hz > 0 else float(n) for n, d in enumerate(data)
+    ]
+    names = sorted(set(labels))
+    if len(names) < 2:
+        return {}
+    picked = names
+    if len(names) > _MOST_FOLDS:  # a fine sweep: every n-th frequency says as much
+        index = np.unique(np.round(np.linspace(0, len(names) - 1, _MOST_FOLDS)).astype(int))
+        picked = [names[i] for i in index]
+    return {name: tuple(label != name for label in labels) for name in picked}
+
+
+def _fit_with_folds(
+    model: Rung,
+    data: tuple[TrialData, ...],
+    folds: dict[float, tuple[bool, ...]],
+    noise: float,
+    rng: np.random.Generator,
+    lower: dict[str, list[Fit]],
+) -> list[Fit]:
+    """Best fit to all trials, then to each fold, each from starts of its own.
+
+    A fold never starts from the fit to all trials: that would leave the optimum of the held-out
+    frequency within reach.
+    """
+    everything = Problem(data, (True,) * len(data), noise, {})
+    problems = [everything, *(replace(everything, use=use) for use in folds.values())]
+    if model.name == f"{PREFERRED}_backlash":  # nested in DelayedPD: start from its solutions
+        starts = [
+            [np.insert(f.values, -1, gap) for gap in (0.002, 0.008, 0.025)]
+            for f in lower[PREFERRED]
+        ]
+        return _best_of(model, problems, np.array(starts), 15)
+    keep = int(np.clip(60 // len(problems), 6, 12))
+    starts = global_starts(model, problems, rng, 256, keep)
+    flat = [p for p in problems for _ in range(keep)]
+    early = fit(model, flat, starts.reshape(-1, starts.shape[-1]), 8)
+    top = []
+    for i in range(len(problems)):
+        own = sorted(early[i * keep : (i + 1) * keep], key=lambda f: f.cost)[:3]
+        top.append([f.values for f in own])
+    return _best_of(model, problems, np.array(top), 25)
+
+
+def _best_of(
+    model: Rung, problems: Sequence[Problem], starts: NDArray, iterations: int
+) -> list[Fit]:
+    """Fit every problem from each of its starts, shape (problems, starts, parameters)."""
+    count = starts.shape[1]
+    flat = [p for p in problems for _ in range(count)]
+    fits = fit(model, flat, starts.reshape(-1, starts.shape[-1]), iterations)
+    return [min(fits[i : i + count], key=lambda f: f.cost) for i in range(0, len(fits), count)]
+
+
+def _profile(
+    model: Rung, data: tuple[TrialData, ...], noise: float, best: Fit
+) -> tuple[Interval, Fit]:
+    """Dead time with its profile-likelihood interval, and the best fit met on the way."""
+    everything = Problem(data, (True,) * len(data), noise, {})
+    residual = _fresh_residuals(model, best.values, data)
+    threshold = 0.5 * chi2.ppf(LEVEL, 1) * _effective(residual)
+    for _ in range(3):
+        centre = best.values[0]
+        spread = np.array([0.001, 0.002, 0.0035, 0.005, 0.0075, 0.010, 0.014])
+        delays = np.concatenate([centre - spread[::-1], [centre], centre + spread])
+        delays = delays[(delays >= model.parameters[0].low) & (delays <= model.parameters[0].high)]
+        problems = [replace(everything, frozen={"delay_s": float(d)}) for d in delays]
+        fits = fit(model, problems, np.tile(best.values, (len(delays), 1)), 10)
+        # neighbours know better ways: pass each point's solution on, outward and back
+        for shift in (1, -1):
+            moved = fit(model, problems, np.roll([f.values for f in fits], shift, axis=0), 4)
+            fits = [min(pair, key=lambda f: f.cost) for pair in zip(fits, moved, strict=True)]
+        lowest = min(fits, key=lambda f: f.cost)
+        if lowest.cost > best.cost - 0.5:
+            break
+        best = min(fit(model, [everything], lowest.values[None], 25) + [best], key=lambda f: f.cost)
+    cost = np.minimum(np.array([f.cost for f in fits]), np.inf) - min(best.cost, lowest.cost)
+    return Interval(float(best.values[0]), *_crossings(delays, cost, best.values[0], threshold)), best
+
+
+def _crossings(
+    delays: NDArray, cost: NDArray, centre: float, threshold: float
+) -> tuple[float, float]:
+    """Where the profile rises through the threshold on either side of `centre`."""
+    below = cost <= threshold
+    inside = np.flatnonzero(below)
+    if not len(inside):
+        return float(centre), float(centre)
+    ends = []
+    for edge, step in ((inside[0], -1), (inside[-1], 1)):
+        beyond = edge + step
+        if 0 <= beyond < len(delays):
+            part = (threshold - cost[edge]) / max(cost[beyond] - cost[edge], 1e-9)
+            ends.append(float(delays[edge] + part * (delays[beyond] - delays[edge])))
+        else:
+            ends.append(float(delays[edge]))
+    return min(ends[0], float(centre)), max(ends[1], float(centre))
+
+
+def _effective(residuals: Sequence[NDArray]) -> float:
+    """How many nominal samples carry the information of one, given their autocorrelation."""
+    total, correlation = 0.0, np.zeros(8)
+    for r in residuals:
+        r = r - r.mean()
+        total += float(r @ r)
+        for lag in range(1, 9):
+            correlation[lag - 1] += float(r[lag:] @ r[:-lag])
+    correlation /= max(total, 1e-18)
+    positive = np.cumprod(correlation > 0.1)  # up to where it fades into its own noise
+    return float(max(1.0, 1.0 + 2.0 * np.sum(correlation * positive)))
+
+
+# ------------------------------------------------------------------------------- scoring
+
+
+def _fresh_residuals(model: Rung, values: NDArray, data: Sequence[TrialData]) -> list[NDArray]:
+    track = positions(model, [(values[None], data)])[0][:, 0]
+    return [look_up(track[:, n], t.sample_step) - t.sample_rad for n, t in enumerate(data)]
+
+
+def score(
+    track: NDArray[np.float64], data: Sequence[TrialData], held_out: dict[float, NDArray]
+) -> Scores:
+    """Scores of simulated positions.
+
+    Parameters
+    ----------
+    track : ndarray, shape (steps + 1, trials)
+        Position at step edges, relative to rest [rad].
+    data : sequence of TrialData
+    held_out : dict of float to ndarray
+        Residuals on each left-out frequency, from fits that have not seen it.
+    """
+    fresh, held, naive, one_step, spread = [], [], [], [], []
+    for n, t in enumerate(data):
+        model = look_up(track[:, n], t.sample_step)
+        fresh.append(model - t.sample_rad)
+        one_step.append(np.diff(model) - np.diff(t.sample_rad))
+        seen = np.isfinite(t.row_rad)
+        held.append((look_up(track[:, n], t.held_step) - t.row_rad)[seen])
+        naive.append((look_up(track[:, n], t.row_step) - t.row_rad)[seen])
+        spread.append(t.sample_rad - t.sample_rad.mean())
+    left = {name: _rms([r]) for name, r in held_out.items()}
+    return Scores(
+        _rms(fresh), _rms(held), _rms(naive), _rms(one_step),
+        _rms(list(held_out.values())) if held_out else float("nan"), left,
+        100.0 * (1.0 - _rms(fresh) / max(_rms(spread), 1e-9)),
+    )  # fmt: skip
+
+
+def _rms(parts: Sequence[NDArray]) -> float:
+    everything = np.concatenate(parts)
+    return float(np.sqrt(np.mean(everything**2))) if len(everything) else float("nan")
+
+
+def _score_preset(
+    parameters: DelayedPDParameters, data: tuple[TrialData, ...], offset_rad: float
+) -> Scores:
+    one = parameters.per_inertia()
+    values = np.array(
+        [one.delay_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
+         one.velocity_limit, offset_rad], float,
+    )  # fmt: skip
+    return score(positions(rung(PREFERRED), [(values[None], data)])[0][:, 0], data, {})
+
+
+def _result(
+    model: Rung,
+    fits: list[Fit],
+    data: tuple[TrialData, ...],
+    folds: dict[float, tuple[bool, ...]],
+    noise: float,
+) -> RungResult:
+    best = fits[0]
+    held_out = {}
+    for (name, use), fold in zip(folds.items(), fits[1:], strict=True):
+        left = tuple(d for d, used in zip(data, use, strict=True) if not used)
+        held_out[name] = np.concatenate(_fresh_residuals(model, fold.values, left))
+    residual = _fresh_residuals(model, best.values, data)
+    # soft-L1 works in units of the noise; its covariance is for residuals of that size
+    inflation = _effective(residual) * max(1.0, _rms(residual) ** 2 / noise**2)
+    sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
+    z = norm.ppf((1 + LEVEL) / 2)
+    values, intervals, undecided = {}, {}, {}
+    for j, p in enumerate(model.parameters):
+        value = float(best.values[j])
+        centre = float(p.encode(value))
+        ends = [float(p.decode(c)) for c in np.clip(
+            [centre - z * sd[j], centre + z * sd[j]], p.encode(p.low), p.encode(p.high))]  # fmt: skip
+        values[p.name] = value
+        intervals[p.name] = Interval(value, ends[0], ends[1])
+        if p.logarithmic and (value <= p.low * 1.01 or value >= p.high / 1.01):
+            undecided[p.name] = f"it sits on its bound {p.low if value <= p.low * 1.01 else p.high:g}"
+        elif np.sqrt(best.covariance[j, j]) > 0.7 * p.prior_sd:
+            undecided[p.name] = "these recordings do not excite it; the value is the prior's"
+        elif p.logarithmic and sd[j] > 0.5:
+            undecided[p.name] = "its interval is wider than a factor of two"
+    scores = score(positions(model, [(best.values[None], data)])[0][:, 0], data, held_out)
+    return RungResult(model.name, values, intervals, undecided, scores)
+
+
+def _choose(rungs: dict[str, RungResult]) -> str:
+    """The rung with the smallest leave-one-out error; DelayedPD where it is as good."""
+    errors = {name: r.scores.leave_one_out for name, r in rungs.items()}
+    if not np.isfinite(list(errors.values())).all():
+        return PREFERRED  # nothing to judge by: the model that training runs
+    best = min(errors, key=lambda name: errors[name])
+    return PREFERRED if errors[PREFERRED] <= _PREFERENCE * errors[best] else best
+
+
+def _warnings(
+    joint: str, rungs: dict[str, RungResult], chosen: str, data: Sequence[TrialData]
+) -> list[str]:
+    pd = rungs[PREFERRED]
+    said = []
+    peak = max(_command_speed(d) for d in data)
+    if "velocity_limit_rad_s" in pd.undecided:
+        said.append(
+            f"{joint}: the speed limit was not excited (commands reach {peak:.1f} rad/s): its "
+            "value comes from what servos of this kind can do. Record a step or a faster tone."
+        )
+    for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
+        if name in pd.undecided:
+            said.append(f"{joint}: {name.split('_')[0]} is not identified: {pd.undecided[name]}.")
+    if chosen != PREFERRED:
+        ours, theirs = pd.scores.leave_one_out, rungs[chosen].scores.leave_one_out
+        said.append(
+            f"{joint}: {chosen} predicts unseen frequencies better ({1e3 * theirs:.1f} against "
+            f"{1e3 * ours:.1f} mrad); simulators still get DelayedPD, the model they can run."
+        )
+    if not np.isfinite(pd.scores.leave_one_out):
+        said.append(
+            f"{joint}: one frequency only, so no model could be tested on motion it had not seen."
+        )
+    return said
+
+
+def _command_speed(trial: TrialData) -> float:
+    """Peak rate of the command [rad/s], over windows longer than a control loop."""
+    window = 25
+    if len(trial.command) <= window:
+        return 0.0
+    moved = trial.command[window:] - trial.command[:-window]
+    return float(np.max(np.abs(moved)) / (window * TIME_STEP_S))

@@ -1,0 +1,333 @@
+"""How late is this servo, and whose fault is it: the bus's, the sensor's, or its own?
+
+The naive lag between a command's row and the position's row is a sum:
+
+    naive lag = age of the feedback + half a loop of command hold + servo lag
+    servo lag = dead time + dynamics
+
+This module measures the left side and the first two terms of the right; the dead time needs a
+model and comes from `sysid.calibrate`. Estimators, each on all rows and on fresh rows:
+
+* integer cross-correlation, the usual script: only whole loop periods can come out;
+* sub-sample cross-correlation, bounded to one period of the tone;
+* sine phase per trial; and the phase slope over all tones, where a lag common to all frequencies
+  has no whole-period ambiguity below half a second.
+
+The default, "hold-aware", is the phase slope of fresh rows at the times they were measured,
+against the command as it was held. Intervals are from a bootstrap over periods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import InputError
+from sysid.poll_lattice import PollLattice, Readings, find_poll_lattice, readings
+from sysid.recording import Trial
+from sysid.tone import ToneResponse, tone_response
+
+LEVEL = 0.90
+"""Coverage of every interval."""
+
+LONGEST_LAG_S = 0.5
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 90 % interval, both in the same unit."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of_draws(cls, value: float, draws: NDArray[np.float64]) -> Interval:
+        """The interval that holds the middle 90 % of `draws`."""
+        low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        return cls(float(value), float(low), float(high))
+
+
+@dataclass(frozen=True)
+class FrequencyLag:
+    """Response of the joint to one tone."""
+
+    frequency_hz: float
+    gain: float
+    phase_deg: float
+    lag: Interval
+    naive_lag_s: float
+    naive_gain: float
+    trial: int
+
+
+@dataclass(frozen=True)
+class LagBudget:
+    """Where one joint's lag comes from. Times in seconds.
+
+    Attributes
+    ----------
+    naive : Interval
+        Command row to position row, all rows.
+    fresh : Interval
+        Command row to fresh rows at the times they were measured.
+    lag : Interval
+        Command edge to the motion the host sees: the servo's own lag.
+    feedback_age_s, command_hold_s : float
+        What the bus adds: `naive - fresh` and `fresh - lag`.
+    by_frequency : tuple of FrequencyLag
+        Empty if the recording has no tones.
+    estimators : dict of str to float
+        All estimators by name [s], for comparison; NaN where one does not apply.
+    lattice : PollLattice
+    noise_rad : float
+        RMS of fresh readings about their tones; NaN if there are none.
+    """
+
+    joint: str
+    naive: Interval
+    fresh: Interval
+    lag: Interval
+    feedback_age_s: float
+    command_hold_s: float
+    by_frequency: tuple[FrequencyLag, ...]
+    estimators: dict[str, float]
+    lattice: PollLattice
+    noise_rad: float
+    warnings: tuple[str, ...]
+
+
+def lag_budget(
+    joint: str,
+    trials: Sequence[Trial],
+    rng: np.random.Generator,
+    lattice: PollLattice | None = None,
+) -> LagBudget:
+    """Measure the lag of one joint and what the bus adds to it.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+        All of this joint.
+    rng : numpy.random.Generator
+        For the bootstrap.
+    lattice : PollLattice, optional
+        If it has been found already.
+
+    Raises
+    ------
+    InputError
+        If nothing moves, or there are too few fresh readings to say anything.
+    """
+    lattice = lattice or find_poll_lattice(trials)
+    read = [readings(t, lattice) for t in trials]
+    if sum(len(r.rows) for r in read) < 16:
+        raise InputError(
+            f"{joint}: only {sum(len(r.rows) for r in read)} readings differ from the one before, "
+            "too few to measure a lag. Was the joint moving and its torque on? "
+            "`pupper-sysid doctor` says more."
+        )
+    tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
+    tones = [t for t in tones if t is not None]
+    warnings: list[str] = []
+    if tones:
+        naive = _slope(tones, "naive_rows")
+        fresh = _slope(tones, "fresh_rows")
+        lag = _slope(tones, "fresh_held")
+        if len({round(t.frequency_hz, 2) for t in tones}) == 1:
+            warnings.append(
+                f"{joint}: one frequency only, so a lag of one period "
+                f"({1e3 / tones[0].frequency_hz:.0f} ms) more would look the same; record several."
+            )
+    else:
+        naive, fresh, lag = _shifts(trials, read, rng)
+        warnings.append(
+            f"{joint}: no tones in this recording, so the lag is one time shift over everything it "
+            "did. Record a sweep for a lag per frequency."
+        )
+    if lattice.kind == "unresolved":
+        warnings.append(
+            f"{joint}: readings are held, but their poll period could not be found; fresh readings "
+            "are dated to the middle between two reads. A longer sweep would settle it."
+        )
+    return LagBudget(
+        joint, naive, fresh, lag,
+        naive.value - fresh.value, fresh.value - lag.value,
+        tuple(_at_frequency(t, lag.value) for t in tones),
+        _estimators(trials, read, tones, lag.value),
+        lattice,
+        float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else float("nan"),
+        tuple(warnings),
+    )  # fmt: skip
+
+
+# --------------------------------------------------------------------------- phase slope
+
+_PAIRS = {
+    "naive_rows": ("naive", "command_rows"),
+    "fresh_rows": ("fresh", "command_rows"),
+    "fresh_held": ("fresh", "command_held"),
+}
+
+
+def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
+    """Lag common to all tones: the slope of the phase through the origin, with its interval."""
+    output, command = _PAIRS[pair]
+    frequency = np.array([t.frequency_hz for t in tones])
+    response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
+    draws = np.stack([getattr(t, f"{output}_draws") / getattr(t, command) for t in tones])
+    weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
+    weight /= weight.sum()
+    centre = _common_lag(response, frequency, weight)
+    lag = weight @ _lag_near(response, frequency, centre)
+    drawn = weight @ _lag_near(draws, frequency[:, None], centre)
+    return Interval.of_draws(lag, drawn)
+
+
+def _common_lag(response: NDArray, frequency: NDArray, weight: NDArray) -> float:
+    """The lag on which all phases agree best: whole periods of single tones cannot win."""
+    spacing = np.diff(np.unique(np.round(frequency, 3)))
+    # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
+    repeat = 1.0 / (spacing.min() if len(spacing) else frequency[0])
+    lags = np.arange(0.0, min(LONGEST_LAG_S, 0.95 * repeat), 2e-4)
+    turned = np.angle(response)[:, None] + 2 * np.pi * frequency[:, None] * lags
+    # agreement in time, not in phase: at low frequencies a given time is a small angle
+    scale = weight[:, None] / frequency[:, None] ** 2
+    return float(lags[int(np.argmax((scale * np.cos(turned)).sum(axis=0)))])
+
+
+def _lag_near(response: NDArray, frequency: NDArray, centre: float) -> NDArray[np.float64]:
+    """Lag of a phase, in the period around `centre` [s]."""
+    turned = np.angle(response * np.exp(2j * np.pi * frequency * centre))
+    return centre - turned / (2 * np.pi * frequency)
+
+
+def _at_frequency(tone: ToneResponse, centre: float) -> FrequencyLag:
+    f, response = tone.frequency_hz, tone.response
+    lag = float(_lag_near(np.array(response), np.array(f), centre))
+    draws = _lag_near(tone.response_draws, np.array(f), centre)
+    naive = tone.naive / tone.command_rows
+    return FrequencyLag(
+        f, abs(response), -360.0 * f * lag, Interval.of_draws(lag, draws),
+        float(_lag_near(np.array(naive), np.array(f), centre + 0.03)), abs(naive), tone.trial,
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------- time shift, any excitation
+
+
+def _shifts(
+    trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator, draws: int = 400
+) -> tuple[Interval, Interval, Interval]:
+    """Naive, fresh and servo lag as the shift of the command that correlates best."""
+    lags = np.arange(0.0, LONGEST_LAG_S, 1e-3)
+    results = []
+    for kind in _PAIRS:
+        parts = [_shift_sums(t, r, kind, lags) for t, r in zip(trials, read, strict=True)]
+        sums = np.concatenate(parts)  # (blocks, 6, lags)
+        weights = rng.exponential(size=(draws, len(sums)))
+        value = _best_shift(sums.sum(axis=0), lags)
+        drawn = [_best_shift(np.tensordot(w, sums, axes=1), lags) for w in weights]
+        results.append(Interval.of_draws(value, np.array(drawn)))
+    return results[0], results[1], results[2]
+
+
+def _shift_sums(trial: Trial, read: Readings, kind: str, lags: NDArray) -> NDArray[np.float64]:
+    """Sums behind the correlation of position and shifted command, per block of half a second."""
+    if kind == "naive_rows":
+        rows = np.flatnonzero(np.isfinite(trial.position_rad))
+        time, position = trial.send_time_s[rows], trial.position_rad[rows]
+    else:
+        time, position = read.time_s, read.position_rad
+    past = time[:, None] - lags
+    if kind == "fresh_held":
+        row = np.searchsorted(trial.send_time_s, past, side="right") - 1
+        command = np.where(row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)])
+    else:
+        command = np.interp(past, trial.send_time_s, trial.command_rad)
+    y = np.broadcast_to(position[:, None], command.shape)
+    products = np.stack([np.ones_like(y), y, command, y * y, y * command, command * command], 1)
+    block = np.floor((time - time[0]) / 0.5).astype(int) if len(time) else np.zeros(0, int)
+    _, block = np.unique(block, return_inverse=True)
+    sums = np.zeros((block.max() + 1 if len(block) else 0, 6, len(lags)))
+    np.add.at(sums, block, products)
+    return sums
+
+
+def _best_shift(sums: NDArray, lags: NDArray) -> float:
+    n, y, c, yy, yc, cc = sums
+    covariance = yc - y * c / n
+    scale = np.sqrt(np.maximum((yy - y * y / n) * (cc - c * c / n), 1e-18))
+    return _parabolic_peak(covariance / scale, lags)
+
+
+def _parabolic_peak(score: NDArray, lags: NDArray) -> float:
+    """Position of the maximum of a sampled curve, refined by the parabola through its top."""
+    k = int(np.argmax(score))
+    if not 0 < k < len(score) - 1:
+        return float(lags[k])
+    left, top, right = score[k - 1 : k + 2]
+    bend = left - 2 * top + right
+    return float(lags[k] + (0.5 * (left - right) / bend if bend < 0 else 0.0) * (lags[1] - lags[0]))
+
+
+# ------------------------------------------------------------------------- for comparison
+
+
+def _estimators(
+    trials: Sequence[Trial], read: Sequence[Readings], tones: Sequence[ToneResponse], lag: float
+) -> dict[str, float]:
+    """All estimators side by side, each the mean over trials [s]."""
+    pairs = list(zip(trials, read, strict=True))
+    found = {
+        "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
+        "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
+        "sub-sample cross-correlation, all rows": [_bounded(t, r, "naive_rows") for t, r in pairs],
+        "sub-sample cross-correlation, fresh rows": [_bounded(t, r, "fresh_rows") for t, r in pairs],
+    }
+    near = {"naive_rows": lag + 0.04, "fresh_rows": lag + 0.01}
+    for kind, name in (("naive_rows", "all rows"), ("fresh_rows", "fresh rows")):
+        output, command = _PAIRS[kind]
+        found[f"sine phase, {name}"] = [
+            float(
+                _lag_near(
+                    np.array(getattr(t, output) / getattr(t, command)),
+                    np.array(t.frequency_hz),
+                    near[kind],
+                )
+            )
+            for t in tones
+        ]
+    result = {k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()}
+    if tones:
+        result["phase slope, all rows"] = _slope(tones, "naive_rows").value
+        result["phase slope, fresh rows"] = _slope(tones, "fresh_rows").value
+        result["hold-aware (default)"] = lag
+    return result
+
+
+def _longest(trial: Trial) -> float:
+    return min(LONGEST_LAG_S, 1.0 / trial.frequency_hz if trial.frequency_hz > 0 else LONGEST_LAG_S)
+
+
+def _integer(trial: Trial, rows: NDArray | None) -> float:
+    """Lag in whole loop periods at which raw correlation peaks: the usual script [s]."""
+    c = trial.command_rad - trial.command_rad.mean()
+    loop = float(np.median(np.diff(trial.send_time_s)))
+    shifts = np.arange(0, max(2, int(_longest(trial) / loop)))
+    rows = np.flatnonzero(np.isfinite(trial.position_rad)) if rows is None else rows
+    rows = rows[rows >= shifts[-1]]
+    if len(rows) < 8:
+        return float("nan")
+    y = trial.position_rad[rows] - trial.position_rad[rows].mean()
+    return float(shifts[int(np.argmax([np.sum(y * c[rows - s]) for s in shifts]))] * loop)
+
+
+def _bounded(trial: Trial, read: Readings, kind: str) -> float:
+    lags = np.arange(0.0, _longest(trial), 1e-3)
+    sums = _shift_sums(trial, read, kind, lags)
+    return _best_shift(sums.sum(axis=0), lags) if len(sums) else float("nan")

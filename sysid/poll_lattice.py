@@ -1,0 +1,418 @@
+"""When was this reading really taken? Find the bus's poll instants from the readings alone.
+
+A polled bus refreshes each servo's position at instants on a lattice `phase + n * period`; a read
+in between returns the old value, and a failed poll leaves it for another period. So a row whose
+value *changed* says: a poll succeeded between the previous read and this one. Enough such
+intervals pin the lattice down to a fraction of a millisecond, and every changed ("fresh") row can
+then be given the time at which it was measured, which is what makes the lag of the servo visible
+behind the age of the feedback.
+
+Method (after facts of the recordings this project was built on): for one stretch of a few seconds
+and a trial period T, count for every phase how many changed rows' intervals contain an instant;
+the log-likelihood of the count, against intervals placed at random, is the score. Real polls drift
+by some 0.4 % from stretch to stretch, so stretches share T only through a Gaussian of that width.
+The score is compared with the same score after the gaps between changes were shuffled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.recording import Trial
+
+OUTLIERS = 0.03
+"""Share of changed rows that may contradict the lattice (a late reply, a missed row)."""
+
+_STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e-4
+_DRIFT = 0.0045  # relative sd of the period between stretches, measured on a Mini Pupper 2
+_BLUR_S = 0.003  # full width of the uncertainty of one poll instant
+_BINS = 64
+_LONGEST_S = 0.12
+_PEAKS = 12
+_MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
+_ALL_FRESH = 0.97
+
+
+@dataclass(frozen=True)
+class PollLattice:
+    """The poll of one joint, as far as its readings show it.
+
+    Attributes
+    ----------
+    kind : {"lattice", "unresolved", "every read"}
+        A lattice was found; readings are held but no lattice is significant; or no reading is
+        ever held, so each is taken as measured when it was read.
+    period_s, period_sd_s : float
+        Time between polls and its standard error; NaN unless `kind` is "lattice".
+    loss, loss_sd : float
+        Probability that a poll fails, and its standard error; NaN without a lattice.
+    z_score : float
+        Score against shuffled rows, in their standard deviations; NaN if it was not computed.
+    hit_rate : float
+        Share of changed rows with a lattice instant between the previous read and this one.
+    fresh_fraction : float
+        Share of rows with a new value, among all rows.
+    phases : tuple of _Phase
+        Lattice of each stretch.
+    """
+
+    kind: str
+    period_s: float
+    period_sd_s: float
+    loss: float
+    loss_sd: float
+    z_score: float
+    hit_rate: float
+    fresh_fraction: float
+    phases: tuple[_Phase, ...] = ()
+
+    @property
+    def mean_age_s(self) -> float:
+        """Mean age of a reading implied by period and loss [s]; NaN without a lattice."""
+        return self.period_s * (0.5 + self.loss / (1 - self.loss))
+
+
+@dataclass(frozen=True)
+class _Phase:
+    """The lattice in one stretch of one trial."""
+
+    trial: int
+    start_s: float
+    stop_s: float
+    period_s: float
+    phase_s: float
+    phase_sd_s: float
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The fresh rows of a trial, each with the time at which it was measured.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (fresh,)
+        Indices into the trial's rows.
+    time_s : ndarray, shape (fresh,)
+        When the position was measured.
+    position_rad : ndarray, shape (fresh,)
+    held_time_s : ndarray, shape (rows,)
+        For every row of the trial, when the value it shows was measured; NaN before the first
+        fresh row.
+    time_sd_s : float
+        Standard error of a shift common to all these times.
+    """
+
+    rows: NDArray[np.int64]
+    time_s: NDArray[np.float64]
+    position_rad: NDArray[np.float64]
+    held_time_s: NDArray[np.float64]
+    time_sd_s: float
+
+
+def fresh_rows(trial: Trial) -> NDArray[np.int64]:
+    """Indices of the rows whose value differs from the last value before them."""
+    valid = np.flatnonzero(np.isfinite(trial.position_rad))
+    changed = np.flatnonzero(np.diff(trial.position_rad[valid]) != 0) + 1
+    return valid[changed]
+
+
+def quantum(trials: Sequence[Trial]) -> float:
+    """Size of one count [rad]: the greatest common divisor of all changes; 0 if there is none."""
+    steps = np.concatenate([np.abs(np.diff(t.position_rad)) for t in trials])
+    steps = np.unique(np.round(steps[np.isfinite(steps) & (steps > 1e-7)], 9))
+    if len(steps) < 3:
+        return 0.0
+    guess = steps[0]
+    for step in steps[1:]:  # Euclid with a tolerance for decimal rounding in the file
+        a, b = max(step, guess), min(step, guess)
+        while b > 2e-5:
+            a, b = b, abs(a - b * np.round(a / b))
+        guess = a
+        if guess < 1e-4:
+            return 0.0
+    counts = np.round(steps / guess)
+    refined = float(np.sum(steps * counts) / np.sum(counts**2))
+    return refined if np.max(np.abs(steps - counts * refined)) < 0.1 * refined else 0.0
+
+
+def find_poll_lattice(
+    trials: Sequence[Trial], rng: np.random.Generator | None = None, shuffles: int = 12
+) -> PollLattice:
+    """Period, loss and phases of the poll behind one joint's readings.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        All of one joint.
+    rng : numpy.random.Generator, optional
+        Shuffles the gaps between changes for the z-score; without it there is none, and the
+        hit rate alone decides.
+    shuffles : int
+
+    Returns
+    -------
+    PollLattice
+    """
+    rows = sum(len(t.read_time_s) for t in trials)
+    fresh = sum(len(fresh_rows(t)) for t in trials)
+    fraction = fresh / max(rows, 1)
+    nothing = PollLattice("unresolved", *[float("nan")] * 6, fraction)
+    loop = _loop_period(trials)
+    moving, moving_fresh = _moving_fresh(trials)
+    if moving and moving_fresh / moving >= _ALL_FRESH:
+        return PollLattice("every read", *[float("nan")] * 6, fraction)
+    stretches = [s for t in trials for s in _stretches(t)]
+    if not stretches or not np.isfinite(loop):
+        return nothing
+
+    # ln T, spaced so that the last poll of a stretch moves by half of the blur
+    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * _BLUR_S / _STRETCH_S))
+    informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
+    period, score = _best_period(informative, grid)
+    z_score = float("nan")
+    if rng is not None:
+        null = [
+            _best_period([_shuffle(s, rng) for s in informative], grid)[1] for _ in range(shuffles)
+        ]
+        z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
+
+    phases = tuple(_refine(s, period) for s in stretches)
+    weights = np.array([len(s.begin) for s in stretches], float)
+    periods = np.array([p.period_s for p in phases])
+    period = float(np.average(periods, weights=weights))
+    spread = float(np.sqrt(np.average((periods - period) ** 2, weights=weights)))
+    effective = weights.sum() ** 2 / np.sum(weights**2)
+    hits = [_contains(s.begin, s.end, p) for s, p in zip(stretches, phases, strict=True)]
+    hit_rate = float(np.mean(np.concatenate(hits)))
+    loss, loss_sd = _loss(trials, phases)
+    found = hit_rate >= 0.9 and not z_score < 4.0
+    return PollLattice(
+        "lattice" if found else "unresolved",
+        period if found else float("nan"),
+        spread / np.sqrt(max(effective - 1, 1)) if found else float("nan"),
+        loss if found else float("nan"),
+        loss_sd if found else float("nan"),
+        z_score,
+        hit_rate,
+        fraction,
+        phases if found else (),
+    )
+
+
+def readings(trial: Trial, lattice: PollLattice) -> Readings:
+    """Fresh rows of `trial` with the times at which they were measured.
+
+    With a lattice: its last instant before the read. Held without a lattice: the middle between
+    the previous read and this one. Never held: the time of the read.
+    """
+    rows = fresh_rows(trial)
+    read = trial.read_time_s
+    before = read[rows - 1] if len(rows) else np.zeros(0)
+    if lattice.kind == "every read":
+        rows = np.flatnonzero(np.isfinite(trial.position_rad))
+        return Readings(rows, read[rows], trial.position_rad[rows], read.copy(), 0.0)
+    time = 0.5 * (before + read[rows])
+    sd = float(np.median(read[rows] - before) / np.sqrt(12 * max(len(rows), 1))) if len(rows) else 0
+    own = [p for p in lattice.phases if p.trial == trial.number]
+    for phase in own:
+        inside = (read[rows] >= phase.start_s) & (read[rows] <= phase.stop_s)
+        count = np.round((time - phase.phase_s) / phase.period_s)
+        instant = phase.phase_s + count * phase.period_s
+        slack = 0.5 * _BLUR_S
+        hit = inside & (instant >= before - slack) & (instant <= read[rows] + slack)
+        time = np.where(hit, np.minimum(instant, read[rows]), time)
+    if own:
+        sd = float(np.sqrt(np.mean([p.phase_sd_s**2 for p in own]) / len(own)))
+    held = np.full(len(read), np.nan)
+    held[rows] = time
+    last = np.maximum.accumulate(np.where(np.isfinite(held), np.arange(len(read)), -1))
+    held = np.where(last >= 0, held[np.maximum(last, 0)], np.nan)
+    return Readings(rows, time, trial.position_rad[rows], held, sd)
+
+
+# ---------------------------------------------------------------- one stretch of one trial
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    trial: int
+    start_s: float
+    stop_s: float
+    begin: NDArray[np.float64]
+    """Previous read of each changed row."""
+    end: NDArray[np.float64]
+    """Read of each changed row."""
+
+
+def _stretches(trial: Trial) -> list[_Stretch]:
+    """Cut a trial into stretches short enough for one strict lattice each."""
+    read, rows = trial.read_time_s, fresh_rows(trial)
+    parts = max(1, int(np.ceil((read[-1] - read[0]) / _STRETCH_S)))
+    edges = np.linspace(read[0], read[-1], parts + 1)
+    found = []
+    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+        own = rows[(read[rows] > start) & (read[rows] <= stop)]
+        if len(own) >= 8:
+            found.append(_Stretch(trial.number, start, stop, read[own - 1], read[own]))
+    return found
+
+
+def _loop_period(trials: Sequence[Trial]) -> float:
+    gaps = [np.diff(t.read_time_s) for t in trials if len(t.read_time_s) > 1]
+    return float(np.median(np.concatenate(gaps))) if gaps else float("nan")
+
+
+def _best_period(stretches: Sequence[_Stretch], grid: NDArray) -> tuple[float, float]:
+    """The common period [s] and its score: a quick search, its best peaks scored with care."""
+    pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
+    best = (float("nan"), -np.inf)
+    for _ in range(_PEAKS):
+        peak = int(np.argmax(pooled))
+        if not np.isfinite(pooled[peak]):
+            break
+        score = sum(_posterior(s, grid[peak], 25, 64)[3] for s in stretches)
+        best = max(best, (float(grid[peak]), float(score)), key=lambda pair: pair[1])
+        pooled[np.abs(np.log(grid / grid[peak])) < 2 * _DRIFT] = -np.inf
+    return best
+
+
+def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64]:
+    """Best log-likelihood over phases for each period, against intervals placed at random."""
+    # No blur here: intervals meet end to end, so with one a poll on a common edge would explain
+    # every row at periods of two loops. Polls that jitter over an edge count as outliers.
+    chance = np.minimum(np.median(end - begin) / periods, 1.0)  # for an interval at random
+    low = begin[None, :] / periods[:, None]
+    length = np.minimum((end - begin)[None, :] / periods[:, None], 1.0)
+    first = np.floor((low % 1.0) * _BINS).astype(np.int64)
+    span = np.round(length * _BINS).astype(np.int64)
+    row = np.arange(len(periods))[:, None] * (2 * _BINS + 1)
+    size = len(periods) * (2 * _BINS + 1)
+    up = np.bincount((row + first).ravel(), minlength=size)
+    down = np.bincount((row + first + span).ravel(), minlength=size)
+    inside = np.cumsum((up - down).reshape(len(periods), -1), axis=1)[:, : 2 * _BINS]
+    hits = (inside[:, :_BINS] + inside[:, _BINS:]).max(axis=1)
+    hit = np.log((1 - OUTLIERS) + OUTLIERS * chance) - np.log(chance)
+    return hits * hit + (len(begin) - hits) * np.log(OUTLIERS)
+
+
+def _pool(profiles: list[NDArray], grid: NDArray) -> NDArray[np.float64]:
+    """Sum of the profiles, each free to sit a little beside the common period."""
+    log_period = np.log(grid)
+    reach = int(np.ceil(3 * _DRIFT / (log_period[1] - log_period[0])))
+    offsets = np.arange(-reach, reach + 1)
+    penalty = -0.5 * (offsets * (log_period[1] - log_period[0]) / _DRIFT) ** 2
+    total = np.zeros(len(grid))
+    for profile in profiles:
+        padded = np.pad(profile, reach, constant_values=-np.inf)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, len(offsets))
+        total += np.max(windows + penalty, axis=1)
+    return total
+
+
+def _shuffle(stretch: _Stretch, rng: np.random.Generator) -> _Stretch:
+    """The same changes with the gaps between them in another order."""
+    order = rng.permutation(len(stretch.end) - 1)
+    end = stretch.end[0] + np.concatenate([[0.0], np.cumsum(np.diff(stretch.end)[order])])
+    return replace(stretch, begin=end - (stretch.end - stretch.begin), end=end)
+
+
+def _posterior(
+    stretch: _Stretch, period: float, period_count: int, phase_count: int
+) -> tuple[NDArray, NDArray, NDArray, float]:
+    """Log-posterior over (period, phase) near `period`, the two axes, and the peak's score."""
+    reference = 0.5 * (stretch.start_s + stretch.stop_s)
+    periods = period * np.exp(np.linspace(-2.5 * _DRIFT, 2.5 * _DRIFT, period_count))
+    steps = np.linspace(-0.5, 0.5, phase_count, endpoint=False)
+    middle = 0.5 * (stretch.begin + stretch.end) - reference
+    width = stretch.end - stretch.begin
+    turns = middle[None, :] / periods[:, None]
+    away = (turns[:, None, :] - steps[None, :, None] + 0.5) % 1.0 - 0.5
+    distance = np.abs(away) * periods[:, None, None]
+    inside = np.clip((0.5 * width - distance) / _BLUR_S + 0.5, 0.0, 1.0)
+    chance = np.minimum(width / period, 1.0)
+    log_likelihood = np.log((1 - OUTLIERS) * inside + OUTLIERS * chance).sum(axis=2)
+    log_likelihood -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
+    return log_likelihood, periods, steps, float(log_likelihood.max() - np.log(chance).sum())
+
+
+def _refine(stretch: _Stretch, period: float) -> _Phase:
+    """Posterior mean of a stretch's period and phase near the common period."""
+    log_likelihood, periods, steps, _ = _posterior(stretch, period, 61, 128)
+    reference = 0.5 * (stretch.start_s + stretch.stop_s)
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    best_period = float(np.sum(weight.sum(axis=1) * periods))
+    # the phase is an angle: average around the peak, not across the seam
+    peak = steps[int(np.argmax(weight.sum(axis=0)))]
+    near = (steps - peak + 0.5) % 1.0 - 0.5
+    marginal = weight.sum(axis=0)
+    mean = float(np.sum(marginal * near))
+    sd = float(np.sqrt(np.sum(marginal * (near - mean) ** 2)))
+    return _Phase(
+        stretch.trial,
+        stretch.start_s,
+        stretch.stop_s,
+        best_period,
+        reference + (peak + mean) * best_period,
+        sd * best_period,
+    )
+
+
+def _contains(begin: NDArray, end: NDArray, phase: _Phase) -> NDArray[np.bool_]:
+    middle = 0.5 * (begin + end)
+    instant = phase.phase_s + phase.period_s * np.round((middle - phase.phase_s) / phase.period_s)
+    return np.abs(instant - middle) <= 0.5 * (end - begin) + 0.5 * _BLUR_S
+
+
+# ------------------------------------------------------------------ where the servo must move
+
+
+def _speed(trial: Trial) -> NDArray[np.float64]:
+    """|command rate| around each row [rad/s], the largest over the past 0.1 s to allow for lag."""
+    rate = np.abs(np.gradient(trial.command_rad, trial.send_time_s))
+    loop = max(float(np.median(np.diff(trial.send_time_s))), 1e-4)
+    reach = max(1, round(0.1 / loop))
+    padded = np.concatenate([np.full(reach, rate[0]), rate])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, reach + 1)
+    # the slowest command in reach: the servo moves even if the lag is unknown
+    return windows.min(axis=1)
+
+
+def _moving_fresh(trials: Sequence[Trial]) -> tuple[int, int]:
+    step = quantum(trials) or 1e-6
+    moving = fresh = 0
+    for trial in trials:
+        if len(trial.read_time_s) < 3:
+            continue
+        gap = float(np.median(np.diff(trial.read_time_s)))
+        rows = np.flatnonzero(_speed(trial) * gap > _MOVING_QUANTA * step)
+        moving += len(rows)
+        fresh += len(np.intersect1d(rows, fresh_rows(trial)))
+    return moving, fresh
+
+
+def _loss(trials: Sequence[Trial], phases: Sequence[_Phase]) -> tuple[float, float]:
+    """Share of polls that left the value as it was while the servo must have been moving."""
+    step = max(quantum(trials), 1e-6)
+    polls = successes = 0
+    for trial in trials:
+        rows, read, speed = fresh_rows(trial), trial.read_time_s, _speed(trial)
+        middle = 0.5 * (read[rows - 1] + read[rows])
+        for phase in (p for p in phases if p.trial == trial.number):
+            first = int(np.ceil((phase.start_s - phase.phase_s) / phase.period_s))
+            last = int(np.floor((phase.stop_s - phase.phase_s) / phase.period_s))
+            counts = np.arange(first, last + 1)
+            row = np.searchsorted(read, phase.phase_s + phase.period_s * counts)
+            sure = speed[np.minimum(row, len(read) - 1)] * phase.period_s > _MOVING_QUANTA * step
+            # each fresh row is the success of the one poll nearest to it
+            seen = np.round((middle - phase.phase_s) / phase.period_s).astype(int)
+            polls += int(sure.sum())
+            successes += len(np.intersect1d(counts[sure], seen))
+    if not polls:
+        return float("nan"), float("nan")
+    loss = 1.0 - successes / polls
+    return loss, float(np.sqrt(max(loss * (1 - loss), 1.0 / polls) / polls))
