@@ -21,6 +21,8 @@ from servo_models import DelayedPDParameters, HeldFeedback
 
 RADIANS_PER_COUNT = np.pi / 550
 CENTRE_COUNT = 512
+SHORTEST_DELAY_S = 0.002
+"""What the emulator can do: two physics steps."""
 
 _SERVO_ID = dict(zip(JOINT_NAMES, (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9), strict=True))
 _ZERO_RAD = {"hip": 0.0, "thigh": np.pi / 4, "calf": -np.pi / 2}
@@ -159,7 +161,7 @@ def draw_robot(rng: np.random.Generator, spec: RobotSpec | None = None) -> Emula
             armature=float(armature),
             effort_limit=spec.stall_torque_nm,
             velocity_limit=float(spec.velocity_limit_rad_s * speed),
-            delay_s=float(max(delay, 0.001)),
+            delay_s=float(max(delay, SHORTEST_DELAY_S)),
         )
         feedback = HeldFeedback(
             poll_period_s=spec.poll_period_s,

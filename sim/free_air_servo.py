@@ -30,7 +30,7 @@ class FreeAirServo:
     Parameters
     ----------
     parameters : DelayedPDParameters
-        Scalars; `delay_s` at least one physics step.
+        Scalars; `delay_s` at least two physics steps.
     position_rad : float
         Where it rests at the start, commanded there for ever.
     time_step_s : float
@@ -39,7 +39,7 @@ class FreeAirServo:
     Raises
     ------
     InputError
-        If the delay is shorter than a physics step.
+        If the delay is shorter than two physics steps.
     """
 
     def __init__(
@@ -49,10 +49,11 @@ class FreeAirServo:
         time_step_s: float = PHYSICS_STEP_S,
     ):
         delay = float(np.asarray(parameters.delay_s))
-        if not delay >= time_step_s:
+        # MuJoCo would take what is left of a shorter delay for a whole step
+        if not delay >= 2 * time_step_s:
             raise InputError(
-                f"emulated servo: delay_s is {delay}; it must be at least the physics step "
-                f"of {time_step_s} s."
+                f"emulated servo: delay_s is {delay}; it must be at least two physics "
+                f"steps of {time_step_s} s."
             )
         native = replace(parameters, delay_s=delay - time_step_s)
         self._model = mujoco.MjModel.from_xml_string(free_air_xml([native], time_step_s))

@@ -19,6 +19,7 @@ import numpy as np
 
 from common.errors import InputError
 from servo_models.delayed_pd import (
+    FRICTION_IMPEDANCE,
     FRICTION_SOLIMP,
     DelayedPDParameters,
     friction_solref,
@@ -40,10 +41,12 @@ def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dic
     time_step_s : float
         Physics step of the model [s].
     """
+    # MuJoCo divides a direct damping by the impedance
+    solref = (FRICTION_IMPEDANCE * x for x in friction_solref(time_step_s))
     return {
         "armature": _number(parameters.armature),
         "frictionloss": _number(parameters.friction_loss),
-        "solreffriction": " ".join(_number(x) for x in friction_solref(time_step_s)),
+        "solreffriction": " ".join(_number(x) for x in solref),
         "solimpfriction": " ".join(_number(x) for x in FRICTION_SOLIMP),
     }
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +110,16 @@ class JointCalibrationResult:
 
 
 @dataclass(frozen=True)
+class DeadTime:
+    """The lag budget of one joint and the part of it that is dead time."""
+
+    budget: LagBudget
+    dead_time: Interval
+    quantum_rad: float
+    offset_rad: float
+
+
+@dataclass(frozen=True)
 class _Task:
     joint: str
     trials: tuple[Trial, ...]
@@ -148,6 +159,33 @@ def calibrate(
     InputError
         If a joint has too little motion to say anything.
     """
+    return _each_joint(_calibrate_joint, recordings, joints, seed, presets, workers, progress)
+
+
+def dead_times(
+    recordings: Sequence[Recording],
+    joints: Sequence[str] | None = None,
+    seed: int = 0,
+    workers: int = 2,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, DeadTime]:
+    """Lag budget and dead time of every joint, without the rest of the ladder.
+
+    Parameters and errors as for `calibrate`.
+    """
+    return _each_joint(_dead_time, recordings, joints, seed, None, workers, progress)
+
+
+def _each_joint(
+    work: Callable[[_Task], Any],
+    recordings: Sequence[Recording],
+    joints: Sequence[str] | None,
+    seed: int,
+    presets: dict[str, dict[str, DelayedPDParameters]] | None,
+    workers: int,
+    progress: Callable[[str], None] | None,
+) -> dict[str, Any]:
+    """`work` on each joint, in processes; results in joint order."""
     chosen = [j for j in JOINT_NAMES if any(j in r.joints for r in recordings)]
     chosen = [j for j in chosen if joints is None or j in joints]
     tasks = []
@@ -155,15 +193,15 @@ def calibrate(
         trials, command_quantum, rounding = joint_trials(recordings, joint)
         own = {name: table[joint] for name, table in (presets or {}).items() if joint in table}
         tasks.append(_Task(joint, trials, command_quantum, rounding, seed, own))
-    found: dict[str, JointCalibrationResult] = {}
+    found: dict[str, Any] = {}
     if workers <= 1 or len(tasks) <= 1:
         for task in tasks:
-            found[task.joint] = _calibrate_joint(task)
+            found[task.joint] = work(task)
             if progress:
                 progress(task.joint)
     else:
         with ProcessPoolExecutor(min(workers, len(tasks))) as pool:
-            futures = {pool.submit(_calibrate_joint, task): task.joint for task in tasks}
+            futures = {pool.submit(work, task): task.joint for task in tasks}
             for future in as_completed(futures):
                 found[futures[future]] = future.result()
                 if progress:
@@ -201,7 +239,18 @@ def joint_rng(seed: int, joint: str) -> np.random.Generator:
     return np.random.default_rng([seed, JOINT_NAMES.index(joint)])
 
 
-def _calibrate_joint(task: _Task) -> JointCalibrationResult:
+@dataclass(frozen=True)
+class _Prepared:
+    """One joint, measured and ready to fit."""
+
+    rng: np.random.Generator
+    budget: LagBudget
+    data: tuple[TrialData, ...]
+    quantum_rad: float
+    noise_rad: float
+
+
+def _prepare(task: _Task) -> _Prepared:
     rng = joint_rng(task.seed, task.joint)
     lattice = find_poll_lattice(task.trials)
     budget = lag_budget(task.joint, task.trials, rng, lattice)
@@ -212,24 +261,36 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
     step = quantum(task.trials)
     # fits of a noise-free servo still meet rounding: a third of a count
     noise = max(budget.noise_rad, step / 3, 1e-4) if np.isfinite(budget.noise_rad) else 0.012
-    folds = _folds(data)
+    return _Prepared(rng, budget, data, step, noise)
+
+
+def _dead_time(task: _Task) -> DeadTime:
+    ready, model = _prepare(task), rung(PREFERRED)
+    (best,) = _fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.rng, {})
+    dead_time, best = _profile(model, ready.data, ready.noise_rad, best)
+    return DeadTime(ready.budget, dead_time, ready.quantum_rad, float(best.values[-1]))
+
+
+def _calibrate_joint(task: _Task) -> JointCalibrationResult:
+    ready = _prepare(task)
+    data, noise, folds = ready.data, ready.noise_rad, _folds(ready.data)
     rungs: dict[str, RungResult] = {}
     best: dict[str, list[Fit]] = {}
+    dead_time = Interval(*[float("nan")] * 3)
     for model in LADDER:
-        best[model.name] = _fit_with_folds(model, data, folds, noise, rng, best)
+        best[model.name] = _fit_with_folds(model, data, folds, noise, ready.rng, best)
         if model.name == PREFERRED:
-            dead_time, improved = _profile(model, data, noise, best[PREFERRED][0])
-            best[PREFERRED][0] = improved
+            dead_time, best[PREFERRED][0] = _profile(model, data, noise, best[PREFERRED][0])
         rungs[model.name] = _result(model, best[model.name], data, folds, noise)
     chosen = _choose(rungs)
     pd = rungs[PREFERRED]
     presets = {
         name: _score_preset(p, data, pd.values["offset_rad"]) for name, p in task.presets.items()
     }
-    warnings = [*budget.warnings, *_warnings(task.joint, rungs, chosen, data)]
+    warnings = [*ready.budget.warnings, *_warnings(task.joint, rungs, chosen, data)]
     return JointCalibrationResult(
-        task.joint, chosen, rungs, dead_time, budget, step, pd.intervals["offset_rad"], presets,
-        data, tuple(warnings),
+        task.joint, chosen, rungs, dead_time, ready.budget, ready.quantum_rad,
+        pd.intervals["offset_rad"], presets, data, tuple(warnings),
     )  # fmt: skip
 
 

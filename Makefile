@@ -1,0 +1,35 @@
+# The two set-up commands: `make demo` shows what the tool does, `make test` proves that it works.
+# Both keep everything in .venv and install it on first use.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := demo
+
+.PHONY: demo test check setup clean
+
+demo: setup
+	$(BIN)/pupper-sysid sweep --freqs 1-10 --joints LF --seed 1 --out $(DEMO)/sweep.csv --truth --force
+	$(BIN)/pupper-sysid delay $(DEMO)/sweep.csv
+	$(BIN)/pupper-sysid calibrate $(DEMO)/sweep.csv --out $(DEMO)/calibrated.yaml --force
+	$(BIN)/pupper-sysid report $(DEMO)/sweep.csv --calibration $(DEMO)/calibrated.yaml --out $(DEMO)/report --force
+
+test: setup
+	$(BIN)/python -m pytest -n 2
+
+check: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+setup: $(VENV)/.installed
+
+# torch first, pinned: whatever asks for it later finds it and does not fetch CUDA
+$(VENV)/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) $(DEMO) build *.egg-info

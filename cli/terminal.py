@@ -1,0 +1,107 @@
+"""What all commands share: where words go, how a table looks, what a number looks like.
+
+Results go to stdout, everything else (progress, warnings, what to run next) to stderr, so that
+`--json` leaves one object on stdout and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from common.errors import InputError
+from common.joints import select_joints
+from sysid.recording import Recording, load, newest_recording
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+def load_all(paths: Sequence[Path]) -> list[Recording]:
+    """The recordings at `paths`, or the newest in `recordings/`; their warnings are shown."""
+    chosen = list(paths)
+    if not chosen:
+        chosen = [newest_recording()]
+        err.print(f"Taking the newest recording, {chosen[0]}.")
+    recordings = [load(path) for path in chosen]
+    for recording in recordings:
+        warn(f"{recording.name}: {text}" for text in recording.warnings)
+    return recordings
+
+
+def pick_joints(recordings: Sequence[Recording], text: str) -> list[str]:
+    """Joints that were recorded and that `text` names."""
+    recorded: list[str] = []
+    for recording in recordings:
+        recorded += [j for j in recording.joints if j not in recorded]
+    return select_joints(text, recorded)
+
+
+def print_json(value: Any) -> None:
+    """One JSON object on stdout; numbers that are none become null."""
+    print(json.dumps(_finite(value), indent=2, ensure_ascii=False))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def warn(sentences) -> None:
+    """Sentences the user should read, on stderr."""
+    for sentence in sentences:
+        err.print(f"[yellow]warning:[/] {sentence}")
+
+
+def table(title: str, *columns: str) -> Table:
+    """An empty table in the house style; the first column is left-aligned text."""
+    made = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    for k, column in enumerate(columns):
+        made.add_column(column, justify="left" if k == 0 else "right", no_wrap=k == 0)
+    return made
+
+
+def ms(seconds: float | None, digits: int = 1) -> str:
+    """Seconds as milliseconds, or a dash."""
+    return number(None if seconds is None else 1e3 * seconds, digits)
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number, or a dash where there is none."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+@contextmanager
+def progress(label: str, total: int) -> Iterator[Any]:
+    """A progress bar on stderr if that is a terminal; yields `advance(what)`."""
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(), console=err, disable=not err.is_terminal, transient=True,
+    ) as bar:  # fmt: skip
+        task = bar.add_task(label, total=total)
+
+        def advance(what: str = "") -> None:
+            bar.update(task, advance=1, description=f"{label} {what}".strip())
+
+        yield advance
+
+
+def need_positive(name: str, value: float) -> None:
+    """Refuse an option that must be positive."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name} is {value}; it must be a positive number.")
