@@ -147,7 +147,7 @@ class Bode:
         recordings = terminal.load_all(self.recordings)
         found = {}
         for joint in terminal.pick_joints(recordings, self.joints):
-            trials, _, _ = calibration.joint_trials(recordings, joint)
+            trials, _ = calibration.joint_trials(recordings, joint)
             rng = calibration.joint_rng(self.seed, joint)
             found[joint] = frequency_response.frequency_response(joint, trials, rng)
         if self.plot:

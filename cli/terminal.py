@@ -105,3 +105,18 @@ def need_positive(name: str, value: float) -> None:
     """Refuse an option that must be positive."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}; it must be a positive number.")
+
+
+@contextmanager
+def seconds_progress(label: str, total_s: float) -> Iterator[Any]:
+    """A progress bar over seconds; yields `advance(done_s, total_s, what)`."""
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} s"),
+        TimeElapsedColumn(), console=err, disable=not err.is_terminal, transient=True,
+    ) as bar:  # fmt: skip
+        task = bar.add_task(label, total=total_s)
+
+        def advance(done_s: float, total: float, what: str) -> None:
+            bar.update(task, completed=done_s, total=total, description=f"{label} {what}")
+
+        yield advance

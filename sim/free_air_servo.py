@@ -22,6 +22,7 @@ PHYSICS_STEP_S = 0.001
 
 _STILL_RAD_S = 1e-4  # MuJoCo's dry friction creeps at up to 3e-5 rad/s, which nobody can see
 _STILL_RAD_S2 = 1e-4
+_STEPS_BETWEEN_LOOKS = 50
 
 
 class FreeAirServo:
@@ -63,7 +64,7 @@ class FreeAirServo:
         self._dt = time_step_s
         self._settled_after = int(delay / time_step_s) + 3
         self._step = 0
-        self._changed = -self._settled_after
+        self._changed = -self._settled_after - 1
         self._goal = float(position_rad)
         self._queue: deque[tuple[float, float]] = deque()
         self._limp = False
@@ -103,6 +104,7 @@ class FreeAirServo:
             if event > self._step:
                 steps = min(event, last) - self._step
                 if not self._resting():
+                    steps = min(steps, _STEPS_BETWEEN_LOOKS)
                     self._data.ctrl[0] = self._goal
                     mujoco.mj_step(self._model, self._data, nstep=steps)
                 self._step += steps

@@ -120,11 +120,22 @@ class DeadTime:
 
 
 @dataclass(frozen=True)
+class Truncation:
+    """How a bus cuts commands to counts: size of one [rad], direction, an angle that is whole.
+
+    The defaults leave commands as they are.
+    """
+
+    quantum_rad: float = 0.0
+    rounding: str | None = None
+    zero_rad: float | None = None
+
+
+@dataclass(frozen=True)
 class _Task:
     joint: str
     trials: tuple[Trial, ...]
-    quantum_rad: float
-    rounding: str | None
+    truncation: Truncation
     seed: int
     presets: dict[str, DelayedPDParameters]
 
@@ -190,9 +201,9 @@ def _each_joint(
     chosen = [j for j in chosen if joints is None or j in joints]
     tasks = []
     for joint in chosen:
-        trials, command_quantum, rounding = joint_trials(recordings, joint)
+        trials, truncation = joint_trials(recordings, joint)
         own = {name: table[joint] for name, table in (presets or {}).items() if joint in table}
-        tasks.append(_Task(joint, trials, command_quantum, rounding, seed, own))
+        tasks.append(_Task(joint, trials, truncation, seed, own))
     found: dict[str, Any] = {}
     if workers <= 1 or len(tasks) <= 1:
         for task in tasks:
@@ -211,27 +222,22 @@ def _each_joint(
 
 def joint_trials(
     recordings: Sequence[Recording], joint: str
-) -> tuple[tuple[Trial, ...], float, str | None]:
-    """All trials of `joint`, renumbered, and how the bus truncated its commands.
-
-    Returns
-    -------
-    trials : tuple of Trial
-    command_quantum_rad : float
-        0 if the recordings do not say.
-    rounding : {"up", "down"} or None
-    """
+) -> tuple[tuple[Trial, ...], Truncation]:
+    """All trials of `joint`, renumbered, and how the bus truncated its commands."""
     trials: list[Trial] = []
-    command_quantum, rounding = 0.0, None
+    truncation = Truncation()
     for recording in recordings:
         if joint not in recording.joints:
             continue
         bus = recording.metadata.get("bus") or {}
-        command_quantum = float(bus.get("command_quantum_rad") or 0.0)
-        rounding = (bus.get("command_rounding") or {}).get(joint)
+        truncation = Truncation(
+            float(bus.get("command_quantum_rad") or 0.0),
+            (bus.get("command_rounding") or {}).get(joint),
+            (bus.get("count_zero_rad") or {}).get(joint),
+        )
         for trial in recording.trials(joint):
             trials.append(replace(trial, number=len(trials)))
-    return tuple(trials), command_quantum, rounding
+    return tuple(trials), truncation
 
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:
@@ -254,8 +260,10 @@ def _prepare(task: _Task) -> _Prepared:
     rng = joint_rng(task.seed, task.joint)
     lattice = find_poll_lattice(task.trials)
     budget = lag_budget(task.joint, task.trials, rng, lattice)
+    cut = task.truncation
     data = tuple(
-        prepare(t, readings(t, lattice), task.quantum_rad, task.rounding) for t in task.trials
+        prepare(t, readings(t, lattice), cut.quantum_rad, cut.rounding, cut.zero_rad)
+        for t in task.trials
     )
     data = tuple(d for d in data if len(d.sample_step))
     step = quantum(task.trials)

@@ -17,10 +17,16 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from common.files import write_text
+from common.files import versions, write_text
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import JointCalibration, Quantity, unit_of
-from sysid.recording import OPTIONAL_COLUMNS, REQUIRED_COLUMNS, Recording
+from sysid.recording import (
+    OPTIONAL_COLUMNS,
+    REQUIRED_COLUMNS,
+    SCHEMA_VERSION,
+    TITLE,
+    Recording,
+)
 
 CALIBRATION_COLUMNS = (
     "joint",
@@ -99,13 +105,17 @@ def _cell(number: float | None) -> float | str:
 
 def _recording(recording: Recording) -> str:
     columns = [c for c in (*REQUIRED_COLUMNS, *OPTIONAL_COLUMNS) if c in recording.table]
-    header = dict(recording.metadata)
+    header = {"schema_version": SCHEMA_VERSION, "versions": versions()} | recording.metadata
     completed = header.pop("completed", None)
+    if completed is None and "imported_from" in header:
+        # foreign layouts have no footer; without one the export would pass for a cut recording
+        completed = {"rows": len(recording.table)}
     header["exported_from"] = {"name": recording.name, "sha256": recording.sha256}
     if recording.warnings:
         header["warnings_when_exported"] = list(recording.warnings)
-    text = _comments("pupper-sysid recording", header)
-    text += recording.table.to_csv(columns=columns, index=False, lineterminator="\n")
+    text = _comments(TITLE.removeprefix("# "), header)
+    table = recording.table.astype({"trial": int})
+    text += table.to_csv(columns=columns, index=False, lineterminator="\n")
     return text + (f"# completed: {_json(completed)}\n" if completed is not None else "")
 
 

@@ -57,7 +57,11 @@ class TrialData:
 
 
 def prepare(
-    trial: Trial, reading: Readings, command_quantum_rad: float = 0.0, rounding: str | None = None
+    trial: Trial,
+    reading: Readings,
+    command_quantum_rad: float = 0.0,
+    rounding: str | None = None,
+    zero_rad: float | None = None,
 ) -> TrialData:
     """Put one trial on the physics clock.
 
@@ -69,13 +73,16 @@ def prepare(
         Size of one count of the command; 0 if commands are not truncated.
     rounding : {"up", "down"}, optional
         Where truncation of the count moves the angle; None leaves the command as it is.
+    zero_rad : float, optional
+        An angle that is a whole count; by default the rest position.
     """
     rest, start = trial.initial_command_rad, trial.send_time_s[0]
     command = trial.command_rad - rest
     if command_quantum_rad > 0 and rounding in ("up", "down"):
-        count = command / command_quantum_rad
+        zero = rest if zero_rad is None else zero_rad
+        count = (trial.command_rad - zero) / command_quantum_rad
         whole = np.ceil(count - 1e-6) if rounding == "up" else np.floor(count + 1e-6)
-        command = whole * command_quantum_rad
+        command = whole * command_quantum_rad + zero - rest
     stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
     steps = int(np.ceil(stop / TIME_STEP_S)) + 2
     edges = TIME_STEP_S * np.arange(steps + 1)

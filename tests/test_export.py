@@ -132,9 +132,25 @@ def test_an_exported_recording_reads_back_as_the_same_recording(tmp_path: Path):
     path = tmp_path / "exported.csv"
     to_csv(imported, path)
     again = load(path)
-    pd.testing.assert_frame_equal(again.table, imported.table)
+    # whole numbers may come back as floats; their values must not change
+    pd.testing.assert_frame_equal(again.table, imported.table, check_dtype=False, check_exact=True)
+    assert again.warnings == imported.warnings, "an export does not look like a cut recording"
     assert again.metadata["exported_from"] == {"name": imported.name, "sha256": imported.sha256}
     assert {k: again.metadata[k] for k in imported.metadata} == imported.metadata
+
+
+def test_a_recording_that_was_cut_short_still_says_so_after_its_export(tmp_path: Path):
+    cut = tmp_path / "cut.csv"
+    to_csv(load(sweep_file(tmp_path)), cut)
+    text = cut.read_text().replace('# imported_from: "single-joint sweep"\n', "")
+    cut.write_text(text[: text.index("# completed")].rstrip("\n")[:-4])
+    exported = tmp_path / "exported.csv"
+    to_csv(load(cut), exported)
+    again = load(exported)
+    assert len(again.table) == 239
+    assert any("not recorded to its end" in warning for warning in again.warnings)
+    said = again.metadata["warnings_when_exported"]
+    assert any("cut short" in warning for warning in said)
 
 
 def test_an_exported_recording_refuses_to_overwrite_what_it_was_made_from(tmp_path: Path):
