@@ -68,20 +68,23 @@ class FreeAirServo:
         self._goal = float(position_rad)
         self._queue: deque[tuple[float, float]] = deque()
         self._limp = False
+        self._asleep = False
 
     def command(self, time_s: float, position_rad: float) -> None:
         """Set the goal from `time_s` on; times must not go backwards."""
         latest = self._queue[-1][1] if self._queue else self._goal
         if not self._limp and position_rad != latest:
             self._queue.append((time_s, float(position_rad)))
+            self._asleep = False
 
     def position_at(self, time_s: float) -> float:
         """True position [rad] at `time_s`, at most one physics step before the latest asked."""
-        if time_s <= 0:
+        if time_s <= 0 or self._asleep:
             return float(self._data.qpos[0])
         self._advance(int(np.ceil(time_s / self._dt - 1e-9)))
         # exact inside a step: MuJoCo moves the joint with the velocity at the step's end
         ahead = self._step * self._dt - time_s
+        self._asleep = not self._queue and self._resting()
         return float(self._data.qpos[0]) - float(self._data.qvel[0]) * ahead
 
     def torque(self, time_s: float, on: bool) -> None:
@@ -95,6 +98,7 @@ class FreeAirServo:
         self._goal = position
         self._queue.clear()
         self._changed = self._step
+        self._asleep = False
 
     def _advance(self, last: int) -> None:
         """Take physics steps until the state is that of the start of step `last`."""

@@ -29,7 +29,7 @@ from sysid.recording import Recording, Trial
 
 PREFERRED = "delayed_pd"
 _PREFERENCE = 1.05
-_MOST_FOLDS = 12
+_MOST_FOLDS = 6
 
 
 @dataclass(frozen=True)
@@ -341,15 +341,16 @@ def _fit_with_folds(
             for f in lower[PREFERRED]
         ]
         return _best_of(model, problems, np.array(starts), 15)
-    keep = int(np.clip(60 // len(problems), 6, 12))
+    # few tones leave many local optima: start from more places
+    keep, final = (12, 3) if len(problems) <= 5 else (4, 2)
     starts = global_starts(model, problems, rng, 256, keep)
     flat = [p for p in problems for _ in range(keep)]
     early = fit(model, flat, starts.reshape(-1, starts.shape[-1]), 8)
     top = []
     for i in range(len(problems)):
-        own = sorted(early[i * keep : (i + 1) * keep], key=lambda f: f.cost)[:3]
+        own = sorted(early[i * keep : (i + 1) * keep], key=lambda f: f.cost)[:final]
         top.append([f.values for f in own])
-    return _best_of(model, problems, np.array(top), 25)
+    return _best_of(model, problems, np.array(top), 20)
 
 
 def _best_of(
@@ -385,7 +386,10 @@ def _profile(
             break
         best = min(fit(model, [everything], lowest.values[None], 25) + [best], key=lambda f: f.cost)
     cost = np.minimum(np.array([f.cost for f in fits]), np.inf) - min(best.cost, lowest.cost)
-    return Interval(float(best.values[0]), *_crossings(delays, cost, best.values[0], threshold)), best
+    low, high = _crossings(delays, cost, best.values[0], threshold)
+    centre, grain = float(best.values[0]), 0.5 * TIME_STEP_S  # no finer than the physics step
+    ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
+    return Interval(centre, float(ends[0]), float(ends[1])), best
 
 
 def _crossings(
@@ -467,10 +471,9 @@ def _score_preset(
     parameters: DelayedPDParameters, data: tuple[TrialData, ...], offset_rad: float
 ) -> Scores:
     one = parameters.per_inertia()
-    values = np.array(
-        [one.delay_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
-         one.velocity_limit, offset_rad], float,
-    )  # fmt: skip
+    parts = (one.delay_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
+             one.velocity_limit, offset_rad)  # fmt: skip
+    values = np.array([np.asarray(part, float).item() for part in parts])
     return score(positions(rung(PREFERRED), [(values[None], data)])[0][:, 0], data, {})
 
 

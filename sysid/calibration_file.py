@@ -178,9 +178,11 @@ def _feedback(lattice: PollLattice, result: JointCalibrationResult) -> Feedback:
         quantum = Quantity(value=0.0, identified="no", why="readings show no common step")
     if lattice.kind == "lattice":
         period = _spread(lattice.period_s, lattice.period_sd_s)
-        loss = _spread(lattice.loss, lattice.loss_sd, 0.0, 0.99)
-        ends = [p * (0.5 + q / (1 - q)) for p, q in ((period.low, loss.low), (period.high, loss.high))]
-        age = _quantity(Interval(lattice.mean_age_s, *ends))
+        # the age grows with the loss; the period's share of its uncertainty is nothing beside it
+        losses = np.clip(lattice.loss + _Z90 * lattice.loss_sd * np.array([-1.0, 1.0]), 0, 0.99)
+        low, high = lattice.period_s * (0.5 + losses / (1 - losses))
+        loss = _quantity(Interval(lattice.loss, *map(float, losses)))
+        age = _quantity(Interval(lattice.mean_age_s, float(low), float(high)))
     else:
         found = result.budget.feedback_age_s
         why = (
@@ -207,9 +209,8 @@ def _quantity(interval: Interval) -> Quantity:
     )
 
 
-def _spread(value: float, sd: float, low: float = 0.0, high: float = np.inf) -> Quantity:
-    ends = np.clip([value - _Z90 * sd, value + _Z90 * sd], low, high)
-    return _quantity(Interval(value, float(ends[0]), float(ends[1])))
+def _spread(value: float, sd: float) -> Quantity:
+    return _quantity(Interval(value, max(value - _Z90 * sd, 0.0), value + _Z90 * sd))
 
 
 def _finite(number: float) -> float | None:

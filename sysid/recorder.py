@@ -139,6 +139,7 @@ class _Session:
         # a joint that the plan does not place stays where it is found
         self._start = np.array([plan.start_pose_rad.get(j, np.nan) for j in bus.joint_names])
         self._sent = self._start.copy()
+        self._total_s = plan.duration_s
         self._loop = LoopStatistics(period_s)
 
     def run(self, path: Path, metadata: dict[str, Any], force: bool) -> Path:
@@ -151,7 +152,7 @@ class _Session:
         with RecordingWriter(path, self._header(metadata), force) as writer:
             try:
                 bus.torque(True)
-                self._progress(0.0, self._plan.duration_s, "moving to the start pose")
+                self._progress(0.0, self._total_s, "moving to the start pose")
                 self._move_to_start()
                 done = 0.0
                 for number, trial in enumerate(self._plan.trials):
@@ -217,7 +218,7 @@ class _Session:
                 self._loop.intervals_s.append(sent_s - last)
             last = sent_s
             self._loop.ticks += 1
-            self._progress(done + min(elapsed, trial.duration_s), self._plan.duration_s, what)
+            self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
             due = int((bus.now() - start) / self._period)
             self._loop.missed_deadlines += max(due - tick - 1, 0)
             tick = max(tick + 1, due)

@@ -1,0 +1,208 @@
+"""What the report's figures show, computed: curves and numbers, no drawing.
+
+`lag_parts` splits one joint's lag into the parts of the lag budget, in milliseconds; `tracks` runs
+the fitted model along every trial, beside what was commanded and read; `hold_runs` counts for how
+many rows each reading stayed the same, and says what the poll lattice would make of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servo_models.delayed_pd import TIME_STEP_S
+from sysid.calibrate import PREFERRED, JointCalibrationResult
+from sysid.delay import Interval
+from sysid.ladder import rung
+from sysid.output_error import look_up, positions
+
+LONGEST_RUN = 12
+"""Hold runs of this many rows and more share the last bar."""
+
+
+@dataclass(frozen=True)
+class LagParts:
+    """The lag budget of one joint [ms], in the order in which the parts happen.
+
+    naive = command hold + dead time + dynamics + feedback age
+    """
+
+    joint: str
+    command_hold_ms: float
+    dead_time_ms: Interval
+    dynamics_ms: float
+    feedback_age_ms: float
+    lag_ms: Interval
+    naive_ms: Interval
+
+    def sentence(self) -> str:
+        """The finding in words."""
+        if abs(self.feedback_age_ms) < 1.0:
+            feedback = "next to nothing is stale feedback"
+        else:
+            feedback = f"{self.feedback_age_ms:.0f} ms is stale feedback"
+        return (
+            f"of the naive {self.naive_ms.value:.0f} ms, {feedback}, "
+            f"{self.command_hold_ms:.0f} ms command hold, {self.lag_ms.value:.0f} ms the servo: "
+            f"{self.dead_time_ms.value:.0f} ms dead time + {self.dynamics_ms:.0f} ms dynamics."
+        )
+
+
+def lag_parts(result: JointCalibrationResult) -> LagParts:
+    """Where the lag of `result`'s joint comes from."""
+    budget = result.budget
+    return LagParts(
+        result.joint,
+        1e3 * budget.command_hold_s,
+        _ms(result.dead_time),
+        1e3 * (budget.lag.value - result.dead_time.value),
+        1e3 * budget.feedback_age_s,
+        _ms(budget.lag),
+        _ms(budget.naive),
+    )
+
+
+def _ms(interval: Interval) -> Interval:
+    return Interval(1e3 * interval.value, 1e3 * interval.low, 1e3 * interval.high)
+
+
+@dataclass(frozen=True)
+class Track:
+    """One trial as it was commanded, simulated and read; angles from rest [rad], times [s].
+
+    Attributes
+    ----------
+    frequency_hz : float
+        NaN if the trial is no tone.
+    time_s, command_rad, model_rad : ndarray, shape (steps,)
+        On the physics clock, from the trial's start.
+    fresh_time_s, fresh_rad : ndarray, shape (fresh,)
+        Fresh readings at the time they were measured.
+    row_time_s, row_rad : ndarray, shape (rows,)
+        Every reading at the time of its row; NaN where missing.
+    fresh_error_rad, row_error_rad : ndarray
+        Reading minus model at those times.
+    fresh_speed_rad_s, row_speed_rad_s : ndarray
+        Speed of the model at those times.
+    """
+
+    frequency_hz: float
+    time_s: NDArray[np.float64]
+    command_rad: NDArray[np.float64]
+    model_rad: NDArray[np.float64]
+    fresh_time_s: NDArray[np.float64]
+    fresh_rad: NDArray[np.float64]
+    row_time_s: NDArray[np.float64]
+    row_rad: NDArray[np.float64]
+    fresh_error_rad: NDArray[np.float64]
+    row_error_rad: NDArray[np.float64]
+    fresh_speed_rad_s: NDArray[np.float64]
+    row_speed_rad_s: NDArray[np.float64]
+
+
+def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track]:
+    """Free run of a fitted model on every trial of its joint.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    model : str
+        Name of a rung of the ladder.
+    """
+    if not result.trials:
+        return []
+    fitted = rung(model)
+    values = np.array([[result.rungs[model].values[name] for name in fitted.names]])
+    simulated = positions(fitted, [(values, result.trials)])[0][:, 0]
+    return [_track(trial, simulated[:, n]) for n, trial in enumerate(result.trials)]
+
+
+def _track(trial, simulated: NDArray) -> Track:
+    steps = len(trial.command)
+    # over a few steps: dry friction makes the speed of a single one jump
+    speed = np.gradient(np.convolve(simulated, np.ones(5) / 5, mode="same"), TIME_STEP_S)
+    return Track(
+        trial.frequency_hz,
+        TIME_STEP_S * np.arange(steps), trial.command, simulated[:steps],
+        TIME_STEP_S * trial.sample_step, trial.sample_rad,
+        TIME_STEP_S * trial.row_step, trial.row_rad,
+        trial.sample_rad - look_up(simulated, trial.sample_step),
+        trial.row_rad - look_up(simulated, trial.row_step),
+        look_up(speed, trial.sample_step), look_up(speed, trial.row_step),
+    )  # fmt: skip
+
+
+def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[float, float]:
+    """A stretch of `track` worth looking at [s]: steady tone, or the liveliest part."""
+    end = float(track.time_s[-1])
+    if track.frequency_hz > 0:
+        length = min(periods / track.frequency_hz, end)
+        start = min(0.5 * end, end - length)
+        return start, start + length
+    if end <= longest_s:
+        return 0.0, end
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(track.command_rad)))])
+    width = int(longest_s / TIME_STEP_S)
+    start = float(track.time_s[int(np.argmax(travel[width:] - travel[:-width]))])
+    return start, start + longest_s
+
+
+def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
+    """At most `count` of the tracks, spread over their frequencies, slowest first."""
+    order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
+    seen: dict[float, Track] = {}
+    for n, track in enumerate(order):
+        seen.setdefault(round(track.frequency_hz, 2) if track.frequency_hz > 0 else -float(n), track)
+    order = list(seen.values())
+    index = np.unique(np.round(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int))
+    return [order[i] for i in index]
+
+
+@dataclass(frozen=True)
+class HoldRuns:
+    """For how many rows a reading stays the same.
+
+    Attributes
+    ----------
+    count : ndarray of int, shape (LONGEST_RUN,)
+        Runs of 1, 2, … rows; the last holds all longer ones.
+    expected : ndarray, shape (LONGEST_RUN,), or None
+        What the poll period and the share of lost polls predict; None without a lattice.
+    """
+
+    count: NDArray[np.int64]
+    expected: NDArray[np.float64] | None
+
+
+def hold_runs(result: JointCalibrationResult) -> HoldRuns:
+    """Count the hold runs of a joint that is moving, and what its poll lattice predicts."""
+    lengths, gaps = [], []
+    for trial in result.trials:
+        seen = np.flatnonzero(np.isfinite(trial.row_rad))
+        changed = np.flatnonzero(np.diff(trial.row_rad[seen]) != 0) + 1
+        lengths.append(np.diff(changed))
+        gaps.append(np.diff(trial.row_step) * TIME_STEP_S)
+    every = np.concatenate(lengths) if lengths else np.zeros(0, int)
+    count = np.bincount(np.clip(every, 1, LONGEST_RUN), minlength=LONGEST_RUN + 1)[1:]
+    lattice = result.budget.lattice
+    if lattice.kind != "lattice" or not len(every):
+        return HoldRuns(count, None)
+    loop = float(np.median(np.concatenate(gaps)))
+    return HoldRuns(count, count.sum() * _expected(lattice.period_s / loop, lattice.loss))
+
+
+def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:
+    """Share of runs of 1, 2, … rows when each poll, `period_rows` apart, fails with `loss`.
+
+    Between two good polls lie k periods with probability (1 - loss) loss^(k-1). A gap of x rows,
+    at a random phase of the loop, is seen as floor(x) or ceil(x) rows, on average as x.
+    """
+    share = np.zeros(LONGEST_RUN + 1)
+    k = np.arange(1, 200)
+    weight = (1 - loss) * loss ** (k - 1)
+    gap = k * period_rows
+    for rows, chance in ((np.floor(gap), 1 - gap % 1), (np.floor(gap) + 1, gap % 1)):
+        np.add.at(share, np.clip(rows, 0, LONGEST_RUN).astype(int), weight * chance)
+    return share[1:] / max(share[1:].sum(), 1e-12)  # several polls within a row leave one run

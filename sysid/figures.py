@@ -1,0 +1,333 @@
+"""The report's figures: each function takes results and returns a matplotlib `Figure`.
+
+Figures are narrow, with large letters, so that they can be read on a phone and in print; colours
+are those of Okabe and Ito, which colour-blind readers can tell apart, and every curve differs from
+the others in more than its colour. Nothing is computed here that is not in `sysid.figure_data`, and
+pyplot's global state is not touched. `save` writes a figure as PNG.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, ParamSpec
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from PIL import Image
+
+from common.files import write_bytes
+from sysid.calibrate import JointCalibrationResult
+from sysid.figure_data import (
+    LONGEST_RUN,
+    LagParts,
+    Track,
+    hold_runs,
+    lag_parts,
+    some_tracks,
+    tracks,
+    window,
+)
+
+if TYPE_CHECKING:  # it brings python-control, which drawing does not need
+    from sysid.frequency_response import FrequencyResponse
+
+WIDTH_IN = 5.6
+DPI = 170
+
+INK = "#333333"
+FAINT = "#9a9a9a"
+BLUE = "#0072B2"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+ORANGE = "#E69F00"
+RED = "#D55E00"
+PINK = "#CC79A7"
+_JOINT_COLOURS = (BLUE, RED, GREEN, PINK, ORANGE, SKY, INK)
+_MARKERS = "osD^vP"
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "xtick.labelsize": 9.5,
+    "ytick.labelsize": 9.5,
+    "legend.fontsize": 9.5,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "figure.facecolor": "white",
+    "axes.titlelocation": "left",
+}
+
+_P = ParamSpec("_P")
+
+
+def _styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
+    @wraps(draw)
+    def styled(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
+        with rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG image."""
+    with rc_context(_STYLE):
+        canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(DPI)
+        canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    buffer = io.BytesIO()
+    # lines and letters need few colours; with a palette the report is a third of the size
+    picture.quantize(128, dither=Image.Dither.NONE).save(
+        buffer, "PNG", optimize=True, dpi=(DPI, DPI)
+    )
+    return buffer.getvalue()
+
+
+def save(figure: Figure, path: Path, force: bool = False) -> None:
+    """Write `figure` to `path` as PNG.
+
+    Raises
+    ------
+    InputError
+        If `path` exists and `force` is not given, or if it cannot be written.
+    """
+    write_bytes(path, png(figure), force)
+
+
+@_styled
+def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
+    """One stacked bar per joint: what happens between a command's row and its position's row.
+
+    Parameters
+    ----------
+    results : dict of joint to JointCalibrationResult
+    """
+    parts = [lag_parts(r) for r in results.values()]
+    figure, axes = _axes(1.9 + 0.52 * len(parts))
+    for row, part in enumerate(parts):
+        _lag_bar(axes, row, part)
+    axes.set_yticks(range(len(parts)), [p.joint for p in parts])
+    axes.set_ylim(len(parts) - 0.4, -0.6)
+    longest = max(max(p.naive_ms.value, _bar_length(p)) for p in parts)
+    axes.set_xlim(0, longest * 1.14)
+    axes.set_xlabel("time after the command's row [ms]")
+    axes.grid(axis="y", visible=False)
+    axes.tick_params(axis="y", length=0)
+    kinds = [Patch(facecolor=c, hatch=h, edgecolor="white", lw=0, label=n) for n, c, h in _LAG_KINDS]
+    whisker = Line2D([], [], color=INK, marker="|", ms=8, markevery=[0, -1], lw=1.5)
+    whisker.set_label("90 % interval of the dead time")
+    naive = Line2D([], [], color=INK, lw=2.2, label="naive lag, the sum")
+    figure.legend(
+        handles=[*kinds, naive, whisker], loc="outside upper left", ncols=2, numpoints=2,
+        columnspacing=1.2,
+    )  # fmt: skip
+    return figure
+
+
+_LAG_KINDS = (
+    ("command hold", SKY, ""),
+    ("dead time", BLUE, ""),
+    ("dynamics", GREEN, ""),
+    ("feedback age (bus poll)", ORANGE, "///"),
+)
+
+
+def _bar_length(part: LagParts) -> float:
+    lengths = (part.command_hold_ms, part.dead_time_ms.value, part.dynamics_ms, part.feedback_age_ms)
+    return sum(max(x, 0.0) for x in lengths)
+
+
+def _lag_bar(axes: Axes, row: int, part: LagParts) -> None:
+    lengths = (part.command_hold_ms, part.dead_time_ms.value, part.dynamics_ms, part.feedback_age_ms)
+    left = 0.0
+    for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
+        shown = max(length, 0.0)
+        axes.barh(row, shown, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0)
+        if shown > 5.0:
+            # the feedback's hatching would run through its number
+            box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
+            axes.text(
+                left + 0.5 * shown, row - 0.13 * (name == "dead time"), f"{length:.0f}",
+                ha="center", va="center", color="white" if colour in (BLUE, GREEN) else "black",
+                bbox=box if hatch else None,
+            )  # fmt: skip
+        left += shown
+    end = part.command_hold_ms + part.dead_time_ms.value
+    below = max(part.dead_time_ms.value - part.dead_time_ms.low, 0.0)
+    above = max(part.dead_time_ms.high - part.dead_time_ms.value, 0.0)
+    axes.errorbar(
+        end, row + 0.17, xerr=[[below], [above]], color="white", capsize=4, lw=3.2, capthick=3.2
+    )
+    axes.errorbar(end, row + 0.17, xerr=[[below], [above]], color=INK, capsize=4, lw=1.5)
+    naive = part.naive_ms.value
+    axes.plot([naive, naive], [row - 0.4, row + 0.4], color=INK, lw=2.2)
+    axes.text(naive + 0.015 * max(naive, 1.0), row, f"{naive:.0f}", va="center", weight="bold")
+
+
+@_styled
+def overlay_figure(
+    result: JointCalibrationResult, found: list[Track] | None = None, panels: int = 4
+) -> Figure:
+    """Command, model and readings, the fresh ones at the time they were measured.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    found : list of Track, optional
+        From `sysid.figure_data.tracks`, if they have been computed.
+    panels : int
+        At most so many frequencies.
+    """
+    shown = some_tracks(tracks(result) if found is None else found, panels)
+    figure, grid = _axes_column(len(shown), 1.2 + 1.75 * len(shown))
+    for axes, track in zip(grid, shown, strict=True):
+        start, stop = window(track)
+        fine, row = _inside(track.time_s, start, stop), _inside(track.row_time_s, start, stop)
+        fresh = _inside(track.fresh_time_s, start, stop)
+        axes.plot(
+            track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
+            label="command, as held",
+        )  # fmt: skip
+        axes.plot(
+            track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5,
+            drawstyle="steps-post", label="readings, row by row",
+        )  # fmt: skip
+        axes.plot(track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2, label="DelayedPD")
+        axes.plot(
+            track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5, mec="white",
+            mew=0.6, label="fresh readings, when measured",
+        )  # fmt: skip
+        axes.set_title(_trial_name(track, result.joint))
+        axes.set_xlim(start, stop)
+        axes.set_ylabel("from rest [rad]")
+    grid[-1].set_xlabel("time in the trial [s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+@_styled
+def hold_histogram_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
+    """For how many rows each reading stayed the same, beside what poll and loss predict.
+
+    Parameters
+    ----------
+    results : dict of joint to JointCalibrationResult
+    """
+    figure, grid = _axes_column(len(results), 1.2 + 1.6 * len(results))
+    length = np.arange(1, LONGEST_RUN + 1)
+    for axes, (joint, result) in zip(grid, results.items(), strict=True):
+        runs, lattice = hold_runs(result), result.budget.lattice
+        axes.bar(length, runs.count, color=ORANGE, label="counted")
+        title = f"{joint}: {_LATTICE_WORDS.get(lattice.kind, lattice.kind)}"
+        if runs.expected is not None:
+            axes.plot(length, runs.expected, "D", color=INK, ms=5, label="predicted by poll and loss")
+            title = (
+                f"{joint}: a poll every {1e3 * lattice.period_s:.2f} ms, "
+                f"{100 * lattice.loss:.0f} % of them lost"
+            )
+        axes.set_title(title)
+        axes.set_ylabel("runs")
+        axes.grid(axis="x", visible=False)
+        axes.set_xticks(length, [str(n) for n in length[:-1]] + [f"≥{LONGEST_RUN}"])
+    grid[-1].set_xlabel("rows with the same value")
+    names = {}
+    for axes in grid:
+        handles, labels = axes.get_legend_handles_labels()
+        names.update(zip(labels, handles, strict=True))
+    figure.legend(list(names.values()), list(names), loc="outside upper left", ncols=2)
+    return figure
+
+
+_LATTICE_WORDS = {
+    "every read": "every reading is new",
+    "unresolved": "held, but no poll period found",
+}
+
+
+@_styled
+def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
+    """What the model leaves unexplained: over speed, fresh against naive; and over time.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    found : list of Track, optional
+        From `sysid.figure_data.tracks`, if they have been computed.
+    """
+    found = tracks(result) if found is None else found
+    figure, (over_speed, over_time) = _axes_column(2, 6.0)
+    mrad = 1e3
+
+    def gathered(name: str) -> NDArray:
+        return np.concatenate([getattr(t, name) for t in found])
+
+    age = 1e3 * result.budget.feedback_age_s
+    over_speed.plot(
+        gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
+        label=f"all rows at their own time: off by speed × age (dashed: {age:.0f} ms)",
+        rasterized=True,
+    )  # fmt: skip
+    over_speed.plot(
+        gathered("fresh_speed_rad_s"), mrad * gathered("fresh_error_rad"), "o", color=RED, ms=3.5,
+        mec="white", mew=0.3, label="fresh rows when they were measured",
+    )  # fmt: skip
+    reach = np.array([-1.0, 1.0]) * np.max(np.abs(gathered("row_speed_rad_s")), initial=0.0)
+    over_speed.plot(reach, -age * reach, color=INK, lw=1.2, ls=(0, (4, 2)))
+    over_speed.set_xlabel("speed of the model [rad/s]")
+    over_speed.set_ylabel("reading − model [mrad]")
+    start = 0.0
+    for n, track in enumerate(found):
+        over_time.plot(
+            start + track.fresh_time_s, mrad * track.fresh_error_rad, ".", color=RED, ms=4
+        )
+        if track.frequency_hz > 0 and len(found) <= 12:
+            over_time.text(
+                start + 0.5 * track.time_s[-1], 0.97, f"{track.frequency_hz:.3g} Hz",
+                transform=over_time.get_xaxis_transform(), ha="center", va="top",
+                fontsize=9,
+            )  # fmt: skip
+        start += float(track.time_s[-1])
+        if n < len(found) - 1:
+            over_time.axvline(start, color=FAINT, lw=0.8)
+    over_time.axhline(0, color=INK, lw=0.8)
+    over_time.margins(x=0.01, y=0.2)
+    over_time.set_xlabel("time, trials end to end [s]")
+    over_time.set_ylabel("fresh − model [mrad]")
+    figure.legend(*over_speed.get_legend_handles_labels(), loc="outside upper left", ncols=1)
+    return figure
+
+
+def _axes(height: float) -> tuple[Figure, Axes]:
+    figure, grid = _axes_column(1, height)
+    return figure, grid[0]
+
+
+def _axes_column(rows: int, height: float) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+    return figure, list(figure.subplots(max(rows, 1), 1, squeeze=False)[:, 0])
+
+
+def _inside(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:
+    return (time >= start) & (time <= stop)
+
+
+def _trial_name(track: Track, joint: str) -> str:
+    return f"{joint}, {track.frequency_hz:.3g} Hz" if track.frequency_hz > 0 else joint

@@ -1,0 +1,348 @@
+"""The report's tables: every number once, for the page with few digits, for CSV with all of them.
+
+Each function turns results into a `Table`. Its rows hold plain values under names that end in their
+unit, which is what goes to CSV; its columns say which of them the page shows, and how.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from servo_models.calibration import Calibration
+from servo_models.calibration_parts import Quantity, unit_of
+from sysid.calibrate import PREFERRED, JointCalibrationResult, Scores
+from sysid.delay import Interval
+from sysid.figure_data import lag_parts
+
+if TYPE_CHECKING:  # it brings python-control, which a table does not need
+    from sysid.frequency_response import FrequencyResponse
+
+MODEL_NAMES = {
+    "pure_delay": "pure delay",
+    "fopdt": "first order + delay",
+    "sopdt": "second order + delay",
+    "dc_servo": "DC servo",
+    "delayed_pd": "DelayedPD",
+    "delayed_pd_backlash": "DelayedPD + backlash",
+}
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the page: its heading and what it shows of a row."""
+
+    heading: str
+    show: Callable[[Row], str]
+    is_text: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report.
+
+    Attributes
+    ----------
+    name : str
+        Of its CSV file, without ending.
+    title : str
+    columns : tuple of Column
+        What the page shows.
+    rows : tuple of dict
+        What the CSV holds; all rows have the same keys.
+    marked : str
+        Rows in which this key is true are set in bold on the page.
+    """
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    marked: str = ""
+
+    def cells(self, row: Row) -> list[tuple[str, bool]]:
+        """The page's cells of `row`: their text and whether it is words."""
+        return [(c.show(row), c.is_text) for c in self.columns]
+
+    def is_marked(self, row: Row) -> bool:
+        """Whether `row` is to stand out."""
+        return bool(self.marked and row[self.marked])
+
+    def to_csv(self) -> str:
+        """All values of all rows; a number that is none is an empty cell."""
+        buffer = io.StringIO()
+        writer = csv.DictWriter(buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: _plain(v) for k, v in row.items()} for row in self.rows)
+        return buffer.getvalue()
+
+
+def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+    """The lag budget per joint."""
+    rows = []
+    for joint, result in results.items():
+        part, lattice = lag_parts(result), result.budget.lattice
+        rows.append(
+            {
+                "joint": joint,
+                **_interval("naive_lag_ms", part.naive_ms),
+                "feedback_age_ms": part.feedback_age_ms,
+                "command_hold_ms": part.command_hold_ms,
+                **_interval("lag_ms", part.lag_ms),
+                **_interval("dead_time_ms", part.dead_time_ms),
+                "dynamics_ms": part.dynamics_ms,
+                "delay_steps_min": result.delay_steps[0],
+                "delay_steps_max": result.delay_steps[1],
+                "poll_period_ms": 1e3 * lattice.period_s,
+                "loss": lattice.loss,
+                "mean_age_from_poll_ms": 1e3 * lattice.mean_age_s,
+            }
+        )
+    columns = (
+        _text("joint", "joint"),
+        _number("naive, ms", "naive_lag_ms"),
+        _number("= feedback age", "feedback_age_ms"),
+        _number("+ command hold", "command_hold_ms"),
+        _ranged("+ servo lag (90 %)", "lag_ms"),
+        _ranged("of it dead time (90 %)", "dead_time_ms"),
+        _number("and dynamics", "dynamics_ms"),
+        _number("poll, ms", "poll_period_ms", 2),
+        _number("lost polls, %", "loss", 0, 100.0),
+    )
+    return Table("lag_budget", "Lag budget", columns, tuple(rows))
+
+
+def estimator_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+    """What each delay estimator says, the usual ones first."""
+    rows = [
+        {"joint": joint, "estimator": name, "lag_ms": 1e3 * value}
+        for joint, result in results.items()
+        for name, value in result.budget.estimators.items()
+    ]
+    columns = (
+        _text("joint", "joint"), _text("estimator", "estimator"), _number("lag, ms", "lag_ms"),
+    )  # fmt: skip
+    return Table("estimators", "The same delay, by other estimators", columns, tuple(rows))
+
+
+def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+    """Gain, phase and lag per tone."""
+    rows = [
+        {
+            "joint": joint,
+            "trial": f.trial,
+            "frequency_hz": f.frequency_hz,
+            "gain": f.gain,
+            "phase_deg": f.phase_deg,
+            **_interval("lag_ms", Interval(*(1e3 * x for x in (f.lag.value, f.lag.low, f.lag.high)))),
+            "naive_lag_ms": 1e3 * f.naive_lag_s,
+            "naive_gain": f.naive_gain,
+        }
+        for joint, result in results.items()
+        for f in sorted(result.budget.by_frequency, key=lambda f: f.frequency_hz)
+    ]
+    columns = (
+        _text("joint", "joint"),
+        _number("Hz", "frequency_hz", 2),
+        _number("gain", "gain", 2),
+        _number("phase, °", "phase_deg", 0),
+        _ranged("lag, ms (90 %)", "lag_ms"),
+        _number("naive gain", "naive_gain", 2),
+        _number("naive lag, ms", "naive_lag_ms"),
+    )
+    return Table("by_frequency", "Frequency by frequency", columns, tuple(rows))
+
+
+def ladder_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+    """Every model of the ladder and every preset, scored the same way."""
+    rows = []
+    for joint, result in results.items():
+        for name, fitted in result.rungs.items():
+            kind = "chosen" if name == result.chosen else "fitted"
+            rows.append(_scored(joint, name, kind, len(fitted.values), fitted.scores))
+        for name, scores in result.presets.items():
+            rows.append(_scored(joint, name, "preset", None, scores))
+    columns = (
+        _text("joint", "joint"),
+        Column("model", _model_cell, True),
+        _number("numbers fitted", "parameter_count", 0),
+        _number("fresh, mrad", "rmse_fresh_mrad"),
+        _number("unseen frequency, mrad", "rmse_leave_one_frequency_out_mrad"),
+        _number("held, mrad", "rmse_held_mrad"),
+        _number("one step, mrad", "rmse_one_step_mrad"),
+        _number("fit, %", "fit_percent"),
+        _number("naive, mrad (misleads)", "rmse_naive_mrad"),
+    )
+    return Table("ladder", "Models, simplest first", columns, tuple(rows), "is_chosen")
+
+
+def _scored(joint: str, model: str, kind: str, count: int | None, s: Scores) -> Row:
+    return {
+        "joint": joint,
+        "model": model,
+        "kind": kind,
+        "is_chosen": kind == "chosen",
+        "parameter_count": count,
+        "rmse_fresh_mrad": 1e3 * s.fresh,
+        "rmse_leave_one_frequency_out_mrad": 1e3 * s.leave_one_out,
+        "rmse_held_mrad": 1e3 * s.held,
+        "rmse_one_step_mrad": 1e3 * s.one_step,
+        "fit_percent": s.fit_percent,
+        "rmse_naive_mrad": 1e3 * s.naive,
+    }
+
+
+def _model_cell(row: Row) -> str:
+    if row["kind"] == "preset":
+        return f"preset “{row['model']}”"
+    mark = ", chosen" if row["kind"] == "chosen" else ""
+    return f"{MODEL_NAMES.get(row['model'], row['model'])}{mark}"
+
+
+def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
+    """Every number of the calibration with its interval and whether it was identified."""
+    rows = []
+    for joint in joints:
+        known = calibration.joint(joint)
+        parts = {
+            "actuator": known.actuator,
+            "ratios to armature": known.actuator.ratios_to_armature,
+            "feedback": known.feedback,
+        }
+        for part, values in parts.items():
+            for name in type(values).model_fields:
+                q = getattr(values, name)
+                if isinstance(q, Quantity):
+                    rows.append(
+                        {
+                            "joint": joint, "part": part, "parameter": name, "unit": _unit(part, name),
+                            "value": q.value, "low": q.low, "high": q.high,
+                            "identified": q.identified, "why": q.why or "",
+                        }  # fmt: skip
+                    )
+    columns = (
+        _text("joint", "joint"),
+        _text("part", "part"),
+        Column("number", lambda row: _readable(row["parameter"], row["part"]), True),
+        Column("value (90 %)", _quantity_cell),
+        _text("unit", "unit"),
+        _text("identified", "identified"),
+        _text("why", "why"),
+    )
+    return Table("parameters", "Parameters", columns, tuple(rows))
+
+
+def _unit(part: str, name: str) -> str:
+    return unit_of(name)
+
+
+def _readable(name: str, part: str) -> str:
+    """A parameter's name without its unit, in words."""
+    for end in ("_nm_s_per_rad", "_nm_per_rad", "_kg_m2", "_rad_s", "_rad", "_nm", "_s"):
+        if name.endswith(end):
+            name = name[: -len(end)]
+            break
+    return name.replace("_", " ") + (" / armature" if part == "ratios to armature" else "")
+
+
+def _quantity_cell(row: Row) -> str:
+    if row["low"] is None or row["high"] is None or row["low"] == row["high"]:
+        return _significant(row["value"])
+    return f"{_significant(row['value'])} ({_significant(row['low'])} … {_significant(row['high'])})"
+
+
+def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str]) -> Table:
+    """The doctor's verdict per recording and joint.
+
+    Parameters
+    ----------
+    examinations : sequence of (str, sysid.doctor.Examination)
+        Name of the recording and what the doctor found.
+    joints : sequence of str
+        Which joints to show.
+    """
+    rows = []
+    for recording, examination in examinations:
+        for joint, j in examination.joints.items():
+            if joint in joints:
+                rows.append(
+                    {
+                        "recording": recording,
+                        "joint": joint,
+                        "verdict": j.verdict,
+                        "loop_period_ms": j.loop_period_ms,
+                        "jitter_ms": j.jitter_ms,
+                        "fresh_fraction": j.fresh_fraction,
+                        "poll_period_ms": j.poll_period_ms,
+                        "loss": j.loss,
+                        "quantum_rad": j.quantum_rad,
+                        "offset_rad": j.offset_rad,
+                        "reasons": " ".join(j.reasons),
+                    }
+                )
+    columns = (
+        _text("recording", "recording"),
+        _text("joint", "joint"),
+        _text("verdict", "verdict"),
+        _number("loop, ms", "loop_period_ms", 2),
+        _number("jitter, ms", "jitter_ms", 2),
+        _number("fresh rows, %", "fresh_fraction", 0, 100.0),
+        _number("poll, ms", "poll_period_ms", 2),
+        _number("lost polls, %", "loss", 0, 100.0),
+        _number("count, mrad", "quantum_rad", 3, 1e3),
+        _number("offset, mrad", "offset_rad", 1, 1e3),
+    )
+    return Table("doctor", "The recordings' health", columns, tuple(rows))
+
+
+# ------------------------------------------------------------------------------ how to show
+
+
+def _text(heading: str, key: str) -> Column:
+    return Column(heading, lambda row: str(row[key]), True)
+
+
+def _number(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:
+    return Column(heading, lambda row: _digits(row[key], digits, factor))
+
+
+def _ranged(heading: str, key: str, digits: int = 1) -> Column:
+    def show(row: Row) -> str:
+        low, high = _digits(row[f"{key}_low"], digits), _digits(row[f"{key}_high"], digits)
+        return f"{_digits(row[key], digits)} ({low} … {high})"
+
+    return Column(heading, show)
+
+
+def _interval(name: str, interval: Interval) -> Row:
+    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+
+
+def _digits(value: float | None, digits: int, factor: float = 1.0) -> str:
+    if value is None or not math.isfinite(value):
+        return "–"
+    text = f"{value * factor:.{digits}f}"
+    return text.replace("-", "−") if float(text) != 0 else text.lstrip("-")
+
+
+def _significant(value: float) -> str:
+    """Three significant digits, without powers of ten where they can be avoided."""
+    if value == 0 or 1e-4 <= abs(value) < 1e6:
+        digits = 2 - math.floor(math.log10(abs(value))) if value else 0
+        return _digits(value, max(digits, 0))
+    return f"{value:.2e}".replace("-", "−")
+
+
+def _plain(value: Any) -> Any:
+    """A value for a CSV cell: no NaN, no NumPy, no infinity."""
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
