@@ -35,6 +35,8 @@ LEVEL = 0.90
 
 LONGEST_LAG_S = 0.5
 
+_USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -157,7 +159,7 @@ def lag_budget(
     return LagBudget(
         joint, naive, fresh, lag,
         naive.value - fresh.value, fresh.value - lag.value,
-        tuple(_at_frequency(t, lag.value) for t in tones),
+        tuple(_at_frequency(t, float(each)) for t, each in zip(tones, _servo_lags(tones), strict=True)),
         _estimators(trials, read, tones, lag.value),
         lattice,
         float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else float("nan"),
@@ -182,38 +184,66 @@ def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
     draws = np.stack([getattr(t, f"{output}_draws") / getattr(t, command) for t in tones])
     weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
     weight /= weight.sum()
-    centre = _common_lag(response, frequency, weight)
-    lag = weight @ _lag_near(response, frequency, centre)
-    drawn = weight @ _lag_near(draws, frequency[:, None], centre)
-    return Interval.of_draws(lag, drawn)
+    lags = tone_lags(response, frequency)
+    drawn = _lag_near(draws, frequency[:, None], lags[:, None])
+    return Interval.of_draws(weight @ lags, weight @ drawn)
 
 
-def _common_lag(response: NDArray, frequency: NDArray, weight: NDArray) -> float:
-    """The lag on which all phases agree best: whole periods of single tones cannot win."""
+def tone_lags(response: NDArray, frequency_hz: NDArray) -> NDArray[np.float64]:
+    """Lag of every tone [s], the right whole period of each included.
+
+    A phase leaves the lag open to whole periods. The lowest tone has the longest period and
+    settles itself below 2 Hz; above, the lag on which all tones agree best settles it. From there
+    each tone takes the period nearest to the lag of the tone below it, for a servo's lag changes
+    by far less than half a period from one tone to the next.
+
+    Parameters
+    ----------
+    response : ndarray of complex, shape (tones,)
+    frequency_hz : ndarray, shape (tones,)
+    """
+    order = np.argsort(frequency_hz, kind="stable")
+    lowest = frequency_hz[order[0]]
+    if lowest <= 2.0:
+        near = 0.4 / lowest  # from a tenth of a period early to nine tenths late
+    else:
+        near = _common_lag(response, frequency_hz)
+    lags = np.empty(len(order))
+    for i in order:
+        near = lags[i] = _lag_near(response[i], frequency_hz[i], near)
+    return lags
+
+
+def _common_lag(response: NDArray, frequency: NDArray) -> float:
+    """The lag on which all phases agree best."""
     spacing = np.diff(np.unique(np.round(frequency, 3)))
     # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
     repeat = 1.0 / (spacing.min() if len(spacing) else frequency[0])
     lags = np.arange(0.0, min(LONGEST_LAG_S, 0.95 * repeat), 2e-4)
     turned = np.angle(response)[:, None] + 2 * np.pi * frequency[:, None] * lags
-    # agreement in time, not in phase: at low frequencies a given time is a small angle
-    scale = weight[:, None] / frequency[:, None] ** 2
-    return float(lags[int(np.argmax((scale * np.cos(turned)).sum(axis=0)))])
+    return float(lags[int(np.argmax(np.cos(turned).sum(axis=0)))])
 
 
-def _lag_near(response: NDArray, frequency: NDArray, centre: float) -> NDArray[np.float64]:
-    """Lag of a phase, in the period around `centre` [s]."""
+def _lag_near(response, frequency, centre):
+    """Lag of a phase, in the period around `centre` [s]; arrays broadcast."""
     turned = np.angle(response * np.exp(2j * np.pi * frequency * centre))
     return centre - turned / (2 * np.pi * frequency)
 
 
-def _at_frequency(tone: ToneResponse, centre: float) -> FrequencyLag:
+def _servo_lags(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
+    if not tones:
+        return np.zeros(0)
+    frequency = np.array([t.frequency_hz for t in tones])
+    return tone_lags(np.array([t.response for t in tones]), frequency)
+
+
+def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
     f, response = tone.frequency_hz, tone.response
-    lag = float(_lag_near(np.array(response), np.array(f), centre))
-    draws = _lag_near(tone.response_draws, np.array(f), centre)
+    draws = _lag_near(tone.response_draws, f, lag)
     naive = tone.naive / tone.command_rows
     return FrequencyLag(
         f, abs(response), -360.0 * f * lag, Interval.of_draws(lag, draws),
-        float(_lag_near(np.array(naive), np.array(f), centre + 0.03)), abs(naive), tone.trial,
+        float(_lag_near(naive, f, lag + _USUAL_AGE_S)), abs(naive), tone.trial,
     )  # fmt: skip
 
 
@@ -289,19 +319,11 @@ def _estimators(
         "sub-sample cross-correlation, all rows": [_bounded(t, r, "naive_rows") for t, r in pairs],
         "sub-sample cross-correlation, fresh rows": [_bounded(t, r, "fresh_rows") for t, r in pairs],
     }
-    near = {"naive_rows": lag + 0.04, "fresh_rows": lag + 0.01}
+    frequency = np.array([t.frequency_hz for t in tones])
     for kind, name in (("naive_rows", "all rows"), ("fresh_rows", "fresh rows")):
         output, command = _PAIRS[kind]
-        found[f"sine phase, {name}"] = [
-            float(
-                _lag_near(
-                    np.array(getattr(t, output) / getattr(t, command)),
-                    np.array(t.frequency_hz),
-                    near[kind],
-                )
-            )
-            for t in tones
-        ]
+        response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
+        found[f"sine phase, {name}"] = list(tone_lags(response, frequency)) if tones else []
     result = {k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()}
     if tones:
         result["phase slope, all rows"] = _slope(tones, "naive_rows").value

@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -260,6 +261,55 @@ _LATTICE_WORDS = {
     "every read": "every reading is new",
     "unresolved": "held, but no poll period found",
 }
+
+
+@_styled
+def bode_figure(
+    responses: Mapping[str, FrequencyResponse],
+    results: Mapping[str, JointCalibrationResult] | None = None,
+) -> Figure:
+    """Gain and phase over frequency, one colour and mark per joint.
+
+    Parameters
+    ----------
+    responses : dict of joint to FrequencyResponse
+    results : dict of joint to JointCalibrationResult, optional
+        If given, the gain of all rows, held ones included, is shown as hollow marks.
+    """
+    figure, (gain, phase) = _axes_column(2, 6.2)
+    for n, (joint, response) in enumerate(responses.items()):
+        colour, mark = _JOINT_COLOURS[n % len(_JOINT_COLOURS)], _MARKERS[n % len(_MARKERS)]
+        order = np.argsort(response.frequency_hz)
+        frequency, value = response.frequency_hz[order], response.response[order]
+        style = {"color": colour, "marker": mark, "ms": 5, "lw": 1.2}
+        gain.plot(frequency, 20 * np.log10(np.abs(value)), label=joint, **style)
+        phase.plot(frequency, np.degrees(np.unwrap(np.angle(value))), **style)
+        naive = results[joint].budget.by_frequency if results and joint in results else ()
+        gain.plot(
+            [f.frequency_hz for f in naive], [20 * np.log10(f.naive_gain) for f in naive],
+            color=colour, marker=mark, ms=6, mfc="none", ls="",
+        )  # fmt: skip
+    gain.axhline(-3.01, color=INK, lw=1, ls=(0, (4, 2)))
+    gain.text(1.0, -3.01, "−3 dB ", transform=gain.get_yaxis_transform(), ha="right", va="bottom")
+    low, high = gain.get_ylim()
+    gain.set_ylim(min(low, -4.0), max(high, 1.0))
+    for axes in (gain, phase):
+        axes.set_xscale("log")
+        ticks = [f for f in _FREQUENCY_TICKS if axes.get_xlim()[0] <= f <= axes.get_xlim()[1]]
+        axes.set_xticks(ticks, [f"{f:g}" for f in ticks])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    gain.set_ylabel("gain [dB]")
+    phase.set_ylabel("phase [°]")
+    phase.set_xlabel("frequency [Hz]")
+    handles, _ = gain.get_legend_handles_labels()
+    if results:
+        hollow = Line2D([], [], color=INK, marker="o", mfc="none", ls="", label="naive: all rows")
+        handles = [*handles, hollow]
+    figure.legend(handles=handles, loc="outside upper left", ncols=3)
+    return figure
+
+
+_FREQUENCY_TICKS = (0.1, 0.2, 0.5, 1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 
 @_styled

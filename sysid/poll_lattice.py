@@ -29,7 +29,7 @@ OUTLIERS = 0.03
 
 _STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e-4
 _DRIFT = 0.0045  # relative sd of the period between stretches, measured on a Mini Pupper 2
-_BLUR_S = 0.003  # full width of the uncertainty of one poll instant
+_BLURS_S = (0.0012, 0.0025, 0.005)  # full width of the uncertainty of one poll instant
 _BINS = 64
 _LONGEST_S = 0.12
 _PEAKS = 12
@@ -165,12 +165,13 @@ def find_poll_lattice(
     moving, moving_fresh = _moving_fresh(trials)
     if moving and moving_fresh / moving >= _ALL_FRESH:
         return PollLattice("every read", *[float("nan")] * 6, fraction)
-    stretches = [s for t in trials for s in _stretches(t)]
+    step = max(quantum(trials), 1e-6)
+    stretches = [s for t in trials if len(t.read_time_s) > 3 for s in _stretches(t, step)]
     if not stretches or not np.isfinite(loop):
         return nothing
 
     # ln T, spaced so that the last poll of a stretch moves by half of the blur
-    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * _BLUR_S / _STRETCH_S))
+    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * _BLURS_S[1] / _STRETCH_S))
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
     period, score = _best_period(informative, grid)
     z_score = float("nan")
@@ -180,7 +181,17 @@ def find_poll_lattice(
         ]
         z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
 
-    phases = tuple(_refine(s, period) for s in stretches)
+    phases = tuple(_refine(s, period, _BLURS_S[1], None) for s in stretches)
+    loss, _ = _loss(trials, phases)
+    if np.isfinite(loss):
+        # second pass: rows that did not change speak too, and the blur is what fits best
+        loss = float(np.clip(loss, 0.02, 0.98))
+        evidence = [
+            sum(_posterior(s, period, blur, loss, 25, 64)[3] for s in informative)
+            for blur in _BLURS_S
+        ]
+        blur = _BLURS_S[int(np.argmax(evidence))]
+        phases = tuple(_refine(s, period, blur, loss) for s in stretches)
     weights = np.array([len(s.begin) for s in stretches], float)
     periods = np.array([p.period_s for p in phases])
     period = float(np.average(periods, weights=weights))
@@ -222,7 +233,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
         inside = (read[rows] >= phase.start_s) & (read[rows] <= phase.stop_s)
         count = np.round((time - phase.phase_s) / phase.period_s)
         instant = phase.phase_s + count * phase.period_s
-        slack = 0.5 * _BLUR_S
+        slack = 0.5 * _BLURS_S[-1]
         hit = inside & (instant >= before - slack) & (instant <= read[rows] + slack)
         time = np.where(hit, np.minimum(instant, read[rows]), time)
     if own:
@@ -246,18 +257,29 @@ class _Stretch:
     """Previous read of each changed row."""
     end: NDArray[np.float64]
     """Read of each changed row."""
+    same_begin: NDArray[np.float64]
+    """Previous read of each row whose value did not change although the servo must have moved."""
+    same_end: NDArray[np.float64]
+    """Read of each such row."""
 
 
-def _stretches(trial: Trial) -> list[_Stretch]:
+def _stretches(trial: Trial, step: float) -> list[_Stretch]:
     """Cut a trial into stretches short enough for one strict lattice each."""
     read, rows = trial.read_time_s, fresh_rows(trial)
+    gap = float(np.median(np.diff(read)))
+    moving = np.flatnonzero(_speed(trial) * gap > _MOVING_QUANTA * step)
+    same = np.setdiff1d(moving[(moving > 0) & np.isfinite(trial.position_rad[moving])], rows)
     parts = max(1, int(np.ceil((read[-1] - read[0]) / _STRETCH_S)))
     edges = np.linspace(read[0], read[-1], parts + 1)
     found = []
     for start, stop in zip(edges[:-1], edges[1:], strict=True):
-        own = rows[(read[rows] > start) & (read[rows] <= stop)]
+        own, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
         if len(own) >= 8:
-            found.append(_Stretch(trial.number, start, stop, read[own - 1], read[own]))
+            found.append(
+                _Stretch(
+                    trial.number, start, stop, read[own - 1], read[own], read[held - 1], read[held]
+                )
+            )
     return found
 
 
@@ -274,7 +296,7 @@ def _best_period(stretches: Sequence[_Stretch], grid: NDArray) -> tuple[float, f
         peak = int(np.argmax(pooled))
         if not np.isfinite(pooled[peak]):
             break
-        score = sum(_posterior(s, grid[peak], 25, 64)[3] for s in stretches)
+        score = sum(_posterior(s, grid[peak], _BLURS_S[1], None, 25, 64)[3] for s in stretches)
         best = max(best, (float(grid[peak]), float(score)), key=lambda pair: pair[1])
         pooled[np.abs(np.log(grid / grid[peak])) < 2 * _DRIFT] = -np.inf
     return best
@@ -321,27 +343,41 @@ def _shuffle(stretch: _Stretch, rng: np.random.Generator) -> _Stretch:
 
 
 def _posterior(
-    stretch: _Stretch, period: float, period_count: int, phase_count: int
+    stretch: _Stretch,
+    period: float,
+    blur: float,
+    loss: float | None,
+    period_count: int,
+    phase_count: int,
 ) -> tuple[NDArray, NDArray, NDArray, float]:
-    """Log-posterior over (period, phase) near `period`, the two axes, and the peak's score."""
+    """Log-posterior over (period, phase) near `period`, the two axes, and the peak's score.
+
+    Without a `loss`, only rows that changed count. With one, a row that did not change although
+    the servo moved says that no poll, or a failed one, lies in its interval.
+    """
     reference = 0.5 * (stretch.start_s + stretch.stop_s)
     periods = period * np.exp(np.linspace(-2.5 * _DRIFT, 2.5 * _DRIFT, period_count))
     steps = np.linspace(-0.5, 0.5, phase_count, endpoint=False)
-    middle = 0.5 * (stretch.begin + stretch.end) - reference
-    width = stretch.end - stretch.begin
-    turns = middle[None, :] / periods[:, None]
-    away = (turns[:, None, :] - steps[None, :, None] + 0.5) % 1.0 - 0.5
-    distance = np.abs(away) * periods[:, None, None]
-    inside = np.clip((0.5 * width - distance) / _BLUR_S + 0.5, 0.0, 1.0)
-    chance = np.minimum(width / period, 1.0)
-    log_likelihood = np.log((1 - OUTLIERS) * inside + OUTLIERS * chance).sum(axis=2)
+
+    def inside(begin: NDArray, end: NDArray) -> NDArray[np.float64]:
+        turns = (0.5 * (begin + end) - reference)[None, :] / periods[:, None]
+        away = (turns[:, None, :] - steps[None, :, None] + 0.5) % 1.0 - 0.5
+        distance = np.abs(away) * periods[:, None, None]
+        return np.clip((0.5 * (end - begin) - distance) / blur + 0.5, 0.0, 1.0)
+
+    chance = np.minimum((stretch.end - stretch.begin) / period, 1.0)
+    changed = (1 - OUTLIERS) * inside(stretch.begin, stretch.end) + OUTLIERS * chance
+    log_likelihood = np.log(changed).sum(axis=2)
+    if loss is not None and len(stretch.same_end):
+        seen = (1 - OUTLIERS) * (1 - loss) * inside(stretch.same_begin, stretch.same_end)
+        log_likelihood += np.log(1 - seen).sum(axis=2)
     log_likelihood -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
     return log_likelihood, periods, steps, float(log_likelihood.max() - np.log(chance).sum())
 
 
-def _refine(stretch: _Stretch, period: float) -> _Phase:
+def _refine(stretch: _Stretch, period: float, blur: float, loss: float | None) -> _Phase:
     """Posterior mean of a stretch's period and phase near the common period."""
-    log_likelihood, periods, steps, _ = _posterior(stretch, period, 61, 128)
+    log_likelihood, periods, steps, _ = _posterior(stretch, period, blur, loss, 61, 128)
     reference = 0.5 * (stretch.start_s + stretch.stop_s)
     weight = np.exp(log_likelihood - log_likelihood.max())
     weight /= weight.sum()
@@ -365,7 +401,7 @@ def _refine(stretch: _Stretch, period: float) -> _Phase:
 def _contains(begin: NDArray, end: NDArray, phase: _Phase) -> NDArray[np.bool_]:
     middle = 0.5 * (begin + end)
     instant = phase.phase_s + phase.period_s * np.round((middle - phase.phase_s) / phase.period_s)
-    return np.abs(instant - middle) <= 0.5 * (end - begin) + 0.5 * _BLUR_S
+    return np.abs(instant - middle) <= 0.5 * (end - begin) + 0.5 * _BLURS_S[1]
 
 
 # ------------------------------------------------------------------ where the servo must move

@@ -11,16 +11,13 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Quantity, unit_of
-from sysid.calibrate import PREFERRED, JointCalibrationResult, Scores
+from sysid.calibrate import JointCalibrationResult, Scores
 from sysid.delay import Interval
 from sysid.figure_data import lag_parts
-
-if TYPE_CHECKING:  # it brings python-control, which a table does not need
-    from sysid.frequency_response import FrequencyResponse
 
 MODEL_NAMES = {
     "pure_delay": "pure delay",
@@ -40,7 +37,8 @@ class Column:
 
     heading: str
     show: Callable[[Row], str]
-    is_text: bool = False
+    kind: Literal["key", "number", "words", "prose"] = "number"
+    """How it is set: a key stays in sight when the table is scrolled, prose is broken into lines."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +64,9 @@ class Table:
     rows: tuple[Row, ...]
     marked: str = ""
 
-    def cells(self, row: Row) -> list[tuple[str, bool]]:
-        """The page's cells of `row`: their text and whether it is words."""
-        return [(c.show(row), c.is_text) for c in self.columns]
+    def cells(self, row: Row) -> list[tuple[str, str]]:
+        """The page's cells of `row`: their text and how each is set."""
+        return [(c.show(row), c.kind) for c in self.columns]
 
     def is_marked(self, row: Row) -> bool:
         """Whether `row` is to stand out."""
@@ -81,6 +79,9 @@ class Table:
         writer.writeheader()
         writer.writerows({k: _plain(v) for k, v in row.items()} for row in self.rows)
         return buffer.getvalue()
+
+
+_KEY = Column("joint", lambda row: row["joint"], "key")
 
 
 def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
@@ -105,7 +106,7 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
             }
         )
     columns = (
-        _text("joint", "joint"),
+        _KEY,
         _number("naive, ms", "naive_lag_ms"),
         _number("= feedback age", "feedback_age_ms"),
         _number("+ command hold", "command_hold_ms"),
@@ -119,16 +120,21 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
 
 
 def estimator_table(results: Mapping[str, JointCalibrationResult]) -> Table:
-    """What each delay estimator says, the usual ones first."""
-    rows = [
-        {"joint": joint, "estimator": name, "lag_ms": 1e3 * value}
-        for joint, result in results.items()
-        for name, value in result.budget.estimators.items()
-    ]
+    """What each delay estimator says, the usual ones first; a column per joint."""
+    names = list(dict.fromkeys(name for r in results.values() for name in r.budget.estimators))
+    rows = tuple(
+        {"estimator": name}
+        | {
+            f"{joint}_lag_ms": 1e3 * r.budget.estimators.get(name, math.nan)
+            for joint, r in results.items()
+        }
+        for name in names
+    )
     columns = (
-        _text("joint", "joint"), _text("estimator", "estimator"), _number("lag, ms", "lag_ms"),
-    )  # fmt: skip
-    return Table("estimators", "The same delay, by other estimators", columns, tuple(rows))
+        Column("lag in ms by", lambda row: row["estimator"], "words"),
+        *(_number(joint, f"{joint}_lag_ms") for joint in results),
+    )
+    return Table("estimators", "The same delay, by other estimators", columns, rows)
 
 
 def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
@@ -148,7 +154,7 @@ def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         for f in sorted(result.budget.by_frequency, key=lambda f: f.frequency_hz)
     ]
     columns = (
-        _text("joint", "joint"),
+        _KEY,
         _number("Hz", "frequency_hz", 2),
         _number("gain", "gain", 2),
         _number("phase, °", "phase_deg", 0),
@@ -169,8 +175,8 @@ def ladder_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         for name, scores in result.presets.items():
             rows.append(_scored(joint, name, "preset", None, scores))
     columns = (
-        _text("joint", "joint"),
-        Column("model", _model_cell, True),
+        _KEY,
+        Column("model", _model_cell, "words"),
         _number("numbers fitted", "parameter_count", 0),
         _number("fresh, mrad", "rmse_fresh_mrad"),
         _number("unseen frequency, mrad", "rmse_leave_one_frequency_out_mrad"),
@@ -199,10 +205,12 @@ def _scored(joint: str, model: str, kind: str, count: int | None, s: Scores) -> 
 
 
 def _model_cell(row: Row) -> str:
-    if row["kind"] == "preset":
-        return f"preset “{row['model']}”"
-    mark = ", chosen" if row["kind"] == "chosen" else ""
-    return f"{MODEL_NAMES.get(row['model'], row['model'])}{mark}"
+    return model_name(row["model"]) + (", chosen" if row["kind"] == "chosen" else "")
+
+
+def model_name(name: str) -> str:
+    """A rung of the ladder or a preset, in words."""
+    return MODEL_NAMES.get(name, f"preset “{name}”")
 
 
 def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
@@ -221,25 +229,20 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
                 if isinstance(q, Quantity):
                     rows.append(
                         {
-                            "joint": joint, "part": part, "parameter": name, "unit": _unit(part, name),
+                            "joint": joint, "part": part, "parameter": name, "unit": unit_of(name),
                             "value": q.value, "low": q.low, "high": q.high,
                             "identified": q.identified, "why": q.why or "",
                         }  # fmt: skip
                     )
     columns = (
-        _text("joint", "joint"),
-        _text("part", "part"),
-        Column("number", lambda row: _readable(row["parameter"], row["part"]), True),
+        _KEY,
+        Column("number", lambda row: _readable(row["parameter"], row["part"]), "words"),
         Column("value (90 %)", _quantity_cell),
         _text("unit", "unit"),
         _text("identified", "identified"),
-        _text("why", "why"),
+        Column("why", lambda row: row["why"], "prose"),
     )
     return Table("parameters", "Parameters", columns, tuple(rows))
-
-
-def _unit(part: str, name: str) -> str:
-    return unit_of(name)
 
 
 def _readable(name: str, part: str) -> str:
@@ -287,8 +290,7 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
                     }
                 )
     columns = (
-        _text("recording", "recording"),
-        _text("joint", "joint"),
+        _KEY,
         _text("verdict", "verdict"),
         _number("loop, ms", "loop_period_ms", 2),
         _number("jitter, ms", "jitter_ms", 2),
@@ -297,6 +299,7 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
         _number("lost polls, %", "loss", 0, 100.0),
         _number("count, mrad", "quantum_rad", 3, 1e3),
         _number("offset, mrad", "offset_rad", 1, 1e3),
+        _text("recording", "recording"),
     )
     return Table("doctor", "The recordings' health", columns, tuple(rows))
 
@@ -305,7 +308,7 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
 
 
 def _text(heading: str, key: str) -> Column:
-    return Column(heading, lambda row: str(row[key]), True)
+    return Column(heading, lambda row: str(row[key]), "words")
 
 
 def _number(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:

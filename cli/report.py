@@ -1,0 +1,103 @@
+"""`report`: everything about some recordings as one page, with its figures and tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from cli import terminal
+from common.errors import InputError
+from common.files import refuse_overwrite
+from servo_models.calibration import Calibration, load_calibration
+from sysid import calibrate as calibration
+from sysid.calibration_file import preset_parameters, to_calibration
+from sysid.recording import Recording
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write one HTML page that opens anywhere, with its figures as PNG and its tables as CSV.
+
+    Example: pupper-sysid report recordings/sweep.csv --out reports/sweep
+    """
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings, pooled per joint; by default the newest in recordings/."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    out: Path | None = None
+    """Folder to write; by default reports/ and the first recording's name."""
+    calibration: Path | None = None
+    """Calibration made from these recordings: its numbers and its seed are used."""
+    force: bool = False
+    """Replace files of a report that is there already."""
+    json: bool = False
+    """Print one JSON object that names the files written, and nothing else."""
+    seed: int = 0
+    """Seed of the bootstrap and of the models' global starts."""
+
+    def run(self) -> None:
+        """Examine, measure, calibrate, write."""
+        import numpy as np
+
+        # here, because drawing and python-control take a second that --help should not
+        from sysid.doctor import examine
+        from sysid.frequency_response import frequency_response
+        from sysid.report import write_report
+
+        recordings = terminal.load_all(self.recordings)
+        joints = terminal.pick_joints(recordings, self.joints)
+        folder = self.out or Path("reports") / recordings[0].name
+        refuse_overwrite(folder / "report.html", self.force)  # before the work, not after it
+        made = self._stored(recordings, joints)
+        seed = self.seed if made is None or made.seed is None else made.seed
+        with terminal.progress("calibrating", len(joints)) as advance:
+            results = calibration.calibrate(
+                recordings, joints, seed, preset_parameters(), progress=advance
+            )
+        with terminal.progress("examining", len(recordings) + len(joints)) as advance:
+            examinations, responses = [], {}
+            for recording in recordings:
+                found = examine(recording, np.random.default_rng(seed))
+                examinations.append((recording.name, found))
+                advance(recording.name)
+            for joint, result in results.items():
+                trials, _, _ = calibration.joint_trials(recordings, joint)
+                if any(t.frequency_hz > 0 for t in trials):
+                    rng = calibration.joint_rng(seed, joint)
+                    responses[joint] = frequency_response(
+                        joint, trials, rng, result.budget.lattice
+                    )
+                advance(joint)
+        made = made or to_calibration(results, recordings, seed)
+        written = write_report(
+            folder, recordings, results, made, examinations, responses, self.force
+        )
+        if self.json:
+            terminal.print_json(
+                {
+                    "report": str(written.path),
+                    "figures": [str(p) for p in written.figures],
+                    "tables": [str(p) for p in written.tables],
+                }
+            )
+        else:
+            terminal.err.print(f"Wrote {written.path}. Open it in a browser.", soft_wrap=True)
+
+    def _stored(self, recordings: list[Recording], joints: list[str]) -> Calibration | None:
+        """The calibration given, if it belongs to the recordings."""
+        if self.calibration is None:
+            return None
+        stored = load_calibration(self.calibration)
+        if {i.sha256 for i in stored.inputs} != {r.sha256 for r in recordings}:
+            made_from = ", ".join(i.name for i in stored.inputs) or "no recording"
+            raise InputError(
+                f"{self.calibration} was made from {made_from}, which is not, byte for byte, what "
+                f"you gave ({', '.join(r.name for r in recordings)}). Give its own recordings, or "
+                "leave --calibration out."
+            )
+        for joint in joints:
+            stored.joint(joint)
+        return stored
