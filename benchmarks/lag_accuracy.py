@@ -2,8 +2,10 @@
 
 Each robot is drawn with its own servos, read losses from 0 to 0.6, count size, poll period and
 jitters; one joint is swept from 1 to 10 Hz through the recorder, exactly as a user would. The
-truth is the lag of the joint's real motion (noise-free, at the instants of the host's reads)
-against the held command, averaged over the tones with the estimator's own weights.
+truth is the lag of the joint's real motion, without noise and every millisecond, against the held
+command, averaged over the tones with the estimator's own weights. (Sampling the motion once per
+loop would not do: it ripples with the steps of the command, and once per loop sees one phase of
+the ripple only.)
 
     .venv/bin/python benchmarks/lag_accuracy.py --robots 240
 
@@ -19,23 +21,23 @@ import argparse
 import os
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-import pandas as pd
 
 from common.joints import JOINT_NAMES
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import draw_robot, random_spec
+from sim.free_air_servo import FreeAirServo
 from sysid.delay import lag_budget, tone_lags
 from sysid.excitation import parse_frequencies, plan
 from sysid.poll_lattice import Readings, find_poll_lattice, readings
 from sysid.recorder import record
-from sysid.recording import load
+from sysid.recording import Trial, load
 from sysid.tone import tone_response
 
 
@@ -65,8 +67,6 @@ def measure(seed: int) -> Result:
         path = Path(folder) / "sweep.csv"
         record(bus, plan("sine", [joint], parse_frequencies("1-10")), path)
         trials = load(path).trials(joint)
-    true = pd.DataFrame(bus.truth_rows(), columns=["time", "joint", "position", "reading_time"])
-    true = true[true.joint == joint]
     lattice = find_poll_lattice(trials)
     budget = lag_budget(joint, trials, np.random.default_rng(seed), lattice)
 
@@ -75,16 +75,9 @@ def measure(seed: int) -> Result:
         tone = tone_response(trial, readings(trial, lattice), np.random.default_rng(0), draws=2)
         if tone is None:
             continue
-        position = np.interp(trial.read_time_s, true.time, true.position)
-        exact = Readings(
-            np.arange(len(position)), trial.read_time_s, position, trial.read_time_s, 0.0
-        )
         tones.append(tone)
-        clean.append(
-            tone_response(
-                replace(trial, position_rad=position), exact, np.random.default_rng(0), draws=2
-            )
-        )
+        exact = true_motion(bus, trial)
+        clean.append(tone_response(trial, exact, np.random.default_rng(0), draws=2))
     frequency = np.array([t.frequency_hz for t in tones])
     lags = tone_lags(np.array([t.response for t in clean]), frequency)
     speed = np.array([abs(t.command_held) for t in tones]) * 2 * np.pi * frequency
@@ -100,6 +93,26 @@ def measure(seed: int) -> Result:
         estimates | {"hold-aware (default)": budget.lag.value},
         abs(lattice.period_s - spec.poll_period_s), lattice.kind,
     )  # fmt: skip
+
+
+def true_motion(bus: EmulatedBus, trial: Trial) -> Readings:
+    """The joint's motion under the commands of `trial`, every millisecond and exact."""
+    servo = bus.robot.servos[JOINT_NAMES.index(trial.joint)]
+    step, zero = bus.robot.spec.quantum_rad, servo.zero_rad
+    counts = (trial.command_rad - zero) / step
+    whole = np.ceil(counts) if servo.command_rounding == "up" else np.floor(counts)
+    start = trial.send_time_s[0] - 1.0
+    motion = FreeAirServo(servo.actuator, trial.initial_command_rad)
+    events = iter(zip(trial.send_time_s - start, zero + whole * step, strict=True))
+    upcoming = next(events)
+    time = np.arange(0.0, trial.send_time_s[-1] - start, 1e-3)
+    position = np.empty(len(time))
+    for k, now in enumerate(time):
+        while upcoming is not None and upcoming[0] <= now:
+            motion.command(*upcoming)
+            upcoming = next(events, None)
+        position[k] = motion.position_at(now)
+    return Readings(np.arange(len(time)), time + start, position, time + start, 0.0)
 
 
 def table(results: list[Result]) -> str:

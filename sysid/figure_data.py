@@ -16,7 +16,7 @@ from servo_models.delayed_pd import TIME_STEP_S
 from sysid.calibrate import PREFERRED, JointCalibrationResult
 from sysid.delay import Interval
 from sysid.ladder import rung
-from sysid.output_error import look_up, positions
+from sysid.output_error import TrialData, look_up, positions
 
 LONGEST_RUN = 12
 """Hold runs of this many rows and more share the last bar."""
@@ -119,13 +119,14 @@ def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track
     return [_track(trial, simulated[:, n]) for n, trial in enumerate(result.trials)]
 
 
-def _track(trial, simulated: NDArray) -> Track:
+def _track(trial: TrialData, simulated: NDArray) -> Track:
     steps = len(trial.command)
     # over a few steps: dry friction makes the speed of a single one jump
-    speed = np.gradient(np.convolve(simulated, np.ones(5) / 5, mode="same"), TIME_STEP_S)
+    smooth = np.convolve(np.pad(simulated, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    speed = np.gradient(smooth, TIME_STEP_S)
     return Track(
         trial.frequency_hz,
-        TIME_STEP_S * np.arange(steps), trial.command, simulated[:steps],
+        np.arange(steps) * np.float64(TIME_STEP_S), trial.command, simulated[:steps],
         TIME_STEP_S * trial.sample_step, trial.sample_rad,
         TIME_STEP_S * trial.row_step, trial.row_rad,
         trial.sample_rad - look_up(simulated, trial.sample_step),
@@ -154,7 +155,9 @@ def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
     order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
     seen: dict[float, Track] = {}
     for n, track in enumerate(order):
-        seen.setdefault(round(track.frequency_hz, 2) if track.frequency_hz > 0 else -float(n), track)
+        seen.setdefault(
+            round(track.frequency_hz, 2) if track.frequency_hz > 0 else -float(n), track
+        )
     order = list(seen.values())
     index = np.unique(np.round(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int))
     return [order[i] for i in index]

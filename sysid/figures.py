@@ -12,7 +12,7 @@ import io
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 import numpy as np
 from matplotlib import rc_context
@@ -38,11 +38,13 @@ from sysid.figure_data import (
     window,
 )
 
-if TYPE_CHECKING:  # it brings python-control, which drawing does not need
+if TYPE_CHECKING:  # python-control, which the second brings, is not needed to draw
+    from matplotlib.typing import RcKeyType
+
     from sysid.frequency_response import FrequencyResponse
 
-WIDTH_IN = 5.6
-DPI = 170
+WIDTH_IN = 5.0
+DPI = 190
 
 INK = "#333333"
 FAINT = "#9a9a9a"
@@ -55,7 +57,7 @@ PINK = "#CC79A7"
 _JOINT_COLOURS = (BLUE, RED, GREEN, PINK, ORANGE, SKY, INK)
 _MARKERS = "osD^vP"
 
-_STYLE = {
+_STYLE: dict[RcKeyType, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "axes.titlesize": 11,
@@ -132,7 +134,9 @@ def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
     axes.set_xlabel("time after the command's row [ms]")
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    kinds = [Patch(facecolor=c, hatch=h, edgecolor="white", lw=0, label=n) for n, c, h in _LAG_KINDS]
+    kinds = [
+        Patch(facecolor=c, hatch=h, edgecolor="white", lw=0, label=n) for n, c, h in _LAG_KINDS
+    ]
     whisker = Line2D([], [], color=INK, marker="|", ms=8, markevery=[0, -1], lw=1.5)
     whisker.set_label("90 % interval of the dead time")
     naive = Line2D([], [], color=INK, lw=2.2, label="naive lag, the sum")
@@ -152,16 +156,28 @@ _LAG_KINDS = (
 
 
 def _bar_length(part: LagParts) -> float:
-    lengths = (part.command_hold_ms, part.dead_time_ms.value, part.dynamics_ms, part.feedback_age_ms)
+    lengths = (
+        part.command_hold_ms,
+        part.dead_time_ms.value,
+        part.dynamics_ms,
+        part.feedback_age_ms,
+    )
     return sum(max(x, 0.0) for x in lengths)
 
 
 def _lag_bar(axes: Axes, row: int, part: LagParts) -> None:
-    lengths = (part.command_hold_ms, part.dead_time_ms.value, part.dynamics_ms, part.feedback_age_ms)
+    lengths = (
+        part.command_hold_ms,
+        part.dead_time_ms.value,
+        part.dynamics_ms,
+        part.feedback_age_ms,
+    )
     left = 0.0
     for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
         shown = max(length, 0.0)
-        axes.barh(row, shown, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0)
+        axes.barh(
+            row, shown, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0
+        )
         if shown > 5.0:
             # the feedback's hatching would run through its number
             box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
@@ -239,7 +255,9 @@ def hold_histogram_figure(results: Mapping[str, JointCalibrationResult]) -> Figu
         axes.bar(length, runs.count, color=ORANGE, label="counted")
         title = f"{joint}: {_LATTICE_WORDS.get(lattice.kind, lattice.kind)}"
         if runs.expected is not None:
-            axes.plot(length, runs.expected, "D", color=INK, ms=5, label="predicted by poll and loss")
+            axes.plot(
+                length, runs.expected, "D", color=INK, ms=5, label="predicted by poll and loss"
+            )
             title = (
                 f"{joint}: a poll every {1e3 * lattice.period_s:.2f} ms, "
                 f"{100 * lattice.loss:.0f} % of them lost"
@@ -332,7 +350,7 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     age = 1e3 * result.budget.feedback_age_s
     over_speed.plot(
         gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
-        label=f"all rows at their own time: off by speed × age (dashed: {age:.0f} ms)",
+        label=f"all rows at their own time (dashed: speed × {age:.0f} ms)",
         rasterized=True,
     )  # fmt: skip
     over_speed.plot(

@@ -266,8 +266,7 @@ class _Stretch:
 def _stretches(trial: Trial, step: float) -> list[_Stretch]:
     """Cut a trial into stretches short enough for one strict lattice each."""
     read, rows = trial.read_time_s, fresh_rows(trial)
-    gap = float(np.median(np.diff(read)))
-    moving = np.flatnonzero(_speed(trial) * gap > _MOVING_QUANTA * step)
+    moving = np.flatnonzero(moving_rows(trial, step))
     same = np.setdiff1d(moving[(moving > 0) & np.isfinite(trial.position_rad[moving])], rows)
     parts = max(1, int(np.ceil((read[-1] - read[0]) / _STRETCH_S)))
     edges = np.linspace(read[0], read[-1], parts + 1)
@@ -407,6 +406,12 @@ def _contains(begin: NDArray, end: NDArray, phase: _Phase) -> NDArray[np.bool_]:
 # ------------------------------------------------------------------ where the servo must move
 
 
+def moving_rows(trial: Trial, step: float) -> NDArray[np.bool_]:
+    """Rows by which the servo must have moved by a count of `step` [rad] since the row before."""
+    gap = float(np.median(np.diff(trial.read_time_s)))
+    return _speed(trial) * gap > _MOVING_QUANTA * step
+
+
 def _speed(trial: Trial) -> NDArray[np.float64]:
     """|command rate| around each row [rad/s], the largest over the past 0.1 s to allow for lag."""
     rate = np.abs(np.gradient(trial.command_rad, trial.send_time_s))
@@ -424,8 +429,7 @@ def _moving_fresh(trials: Sequence[Trial]) -> tuple[int, int]:
     for trial in trials:
         if len(trial.read_time_s) < 3:
             continue
-        gap = float(np.median(np.diff(trial.read_time_s)))
-        rows = np.flatnonzero(_speed(trial) * gap > _MOVING_QUANTA * step)
+        rows = np.flatnonzero(moving_rows(trial, step))
         moving += len(rows)
         fresh += len(np.intersect1d(rows, fresh_rows(trial)))
     return moving, fresh

@@ -177,7 +177,9 @@ def sections(
         _models(results),
         _parameters(results, calibration),
         _residuals(results, runs),
-        Section("next", "What to record next", findings=[("", s) for s in advice(results, examinations)]),
+        Section(
+            "next", "What to record next", findings=[("", s) for s in advice(results, examinations)]
+        ),
         _provenance(recordings, calibration),
     ]
     return [s for s in made if s.text or s.findings or s.figures or s.tables]
@@ -314,9 +316,7 @@ def _best_by_naive_score(result: JointCalibrationResult) -> str:
     return min(scores, key=lambda name: scores[name])
 
 
-def _parameters(
-    results: Mapping[str, JointCalibrationResult], calibration: Calibration
-) -> Section:
+def _parameters(results: Mapping[str, JointCalibrationResult], calibration: Calibration) -> Section:
     scale = calibration.joint(next(iter(results))).actuator.scale
     return Section(
         "parameters",
@@ -381,7 +381,5 @@ def _title(recordings: Sequence[Recording]) -> str:
     return f"Servo report: {first}" + (f" and {more} more" if more else "")
 
 
-def _subtitle(
-    results: Mapping[str, JointCalibrationResult], calibration: Calibration
-) -> str:
+def _subtitle(results: Mapping[str, JointCalibrationResult], calibration: Calibration) -> str:
     return f"{calibration.robot} · {', '.join(results)} · {calibration.created}"

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from common.joints import JOINT_NAMES
-from servo_models.delayed_pd import TIME_STEP_S
 from sysid.calibrate import PREFERRED, JointCalibrationResult
 
 _FEW_FREQUENCIES = 4
 _FAST_HZ = 5.0  # below it a servo of 20 ms dynamics looks like 20 ms more of dead time
 _WIDE_MS = 6.0
-_SHORT_READINGS = 400
-_LONG_READINGS_S = 30.0
+_FEW_READINGS = 400
+_LONG_S = 30.0
 
 
 def advice(
@@ -48,14 +47,15 @@ def advice(
             grouped.setdefault(sentence, []).append(joint)
     said = [f"{_names(joints, results)}: {sentence}" for sentence, joints in grouped.items()]
     said.append(
-        "Torques rest on an assumed stall torque, because a joint that swings in free air shows only "
-        "ratios to its inertia. Hang a known mass at a known distance from the joint and record the "
-        "same sweep: that gives the scale."
+        "Torques rest on an assumed stall torque, because a joint that swings in free air shows "
+        "only ratios to its inertia. Hang a known mass at a known distance from the joint and "
+        "record the same sweep: that gives the scale."
     )
     missing = [j for j in JOINT_NAMES if j not in results]
     if missing:
         said.append(
-            f"Nothing is known of {', '.join(missing)}. `pupper-sysid sweep --joints all` records them."
+            f"Nothing is known of {', '.join(missing)}. "
+            "`pupper-sysid sweep --joints all` records them."
         )
     return said
 
@@ -64,7 +64,6 @@ def _gaps(result: JointCalibrationResult) -> list[str]:
     """Sentences for one joint, without its name."""
     pd, lattice = result.rungs[PREFERRED], result.budget.lattice
     tones = sorted({round(t.frequency_hz, 2) for t in result.trials if t.frequency_hz > 0})
-    seconds = sum(len(t.command) for t in result.trials) * TIME_STEP_S
     fresh = sum(len(t.sample_step) for t in result.trials)
     width = 1e3 * (result.dead_time.high - result.dead_time.low)
     said = []
@@ -98,19 +97,19 @@ def _gaps(result: JointCalibrationResult) -> list[str]:
         )
     if tones and (tones[-1] < _FAST_HZ or width > _WIDE_MS):
         said.append(
-            f"dead time is known to {width:.0f} ms at best (90 %), because at {tones[-1]:g} Hz and "
-            "below it looks much like slow dynamics. Faster tones (up to 10 Hz, at a smaller "
-            "amplitude) or steps would tell them apart."
+            f"the dead time rests on tones of {tones[-1]:g} Hz and below, where it looks much like "
+            "slow dynamics. Faster tones (up to 10 Hz, at a smaller amplitude) or steps would tell "
+            "them apart."
         )
-    if fresh < _SHORT_READINGS:
+    if fresh < _FEW_READINGS:
         said.append(
-            f"{fresh} fresh readings in {seconds:.0f} s are few. Hold each tone longer: "
-            "four times the time halves every interval."
+            f"fewer than {_FEW_READINGS} fresh readings. Hold each tone longer: four times the "
+            "time halves every interval."
         )
     if lattice.kind == "unresolved":
         said.append(
             "readings are held, but the bus's poll period could not be found. A longer sweep "
-            f"({_LONG_READINGS_S:g} s or more) at full amplitude would settle it."
+            f"({_LONG_S:g} s or more) at full amplitude would settle it."
         )
     if not np.isfinite(pd.scores.leave_one_out) and tones:
         said.append("no frequency could be left out, so nothing tested the model on new motion.")

@@ -38,7 +38,7 @@ class Column:
     heading: str
     show: Callable[[Row], str]
     kind: Literal["key", "number", "words", "prose"] = "number"
-    """How it is set: a key stays in sight when the table is scrolled, prose is broken into lines."""
+    """How it is set: a key stays in sight when a table is scrolled, prose is broken into lines."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,9 @@ class Table:
     def to_csv(self) -> str:
         """All values of all rows; a number that is none is an empty cell."""
         buffer = io.StringIO()
-        writer = csv.DictWriter(buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n")
+        writer = csv.DictWriter(
+            buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n"
+        )
         writer.writeheader()
         writer.writerows({k: _plain(v) for k, v in row.items()} for row in self.rows)
         return buffer.getvalue()
@@ -146,7 +148,9 @@ def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
             "frequency_hz": f.frequency_hz,
             "gain": f.gain,
             "phase_deg": f.phase_deg,
-            **_interval("lag_ms", Interval(*(1e3 * x for x in (f.lag.value, f.lag.low, f.lag.high)))),
+            **_interval(
+                "lag_ms", Interval(*(1e3 * x for x in (f.lag.value, f.lag.low, f.lag.high)))
+            ),
             "naive_lag_ms": 1e3 * f.naive_lag_s,
             "naive_gain": f.naive_gain,
         }
@@ -229,10 +233,16 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
                 if isinstance(q, Quantity):
                     rows.append(
                         {
-                            "joint": joint, "part": part, "parameter": name, "unit": unit_of(name),
-                            "value": q.value, "low": q.low, "high": q.high,
-                            "identified": q.identified, "why": q.why or "",
-                        }  # fmt: skip
+                            "joint": joint,
+                            "part": part,
+                            "parameter": name,
+                            "unit": unit_of(name),
+                            "value": q.value,
+                            "low": q.low,
+                            "high": q.high,
+                            "identified": q.identified,
+                            "why": q.why or "",
+                        }
                     )
     columns = (
         _KEY,
@@ -257,7 +267,9 @@ def _readable(name: str, part: str) -> str:
 def _quantity_cell(row: Row) -> str:
     if row["low"] is None or row["high"] is None or row["low"] == row["high"]:
         return _significant(row["value"])
-    return f"{_significant(row['value'])} ({_significant(row['low'])} … {_significant(row['high'])})"
+    return (
+        f"{_significant(row['value'])} ({_significant(row['low'])} … {_significant(row['high'])})"
+    )
 
 
 def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str]) -> Table:

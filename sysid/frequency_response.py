@@ -1,0 +1,284 @@
+"""Frequency response of one joint: gain and phase per tone, bandwidth, fitted transfer functions.
+
+Every tone of a sweep gives one complex number, the response from the command as held to the motion
+as measured, with a covariance from the bootstrap over periods. The describing gain belongs to the
+amplitude it was measured at: friction and the speed limit make a servo's gain depend on it.
+
+Two transfer functions are fitted by least squares weighted with those covariances, their delay
+exact (a factor exp(-jωT), no Padé approximation):
+
+    FOPDT   K exp(-Ts) / (τ s + 1)
+    SOPDT   K exp(-Ts) ω² / (s² + 2 ζ ω s + ω²)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import control
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from common.errors import InputError
+from sysid.delay import Interval, tone_lags
+from sysid.poll_lattice import PollLattice, find_poll_lattice, readings
+from sysid.recording import Trial
+from sysid.tone import ToneResponse, tone_response
+
+_DRAWS = 60  # refits behind the intervals of the transfer functions
+
+
+@dataclass(frozen=True)
+class TransferFunction:
+    """A fitted transfer function with exact delay.
+
+    Attributes
+    ----------
+    name : {"FOPDT", "SOPDT"}
+    parameters : dict of str to Interval
+        By name, each name ending in its unit.
+    chi2_per_dof : float
+        Misfit in units of the tones' uncertainty; far above 1 means the servo is not linear.
+    """
+
+    name: str
+    parameters: dict[str, Interval]
+    chi2_per_dof: float
+
+    def values(self) -> NDArray[np.float64]:
+        """Parameters in the order of their names."""
+        return np.array([p.value for p in self.parameters.values()])
+
+    def evaluate(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Response at `frequency_hz`, delay included."""
+        return _MODELS[self.name].response(self.values(), np.asarray(frequency_hz, float))
+
+    def rational(self) -> control.TransferFunction:
+        """The part without the delay, for python-control."""
+        v = self.values()
+        if self.name == "FOPDT":
+            return control.tf([v[0]], [v[2], 1.0])
+        return control.tf([v[0] * v[2] ** 2], [1.0, 2 * v[3] * v[2], v[2] ** 2])
+
+    def __str__(self) -> str:
+        p = {name: interval.value for name, interval in self.parameters.items()}
+        delay = f"exp(-{p['delay_s']:.4f} s)"
+        if self.name == "FOPDT":
+            return f"{p['gain']:.3f} {delay} / ({p['time_constant_s']:.4f} s + 1)"
+        w, z = p["natural_frequency_rad_s"], p["damping_ratio"]
+        return f"{p['gain']:.3f} {delay} · {w**2:.0f} / (s² + {2 * z * w:.1f} s + {w**2:.0f})"
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """Measured response of one joint; arrays are over its tones, by frequency.
+
+    Attributes
+    ----------
+    frequency_hz, amplitude_rad : ndarray
+    response, naive_response : ndarray of complex
+        Of fresh readings against the held command; of all rows against their commands.
+    covariance : ndarray, shape (tones, 2, 2)
+        Of the response's real and imaginary parts.
+    bandwidth_hz : Interval or None
+        Where the gain falls below -3 dB of the lowest tone's; None if no tone reaches that.
+    fits : tuple of TransferFunction
+    """
+
+    joint: str
+    frequency_hz: NDArray[np.float64]
+    amplitude_rad: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    naive_response: NDArray[np.complex128]
+    covariance: NDArray[np.float64]
+    bandwidth_hz: Interval | None
+    fits: tuple[TransferFunction, ...]
+
+    @property
+    def gain(self) -> NDArray[np.float64]:
+        """Describing gain, response amplitude over command amplitude."""
+        return np.abs(self.response)
+
+    @property
+    def phase_deg(self) -> NDArray[np.float64]:
+        """Phase [degrees], unwrapped by the lag that all tones share."""
+        return -360.0 * self.frequency_hz * tone_lags(self.response, self.frequency_hz)
+
+    def frd(self) -> control.FrequencyResponseData:
+        """The measurement as python-control holds it, over rad/s."""
+        return control.frd(self.response, 2 * np.pi * self.frequency_hz)
+
+    def bandwidth_text(self) -> str:
+        """The bandwidth in words."""
+        if self.bandwidth_hz is None:
+            return f"above {self.frequency_hz[-1]:.1f} Hz, the highest tone"
+        b = self.bandwidth_hz
+        return f"{b.value:.1f} Hz ({b.low:.1f} … {b.high:.1f})"
+
+    def summary(self) -> str:
+        """Table and fits as plain text."""
+        lines = ["    Hz  amplitude rad   gain      dB  phase °  naive gain"]
+        for row in zip(
+            self.frequency_hz, self.amplitude_rad, self.gain, 20 * np.log10(self.gain),
+            self.phase_deg, np.abs(self.naive_response), strict=True,
+        ):  # fmt: skip
+            lines.append("{:6.2f} {:14.3f} {:6.3f} {:+7.2f} {:8.1f} {:11.3f}".format(*row))
+        lines.append(f"  −3 dB bandwidth: {self.bandwidth_text()}")
+        for fit in self.fits:
+            lines.append(f"  {fit.name}: {fit}   (chi²/dof {fit.chi2_per_dof:.1f})")
+        return "\n".join(lines)
+
+
+def frequency_response(
+    joint: str,
+    trials: Sequence[Trial],
+    rng: np.random.Generator,
+    lattice: PollLattice | None = None,
+) -> FrequencyResponse:
+    """Measure the frequency response of one joint.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+        All of this joint.
+    rng : numpy.random.Generator
+        For the bootstrap.
+    lattice : PollLattice, optional
+        If it has been found already.
+
+    Raises
+    ------
+    InputError
+        If the recording has no tones.
+    """
+    lattice = lattice or find_poll_lattice(trials)
+    tones = [tone_response(t, readings(t, lattice), rng) for t in trials]
+    tones = sorted((t for t in tones if t is not None), key=lambda t: t.frequency_hz)
+    if not tones:
+        raise InputError(
+            f"{joint}: this recording has no tone of two periods or more, so there is no frequency "
+            "response to show. Record one with `pupper-sysid sweep --freqs 1-10`."
+        )
+    draws = np.stack([t.response_draws for t in tones])
+    return FrequencyResponse(
+        joint,
+        np.array([t.frequency_hz for t in tones]),
+        np.array([abs(t.command_held) for t in tones]),
+        np.array([t.response for t in tones]),
+        np.array([t.naive / t.command_rows for t in tones]),
+        np.stack([np.cov(d.real, d.imag) for d in draws]),
+        _bandwidth(tones, draws),
+        tuple(_fit(name, tones, draws) for name in _MODELS if len(tones) >= 2),
+    )
+
+
+def to_json(found: FrequencyResponse) -> dict[str, Any]:
+    """Object of one joint in `bode --json`."""
+    bandwidth = found.bandwidth_hz
+    return {
+        "by_frequency": [
+            {
+                "frequency_hz": f, "amplitude_rad": a, "gain": g, "phase_deg": p,
+                "naive_gain": n, "covariance": c.tolist(),
+            }
+            for f, a, g, p, n, c in zip(
+                found.frequency_hz, found.amplitude_rad, found.gain, found.phase_deg,
+                np.abs(found.naive_response), found.covariance, strict=True,
+            )
+        ],
+        "bandwidth_hz": None if bandwidth is None else bandwidth.value,
+        "bandwidth_ci_hz": None if bandwidth is None else [bandwidth.low, bandwidth.high],
+        "transfer_functions": {
+            fit.name: {
+                "parameters": {n: p.value for n, p in fit.parameters.items()},
+                "intervals": {n: [p.low, p.high] for n, p in fit.parameters.items()},
+                "chi2_per_dof": fit.chi2_per_dof,
+                "text": str(fit),
+            }
+            for fit in found.fits
+        },
+    }  # fmt: skip
+
+
+def _bandwidth(tones: Sequence[ToneResponse], draws: NDArray) -> Interval | None:
+    frequency = np.array([t.frequency_hz for t in tones])
+
+    def crossing(gain: NDArray) -> float:
+        below = np.flatnonzero(gain < gain[0] / np.sqrt(2))
+        if not len(below):
+            return float("nan")
+        k = below[0]
+        target = 0.5 * np.log(0.5) + np.log(gain[0])
+        rise = np.log(gain[k - 1 : k + 1])
+        share = (rise[0] - target) / (rise[0] - rise[1])
+        return float(frequency[k - 1] + share * (frequency[k] - frequency[k - 1]))
+
+    value = crossing(np.abs(np.array([t.response for t in tones])))
+    if not np.isfinite(value):
+        return None
+    drawn = np.array([crossing(g) for g in np.abs(draws).T])
+    return Interval.of_draws(value, drawn[np.isfinite(drawn)])
+
+
+@dataclass(frozen=True)
+class _Model:
+    names: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    starts: tuple[tuple[float, ...], ...]
+    response: Callable[[NDArray, NDArray], NDArray]
+
+
+def _fopdt(v: NDArray, f: NDArray) -> NDArray[np.complex128]:
+    s = 2j * np.pi * f
+    return v[0] * np.exp(-v[1] * s) / (v[2] * s + 1)
+
+
+def _sopdt(v: NDArray, f: NDArray) -> NDArray[np.complex128]:
+    s = 2j * np.pi * f
+    return v[0] * np.exp(-v[1] * s) * v[2] ** 2 / (s**2 + 2 * v[3] * v[2] * s + v[2] ** 2)
+
+
+_MODELS = {
+    "FOPDT": _Model(
+        ("gain", "delay_s", "time_constant_s"), (0.2, 0.0, 1e-4), (2.0, 0.3, 0.5),
+        ((1.0, 0.02, 0.02), (1.0, 0.04, 0.005)), _fopdt,
+    ),
+    "SOPDT": _Model(
+        ("gain", "delay_s", "natural_frequency_rad_s", "damping_ratio"), (0.2, 0.0, 8.0, 0.1),
+        (2.0, 0.3, 600.0, 4.0), ((1.0, 0.02, 90.0, 0.8), (1.0, 0.01, 50.0, 0.5)), _sopdt,
+    ),
+}  # fmt: skip
+
+
+def _fit(name: str, tones: Sequence[ToneResponse], draws: NDArray) -> TransferFunction:
+    model = _MODELS[name]
+    frequency = np.array([t.frequency_hz for t in tones])
+    measured = np.array([t.response for t in tones])
+    factors = [
+        np.linalg.inv(np.linalg.cholesky(np.cov(d.real, d.imag) + 1e-10 * np.eye(2))) for d in draws
+    ]
+    whiten = np.stack(factors)
+
+    def solve(target: NDArray, starts: Sequence[Sequence[float]]):
+        def residual(v: NDArray) -> NDArray[np.float64]:
+            away = model.response(v, frequency) - target
+            return np.einsum("nij,nj->ni", whiten, np.stack([away.real, away.imag], 1)).ravel()
+
+        fits = [
+            least_squares(residual, s, bounds=(model.low, model.high), x_scale=np.abs(s))
+            for s in starts
+        ]
+        return min(fits, key=lambda fit: fit.cost)
+
+    best = solve(measured, model.starts)
+    refits = np.array([solve(draws[:, k], [best.x]).x for k in range(min(_DRAWS, draws.shape[1]))])
+    intervals = {
+        n: Interval.of_draws(best.x[k], refits[:, k]) for k, n in enumerate(model.names)
+    }
+    dof = max(2 * len(tones) - len(model.names), 1)
+    return TransferFunction(name, intervals, 2 * best.cost / dof)
