@@ -45,7 +45,6 @@ class Report:
         # here, because drawing and python-control take a second that --help should not
         from sysid.doctor import examine
         from sysid.frequency_response import frequency_response
-
         from sysid.report import write_report
 
         recordings = terminal.load_all(self.recordings)
@@ -65,8 +64,8 @@ class Report:
                 examinations.append((recording.name, found))
                 advance(recording.name)
             for joint, result in results.items():
-                trials = calibration.joint_trials(recordings, joint)[0]
-                if any(t.frequency_hz > 0 for t in trials):
+                if result.budget.by_frequency:
+                    trials = calibration.joint_trials(recordings, joint)[0]
                     rng = calibration.joint_rng(seed, joint)
                     responses[joint] = frequency_response(joint, trials, rng, result.budget.lattice)
                 advance(joint)

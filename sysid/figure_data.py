@@ -8,15 +8,20 @@ many rows each reading stayed the same, and says what the poll lattice would mak
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from servo_models.delayed_pd import TIME_STEP_S
 from sysid.calibrate import PREFERRED, JointCalibrationResult
-from sysid.delay import Interval
+from sysid.delay import LEVEL, Interval
 from sysid.ladder import rung
 from sysid.output_error import TrialData, look_up, positions
+
+if TYPE_CHECKING:  # it brings python-control, which is not needed here
+    from sysid.frequency_response import FrequencyResponse
 
 LONGEST_RUN = 12
 """Hold runs of this many rows and more share the last bar."""
@@ -161,6 +166,17 @@ def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
     order = list(seen.values())
     index = np.unique(np.round(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int))
     return [order[i] for i in index]
+
+
+def response_errors(response: FrequencyResponse) -> tuple[NDArray, NDArray]:
+    """Half of the 90 % intervals of gain [dB] and phase [degrees], shape (tones,) each."""
+    along = response.response / np.abs(response.response)
+    sd = []
+    for direction in (along, 1j * along):
+        u = np.stack([direction.real, direction.imag], axis=-1)
+        sd.append(np.sqrt(np.einsum("ni,nij,nj->n", u, response.covariance, u)))
+    relative = norm.ppf((1 + LEVEL) / 2) * np.array(sd) / np.abs(response.response)
+    return 20 / np.log(10) * relative[0], np.degrees(relative[1])
 
 
 @dataclass(frozen=True)

@@ -1,31 +1,22 @@
 """The report's figures: each function takes results and returns a matplotlib `Figure`.
 
-Figures are narrow, with large letters, so that they can be read on a phone and in print; colours
-are those of Okabe and Ito, which colour-blind readers can tell apart, and every curve differs from
-the others in more than its colour. Nothing is computed here that is not in `sysid.figure_data`, and
-pyplot's global state is not touched. `save` writes a figure as PNG.
+They only draw: curves come from `sysid.figure_data`, looks from `sysid.figure_style`. Every curve
+differs from the others in more than its colour. `save` writes a figure as PNG.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Mapping
-from functools import wraps
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
-from PIL import Image
 
-from common.files import write_bytes
 from sysid.calibrate import JointCalibrationResult
 from sysid.figure_data import (
     LONGEST_RUN,
@@ -33,89 +24,42 @@ from sysid.figure_data import (
     Track,
     hold_runs,
     lag_parts,
+    response_errors,
     some_tracks,
     tracks,
     window,
 )
+from sysid.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    JOINT_COLOURS,
+    MARKERS,
+    ORANGE,
+    RED,
+    SKY,
+    axes_column,
+    png,
+    save,
+    styled,
+)
 
-if TYPE_CHECKING:  # python-control, which the second brings, is not needed to draw
-    from matplotlib.typing import RcKeyType
-
+if TYPE_CHECKING:  # it brings python-control, which is not needed to draw
     from sysid.frequency_response import FrequencyResponse
 
-WIDTH_IN = 5.0
-DPI = 190
-
-INK = "#333333"
-FAINT = "#9a9a9a"
-BLUE = "#0072B2"
-SKY = "#56B4E9"
-GREEN = "#009E73"
-ORANGE = "#E69F00"
-RED = "#D55E00"
-PINK = "#CC79A7"
-_JOINT_COLOURS = (BLUE, RED, GREEN, PINK, ORANGE, SKY, INK)
-_MARKERS = "osD^vP"
-
-_STYLE: dict[RcKeyType, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.labelsize": 10,
-    "xtick.labelsize": 9.5,
-    "ytick.labelsize": 9.5,
-    "legend.fontsize": 9.5,
-    "legend.frameon": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": INK,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "figure.facecolor": "white",
-    "axes.titlelocation": "left",
-}
-
-_P = ParamSpec("_P")
+__all__ = [
+    "bode_figure",
+    "hold_histogram_figure",
+    "lag_budget_figure",
+    "overlay_figure",
+    "png",
+    "residual_figure",
+    "save",
+]
 
 
-def _styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
-    @wraps(draw)
-    def styled(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
-        with rc_context(_STYLE):
-            return draw(*args, **kwargs)
-
-    return styled
-
-
-def png(figure: Figure) -> bytes:
-    """The figure as a PNG image."""
-    with rc_context(_STYLE):
-        canvas = FigureCanvasAgg(figure)
-        figure.set_dpi(DPI)
-        canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    buffer = io.BytesIO()
-    # lines and letters need few colours; with a palette the report is a third of the size
-    picture.quantize(128, dither=Image.Dither.NONE).save(
-        buffer, "PNG", optimize=True, dpi=(DPI, DPI)
-    )
-    return buffer.getvalue()
-
-
-def save(figure: Figure, path: Path, force: bool = False) -> None:
-    """Write `figure` to `path` as PNG.
-
-    Raises
-    ------
-    InputError
-        If `path` exists and `force` is not given, or if it cannot be written.
-    """
-    write_bytes(path, png(figure), force)
-
-
-@_styled
+@styled
 def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
     """One stacked bar per joint: what happens between a command's row and its position's row.
 
@@ -124,7 +68,7 @@ def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
     results : dict of joint to JointCalibrationResult
     """
     parts = [lag_parts(r) for r in results.values()]
-    figure, axes = _axes(1.9 + 0.52 * len(parts))
+    figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(parts))
     for row, part in enumerate(parts):
         _lag_bar(axes, row, part)
     axes.set_yticks(range(len(parts)), [p.joint for p in parts])
@@ -199,7 +143,7 @@ def _lag_bar(axes: Axes, row: int, part: LagParts) -> None:
     axes.text(naive + 0.015 * max(naive, 1.0), row, f"{naive:.0f}", va="center", weight="bold")
 
 
-@_styled
+@styled
 def overlay_figure(
     result: JointCalibrationResult, found: list[Track] | None = None, panels: int = 4
 ) -> Figure:
@@ -214,7 +158,7 @@ def overlay_figure(
         At most so many frequencies.
     """
     shown = some_tracks(tracks(result) if found is None else found, panels)
-    figure, grid = _axes_column(len(shown), 1.2 + 1.75 * len(shown))
+    figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
     for axes, track in zip(grid, shown, strict=True):
         start, stop = window(track)
         fine, row = _inside(track.time_s, start, stop), _inside(track.row_time_s, start, stop)
@@ -240,7 +184,7 @@ def overlay_figure(
     return figure
 
 
-@_styled
+@styled
 def hold_histogram_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
     """For how many rows each reading stayed the same, beside what poll and loss predict.
 
@@ -248,7 +192,7 @@ def hold_histogram_figure(results: Mapping[str, JointCalibrationResult]) -> Figu
     ----------
     results : dict of joint to JointCalibrationResult
     """
-    figure, grid = _axes_column(len(results), 1.2 + 1.6 * len(results))
+    figure, grid = axes_column(len(results), 1.2 + 1.6 * len(results))
     length = np.arange(1, LONGEST_RUN + 1)
     for axes, (joint, result) in zip(grid, results.items(), strict=True):
         runs, lattice = hold_runs(result), result.budget.lattice
@@ -281,32 +225,31 @@ _LATTICE_WORDS = {
 }
 
 
-@_styled
-def bode_figure(
-    responses: Mapping[str, FrequencyResponse],
-    results: Mapping[str, JointCalibrationResult] | None = None,
-) -> Figure:
-    """Gain and phase over frequency, one colour and mark per joint.
+@styled
+def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
+    """Gain and phase over frequency: measured, from all rows, and as a fitted transfer function.
 
     Parameters
     ----------
     responses : dict of joint to FrequencyResponse
-    results : dict of joint to JointCalibrationResult, optional
-        If given, the gain of all rows, held ones included, is shown as hollow marks.
     """
-    figure, (gain, phase) = _axes_column(2, 6.2)
+    figure, (gain, phase) = axes_column(2, 6.4)
     for n, (joint, response) in enumerate(responses.items()):
-        colour, mark = _JOINT_COLOURS[n % len(_JOINT_COLOURS)], _MARKERS[n % len(_MARKERS)]
-        order = np.argsort(response.frequency_hz)
-        frequency, value = response.frequency_hz[order], response.response[order]
-        style = {"color": colour, "marker": mark, "ms": 5, "lw": 1.2}
-        gain.plot(frequency, 20 * np.log10(np.abs(value)), label=joint, **style)
-        phase.plot(frequency, np.degrees(np.unwrap(np.angle(value))), **style)
-        naive = results[joint].budget.by_frequency if results and joint in results else ()
+        colour, mark = JOINT_COLOURS[n % len(JOINT_COLOURS)], MARKERS[n % len(MARKERS)]
+        frequency, (gain_error, phase_error) = response.frequency_hz, response_errors(response)
+        style = {"color": colour, "marker": mark, "ms": 5, "ls": "", "elinewidth": 1.2}
+        decibels = 20 * np.log10(response.gain)
+        gain.errorbar(frequency, decibels, yerr=gain_error, label=joint, **style)
+        phase.errorbar(frequency, response.phase_deg, yerr=phase_error, **style)
         gain.plot(
-            [f.frequency_hz for f in naive], [20 * np.log10(f.naive_gain) for f in naive],
-            color=colour, marker=mark, ms=6, mfc="none", ls="",
+            frequency, 20 * np.log10(np.abs(response.naive_response)), color=colour, marker=mark,
+            ms=6, mfc="none", ls="",
         )  # fmt: skip
+        for fit in response.fits[-1:]:
+            fine = np.geomspace(frequency[0], frequency[-1], 200)
+            fitted = fit.evaluate(fine)
+            gain.plot(fine, 20 * np.log10(np.abs(fitted)), color=colour, lw=1.2)
+            phase.plot(fine, np.degrees(np.unwrap(np.angle(fitted))), color=colour, lw=1.2)
     gain.axhline(-3.01, color=INK, lw=1, ls=(0, (4, 2)))
     gain.text(1.0, -3.01, "−3 dB ", transform=gain.get_yaxis_transform(), ha="right", va="bottom")
     low, high = gain.get_ylim()
@@ -320,17 +263,16 @@ def bode_figure(
     phase.set_ylabel("phase [°]")
     phase.set_xlabel("frequency [Hz]")
     handles, _ = gain.get_legend_handles_labels()
-    if results:
-        hollow = Line2D([], [], color=INK, marker="o", mfc="none", ls="", label="naive: all rows")
-        handles = [*handles, hollow]
-    figure.legend(handles=handles, loc="outside upper left", ncols=3)
+    hollow = Line2D([], [], color=INK, marker="o", mfc="none", ls="", label="naive: all rows")
+    line = Line2D([], [], color=INK, lw=1.2, label="fitted")
+    figure.legend(handles=[*handles, hollow, line], loc="outside upper left", ncols=3)
     return figure
 
 
 _FREQUENCY_TICKS = (0.1, 0.2, 0.5, 1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 
-@_styled
+@styled
 def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
     """What the model leaves unexplained: over speed, fresh against naive; and over time.
 
@@ -341,7 +283,7 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
         From `sysid.figure_data.tracks`, if they have been computed.
     """
     found = tracks(result) if found is None else found
-    figure, (over_speed, over_time) = _axes_column(2, 6.0)
+    figure, (over_speed, over_time) = axes_column(2, 6.0)
     mrad = 1e3
 
     def gathered(name: str) -> NDArray:
@@ -381,16 +323,6 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     over_time.set_ylabel("fresh − model [mrad]")
     figure.legend(*over_speed.get_legend_handles_labels(), loc="outside upper left", ncols=1)
     return figure
-
-
-def _axes(height: float) -> tuple[Figure, Axes]:
-    figure, grid = _axes_column(1, height)
-    return figure, grid[0]
-
-
-def _axes_column(rows: int, height: float) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
-    return figure, list(figure.subplots(max(rows, 1), 1, squeeze=False)[:, 0])
 
 
 def _inside(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:

@@ -273,16 +273,20 @@ def _bode(
         pictures.append(
             Picture(
                 "bode",
-                "Frequency response from the held command to the motion, from fresh readings. "
-                "Hollow marks: gain of all rows, held ones included, which is too low.",
-                figures.png(figures.bode_figure(responses, results)),
+                "Frequency response from the held command to the motion, from fresh readings, with "
+                "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too "
+                "low.",
+                figures.png(figures.bode_figure(responses)),
             )
         )
-    findings = [(joint, response.summary()) for joint, response in responses.items()]
-    table = tables.frequency_table(results)
+    findings = [
+        (joint, f"−3 dB bandwidth {response.bandwidth_text()}.")
+        for joint, response in responses.items()
+    ]
+    made = [tables.frequency_table(results), tables.transfer_table(responses)]
     return Section(
         "bode", "Frequency response", findings=findings, figures=pictures,
-        tables=[table] if table.rows else [],
+        tables=[t for t in made if t.rows],
     )  # fmt: skip
 
 

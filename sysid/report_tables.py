@@ -11,13 +11,16 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Quantity, unit_of
 from sysid.calibrate import JointCalibrationResult, Scores
 from sysid.delay import Interval
 from sysid.figure_data import lag_parts
+
+if TYPE_CHECKING:  # it brings python-control, which a table does not need
+    from sysid.frequency_response import FrequencyResponse
 
 MODEL_NAMES = {
     "pure_delay": "pure delay",
@@ -169,6 +172,33 @@ def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     return Table("by_frequency", "Frequency by frequency", columns, tuple(rows))
 
 
+def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
+    """The fitted transfer functions, number by number."""
+    rows = [
+        {
+            "joint": joint,
+            "transfer_function": fit.name,
+            "parameter": name,
+            **_interval("value", p),
+            "chi2_per_dof": fit.chi2_per_dof,
+        }
+        for joint, response in responses.items()
+        for fit in response.fits
+        for name, p in fit.parameters.items()
+    ]
+    columns = (
+        _KEY,
+        _text("form", "transfer_function"),
+        Column("number", lambda row: row["parameter"].replace("_", " "), "words"),
+        Column(
+            "value (90 %)",
+            lambda row: _value_cell(row["value"], row["value_low"], row["value_high"]),
+        ),
+        _number("misfit, χ²/dof", "chi2_per_dof"),
+    )
+    return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))
+
+
 def ladder_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """Every model of the ladder and every preset, scored the same way."""
     rows = []
@@ -247,7 +277,7 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
     columns = (
         _KEY,
         Column("number", lambda row: _readable(row["parameter"], row["part"]), "words"),
-        Column("value (90 %)", _quantity_cell),
+        Column("value (90 %)", lambda row: _value_cell(row["value"], row["low"], row["high"])),
         _text("unit", "unit"),
         _text("identified", "identified"),
         Column("why", lambda row: row["why"], "prose"),
@@ -264,12 +294,10 @@ def _readable(name: str, part: str) -> str:
     return name.replace("_", " ") + (" / armature" if part == "ratios to armature" else "")
 
 
-def _quantity_cell(row: Row) -> str:
-    if row["low"] is None or row["high"] is None or row["low"] == row["high"]:
-        return _significant(row["value"])
-    return (
-        f"{_significant(row['value'])} ({_significant(row['low'])} … {_significant(row['high'])})"
-    )
+def _value_cell(value: float, low: float | None, high: float | None) -> str:
+    if low is None or high is None or low == high:
+        return _significant(value)
+    return f"{_significant(value)} ({_significant(low)} … {_significant(high)})"
 
 
 def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str]) -> Table:

@@ -19,7 +19,15 @@ from sysid import figures
 from sysid.calibrate import JointCalibrationResult, RungResult, Scores
 from sysid.calibration_file import to_calibration
 from sysid.delay import FrequencyLag, Interval, LagBudget
-from sysid.figure_data import LONGEST_RUN, hold_runs, lag_parts, tracks, window
+from sysid.figure_data import (
+    LONGEST_RUN,
+    hold_runs,
+    lag_parts,
+    response_errors,
+    tracks,
+    window,
+)
+from sysid.frequency_response import FrequencyResponse, TransferFunction
 from sysid.ladder import LADDER, rung
 from sysid.output_error import TrialData, look_up, positions
 from sysid.poll_lattice import PollLattice
@@ -109,7 +117,15 @@ def examined() -> SimpleNamespace:
 def write(folder, name: str = "sweep", force: bool = False):
     recordings, results = [recording_of(name)], {"LF_thigh": result_of()}
     calibration = to_calibration(results, recordings, 3)
-    return write_report(folder, recordings, results, calibration, [(name, examined())], {}, force)
+    return write_report(
+        folder,
+        recordings,
+        results,
+        calibration,
+        [(name, examined())],
+        {"LF_thigh": response_of()},
+        force,
+    )
 
 
 class Page(HTMLParser):
@@ -204,6 +220,12 @@ def test_frequency_csv_has_one_row_per_tone(written):
     rows = rows_of(written, "by_frequency")
     assert [float(r["frequency_hz"]) for r in rows] == [1.0, 2.0]
     assert float(rows[1]["phase_deg"]) == pytest.approx(-30.0)
+
+
+def test_transfer_function_csv_has_every_fitted_number(written):
+    rows = {r["parameter"]: r for r in rows_of(written, "transfer_functions")}
+    assert float(rows["delay_s"]["value_high"]) == pytest.approx(0.11)
+    assert float(rows["gain"]["chi2_per_dof"]) == 1.5
 
 
 def test_ladder_csv_scores_models_and_presets_and_marks_the_chosen_one(written):
@@ -322,14 +344,39 @@ def test_the_lag_figure_draws_the_parts_end_to_end():
     assert np.ravel(ends) == pytest.approx([0, 9.5, 9.5, 33.5, 33.5, 53.5, 53.5, 81.0])
 
 
+def response_of() -> FrequencyResponse:
+    """A tenth of the command, 100 ms late; 2 % uncertain along the response, 1 % across."""
+    frequency = np.array([1.0, 4.0, 8.0])
+    turned = 0.1 * np.exp(-2j * np.pi * 0.1 * frequency)
+    along = np.stack([turned.real, turned.imag], axis=-1) / 0.1
+    across = along[:, ::-1] * np.array([-1.0, 1.0])
+    covariance = np.stack(
+        [
+            0.002**2 * np.outer(u, u) + 0.001**2 * np.outer(v, v)
+            for u, v in zip(along, across, strict=True)
+        ]
+    )
+    fit = TransferFunction(
+        "FOPDT",
+        {"gain": interval(0.1), "delay_s": interval(0.1), "time_constant_s": interval(1e-3)},
+        1.5,
+    )
+    return FrequencyResponse(
+        "LF_thigh", frequency, np.full(3, 0.2), turned, 0.5 * turned, covariance, None, (fit,)
+    )
+
+
 def test_the_bode_figure_shows_gain_in_decibels_and_unwrapped_phase():
-    frequency = np.array([8.0, 1.0, 4.0])  # in no order
-    turned = 0.1 * np.exp(-2j * np.pi * 0.1 * frequency)  # a tenth, 100 ms late
-    response = SimpleNamespace(frequency_hz=frequency, response=turned)
-    gain, phase = figures.bode_figure({"LF_thigh": response}).axes
-    assert gain.lines[0].get_xdata() == pytest.approx([1.0, 4.0, 8.0])
+    gain, phase = figures.bode_figure({"LF_thigh": response_of()}).axes
     assert gain.lines[0].get_ydata() == pytest.approx([-20.0] * 3)
     assert phase.lines[0].get_ydata() == pytest.approx([-36.0, -144.0, -288.0])
+
+
+def test_bode_intervals_follow_from_the_covariance():
+    gain_db, phase_deg = response_errors(response_of())
+    # 90 % of a Gaussian lies within 1.645 standard deviations; 1 % is 0.0869 dB or 0.573 degrees
+    assert gain_db == pytest.approx(np.full(3, 1.645 * 2 * 0.08686), rel=1e-3)
+    assert phase_deg == pytest.approx(np.full(3, 1.645 * 0.57296), rel=1e-3)
 
 
 def test_saving_a_figure_refuses_to_overwrite(tmp_path):

@@ -1,0 +1,105 @@
+"""How the report's figures look, and how they become PNG files.
+
+Figures are narrow, with large letters, so that they can be read on a phone and in print; colours
+are those of Okabe and Ito, which colour-blind readers can tell apart. pyplot's global state is not
+touched.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from common.files import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
+WIDTH_IN = 5.0
+DPI = 190
+
+INK = "#333333"
+FAINT = "#9a9a9a"
+BLUE = "#0072B2"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+ORANGE = "#E69F00"
+RED = "#D55E00"
+PINK = "#CC79A7"
+JOINT_COLOURS = (BLUE, RED, GREEN, PINK, ORANGE, SKY, INK)
+MARKERS = "osD^vP"
+
+_STYLE: dict[RcKeyType, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "xtick.labelsize": 9.5,
+    "ytick.labelsize": 9.5,
+    "legend.fontsize": 9.5,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "figure.facecolor": "white",
+    "axes.titlelocation": "left",
+}
+
+_P = ParamSpec("_P")
+
+
+def styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
+    """A drawing function in the house style; matplotlib's settings are as before afterwards."""
+
+    @wraps(draw)
+    def drawn(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
+        with rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG image."""
+    with rc_context(_STYLE):
+        canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(DPI)
+        canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    buffer = io.BytesIO()
+    # lines and letters need few colours; with a palette the report is a third of the size
+    picture.quantize(128, dither=Image.Dither.NONE).save(
+        buffer, "PNG", optimize=True, dpi=(DPI, DPI)
+    )
+    return buffer.getvalue()
+
+
+def save(figure: Figure, path: Path, force: bool = False) -> None:
+    """Write `figure` to `path` as PNG.
+
+    Raises
+    ------
+    InputError
+        If `path` exists and `force` is not given, or if it cannot be written.
+    """
+    write_bytes(path, png(figure), force)
+
+
+def axes_column(rows: int, height: float) -> tuple[Figure, list[Axes]]:
+    """An empty figure of `rows` axes above each other, `height` inches high."""
+    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+    return figure, list(figure.subplots(max(rows, 1), 1, squeeze=False)[:, 0])

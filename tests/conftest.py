@@ -1,0 +1,24 @@
+"""Fixtures: the recordings of a real robot, where they are at hand."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of the real recordings: $PUPPER_REAL_DATA, else ../shared/real; skips without."""
+    folder = Path(
+        os.environ.get("PUPPER_REAL_DATA")
+        or Path(__file__).resolve().parents[2] / "shared" / "real"
+    )
+    if not (folder / "real_motor_0_LF_hip_amp0.3.csv").exists():
+        pytest.skip("no recordings of a real robot here (set PUPPER_REAL_DATA)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def real_sweeps(real_data: Path) -> list[Path]:
+    """The hip and thigh sweeps."""
+    return sorted(real_data.glob("real_motor_*.csv"))
