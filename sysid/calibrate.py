@@ -295,7 +295,7 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
     presets = {
         name: _score_preset(p, data, pd.values["offset_rad"]) for name, p in task.presets.items()
     }
-    warnings = [*ready.budget.warnings, *_warnings(task.joint, rungs, chosen, data)]
+    warnings = [*ready.budget.warnings, *_warnings(task.joint, rungs, chosen)]
     return JointCalibrationResult(
         task.joint, chosen, rungs, dead_time, ready.budget, ready.quantum_rad,
         pd.intervals["offset_rad"], presets, data, tuple(warnings),
@@ -494,6 +494,7 @@ def _result(
     inflation = _effective(residual) * max(1.0, _rms(residual) ** 2 / noise**2)
     sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
     z = norm.ppf((1 + LEVEL) / 2)
+    speed = max(_command_speed(d) for d in data)
     values, intervals, undecided = {}, {}, {}
     for j, p in enumerate(model.parameters):
         value = float(best.values[j])
@@ -502,7 +503,9 @@ def _result(
             [centre - z * sd[j], centre + z * sd[j]], p.encode(p.low), p.encode(p.high))]  # fmt: skip
         values[p.name] = value
         intervals[p.name] = Interval(value, ends[0], ends[1])
-        if p.logarithmic and (value <= p.low * 1.01 or value >= p.high / 1.01):
+        if p.name.endswith("_rad_s") and p.name != "natural_frequency_rad_s" and speed < 0.8 * value:
+            undecided[p.name] = f"commands reach {speed:.1f} rad/s only, so it was never felt in full"
+        elif p.logarithmic and (value <= p.low * 1.01 or value >= p.high / 1.01):
             undecided[p.name] = f"it sits on its bound {p.low if value <= p.low * 1.01 else p.high:g}"
         elif np.sqrt(best.covariance[j, j]) > 0.7 * p.prior_sd:
             undecided[p.name] = "these recordings do not excite it; the value is the prior's"
@@ -522,15 +525,14 @@ def _choose(rungs: dict[str, RungResult]) -> str:
 
 
 def _warnings(
-    joint: str, rungs: dict[str, RungResult], chosen: str, data: Sequence[TrialData]
+    joint: str, rungs: dict[str, RungResult], chosen: str
 ) -> list[str]:
     pd = rungs[PREFERRED]
     said = []
-    peak = max(_command_speed(d) for d in data)
     if "velocity_limit_rad_s" in pd.undecided:
         said.append(
-            f"{joint}: the speed limit was not excited (commands reach {peak:.1f} rad/s): its "
-            "value comes from what servos of this kind can do. Record a step or a faster tone."
+            f"{joint}: the speed limit was not excited: "
+            f"{pd.undecided['velocity_limit_rad_s']}. Record a faster tone or a step."
         )
     for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
         if name in pd.undecided:
