@@ -33,7 +33,7 @@ from common.joints import DEFAULT_POSE, JOINT_NAMES
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import EmulatedRobot, draw_robot, random_spec
 from sim.free_air_servo import FreeAirServo
-from sysid.delay import lag_budget, tone_lags
+from sysid.delay import lag_budget, tone_lags, tone_weights
 from sysid.excitation import parse_frequencies, plan
 from sysid.poll_lattice import Readings, find_poll_lattice, readings
 from sysid.recorder import record
@@ -83,14 +83,15 @@ def measure(seed: int) -> Result:
     speed = np.array([abs(t.command_held) for t in tones]) * 2 * np.pi * frequency
     fresh = np.array([t.fresh_count for t in tones])
     scatter = np.array([t.residual_rad for t in tones])
-    information = float(np.sum(fresh * speed**2 / (2 * scatter**2)))
-    truth = float(np.average(lags, weights=[1 / t.lag_variance_s2 for t in tones]))
+    used = tone_weights(tones) > 0
+    information = float(np.sum((fresh * speed**2 / (2 * scatter**2))[used]))
+    truth = float(np.average(lags, weights=tone_weights(tones)))
     estimates = {k: v for k, v in budget.estimators.items() if "hold-aware" not in k}
     for name in estimates:  # the others measure from rows: give them the command hold
         estimates[name] -= budget.command_hold_s
     return Result(
         spec.loss, truth, information**-0.5,
-        sum(1 / t.lag_variance_s2 for t in tones) ** -0.5, budget.lag.low, budget.lag.high,
+        sum(1 / t.lag_variance_s2 for t in np.array(tones)[used]) ** -0.5, budget.lag.low, budget.lag.high,
         estimates | {"hold-aware (default)": budget.lag.value},
         abs(lattice.period_s - spec.poll_period_s), lattice.kind,
     )  # fmt: skip

@@ -40,8 +40,6 @@ class Report:
 
     def run(self) -> None:
         """Examine, measure, calibrate, write."""
-        import numpy as np
-
         # here, because drawing and python-control take a second that --help should not
         from sysid.doctor import examine
         from sysid.frequency_response import frequency_response
@@ -60,7 +58,7 @@ class Report:
         with terminal.progress("examining", len(recordings) + len(joints)) as advance:
             examinations, responses = [], {}
             for recording in recordings:
-                found = examine(recording, np.random.default_rng(seed))
+                found = examine(recording, seed)
                 examinations.append((recording.name, found))
                 advance(recording.name)
             for joint, result in results.items():

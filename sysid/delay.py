@@ -35,6 +35,7 @@ LEVEL = 0.90
 
 LONGEST_LAG_S = 0.5
 
+_FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
 
 
@@ -140,6 +141,13 @@ def lag_budget(
         naive = _slope(tones, "naive_rows")
         fresh = _slope(tones, "fresh_rows")
         lag = _slope(tones, "fresh_held")
+        lost = [t for t, w in zip(tones, tone_weights(tones), strict=True) if w == 0]
+        if lost:
+            listed = ", ".join(f"{t.frequency_hz:.3g}" for t in lost)
+            warnings.append(
+                f"{joint}: at {listed} Hz it moves less than half as far as told, so these tones "
+                "are left out of the lag; record them with a smaller amplitude."
+            )
         if len({round(t.frequency_hz, 2) for t in tones}) == 1:
             warnings.append(
                 f"{joint}: one frequency only, so a lag of one period "
@@ -182,11 +190,22 @@ def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
     frequency = np.array([t.frequency_hz for t in tones])
     response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
     draws = np.stack([getattr(t, f"{output}_draws") / getattr(t, command) for t in tones])
-    weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
-    weight /= weight.sum()
+    weight = tone_weights(tones)
     lags = tone_lags(response, frequency)
     drawn = _lag_near(draws, frequency[:, None], lags[:, None])
     return Interval.of_draws(weight @ lags, weight @ drawn)
+
+
+def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
+    """Share of each tone in the joint's lag: inverse variance, nothing where it cannot follow.
+
+    A servo that moves less than half as far as it does at its best is cut short by its torque or
+    speed limit; when its motion comes then is no delay.
+    """
+    gain = np.array([abs(t.response) for t in tones])
+    weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
+    weight = np.where(gain >= _FOLLOWS * gain.max(), weight, 0.0)
+    return weight / weight.sum()
 
 
 def tone_lags(response: NDArray, frequency_hz: NDArray) -> NDArray[np.float64]:

@@ -1,12 +1,13 @@
 """What the report's figures show, computed: curves and numbers, no drawing.
 
 `lag_parts` splits one joint's lag into the parts of the lag budget, in milliseconds; `tracks` runs
-the fitted model along every trial, beside what was commanded and read; `hold_runs` counts for how
-many rows each reading stayed the same, and says what the poll lattice would make of it.
+the fitted model along every trial, beside what was commanded and read; `hold_runs` sets for how
+many rows each reading stayed the same beside what the poll lattice would make of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,8 +20,10 @@ from sysid.calibrate import PREFERRED, JointCalibrationResult
 from sysid.delay import LEVEL, Interval
 from sysid.ladder import rung
 from sysid.output_error import TrialData, look_up, positions
+from sysid.poll_lattice import PollLattice
 
-if TYPE_CHECKING:  # it brings python-control, which is not needed here
+if TYPE_CHECKING:  # the second brings python-control, which is not needed here
+    from sysid.doctor import JointExamination
     from sysid.frequency_response import FrequencyResponse
 
 LONGEST_RUN = 12
@@ -185,31 +188,37 @@ class HoldRuns:
 
     Attributes
     ----------
+    lattice : PollLattice
     count : ndarray of int, shape (LONGEST_RUN,)
         Runs of 1, 2, … rows; the last holds all longer ones.
     expected : ndarray, shape (LONGEST_RUN,), or None
         What the poll period and the share of lost polls predict; None without a lattice.
     """
 
+    lattice: PollLattice
     count: NDArray[np.int64]
     expected: NDArray[np.float64] | None
 
 
-def hold_runs(result: JointCalibrationResult) -> HoldRuns:
-    """Count the hold runs of a joint that is moving, and what its poll lattice predicts."""
-    lengths, gaps = [], []
-    for trial in result.trials:
-        seen = np.flatnonzero(np.isfinite(trial.row_rad))
-        changed = np.flatnonzero(np.diff(trial.row_rad[seen]) != 0) + 1
-        lengths.append(np.diff(changed))
-        gaps.append(np.diff(trial.row_step) * TIME_STEP_S)
-    every = np.concatenate(lengths) if lengths else np.zeros(0, int)
-    count = np.bincount(np.clip(every, 1, LONGEST_RUN), minlength=LONGEST_RUN + 1)[1:]
-    lattice = result.budget.lattice
-    if lattice.kind != "lattice" or not len(every):
-        return HoldRuns(count, None)
-    loop = float(np.median(np.concatenate(gaps)))
-    return HoldRuns(count, count.sum() * _expected(lattice.period_s / loop, lattice.loss))
+def hold_runs(examined: Sequence[JointExamination], lattice: PollLattice) -> HoldRuns:
+    """The doctor's hold runs of one joint, and what its poll lattice predicts.
+
+    Parameters
+    ----------
+    examined : sequence of JointExamination
+        One per recording; their counts are added.
+    lattice : PollLattice
+    """
+    count = np.zeros(LONGEST_RUN, dtype=np.int64)
+    for found in examined:
+        length = np.clip(np.arange(len(found.hold_histogram)), 0, LONGEST_RUN - 1)
+        np.add.at(count, length, np.array(found.hold_histogram, dtype=np.int64))
+    if lattice.kind != "lattice" or not count.any():
+        return HoldRuns(lattice, count, None)
+    loop = float(np.median([found.loop_period_ms for found in examined]))
+    return HoldRuns(
+        lattice, count, count.sum() * _expected(1e3 * lattice.period_s / loop, lattice.loss)
+    )
 
 
 def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from sysid.calibrate import JointCalibrationResult
 from sysid.figure_data import (
     LONGEST_RUN,
+    HoldRuns,
     LagParts,
     Track,
-    hold_runs,
     lag_parts,
     response_errors,
     some_tracks,
@@ -185,17 +185,18 @@ def overlay_figure(
 
 
 @styled
-def hold_histogram_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
+def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
     """For how many rows each reading stayed the same, beside what poll and loss predict.
 
     Parameters
     ----------
-    results : dict of joint to JointCalibrationResult
+    found : dict of joint to HoldRuns
+        From `sysid.figure_data.hold_runs`.
     """
-    figure, grid = axes_column(len(results), 1.2 + 1.6 * len(results))
+    figure, grid = axes_column(len(found), 1.2 + 1.6 * len(found))
     length = np.arange(1, LONGEST_RUN + 1)
-    for axes, (joint, result) in zip(grid, results.items(), strict=True):
-        runs, lattice = hold_runs(result), result.budget.lattice
+    for axes, (joint, runs) in zip(grid, found.items(), strict=True):
+        lattice = runs.lattice
         axes.bar(length, runs.count, color=ORANGE, label="counted")
         title = f"{joint}: {_LATTICE_WORDS.get(lattice.kind, lattice.kind)}"
         if runs.expected is not None:

@@ -21,7 +21,7 @@ from servo_models.calibration import Calibration
 from sysid import figures
 from sysid import report_tables as tables
 from sysid.calibrate import PREFERRED, JointCalibrationResult
-from sysid.figure_data import Track, lag_parts, tracks
+from sysid.figure_data import Track, hold_runs, lag_parts, tracks
 from sysid.recording import Recording
 from sysid.report_advice import advice
 from sysid.report_tables import MODEL_NAMES, Column, Table
@@ -172,7 +172,7 @@ def sections(
         _lag(results),
         _doctor(examinations, results),
         _overlays(results, runs),
-        _holds(results),
+        _holds(examinations, results),
         _bode(results, responses),
         _models(results),
         _parameters(results, calibration),
@@ -222,7 +222,10 @@ def _doctor(
     examinations: Sequence[tuple[str, Examination]], results: Mapping[str, JointCalibrationResult]
 ) -> Section:
     findings = [
-        (f"{recording}, {joint}", f"{found.verdict}. {' '.join(found.reasons)}".strip())
+        (
+            f"{recording}, {joint}",
+            " ".join(_sentence(s) for s in (f"{found.verdict}.", *found.reasons)),
+        )
         for recording, examination in examinations
         for joint, found in examination.joints.items()
         if joint in results
@@ -233,6 +236,10 @@ def _doctor(
         findings=findings,
         tables=[tables.doctor_table(examinations, list(results))],
     )
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _overlays(
@@ -255,12 +262,21 @@ def _overlays(
     )
 
 
-def _holds(results: Mapping[str, JointCalibrationResult]) -> Section:
+def _holds(
+    examinations: Sequence[tuple[str, Examination]], results: Mapping[str, JointCalibrationResult]
+) -> Section:
+    found = {}
+    for joint, result in results.items():
+        examined = [e.joints[joint] for _, e in examinations if joint in e.joints]
+        if examined:
+            found[joint] = hold_runs(examined, result.budget.lattice)
+    if not found:
+        return Section("holds", "How long readings are held")
     picture = Picture(
         "holds",
-        "For how many rows in a row each reading stayed the same. A sensor that is read afresh "
-        "each time would have all its runs at 1.",
-        figures.png(figures.hold_histogram_figure(results)),
+        "For how many rows in a row each reading stayed the same while its joint moved. A sensor "
+        "that is read afresh each time would have all its runs at 1.",
+        figures.png(figures.hold_histogram_figure(found)),
     )
     return Section("holds", "How long readings are held", figures=[picture])
 

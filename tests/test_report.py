@@ -19,6 +19,7 @@ from sysid import figures
 from sysid.calibrate import JointCalibrationResult, RungResult, Scores
 from sysid.calibration_file import to_calibration
 from sysid.delay import FrequencyLag, Interval, LagBudget
+from sysid.doctor import Examination, JointExamination
 from sysid.figure_data import (
     LONGEST_RUN,
     hold_runs,
@@ -105,13 +106,17 @@ def recording_of(name: str = "sweep") -> Recording:
     return Recording(table, {"bus": {"kind": "emulated"}}, name, None, "0" * 64)
 
 
-def examined() -> SimpleNamespace:
-    found = SimpleNamespace(
-        verdict="use with care", reasons=("Two frequencies only.",), loop_period_ms=20.0,
-        jitter_ms=0.1, fresh_fraction=2 / 3, poll_period_ms=30.0, loss=0.0, quantum_rad=0.0057,
-        offset_rad=0.01,
+def examined_joint() -> JointExamination:
+    return JointExamination(
+        verdict="use with care", reasons=("two frequencies only.",), loop_period_ms=20.0,
+        jitter_ms=0.1, fresh_fraction=2 / 3, poll_period_ms=30.0, loss=0.0, z_score=20.0, hit_rate=1.0,
+        quantum_rad=0.0057, offset_rad=0.01, missing_fraction=0.0, peak_command_rad_s=2.5,
+        hold_histogram=(50, 50),
     )  # fmt: skip
-    return SimpleNamespace(joints={"LF_thigh": found})
+
+
+def examined(name: str) -> Examination:
+    return Examination(name, (), {"LF_thigh": examined_joint()})
 
 
 def write(folder, name: str = "sweep", force: bool = False):
@@ -122,7 +127,7 @@ def write(folder, name: str = "sweep", force: bool = False):
         recordings,
         results,
         calibration,
-        [(name, examined())],
+        [(name, examined(name))],
         {"LF_thigh": response_of()},
         force,
     )
@@ -179,6 +184,10 @@ def test_every_link_of_the_contents_has_its_section(page):
 
 def test_a_hostile_recording_name_is_shown_not_run(page):
     assert HOSTILE in page.text
+
+
+def test_the_doctors_verdict_is_on_the_page_in_sentences(page):
+    assert "Use with care. Two frequencies only." in page.text
 
 
 def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
@@ -305,31 +314,27 @@ def test_a_window_lies_inside_its_trial_and_holds_whole_periods():
         assert (stop - start) * track.frequency_hz == pytest.approx(1.5)
 
 
-def rows_held(held: list[int]) -> TrialData:
-    """A trial whose reading stays the same for so many rows, one after another."""
-    value = np.repeat(np.arange(len(held), dtype=float), held)
-    step = np.arange(len(value)) * LOOP_S / TIME_STEP_S
-    return TrialData(np.nan, 0.0, np.zeros(2000), step, value, step, step, value)
-
-
-def test_hold_runs_are_counted_between_changes():
-    # the first and the last run are cut off by the trial's ends, so they do not count
-    runs = hold_runs(result_of(trials=(rows_held([5, 1, 1, 2, 3, LONGEST_RUN + 4, 5]),)))
-    assert runs.count.tolist() == [2, 1, 1] + [0] * (LONGEST_RUN - 4) + [1]
+def test_the_last_bar_of_the_hold_runs_holds_all_longer_ones():
+    found = SimpleNamespace(loop_period_ms=20.0, hold_histogram=(3, 1) + (0,) * LONGEST_RUN + (2,))
+    runs = hold_runs([found, found], LATTICE)
+    assert runs.count.tolist() == [6, 2] + [0] * (LONGEST_RUN - 3) + [4]
 
 
 def test_predicted_hold_runs_follow_from_poll_and_loss():
     # a poll every 1.5 rows that never fails is seen after 1 row or 2, equally often
-    runs = hold_runs(result_of(trials=(rows_held([1] * 52),)))
-    assert runs.expected is not None
+    runs = hold_runs([SimpleNamespace(loop_period_ms=20.0, hold_histogram=(50,))], LATTICE)
     assert runs.expected == pytest.approx([25.0, 25.0] + [0.0] * (LONGEST_RUN - 2), abs=1e-9)
+    # half of the polls lost: gaps of 2, 4, 6 … rows, each half as frequent as the one before
+    halves = replace(LATTICE, period_s=0.040, loss=0.5)
+    runs = hold_runs([SimpleNamespace(loop_period_ms=20.0, hold_histogram=(64,))], halves)
+    assert runs.expected[:6] == pytest.approx([0, 32, 0, 16, 0, 8], abs=1e-6)
 
 
 def test_letters_in_figures_are_nine_points_or_more():
     drawn = [
         figures.lag_budget_figure({"LF_thigh": result_of()}),
         figures.overlay_figure(result_of()),
-        figures.hold_histogram_figure({"LF_thigh": result_of()}),
+        figures.hold_histogram_figure({"LF_thigh": hold_runs([examined_joint()], LATTICE)}),
         figures.residual_figure(result_of()),
     ]
     for figure in drawn:
