@@ -91,7 +91,8 @@ def measure(seed: int) -> Result:
         estimates[name] -= budget.command_hold_s
     return Result(
         spec.loss, truth, information**-0.5,
-        sum(1 / t.lag_variance_s2 for t in np.array(tones)[used]) ** -0.5, budget.lag.low, budget.lag.high,
+        sum(1 / t.lag_variance_s2 for t in np.array(tones)[used]) ** -0.5,
+        budget.lag.low, budget.lag.high,
         estimates | {"hold-aware (default)": budget.lag.value},
         abs(lattice.period_s - spec.poll_period_s), lattice.kind,
     )  # fmt: skip
@@ -171,8 +172,8 @@ def table(results: list[Result]) -> str:
         f"{len(results)} robots, losses {min(r.loss for r in results):.2f} to "
         f"{max(r.loss for r in results):.2f}. 90 % interval covers the truth in "
         f"{100 * inside.mean():.1f} %; half width {1e3 * width.mean():.2f} ms on average; "
-        f"Cramér-Rao bound {1e3 * np.sqrt(np.mean(bound**2)):.2f} ms; with the poll's unknown phase "
-        f"{1e3 * np.sqrt(np.mean(phase**2)):.2f} ms, of which the spread is "
+        f"Cramér-Rao bound {1e3 * np.sqrt(np.mean(bound**2)):.2f} ms; with the poll's "
+        f"unknown phase {1e3 * np.sqrt(np.mean(phase**2)):.2f} ms, of which the spread is "
         f"{np.sqrt(np.mean((ours - ours.mean()) ** 2) / np.mean(phase**2)):.2f} times "
         f"(middle half: {np.median(np.abs(ours - np.median(ours)) / phase) / 0.6745:.2f} times).",
         f"Poll lattice found for {100 * found.mean():.1f} %, "

@@ -164,5 +164,3 @@ class Bode:
             terminal.out.print(response.summary(), soft_wrap=True)
         if self.plot:
             terminal.err.print(f"Wrote {self.plot}.")
-
-

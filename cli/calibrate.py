@@ -85,8 +85,8 @@ class Calibrate:
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print(
-            f"\nTorques assume a stall torque of {self.stall_torque:g} N·m; free-air recordings give "
-            "only their ratios. Errors are free-run, on fresh readings.",
+            f"\nTorques assume a stall torque of {self.stall_torque:g} N·m; free-air recordings "
+            "give only their ratios. Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
         for r in results.values():

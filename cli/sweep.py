@@ -101,8 +101,8 @@ class Sweep:
             )
             return
         terminal.out.print(
-            f"Recorded {len(chosen.trials)} trials of {len(joints)} joints, {chosen.duration_s:.0f} s "
-            f"of motion, in {elapsed:.1f} s.",
+            f"Recorded {len(chosen.trials)} trials of {len(joints)} joints, "
+            f"{chosen.duration_s:.0f} s of motion, in {elapsed:.1f} s.",
             soft_wrap=True,
         )
         for name in written:

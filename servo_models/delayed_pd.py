@@ -39,8 +39,11 @@ FRICTION_SOLIMP = (FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
 
 
 def friction_solref(time_step_s: float) -> tuple[float, float]:
-    """MuJoCo `solreffriction` in its direct form: stop within one time step, no spring."""
-    return 0.0, -1.0 / time_step_s
+    """MuJoCo `solreffriction` in its direct form: stop within one time step, no spring.
+
+    MuJoCo divides a direct damping by the impedance, hence the factor.
+    """
+    return 0.0, -FRICTION_IMPEDANCE / time_step_s
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,9 @@ class DelayedPD:
     def __init__(self, parameters: DelayedPDParameters, time_step_s: float = TIME_STEP_S):
         if not (np.isfinite(time_step_s) and time_step_s > 0):
             raise InputError(f"DelayedPD: time_step_s is {time_step_s}; it must be positive.")
-        values = {f.name: np.asarray(getattr(parameters, f.name), float) for f in fields(parameters)}
+        values = {
+            f.name: np.asarray(getattr(parameters, f.name), float) for f in fields(parameters)
+        }
         for name, value in values.items():
             lowest = np.min(value)
             # an infinite limit is a way to say "none"; everything else must be a number
@@ -249,5 +254,4 @@ def integrate(
         np.multiply(velocity, h, out=change)
         position += change
         flat_positions[k] = position
-    final = tuple(x.reshape(batch) for x in (position, velocity, setpoint))
-    return positions, final
+    return positions, (position.reshape(batch), velocity.reshape(batch), setpoint.reshape(batch))

@@ -39,7 +39,9 @@ class HeldFeedback:
 
     def __post_init__(self):
         if not self.poll_period_s >= 0 or not np.isfinite(self.poll_period_s):
-            raise InputError(f"HeldFeedback: poll_period_s is {self.poll_period_s}; it must be ≥ 0.")
+            raise InputError(
+                f"HeldFeedback: poll_period_s is {self.poll_period_s}; it must be ≥ 0."
+            )
         if not 0 <= self.loss < 1:
             raise InputError(f"HeldFeedback: loss is {self.loss}; it must be in [0, 1).")
         if not self.quantum_rad >= 0:

@@ -19,7 +19,6 @@ import numpy as np
 
 from common.errors import InputError
 from servo_models.delayed_pd import (
-    FRICTION_IMPEDANCE,
     FRICTION_SOLIMP,
     DelayedPDParameters,
     friction_solref,
@@ -42,7 +41,7 @@ def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dic
         Physics step of the model [s].
     """
     # MuJoCo divides a direct damping by the impedance
-    solref = (FRICTION_IMPEDANCE * x for x in friction_solref(time_step_s))
+    solref = friction_solref(time_step_s)
     return {
         "armature": _number(parameters.armature),
         "frictionloss": _number(parameters.friction_loss),

@@ -23,7 +23,16 @@ from common.joints import JOINT_NAMES
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from sysid.delay import LEVEL, Interval, LagBudget, lag_budget
 from sysid.ladder import LADDER, Rung, rung
-from sysid.output_error import Fit, Problem, TrialData, fit, global_starts, look_up, positions, prepare
+from sysid.output_error import (
+    Fit,
+    Problem,
+    TrialData,
+    fit,
+    global_starts,
+    look_up,
+    positions,
+    prepare,
+)
 from sysid.poll_lattice import find_poll_lattice, quantum, readings
 from sysid.recording import Recording, Trial
 
@@ -369,7 +378,8 @@ def _profile(
     """Dead time with its profile-likelihood interval, and the best fit met on the way."""
     everything = Problem(data, (True,) * len(data), noise, {})
     residual = _fresh_residuals(model, best.values, data)
-    threshold = 0.5 * chi2.ppf(LEVEL, 1) * _effective(residual)
+    threshold = 0.5 * float(chi2.ppf(LEVEL, 1)) * _effective(residual)
+    fits, lowest, delays = [best], best, np.array([best.values[0]])
     for _ in range(3):
         centre = best.values[0]
         spread = np.array([0.001, 0.002, 0.0035, 0.005, 0.0075, 0.010, 0.014])
@@ -384,8 +394,8 @@ def _profile(
         lowest = min(fits, key=lambda f: f.cost)
         if lowest.cost > best.cost - 0.5:
             break
-        best = min(fit(model, [everything], lowest.values[None], 25) + [best], key=lambda f: f.cost)
-    cost = np.minimum(np.array([f.cost for f in fits]), np.inf) - min(best.cost, lowest.cost)
+        best = min(*fit(model, [everything], lowest.values[None], 25), best, key=lambda f: f.cost)
+    cost = np.array([f.cost for f in fits]) - min(best.cost, lowest.cost)
     low, high = _crossings(delays, cost, best.values[0], threshold)
     centre, grain = float(best.values[0]), 0.5 * TIME_STEP_S  # no finer than the physics step
     ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
@@ -499,14 +509,24 @@ def _result(
     for j, p in enumerate(model.parameters):
         value = float(best.values[j])
         centre = float(p.encode(value))
-        ends = [float(p.decode(c)) for c in np.clip(
-            [centre - z * sd[j], centre + z * sd[j]], p.encode(p.low), p.encode(p.high))]  # fmt: skip
+        around = np.clip(
+            [centre - z * sd[j], centre + z * sd[j]], p.encode(p.low), p.encode(p.high)
+        )
+        ends = [float(p.decode(c)) for c in around]
         values[p.name] = value
         intervals[p.name] = Interval(value, ends[0], ends[1])
-        if p.name.endswith("_rad_s") and p.name != "natural_frequency_rad_s" and speed < 0.8 * value:
-            undecided[p.name] = f"commands reach {speed:.1f} rad/s only, so it was never felt in full"
+        if (
+            p.name.endswith("_rad_s")
+            and p.name != "natural_frequency_rad_s"
+            and speed < 0.8 * value
+        ):
+            undecided[p.name] = (
+                f"commands reach {speed:.1f} rad/s only, so it was never felt in full"
+            )
         elif p.logarithmic and (value <= p.low * 1.01 or value >= p.high / 1.01):
-            undecided[p.name] = f"it sits on its bound {p.low if value <= p.low * 1.01 else p.high:g}"
+            undecided[p.name] = (
+                f"it sits on its bound {p.low if value <= p.low * 1.01 else p.high:g}"
+            )
         elif np.sqrt(best.covariance[j, j]) > 0.7 * p.prior_sd:
             undecided[p.name] = "these recordings do not excite it; the value is the prior's"
         elif p.logarithmic and sd[j] > 0.5:
@@ -524,9 +544,7 @@ def _choose(rungs: dict[str, RungResult]) -> str:
     return PREFERRED if errors[PREFERRED] <= _PREFERENCE * errors[best] else best
 
 
-def _warnings(
-    joint: str, rungs: dict[str, RungResult], chosen: str
-) -> list[str]:
+def _warnings(joint: str, rungs: dict[str, RungResult], chosen: str) -> list[str]:
     pd = rungs[PREFERRED]
     said = []
     if "velocity_limit_rad_s" in pd.undecided:

@@ -1,4 +1,4 @@
-"""Turn what calibration found into the `Calibration` that simulators read, scale and caveats included.
+"""Turn what calibration found into the `Calibration` that simulators read, caveats included.
 
 Free-air positions give ratios to the armature. One torque sets the scale: the stall torque, which
 is the effort limit; so armature = stall torque / (effort limit per inertia), and the rest follows.
@@ -7,6 +7,7 @@ is the effort limit; so armature = stall torque / (effort limit per inertia), an
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -148,7 +149,9 @@ def _ladder_row(rung: RungResult) -> LadderRow:
     )
 
 
-def _ratio(pd: RungResult, name: str, factor: float, known: str = "yes") -> Quantity:
+def _ratio(
+    pd: RungResult, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
+) -> Quantity:
     """A fitted number times `factor`, with its interval and whether the data settled it."""
     interval, why = pd.intervals[name], pd.undecided.get(name)
     return Quantity(

@@ -167,7 +167,7 @@ def lag_budget(
     return LagBudget(
         joint, naive, fresh, lag,
         naive.value - fresh.value, fresh.value - lag.value,
-        tuple(_at_frequency(t, float(each)) for t, each in zip(tones, _servo_lags(tones), strict=True)),
+        tuple(map(_at_frequency, tones, _servo_lags(tones))),
         _estimators(trials, read, tones, lag.value),
         lattice,
         float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else float("nan"),
@@ -193,7 +193,7 @@ def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
     weight = tone_weights(tones)
     lags = tone_lags(response, frequency)
     drawn = _lag_near(draws, frequency[:, None], lags[:, None])
-    return Interval.of_draws(weight @ lags, weight @ drawn)
+    return Interval.of_draws(float(weight @ lags), weight @ drawn)
 
 
 def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
@@ -249,11 +249,11 @@ def _lag_near(response, frequency, centre):
     return centre - turned / (2 * np.pi * frequency)
 
 
-def _servo_lags(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
+def _servo_lags(tones: Sequence[ToneResponse]) -> list[float]:
     if not tones:
-        return np.zeros(0)
+        return []
     frequency = np.array([t.frequency_hz for t in tones])
-    return tone_lags(np.array([t.response for t in tones]), frequency)
+    return tone_lags(np.array([t.response for t in tones]), frequency).tolist()
 
 
 def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
@@ -295,7 +295,9 @@ def _shift_sums(trial: Trial, read: Readings, kind: str, lags: NDArray) -> NDArr
     past = time[:, None] - lags
     if kind == "fresh_held":
         row = np.searchsorted(trial.send_time_s, past, side="right") - 1
-        command = np.where(row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)])
+        command = np.where(
+            row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)]
+        )
     else:
         command = np.interp(past, trial.send_time_s, trial.command_rad)
     y = np.broadcast_to(position[:, None], command.shape)
@@ -336,14 +338,18 @@ def _estimators(
         "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
         "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
         "sub-sample cross-correlation, all rows": [_bounded(t, r, "naive_rows") for t, r in pairs],
-        "sub-sample cross-correlation, fresh rows": [_bounded(t, r, "fresh_rows") for t, r in pairs],
+        "sub-sample cross-correlation, fresh rows": [
+            _bounded(t, r, "fresh_rows") for t, r in pairs
+        ],
     }
     frequency = np.array([t.frequency_hz for t in tones])
     for kind, name in (("naive_rows", "all rows"), ("fresh_rows", "fresh rows")):
         output, command = _PAIRS[kind]
         response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
         found[f"sine phase, {name}"] = list(tone_lags(response, frequency)) if tones else []
-    result = {k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()}
+    result = {
+        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()
+    }
     if tones:
         result["phase slope, all rows"] = _slope(tones, "naive_rows").value
         result["phase slope, fresh rows"] = _slope(tones, "fresh_rows").value

@@ -34,6 +34,9 @@ _COUNT_FALLS = {
     "calf": {"LF": True, "RF": False, "LB": True, "RB": False},
 }
 
+# Angle of the count in the middle, absolute: the standing pose in whole degrees.
+_ZERO_RAD = {"hip": 0.0, "thigh": math.pi / 4, "calf": -math.pi / 2}
+
 _SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
 _PLAYBACK = ("time_s", "loop")
 _TIDY = (
@@ -72,6 +75,7 @@ def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> 
             "kind": "esp32 proxy",
             "command_quantum_rad": COMMAND_QUANTUM_RAD,
             "command_rounding": {j: rounding(j) for j in joints},
+            "count_zero_rad": {j: _ZERO_RAD[j.split("_")[1]] for j in joints},
         },
     }
     if pose is not None:

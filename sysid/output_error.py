@@ -338,8 +338,7 @@ def _residuals(rung: Rung, problems: Sequence[Problem], points: NDArray) -> list
     found: dict[int, NDArray] = {}
     for (key, members), track in zip(groups.items(), tracks, strict=True):
         parts = [
-            look_up(track[:, :, n], t.sample_step).T - t.sample_rad
-            for n, t in enumerate(used[key])
+            look_up(track[:, :, n], t.sample_step).T - t.sample_rad for n, t in enumerate(used[key])
         ]
         each = np.concatenate(parts, axis=1).reshape(len(members), points.shape[1], -1)
         found.update(zip(members, each, strict=True))

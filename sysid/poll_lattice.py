@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,18 +161,21 @@ def find_poll_lattice(
     rows = sum(len(t.read_time_s) for t in trials)
     fresh = sum(len(fresh_rows(t)) for t in trials)
     fraction = fresh / max(rows, 1)
-    nothing = PollLattice("unresolved", *[float("nan")] * 6, fraction)
+    nan = float("nan")
+    nothing = PollLattice("unresolved", nan, nan, nan, nan, nan, nan, fraction)
     loop = _loop_period(trials)
     moving, moving_fresh = _moving_fresh(trials)
     if moving and moving_fresh / moving >= _ALL_FRESH:
-        return PollLattice("every read", *[float("nan")] * 6, fraction)
+        return replace(nothing, kind="every read")
     step = max(quantum(trials), 1e-6)
     stretches = [s for t in trials if len(t.read_time_s) > 3 for s in _stretches(t, step)]
     if not stretches or not np.isfinite(loop):
         return nothing
 
     # ln T, spaced so that the last poll of a stretch moves by half of the blur
-    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * _BLURS_S[1] / _STRETCH_S))
+    grid = np.exp(
+        np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * _BLURS_S[1] / _STRETCH_S)
+    )
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
     period, score = _best_period(informative, grid)
     z_score = float("nan")
@@ -271,7 +275,7 @@ def _stretches(trial: Trial, step: float) -> list[_Stretch]:
     parts = max(1, int(np.ceil((read[-1] - read[0]) / _STRETCH_S)))
     edges = np.linspace(read[0], read[-1], parts + 1)
     found = []
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges):
         own, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
         if len(own) >= 8:
             found.append(

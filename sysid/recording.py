@@ -116,17 +116,22 @@ class Recording:
     def _trials(self) -> dict[str, list[Trial]]:
         rest = self.metadata.get("start_pose_rad") or {}
         found: dict[str, list[Trial]] = {}
-        for (joint, number), rows in self.table.groupby(["joint", "trial"], sort=True):
+        for _, rows in self.table.groupby(["joint", "trial"], sort=True):
             columns = {c: rows[c].to_numpy() for c in rows.columns}
-            joint, count = str(joint), columns.get("position_count")
+            joint, number = str(columns["joint"][0]), columns["trial"][0]
+            count = columns.get("position_count")
             found.setdefault(joint, []).append(
                 Trial(
-                    joint, int(number), float(columns["frequency_hz"][0]),
-                    columns["send_time_s"], columns["read_time_s"],
-                    columns["command_rad"], columns["position_rad"],
+                    joint,
+                    int(number),
+                    float(columns["frequency_hz"][0]),
+                    columns["send_time_s"],
+                    columns["read_time_s"],
+                    columns["command_rad"],
+                    columns["position_rad"],
                     None if count is None else np.nan_to_num(count, nan=-1).astype(np.int64),
                     float(rest.get(joint, columns["command_rad"][0])),
-                )  # fmt: skip
+                )
             )
         return found
 

@@ -79,8 +79,9 @@ def parse(path: Path, text: str) -> Parsed:
     for n, row in zip(numbers, cells, strict=True):
         if len(row) != len(columns):
             raise InputError(
-                f"{path}, line {n}: {len(row)} cells where the header names {len(columns)} columns; "
-                "command and position must have the same number of values. Mend or remove the line."
+                f"{path}, line {n}: {len(row)} cells where the header names {len(columns)} "
+                "columns; command and position must have the same number of values. Mend or "
+                "remove the line."
             )
     if ours and "completed" not in metadata:
         warnings.append("it was not recorded to its end; what is there is used.")
@@ -102,17 +103,18 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
         If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
     """
     warnings: list[str] = []
-    for name in pd.unique(table["joint"]):
+    for name in dict.fromkeys(table["joint"].to_list()):
         if name not in JOINT_NAMES:
             near = difflib.get_close_matches(str(name), JOINT_NAMES, n=1, cutoff=0.4)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(JOINT_NAMES)}."
             raise InputError(f"{path}, column joint: '{name}' is no joint; {hint}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
-    lost = table[needed].isna().any(axis=1)
+    lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
     if lost.any():
         warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
-        table = table[~lost]
-    missing = float(table["position_rad"].isna().mean()) if len(table) else 1.0
+        table = table.loc[~lost]
+    position = table["position_rad"].to_numpy(float)
+    missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
     if missing == 1.0:
         raise InputError(
             f"{path}, column position_rad: no row has a position, so the bus never answered. "
@@ -125,8 +127,9 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     again = table.duplicated(["joint", "trial", "send_time_s"])
     if again.any():
         warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
-        table = table[~again]
-    for (joint, trial), rows in table.groupby(["joint", "trial"], sort=False):
+        table = table.loc[~again]
+    for _, rows in table.groupby(["joint", "trial"], sort=False):
+        joint, trial = rows["joint"].iloc[0], rows["trial"].iloc[0]
         for column in ("send_time_s", "read_time_s"):
             back = np.flatnonzero(np.diff(rows[column].to_numpy()) < 0)
             if len(back):
@@ -154,8 +157,8 @@ def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
     near = difflib.get_close_matches(lacking[0], spare, n=1, cutoff=0.5)
     hint = f" Was '{near[0]}' meant? Rename it." if near else ""
     raise InputError(
-        f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(map(str, table.columns))}."
-        f"{hint} A recording needs {', '.join(columns)}."
+        f"{path}: column {', '.join(lacking)} is missing; it has "
+        f"{', '.join(map(str, table.columns))}.{hint} A recording needs {', '.join(columns)}."
     )
 
 

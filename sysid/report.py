@@ -33,19 +33,12 @@ if TYPE_CHECKING:  # both bring libraries that a page does not need
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report, drawn.
-
-    Attributes
-    ----------
-    name : str
-        Of its PNG file, without ending.
-    caption : str
-        What to see in it; also its text for those who cannot see it.
-    png : bytes
-    """
+    """A figure of the report, drawn."""
 
     name: str
+    """Of its PNG file, without ending."""
     caption: str
+    """What to see in it; also its text for those who cannot see it."""
     png: bytes
 
     @property
@@ -222,10 +215,7 @@ def _doctor(
     examinations: Sequence[tuple[str, Examination]], results: Mapping[str, JointCalibrationResult]
 ) -> Section:
     findings = [
-        (
-            f"{recording}, {joint}",
-            " ".join(_sentence(s) for s in (f"{found.verdict}.", *found.reasons)),
-        )
+        (f"{recording}, {joint}", _sentences([f"{found.verdict}.", *found.reasons]))
         for recording, examination in examinations
         for joint, found in examination.joints.items()
         if joint in results
@@ -238,8 +228,8 @@ def _doctor(
     )
 
 
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
+def _sentences(texts: Sequence[str]) -> str:
+    return " ".join(text[:1].upper() + text[1:] for text in texts)
 
 
 def _overlays(

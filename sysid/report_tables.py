@@ -189,11 +189,12 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
     columns = (
         _KEY,
         _text("form", "transfer_function"),
-        Column("number", lambda row: row["parameter"].replace("_", " "), "words"),
+        Column("number", lambda row: _readable(row["parameter"], ""), "words"),
         Column(
             "value (90 %)",
             lambda row: _value_cell(row["value"], row["value_low"], row["value_high"]),
         ),
+        Column("unit", lambda row: unit_of(row["parameter"]), "words"),
         _number("misfit, χ²/dof", "chi2_per_dof"),
     )
     return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))

@@ -139,7 +139,12 @@ def _design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:
 
 
 def _fit(
-    time: NDArray, value: NDArray, frequency: float, start: float, rng: np.random.Generator, draws: int
+    time: NDArray,
+    value: NDArray,
+    frequency: float,
+    start: float,
+    rng: np.random.Generator,
+    draws: int,
 ) -> tuple[complex, NDArray[np.complex128], float]:
     design = _design(time, frequency)
     block = np.floor((time - start) * frequency).astype(int)
@@ -152,13 +157,18 @@ def _fit(
     residual = float(np.sqrt(np.mean((design @ solution - value) ** 2)))
     # Rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
     if len(names) < 8:
-        return _fit_blocks(design, value, solution, 8, rng, draws) + (residual,)
+        return (*_fit_blocks(design, value, solution, 8, rng, draws), residual)
     weights = rng.exponential(size=(draws, len(names)))
-    return _weighted(gram, moment, weights, solution) + (residual,)
+    return (*_weighted(gram, moment, weights, solution), residual)
 
 
 def _fit_blocks(
-    design: NDArray, value: NDArray, solution: NDArray, count: int, rng: np.random.Generator, draws: int
+    design: NDArray,
+    value: NDArray,
+    solution: NDArray,
+    count: int,
+    rng: np.random.Generator,
+    draws: int,
 ) -> tuple[complex, NDArray[np.complex128]]:
     """As `_fit`, over `count` runs of neighbouring rows where there are too few periods."""
     parts = np.array_split(np.arange(len(value)), count)

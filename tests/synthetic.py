@@ -66,10 +66,13 @@ def tone_trials(
         shrink = gain * np.sinc(f * LOOP_S)
         trials.append(
             held_trial(
-                lambda t, f=f, a=amplitude * shrink: a * np.sin(2 * np.pi * f * (t - late)),
+                lambda t, f=f, a=amplitude * shrink, d=late: a * np.sin(2 * np.pi * f * (t - d)),
                 lambda t, f=f: amplitude * np.sin(2 * np.pi * f * t),
-                rng, frequency_hz=f, number=n, start_s=6.0 * n, **options,
-            )  # fmt: skip
+                rng,
+                frequency_hz=f,
+                number=n,
+                start_s=6.0 * n,
+                **options,
+            )
         )
     return trials
-

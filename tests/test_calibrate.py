@@ -1,4 +1,4 @@
-"""Calibration recovers a servo it has not seen, says what it does not know, and beats the paper's."""
+"""Calibration recovers a servo, says what it does not know, and beats the published setting."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 from synthetic import LOOP_S, tone_trials
 
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
-from sysid.calibrate import _calibrate_joint, _Task, Truncation, calibrate
+from sysid.calibrate import Truncation, _calibrate_joint, _Task, calibrate
 from sysid.calibration_file import preset_parameters, to_calibration
 from sysid.ladder import LADDER, rung
 from sysid.output_error import Problem, fit, positions, prepare

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: JSON on stdout alone, sentences, exit codes, no overwriting."""
+"""The command line as a user meets it: JSON alone on stdout, sentences, exit codes."""
 
 import json
 import os
@@ -143,7 +143,7 @@ def test_bad_input_ends_with_2_and_a_sentence(capsys, arguments, said):
 def table_with(tmp_path, change):
     """The sample's LF_hip rows, changed, as a file."""
     table = load(SWEEP).table.query("joint == 'LF_hip' and trial < 3").copy()
-    change(table)
+    table = change(table)
     path = tmp_path / "changed.csv"
     path.write_text('# pupper-sysid recording\n# completed: {"rows": 1}\n')
     table.to_csv(path, mode="a", index=False)
@@ -151,15 +151,14 @@ def table_with(tmp_path, change):
 
 
 def swap(table):
-    command, position = table.command_rad.copy(), table.position_rad.copy()
-    table["command_rad"], table["position_rad"] = position, command
+    return table.assign(command_rad=table.position_rad, position_rad=table.command_rad)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda t: t.__setitem__("position_rad", 0.1), "reading does not"),
-        (lambda t: t.__setitem__("command_rad", 0.1), "command never changes"),
+        (lambda t: t.assign(position_rad=0.1), "reading does not"),
+        (lambda t: t.assign(command_rad=0.1), "command never changes"),
         (swap, "swapped"),
     ],
 )
@@ -172,14 +171,14 @@ def test_doctor_refuses_logs_that_cannot_be_used_and_says_why(capsys, tmp_path, 
 
 
 def test_constant_feedback_is_answered_in_a_sentence_by_every_command(capsys, tmp_path):
-    path = table_with(tmp_path, lambda t: t.__setitem__("position_rad", 0.1))
+    path = table_with(tmp_path, lambda t: t.assign(position_rad=0.1))
     for command in ("delay", "bode", "calibrate"):
         code, _, err = run(capsys, command, path)
         assert code == 2 and "LF_hip" in err and "defect" not in err
 
 
 def test_one_frequency_is_calibrated_with_a_warning(capsys, tmp_path):
-    path = table_with(tmp_path, lambda t: t.drop(t[t.trial != 2].index, inplace=True))
+    path = table_with(tmp_path, lambda t: t[t.trial == 2])
     code, out, _ = run(capsys, "calibrate", path, "--json")
     joint = json.loads(out)["joints"]["LF_hip"]
     assert code == 0 and joint["rmse_leave_one_frequency_out_rad"] is None
@@ -191,7 +190,8 @@ def test_a_sweep_killed_half_way_leaves_a_file_that_every_command_reads(capsys, 
     sweep = subprocess.Popen(
         [sys.executable, "-m", "cli.pupper_sysid", "sweep", "--freqs", "4,5", "--joints", "LF_hip",
          "--duration", "2", "--real-time", "--out", str(path)],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     stop = time.monotonic() + 40
     while time.monotonic() < stop and not (path.exists() and path.read_text().count("\n") > 190):

@@ -77,20 +77,25 @@ def changed(index, column, text):
     return lines
 
 
+# fmt: off
 BAD = {
     "no rows": ([], HEADER, "no rows"),
     "missing column": (rows(), HEADER.replace(",position_rad", ",x"), "position_rad is missing"),
-    "renamed column": (rows(), HEADER.replace("command_rad", "comand_rad"), "Was 'comand_rad' meant"),
-    "text in a number": (changed(3, "position_rad", "hello"), HEADER, r"line 7, .*'hello' is not a"),
+    "renamed column": (
+        rows(), HEADER.replace("command_rad", "comand_rad"), "Was .comand_rad. meant"),
+    "text in a number": (
+        changed(3, "position_rad", "hello"), HEADER, r"line 7, .*'hello' is not a"),
     "infinite": (changed(3, "command_rad", "inf"), HEADER, "infinite"),
     "one row": (rows(1), HEADER, "1 usable rows"),
-    "no position at all": ([r.rsplit(",", 1)[0] + "," for r in rows()], HEADER, "bus never answered"),
+    "no position at all": (
+        [r.rsplit(",", 1)[0] + "," for r in rows()], HEADER, "bus never answered"),
     "times backwards": (changed(25, "send_time_s", "0.0101"), HEADER, "runs backwards"),
     "degrees": (changed(8, "position_rad", "45.0"), HEADER, "looks like degrees"),
     "another length": ([*rows()[:10], "0.5,0.5,0", *rows()[11:]], HEADER, "same number of values"),
     "unknown joint": (rows(joint="LF_hipp"), HEADER, "did you mean LF_hip"),
     "column twice": (rows(), HEADER.replace("read_time_s", "send_time_s"), "stands twice"),
-}  # fmt: skip
+}
+# fmt: on
 
 
 @pytest.mark.parametrize("case", BAD)
