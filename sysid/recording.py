@@ -15,8 +15,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,19 +25,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from common.errors import InputError, PupperError
+from common.errors import InputError
 from common.files import refuse_overwrite, versions
 from common.joints import JOINT_NAMES
-from sysid.importers import convert
-from sysid.recording_check import check
-from sysid.recording_table import (
-    OPTIONAL_COLUMNS,
-    REQUIRED_COLUMNS,
-    SCHEMA_VERSION,
-    TITLE,
-    parse,
-)
 
+SCHEMA_VERSION = 1
+TITLE = "# pupper-sysid recording"
+REQUIRED_COLUMNS = (
+    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
+)  # fmt: skip
+OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
 FOLDER = Path("recordings")
 
 _SYNC_S = 1.0  # at most this much is lost with the power
@@ -120,26 +116,24 @@ class Recording:
     def _trials(self) -> dict[str, list[Trial]]:
         rest = self.metadata.get("start_pose_rad") or {}
         found: dict[str, list[Trial]] = {}
-        for _, rows in self.table.groupby(["joint", "trial"], sort=False):
-            trial = _trial(rows, rest)
-            found.setdefault(trial.joint, []).append(trial)
-        return {j: sorted(t, key=lambda trial: trial.send_time_s[0]) for j, t in found.items()}
-
-
-def _trial(rows: pd.DataFrame, rest: dict[str, float]) -> Trial:
-    columns: dict[str, NDArray] = {str(name): rows[name].to_numpy() for name in rows.columns}
-    joint, count = str(columns["joint"][0]), columns.get("position_count")
-    return Trial(
-        joint=joint,
-        number=int(columns["trial"][0]),
-        frequency_hz=float(columns["frequency_hz"][0]),
-        send_time_s=columns["send_time_s"],
-        read_time_s=columns["read_time_s"],
-        command_rad=columns["command_rad"],
-        position_rad=columns["position_rad"],
-        position_count=None if count is None else np.nan_to_num(count, nan=-1).astype(np.int64),
-        initial_command_rad=float(rest[joint] if joint in rest else columns["command_rad"][0]),
-    )
+        for _, rows in self.table.groupby(["joint", "trial"], sort=True):
+            columns = {c: rows[c].to_numpy() for c in rows.columns}
+            joint, number = str(columns["joint"][0]), columns["trial"][0]
+            count = columns.get("position_count")
+            found.setdefault(joint, []).append(
+                Trial(
+                    joint,
+                    int(number),
+                    float(columns["frequency_hz"][0]),
+                    columns["send_time_s"],
+                    columns["read_time_s"],
+                    columns["command_rad"],
+                    columns["position_rad"],
+                    None if count is None else np.nan_to_num(count, nan=-1).astype(np.int64),
+                    float(rest.get(joint, columns["command_rad"][0])),
+                )
+            )
+        return found
 
 
 def load(path: Path) -> Recording:
@@ -150,16 +144,20 @@ def load(path: Path) -> Recording:
     InputError
         If it is no recording, or cannot be used; the sentence says where and what to do.
     """
+    from sysid.importers import convert
+    from sysid.recording_table import check, parse
+
     path = Path(path)
     if path.name.endswith(".truth.csv"):
         raise InputError(
             f"{path} is the truth that belongs to {path.name.removesuffix('.truth.csv')}.csv, "
             "not a recording; give that one."
         )
-    text, digest = _read(path)
+    text = _read(path)
     parsed = parse(path, text)
     table, metadata, warnings = convert(path, parsed)
     table, more = check(path, table)
+    digest = hashlib.sha256(text.encode()).hexdigest()
     found = [*parsed.warnings, *warnings, *more]
     return Recording(table, metadata, path.stem, path, digest, tuple(found))
 
@@ -181,8 +179,7 @@ def newest_recording(folder: Path = FOLDER) -> Path:
     return max(found, key=lambda p: p.stat().st_mtime)
 
 
-def _read(path: Path) -> tuple[str, str]:
-    """Text of the file, and the SHA-256 of its bytes."""
+def _read(path: Path) -> str:
     largest = 500e6
     try:
         if path.stat().st_size > largest:
@@ -197,11 +194,9 @@ def _read(path: Path) -> tuple[str, str]:
     try:
         if b"\0" in data:
             raise ValueError
-        return data.decode("utf-8-sig"), hashlib.sha256(data).hexdigest()
+        return data.decode("utf-8-sig")
     except ValueError:
-        raise InputError(
-            f"{path} is not a text file; a recording is CSV, in UTF-8. Name that file."
-        ) from None
+        raise InputError(f"{path} is not a text file; a recording is CSV.") from None
 
 
 class RecordingWriter:
@@ -214,13 +209,6 @@ class RecordingWriter:
         Header entries; each value must be JSON.
     force : bool
         Replace an existing file.
-
-    Raises
-    ------
-    InputError
-        If the file exists and `force` is not given, or its folder cannot be written to.
-    PupperError
-        If the disk is full or gone, here or while rows are appended.
 
     Examples
     --------
@@ -236,55 +224,41 @@ class RecordingWriter:
             self._file = path.open("w", encoding="utf-8", newline="\n")
         except OSError as error:
             raise InputError(f"{path} cannot be written: {error.strerror}.") from error
-        self._path = path
         self._columns: tuple[str, ...] = ()
         self._synced = 0.0
         created = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
         header = {"schema_version": SCHEMA_VERSION, "created": created, "versions": versions()}
-        with self._writing():
-            self._file.write(f"{TITLE}\n")
-            for key, value in (header | metadata).items():
-                self._file.write(f"# {key}: {json.dumps(value, ensure_ascii=False)}\n")
-            self._flush()
+        self._file.write(f"{TITLE}\n")
+        for key, value in (header | metadata).items():
+            self._file.write(f"# {key}: {json.dumps(value, ensure_ascii=False)}\n")
+        self._flush()
 
     def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
         """Write rows, each a dict of columns; the first decides which optional ones there are."""
         rows = [rows] if isinstance(rows, dict) else rows
-        with self._writing():
-            if rows and not self._columns:
-                optional = [c for c in OPTIONAL_COLUMNS if c in rows[0]]
-                self._columns = (*REQUIRED_COLUMNS, *optional)
-                self._file.write(",".join(self._columns) + "\n")
-            for row in rows:
-                self._file.write(",".join(_cell(c, row[c]) for c in self._columns) + "\n")
-            self._flush()
+        if rows and not self._columns:
+            optional = [c for c in OPTIONAL_COLUMNS if c in rows[0]]
+            self._columns = (*REQUIRED_COLUMNS, *optional)
+            self._file.write(",".join(self._columns) + "\n")
+        for row in rows:
+            self._file.write(",".join(_cell(c, row[c]) for c in self._columns) + "\n")
+        self._flush()
 
     def close(self, completed: dict[str, Any] | None = None) -> None:
         """Close the file; `completed` becomes its footer. May be called twice."""
         if self._file.closed:
             return
-        with self._writing():
-            if completed is not None:
-                self._file.write(f"# completed: {json.dumps(completed, ensure_ascii=False)}\n")
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
+        if completed is not None:
+            self._file.write(f"# completed: {json.dumps(completed, ensure_ascii=False)}\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
 
     def __enter__(self) -> RecordingWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise PupperError(
-                f"{self._path} cannot be written: {error.strerror}. The rows before are kept; "
-                "make room, then record again."
-            ) from error
 
     def _flush(self) -> None:
         self._file.flush()

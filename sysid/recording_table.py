@@ -1,49 +1,25 @@
-"""The border of `sysid.recording`: text becomes a table of numbers, or a sentence about why not.
-
-`parse` splits a file into header and cells, `numbers` turns the cells of the columns that a layout
-needs into numbers; what the numbers mean is judged in `sysid.recording_check`. Tables are indexed
-by the line of the file, so that every sentence can name one.
-"""
+"""The border of `sysid.recording`: text becomes a table of numbers, or a sentence about why not."""
 
 from __future__ import annotations
 
 import csv
 import difflib
+import io
 import json
-import math
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from common.errors import InputError
 from common.joints import JOINT_NAMES
 
-SCHEMA_VERSION = 1
-TITLE = "# pupper-sysid recording"
-REQUIRED_COLUMNS = (
-    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
-)  # fmt: skip
-OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
-
-LARGEST_RAD = 2 * math.pi + 0.5
-"""No joint of a legged robot turns further."""
-
-_LARGEST_COUNT = 2**31
-
-
-class BusHeader(BaseModel):
-    """What is known of the bus in a recording's header; other keys are kept as they are."""
-
-    model_config = ConfigDict(extra="allow", strict=True)
-
-    command_quantum_rad: FiniteFloat | None = Field(default=None, ge=0)
-    command_rounding: dict[str, Literal["up", "down"]] | None = None
+_LEAST_ROWS = 20
+_LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
+_TEXT_COLUMNS = ("joint", "signal")
 
 
 class Header(BaseModel):
@@ -51,12 +27,11 @@ class Header(BaseModel):
 
     model_config = ConfigDict(extra="allow", strict=True)
 
-    schema_version: int = Field(default=SCHEMA_VERSION, ge=1)
-    bus: BusHeader = BusHeader()
+    schema_version: int = 1
+    bus: dict[str, Any] = {}
     joints: list[str] = []
-    start_pose_rad: dict[str, FiniteFloat] = {}
-    read_after_send_s: FiniteFloat | None = None
-    seed: int | None = None
+    start_pose_rad: dict[str, float] = {}
+    read_after_send_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -66,49 +41,39 @@ class Parsed:
     Attributes
     ----------
     metadata : dict
-    columns : dict of str to list of str
-        Cells of each column.
-    lines : list of int
-        Line of the file that each row stands on.
+    table : pandas.DataFrame
+        Numbers, but for the columns of text; empty cells are NaN.
     warnings : list of str
     """
 
     metadata: dict[str, Any]
-    columns: dict[str, list[str]]
-    lines: list[int]
-    warnings: list[str]
+    table: pd.DataFrame
+    warnings: list[str] = field(default_factory=list)
 
 
 def parse(path: Path, text: str) -> Parsed:
-    """Cells of a CSV file with a comment header.
+    """Cells of a CSV file with a comment header, as numbers.
 
     Raises
     ------
     InputError
-        For ragged rows, no rows, doubled column names, a broken or newer header.
+        For ragged rows, text where a number belongs, a broken or newer header.
     """
-    # str.splitlines would also split at form feeds and the like, inside cells
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    lines = text.splitlines()
     metadata = _header(path, lines)
     warnings: list[str] = []
     rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if not rows:
         raise InputError(f"{path} has no rows: the recording never started. Record it again.")
-    columns = [c.strip() for c in _cells(path, *rows[0])]
-    if len(columns) == 1 and (other := set(columns[0]) & set(";\t")):
-        raise InputError(
-            f"{path}, line {rows[0][0]}: columns are separated by {sorted(other)[0]!r}, not by "
-            "commas. Save it with commas between cells and points in numbers."
-        )
+    columns = [c.strip() for c in next(csv.reader([rows[0][1]]))]
     if len(set(columns)) != len(columns):
         raise InputError(f"{path}, line {rows[0][0]}: a column name stands twice. Rename one.")
     ours = "send_time_s" in columns
-    cells = [_cells(path, n, line) for n, line in rows[1:]]
+    cells = list(csv.reader(io.StringIO("\n".join(line for _, line in rows[1:]))))
     numbers = [n for n, _ in rows[1:]]
-    # killed in the middle of a row: it has too few cells, or no end of line
-    last = next(n for n in range(len(lines), 0, -1) if lines[n - 1].strip())
-    unended = ours and last == len(lines)
-    if cells and numbers[-1] == last and (len(cells[-1]) < len(columns) or unended):
+    # killed in the middle of a line: the last one has no end, or too few cells
+    cut = bool(cells) and (len(cells[-1]) < len(columns) or (ours and not text.endswith("\n")))
+    if cut:
         cells, numbers = cells[:-1], numbers[:-1]
         warnings.append("its last line was cut short and has been left out.")
     for n, row in zip(numbers, cells, strict=True):
@@ -122,78 +87,79 @@ def parse(path: Path, text: str) -> Parsed:
         warnings.append("it was not recorded to its end; what is there is used.")
     if not cells:
         raise InputError(f"{path} has column names but no rows. Record it again.")
-    data = {name: [row[k].strip() for row in cells] for k, name in enumerate(columns)}
-    return Parsed(metadata, data, numbers, warnings)
+    data = {
+        name: _column(path, name, [row[k] for row in cells], numbers)
+        for k, name in enumerate(columns)
+    }
+    return Parsed(metadata, pd.DataFrame(data), warnings)
 
 
-def require(
-    path: Path, columns: Iterable[str], needed: Collection[str], others: Collection[str] = ()
-) -> None:
-    """Raise a sentence that names the `needed` columns not in `columns`, and what was meant.
-
-    `others` are columns with a meaning of their own, never proposed.
-    """
-    columns = list(columns)
-    lacking = [c for c in needed if c not in columns]
-    if not lacking:
-        return
-    spare = [c for c in columns if c not in needed and c not in others]
-    near = difflib.get_close_matches(lacking[0], spare, n=1, cutoff=0.5)
-    hint = f" Was '{near[0]}' meant? Rename it." if near else ""
-    lack = f"column {lacking[0]} is" if len(lacking) == 1 else f"columns {', '.join(lacking)} are"
-    raise InputError(
-        f"{path}: {lack} missing; it has {', '.join(columns)}.{hint} "
-        f"A recording of this kind needs {', '.join(needed)}."
-    )
-
-
-def numbers(path: Path, parsed: Parsed, names: Iterable[str]) -> pd.DataFrame:
-    """The named columns as numbers, indexed by line; empty cells are NaN.
+def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Refuse or repair a tidy table; returns it in time order with what was repaired.
 
     Raises
     ------
     InputError
-        If a cell is no number, or infinite; the sentence names the line.
+        If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
     """
-    table = {name: _numbers(path, name, parsed.columns[name], parsed.lines) for name in names}
-    return pd.DataFrame(table, index=parsed.lines)
-
-
-def unknown_joint(name: str) -> str:
-    """Sentence about a name that is no joint's, with the nearest that is."""
-    near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(JOINT_NAMES)}."
-    return f"{name[:40]!r} is no joint; {hint}"
-
-
-def refuse_fractions(path: Path, column: str, lines: NDArray, values: NDArray) -> None:
-    """Raise unless all `values` are whole numbers of a size that can be counted, or NaN."""
-    wrong = np.flatnonzero((values % 1 != 0) | (np.abs(values) > _LARGEST_COUNT))
-    wrong = wrong[np.isfinite(values[wrong])]
-    if len(wrong):
+    warnings: list[str] = []
+    for name in dict.fromkeys(table["joint"].to_list()):
+        if name not in JOINT_NAMES:
+            near = difflib.get_close_matches(str(name), JOINT_NAMES, n=1, cutoff=0.4)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(JOINT_NAMES)}."
+            raise InputError(f"{path}, column joint: '{name}' is no joint; {hint}")
+    needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
+    lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
+    if lost.any():
+        warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
+        table = table.loc[~lost]
+    position = table["position_rad"].to_numpy(float)
+    missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
+    if missing == 1.0:
         raise InputError(
-            f"{path}, line {lines[wrong[0]]}, column {column}: {values[wrong[0]]:g} is not a whole "
-            "number that counts something. Mend the cell."
+            f"{path}, column position_rad: no row has a position, so the bus never answered. "
+            "Check power and wiring, then record again."
         )
-
-
-def refuse_degrees(path: Path, column: str, lines: NDArray, values: NDArray) -> None:
-    """Raise if an angle is larger than any joint's in radians."""
-    wrong = np.flatnonzero(np.abs(values) > LARGEST_RAD)
-    if len(wrong):
+    if missing > 0:
+        warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
+    for column in ("command_rad", "position_rad"):
+        _refuse_degrees(path, column, table[column].to_numpy())
+    again = table.duplicated(["joint", "trial", "send_time_s"])
+    if again.any():
+        warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
+        table = table.loc[~again]
+    for _, rows in table.groupby(["joint", "trial"], sort=False):
+        joint, trial = rows["joint"].iloc[0], rows["trial"].iloc[0]
+        for column in ("send_time_s", "read_time_s"):
+            back = np.flatnonzero(np.diff(rows[column].to_numpy()) < 0)
+            if len(back):
+                raise InputError(
+                    f"{path}, column {column}: time runs backwards in trial {trial:g} of {joint}, "
+                    f"after {rows[column].iloc[back[0]]:.4f} s. Sort the rows, or give each pass "
+                    "its own trial number."
+                )
+        if len(rows) < _LEAST_ROWS:
+            warnings.append(f"trial {trial:g} of {joint} has only {len(rows)} rows.")
+    if len(table) < _LEAST_ROWS:
         raise InputError(
-            f"{path}, line {lines[wrong[0]]}, column {column}: values reach "
-            f"{np.nanmax(np.abs(values)):.4g}, more than a turn, which looks like degrees or "
-            "counts. Angles must be radians: multiply degrees by 0.0174533."
+            f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed to say "
+            "anything. Record for longer."
         )
+    return table.reset_index(drop=True), warnings
 
 
-def _cells(path: Path, number: int, line: str) -> list[str]:
-    # line by line, because an unbalanced quote would swallow the rest of the file
-    try:
-        return next(csv.reader([line]))
-    except csv.Error as error:
-        raise InputError(f"{path}, line {number}: {error}. Mend or remove the line.") from None
+def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
+    """Raise a sentence that names the columns `table` lacks, and what they may be called there."""
+    lacking = [c for c in columns if c not in table.columns]
+    if not lacking:
+        return
+    spare = [str(c) for c in table.columns if c not in columns]
+    near = difflib.get_close_matches(lacking[0], spare, n=1, cutoff=0.5)
+    hint = f" Was '{near[0]}' meant? Rename it." if near else ""
+    raise InputError(
+        f"{path}: column {', '.join(lacking)} is missing; it has "
+        f"{', '.join(map(str, table.columns))}.{hint} A recording needs {', '.join(columns)}."
+    )
 
 
 def _header(path: Path, lines: list[str]) -> dict[str, Any]:
@@ -205,7 +171,7 @@ def _header(path: Path, lines: list[str]) -> dict[str, Any]:
         try:
             metadata[key.strip()] = json.loads(value)
         except (ValueError, RecursionError):
-            if lines[0].startswith(TITLE) and n < len(lines):
+            if lines[0].startswith("# pupper-sysid recording") and n < len(lines):
                 raise InputError(
                     f"{path}, line {n}: the value of '{key}' is not JSON. Mend or remove the line."
                 ) from None
@@ -214,39 +180,39 @@ def _header(path: Path, lines: list[str]) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise InputError(
-            f"{path}, header, {where}: {first['msg']}. Mend or remove that entry."
-        ) from None
-    if header.schema_version > SCHEMA_VERSION:
+        raise InputError(f"{path}, header, {where}: {first['msg']}.") from None
+    if header.schema_version > 1:
         raise InputError(
             f"{path} has schema_version {header.schema_version}, written by a newer pupper-sysid; "
-            f"this one reads up to {SCHEMA_VERSION}. Upgrade."
+            "this one reads up to 1. Upgrade."
         )
-    for joint, angle in header.start_pose_rad.items():
-        if abs(angle) > LARGEST_RAD:
-            raise InputError(
-                f"{path}, header, start_pose_rad.{joint}: {angle:.4g} is more than a turn, which "
-                "looks like degrees. Angles must be radians: multiply degrees by 0.0174533."
-            )
     return metadata
 
 
-def _numbers(path: Path, name: str, cells: list[str], lines: list[int]) -> np.ndarray:
+def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
+    if name in _TEXT_COLUMNS:
+        return [c.strip() for c in cells]
     values = np.full(len(cells), np.nan)
-    for k, text in enumerate(cells):
+    for k, cell in enumerate(cells):
+        text = cell.strip()
         if text == "":
             continue
         try:
-            # float() would also take 1_000 and the digits of other scripts
-            values[k] = float(text) if text.isascii() and "_" not in text else float("no")
+            values[k] = float(text)
         except ValueError:
             raise InputError(
-                f"{path}, line {lines[k]}, column {name}: {text[:40]!r} is not a number. "
+                f"{path}, line {numbers[k]}, column {name}: '{text[:40]}' is not a number. "
                 "Mend the cell, or leave it empty if there was no reading."
             ) from None
         if np.isinf(values[k]):
-            raise InputError(
-                f"{path}, line {lines[k]}, column {name}: the value is infinite. "
-                "Mend the cell, or leave it empty if there was no reading."
-            )
+            raise InputError(f"{path}, line {numbers[k]}, column {name}: the value is infinite.")
     return values
+
+
+def _refuse_degrees(path: Path, column: str, values: np.ndarray) -> None:
+    largest = float(np.nanmax(np.abs(values)))
+    if largest > _LARGEST_RAD:
+        raise InputError(
+            f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
+            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533."
+        )
