@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -15,20 +17,24 @@ import tyro
 
 from cli.analyse import Bode, Delay, Doctor
 from cli.calibrate import Calibrate
+from cli.emulate import Emulate
 from cli.export import Export
 from cli.report import Report
+from cli.scan import Scan
 from cli.sweep import Sweep
 from cli.terminal import err
 from common.errors import PupperError
 
 Command = (
-    Annotated[Sweep, tyro.conf.subcommand("sweep")]
+    Annotated[Scan, tyro.conf.subcommand("scan")]
+    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Delay, tyro.conf.subcommand("delay")]
     | Annotated[Bode, tyro.conf.subcommand("bode")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Emulate, tyro.conf.subcommand("emulate")]
 )
 
 DESCRIPTION = """Measure a cheap servo and get a simulator that moves like it.
@@ -50,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=given,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
+        _end_politely()
         command.run()
     except PupperError as error:
         if debug:
@@ -71,6 +78,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
             soft_wrap=True,
         )
         sys.exit(1)
+
+
+def _end_politely() -> None:
+    """End on SIGTERM and a closed terminal as on Ctrl-C: the robot is parked first."""
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), stop)
 
 
 if __name__ == "__main__":

@@ -5,20 +5,26 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from cli import terminal
+from cli.buses import connect
 from common.errors import InputError
 from common.files import refuse_overwrite
 from common.joints import select_joints
+from hardware.bus import ServoBus
+from hardware.loop import request_real_time_priority
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import draw_robot
-from sysid import command_playback
-from sysid.excitation import parse_frequencies, plan
+from sysid.command_playback import playback
+from sysid.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan, start_pose
 from sysid.recorder import LOOP_PERIOD_S, record
 from sysid.recording import FOLDER
+from sysid.resume import header_of, resume_point
+
+EMULATED = "emulated"
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,12 @@ class Sweep:
     """Frequencies [Hz]: 1-10, 1-10:0.5 or 1,2,4,6.5."""
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; one after the other."""
+    bus: str = EMULATED
+    """emulated (no robot needed), esp32 (on the robot), or feetech:DEVICE, e.g.
+    feetech:/dev/ttyUSB0."""
+    joint_map: str | None = None
+    """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
+    fits the bus."""
     kind: Literal["sine", "chirp", "multisine", "steps", "square"] = "sine"
     """Shape of the motion."""
     playback: Path | None = None
@@ -44,6 +56,8 @@ class Sweep:
     """Control loop [Hz]."""
     out: Path | None = None
     """File to write; by default recordings/<kind>_<date>_<time>.csv."""
+    resume: Path | None = None
+    """Continue this unfinished recording, as it was planned; other options are not looked at."""
     truth: bool = False
     """Also write what the emulated robot really did, beside the recording."""
     real_time: bool = False
@@ -57,36 +71,76 @@ class Sweep:
 
     def run(self) -> None:
         """Plan, record, and say what to run next."""
-        terminal.need_positive("--rate", self.rate)
-        period = 1.0 / self.rate
-        joints = select_joints(self.joints)
-        rng = np.random.default_rng(self.seed)
-        bus = EmulatedBus(draw_robot(rng), rng, real_time=self.real_time)
-        if self.playback:
-            chosen = command_playback.playback(self.playback, joints)
+        if self.resume:
+            path = self.resume
+            request = dict(header_of(path)["sweep"])
         else:
-            chosen = plan(
-                self.kind, joints, parse_frequencies(self.freqs), self.amplitude, self.duration,
-                period, bus.metadata["speed_limit_rad_s"],
-            )  # fmt: skip
-        terminal.warn(chosen.warnings)
-        path = self.out or FOLDER / f"{self._name()}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
-        if path.suffix != ".csv":
-            raise InputError(f"--out {path}: a recording is a .csv file.")
+            request = self._request()
+            name = "playback" if self.playback else self.kind
+            path = self.out or FOLDER / f"{name}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
+            if path.suffix != ".csv":
+                raise InputError(f"--out {path}: a recording is a .csv file.")
+            refuse_overwrite(path, self.force)
         stem = path.with_suffix("")
         for other in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
             refuse_overwrite(Path(other), self.force)
-        terminal.err.print(
-            "No robot: using the emulated one" + (", in real time." if self.real_time else ".")
-        )
+        if self.truth and (self.resume or request["bus"] != EMULATED):
+            raise InputError("--truth: only a new recording of the emulated robot has its truth.")
+        bus = _open(request)
+        try:
+            chosen = _plan(request, bus)
+            resume = resume_point(path, chosen, request["loop_period_s"]) if self.resume else None
+        except BaseException:
+            bus.close()
+            raise
+        terminal.warn(chosen.warnings)
+        if resume:
+            terminal.err.print(
+                f"Continuing {path} at trial {resume.next_trial + 1} of {len(chosen.trials)}."
+            )
         started = time.perf_counter()
         with terminal.seconds_progress("recording", chosen.duration_s) as advance:
             record(
-                bus, chosen, path, loop_period_s=period, metadata={"seed": self.seed},
-                force=self.force, progress=advance,
+                bus, chosen, path, loop_period_s=request["loop_period_s"],
+                metadata={"seed": request["seed"], "sweep": request, "priority": self._priority()},
+                force=self.force, resume=resume, progress=advance,
             )  # fmt: skip
-        written = [path, *(bus.write_truth(stem, self.force) if self.truth else ())]
-        elapsed = time.perf_counter() - started
+        written = [path]
+        if self.truth and isinstance(bus, EmulatedBus):
+            written += bus.write_truth(stem, self.force)
+        self._say(request, chosen, written, time.perf_counter() - started)
+
+    def _request(self) -> dict[str, Any]:
+        """All that decides what will be done; the recording keeps it, so that it can go on."""
+        terminal.need_positive("--rate", self.rate)
+        bus = self.bus
+        if self.real_time and bus != EMULATED:
+            raise InputError("--real-time: a real bus knows no other time; leave it out.")
+        return {
+            "bus": bus,
+            "joint_map": self.joint_map,
+            "real_time": self.real_time,
+            "seed": self.seed,
+            "loop_period_s": 1.0 / self.rate,
+            "kind": self.kind,
+            "joints": select_joints(self.joints),
+            "frequencies_hz": parse_frequencies(self.freqs),
+            "amplitude_rad": self.amplitude,
+            "duration_s": self.duration,
+            "playback": str(self.playback) if self.playback else None,
+        }
+
+    def _priority(self) -> str:
+        if self.bus == EMULATED and not self.real_time:
+            return "none: virtual time"
+        said = request_real_time_priority()
+        terminal.err.print(f"Control loop at {said}.")
+        return said
+
+    def _say(
+        self, request: dict[str, Any], chosen: Plan, written: list[Path], elapsed: float
+    ) -> None:
+        path, joints = written[0], request["joints"]
         if self.json:
             terminal.print_json(
                 {
@@ -113,5 +167,30 @@ class Sweep:
             soft_wrap=True,
         )
 
-    def _name(self) -> str:
-        return "playback" if self.playback else self.kind
+
+def _open(request: dict[str, Any]) -> ServoBus:
+    """The bus that a request names."""
+    if request["bus"] == EMULATED:
+        if request["joint_map"]:
+            raise InputError("--joint-map: the emulated robot has its own; leave it out.")
+        rng = np.random.default_rng(request["seed"])
+        real_time = bool(request["real_time"])
+        terminal.err.print(
+            "No robot: using the emulated one" + (", in real time." if real_time else ".")
+        )
+        return EmulatedBus(draw_robot(rng), rng, real_time=real_time)
+    return connect(request["bus"], request["joint_map"], request["joints"])
+
+
+def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
+    """The plan that a request describes, within the limits of the bus."""
+    joints = request["joints"]
+    if request["playback"]:
+        return playback(Path(request["playback"]), joints)
+    room = bus.limits.room(start_pose(bus.joint_names))
+    return plan(
+        request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
+        request["duration_s"], request["loop_period_s"], bus.metadata["speed_limit_rad_s"],
+        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ),
+        dict(zip(bus.joint_names, map(float, room), strict=True)),
+    )  # fmt: skip

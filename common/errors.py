@@ -23,3 +23,7 @@ class FileExistsRefusal(InputError):
 
 class BusError(PupperError):
     """The servo bus did not do what it was asked."""
+
+
+class SafetyStop(BusError):
+    """The robot was stopped because going on could have harmed it."""

@@ -28,11 +28,11 @@ from pydantic_core import PydanticCustomError
 from common.errors import InputError
 from common.files import write_text
 from common.joints import JOINT_NAMES
+from common.strict_yaml import dump, read
 from servo_models.calibration_parts import JointCalibration, Part, Whole
 from servo_models.calibration_refusals import explain
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from servo_models.held_feedback import HeldFeedback
-from servo_models.strict_yaml import dump, read
 
 SCHEMA = "pupper-calibration"
 SCHEMA_VERSION = 1

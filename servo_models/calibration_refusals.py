@@ -17,8 +17,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from common.strict_yaml import Place, place_text
 from servo_models.calibration_parts import UNIT_OF_NAME, Band, Quantity, unit_of
-from servo_models.strict_yaml import Place, place_text
 
 _UNITS = (
     "nm_s_per_rad|nm_per_rad|nm_s_per_deg|nm_per_deg|kg_m2|g_cm2|kg_cm|mnm|nmm|nm|"

@@ -11,6 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
+from hardware.clock import HostClock
+
 
 class Clock(Protocol):
     """What a bus needs of time."""
@@ -55,20 +57,8 @@ class VirtualClock:
         self._now += duration_s * self._rng.uniform(0.8, 1.2)
 
 
-class RealClock:
-    """The host's monotonic clock, from 0 at construction."""
-
-    def __init__(self):
-        self._start = time.monotonic()
-
-    def now(self) -> float:
-        """Time [s], to the microsecond."""
-        return round(time.monotonic() - self._start, 6)
-
-    def sleep_until(self, time_s: float) -> None:
-        """Sleep until `time_s`."""
-        while (left := time_s - self.now()) > 0:
-            time.sleep(left)
+class RealClock(HostClock):
+    """The host's own clock; exchanges take real time."""
 
     def spend(self, duration_s: float) -> None:
         """Sleep for `duration_s`."""

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from common.errors import BusError
 from common.files import refuse_overwrite, write_text
 from common.joints import DEFAULT_POSE, JOINT_NAMES
-from hardware.bus import BusSample
+from hardware.bus import BusSample, Sent
+from hardware.joint_map import load_joint_map
 from sim.clocks import Clock, RealClock, VirtualClock
 from sim.emulated_robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
 from sim.free_air_servo import FreeAirServo
@@ -86,10 +87,11 @@ class EmulatedBus:
         self._changes: list[list[float]] = [[] for _ in JOINT_NAMES]
         self._log: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
         self._closed = False
+        self.limits = load_joint_map("mini_pupper_2").per_servo().position_limits()
         self.metadata: dict[str, Any] = {
             "kind": "emulated",
-            "quantum_rad": spec.quantum_rad,
-            "command_quantum_rad": spec.quantum_rad,
+            "coordinates": "servo",
+            "command_quantum_rad": {s.joint: spec.quantum_rad for s in robot.servos},
             "command_rounding": {s.joint: s.command_rounding for s in robot.servos},
             "count_zero_rad": {s.joint: s.zero_rad for s in robot.servos},
             "speed_limit_rad_s": NOMINAL_SPEED_LIMIT_RAD_S,
@@ -104,8 +106,8 @@ class EmulatedBus:
         """Return when `now()` has reached `time_s`; in virtual time this costs nothing."""
         self._clock.sleep_until(time_s)
 
-    def write(self, position_rad: NDArray[np.float64]) -> float:
-        """Send goal positions [rad], shape (12,); returns the time of sending [s].
+    def write(self, position_rad: NDArray[np.float64]) -> Sent:
+        """Send goal positions [rad], shape (12,).
 
         Raises
         ------
@@ -118,14 +120,14 @@ class EmulatedBus:
             raise BusError(
                 f"emulated bus: goals must be {len(JOINT_NAMES)} finite angles, got {goal}."
             )
-        sent = self._clock.now()
+        sent, asked = self._clock.now(), goal
         goal = self._truncated(goal)
         for i in np.flatnonzero(goal != self._goal):
             self._servos[i].command(sent, goal[i])
             self._changes[i].append(sent)
         self._goal = goal
         self._clock.spend(self.robot.spec.write_duration_s)
-        return sent
+        return Sent(sent, asked)
 
     def read(self) -> BusSample:
         """Read all joints once: whatever the last successful poll of each has left.
@@ -147,9 +149,10 @@ class EmulatedBus:
         self._measured_s = measured
         true = np.array([servo.position_at(time_s) for servo in self._servos])
         self._log.append((time_s, true, measured))
-        return BusSample(time_s, self._reading.copy(), self._count.copy())
+        at = np.full(len(JOINT_NAMES), time_s)
+        return BusSample(at, self._reading.copy(), self._count.copy())
 
-    def torque(self, on: bool) -> None:
+    def torque(self, on: bool) -> bool:
         """Hold the present pose, or let every joint go limp."""
         self._refuse_closed()
         now = self._clock.now()
@@ -157,6 +160,7 @@ class EmulatedBus:
             servo.torque(now, on)
         # the next write must reach the servos even if it repeats the last one
         self._goal = np.full(len(JOINT_NAMES), np.nan)
+        return True
 
     def close(self) -> None:
         """Release the bus; what is known of the truth stays."""

@@ -17,17 +17,13 @@ import numpy as np
 
 from common.errors import InputError
 from common.joints import JOINT_NAMES
+from hardware.joint_map import load_joint_map
 from servo_models import DelayedPDParameters, HeldFeedback
 
 RADIANS_PER_COUNT = np.pi / 550
 CENTRE_COUNT = 512
 SHORTEST_DELAY_S = 0.002
 """What the emulator can do: two physics steps."""
-
-_SERVO_ID = dict(zip(JOINT_NAMES, (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9), strict=True))
-_ZERO_RAD = {"hip": 0.0, "thigh": np.pi / 4, "calf": -np.pi / 2}
-# direction of the counts as the angle grows (left servos are mounted the other way round)
-_SIGN = {"hip": {"LF": -1, "RF": -1, "LB": 1, "RB": 1}, "leg": {"L": -1, "R": 1}}
 
 
 @dataclass(frozen=True)
@@ -147,9 +143,11 @@ def draw_robot(rng: np.random.Generator, spec: RobotSpec | None = None) -> Emula
     """One robot made to `spec` (default: like the published Mini Pupper 2)."""
     spec = spec or RobotSpec()
     start = rng.uniform(0.0, spec.poll_period_s)
+    layout = load_joint_map("mini_pupper_2").per_servo()
     servos = []
-    for joint in JOINT_NAMES:
-        leg, kind = joint.split("_")
+    for joint, servo_id, sign, zero in zip(
+        JOINT_NAMES, layout.ids, layout.sign(), layout.zero_rad(), strict=True
+    ):
         kp, kd, friction, effort = np.exp(spec.gain_spread * rng.standard_normal(4))
         speed = np.exp(spec.velocity_spread * rng.standard_normal())
         delay = spec.delay_s + spec.delay_sd_s * rng.standard_normal()
@@ -169,10 +167,8 @@ def draw_robot(rng: np.random.Generator, spec: RobotSpec | None = None) -> Emula
             quantum_rad=spec.quantum_rad,
             offset_rad=float(spec.offset_sd_rad * rng.standard_normal()),
         )
-        share = (_SERVO_ID[joint] - 1) / len(JOINT_NAMES)
-        sign = _SIGN["hip"][leg] if kind == "hip" else _SIGN["leg"][leg[0]]
-        phase = float(start + share * spec.poll_period_s)
-        servos.append(EmulatedServo(joint, actuator, feedback, phase, _ZERO_RAD[kind], sign))
+        phase = float(start + (servo_id - 1) / len(JOINT_NAMES) * spec.poll_period_s)
+        servos.append(EmulatedServo(joint, actuator, feedback, phase, float(zero), int(sign)))
     return EmulatedRobot(spec, tuple(servos))
 
 

@@ -61,6 +61,7 @@ class FreeAirServo:
         self._data = mujoco.MjData(self._model)
         rest_at(self._model, self._data, [position_rad])
         self._gains = self._model.actuator_biasprm.copy()
+        self._effort = float(np.asarray(parameters.effort_limit))
         self._dt = time_step_s
         self._settled_after = int(delay / time_step_s) + 3
         self._step = 0
@@ -86,6 +87,13 @@ class FreeAirServo:
         ahead = self._step * self._dt - time_s
         self._asleep = not self._queue and self._resting()
         return float(self._data.qpos[0]) - float(self._data.qvel[0]) * ahead
+
+    @property
+    def load(self) -> float:
+        """Share of the effort limit at work, signed, at the time last asked for."""
+        if self._limp or self._asleep:
+            return 0.0
+        return float(self._data.actuator_force[0]) / self._effort
 
     def torque(self, time_s: float, on: bool) -> None:
         """Hold the present position, or go limp, from `time_s` on."""

@@ -239,8 +239,9 @@ def joint_trials(
         if joint not in recording.joints:
             continue
         bus = recording.metadata.get("bus") or {}
+        quantum = bus.get("command_quantum_rad") or 0.0
         truncation = Truncation(
-            float(bus.get("command_quantum_rad") or 0.0),
+            float((quantum.get(joint) or 0.0) if isinstance(quantum, dict) else quantum),
             (bus.get("command_rounding") or {}).get(joint),
             (bus.get("count_zero_rad") or {}).get(joint),
         )

@@ -38,6 +38,7 @@ POLL_RATE_HZ = 1 / 0.02685
 """Feedback polls of a Mini Pupper 2, as far as is known before the recording [Hz]."""
 
 _RATIOS = 12
+_LEAST_ROOM_RAD = 0.03
 _NUDGE_STEP_HZ = 0.01
 
 
@@ -103,6 +104,7 @@ def plan(
     loop_period_s: float = 0.019,
     speed_limit_rad_s: float = 7.5,
     poll_rate_hz: float = POLL_RATE_HZ,
+    room_rad: Mapping[str, float] | None = None,
 ) -> Plan:
     """The trials of an excitation, one joint after the other.
 
@@ -127,6 +129,8 @@ def plan(
         What the servo can do.
     poll_rate_hz : float
         Feedback polls per second, 0 if there are none.
+    room_rad : mapping of joint to float, optional
+        How far each joint may swing to both sides of its start pose.
 
     Raises
     ------
@@ -150,6 +154,7 @@ def plan(
     if not frequencies and kind != "steps":
         raise InputError("excitation: no frequency was chosen; give at least one, such as 1-10.")
     warnings: list[str] = []
+    amplitude_rad = _within(amplitude_rad, joints, room_rad or {}, warnings)
     top_speed = SPEED_MARGIN * speed_limit_rad_s
     if kind in ("sine", "square"):
         shapes = []
@@ -192,6 +197,11 @@ def plan(
         "warnings": list(dict.fromkeys(warnings)),
     }
     return Plan(trials, dict(DEFAULT_POSE), description, tuple(dict.fromkeys(warnings)))
+
+
+def start_pose(joints: Sequence[str]) -> NDArray[np.float64]:
+    """The pose from which excitations start, shape (joints,) [rad]."""
+    return np.array([DEFAULT_POSE[joint] for joint in joints])
 
 
 def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
@@ -277,6 +287,25 @@ def _checked_frequency(value: float, highest_hz: float) -> float:
             "half the rate at which commands are sent."
         )
     return float(value)
+
+
+def _within(
+    amplitude: float, joints: Sequence[str], room: Mapping[str, float], warnings: list[str]
+) -> float:
+    """`amplitude`, or less where a joint has no room for it; then with a warning."""
+    tight = min((j for j in joints if j in room), key=lambda j: room[j], default=None)
+    if tight is None or room[tight] >= amplitude:
+        return amplitude
+    if room[tight] < _LEAST_ROOM_RAD:
+        raise InputError(
+            f"excitation: {tight} has {room[tight]:.3f} rad of room on either side of its start "
+            "pose, too little to learn from. Check its limits in the joint map."
+        )
+    warnings.append(
+        f"amplitude reduced from {amplitude:g} to {room[tight]:.3f} rad, the room that the joint "
+        f"map's limits leave {tight}."
+    )
+    return room[tight]
 
 
 def _bounded(

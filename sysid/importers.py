@@ -10,7 +10,6 @@ by `READ_AFTER_SEND_S`, and the metadata say so.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +18,12 @@ import pandas as pd
 
 from common.errors import InputError
 from common.joints import DEFAULT_POSE, JOINT_NAMES
+from hardware.joint_map import load_joint_map
 from sysid.recording_table import Parsed, require
 
 READ_AFTER_SEND_S = 0.0005
 PAUSE_S = 0.5
 """Return to the start pose between tones of the sweep script, not in its file."""
-
-COMMAND_QUANTUM_RAD = math.pi / 550
-
-# Direction of the count with the angle, per leg: facts of the Mini Pupper 2's servo mounting.
-_COUNT_FALLS = {
-    "hip": {"LF": True, "RF": True, "LB": False, "RB": False},
-    "thigh": {"LF": True, "RF": False, "LB": True, "RB": False},
-    "calf": {"LF": True, "RF": False, "LB": True, "RB": False},
-}
-
-# Angle of the count in the middle, absolute: the standing pose in whole degrees.
-_ZERO_RAD = {"hip": 0.0, "thigh": math.pi / 4, "calf": -math.pi / 2}
 
 _SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
 _PLAYBACK = ("time_s", "loop")
@@ -67,26 +55,23 @@ def convert(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], l
 
 
 def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:
+    servos = load_joint_map("mini_pupper_2").per_servo().select(joints)
+    # int() of the count: the angle goes up where counts fall as angles rise
+    moved = ["up" if sign < 0 else "down" for sign in servos.sign()]
     metadata: dict[str, Any] = {
         "imported_from": layout,
         "read_after_send_s": READ_AFTER_SEND_S,
         "joints": joints,
         "bus": {
             "kind": "esp32 proxy",
-            "command_quantum_rad": COMMAND_QUANTUM_RAD,
-            "command_rounding": {j: rounding(j) for j in joints},
-            "count_zero_rad": {j: _ZERO_RAD[j.split("_")[1]] for j in joints},
+            "command_quantum_rad": dict(zip(joints, 1 / servos.counts_per_rad(), strict=True)),
+            "command_rounding": dict(zip(joints, moved, strict=True)),
+            "count_zero_rad": dict(zip(joints, servos.zero_rad(), strict=True)),
         },
     }
     if pose is not None:
         metadata["start_pose_rad"] = pose
     return metadata
-
-
-def rounding(joint: str) -> str:
-    """Where `int()` of the count moves the angle of `joint`: "up" if counts fall as angles rise."""
-    leg, kind = joint.split("_")
-    return "up" if _COUNT_FALLS[kind][leg] else "down"
 
 
 def _sweep(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:

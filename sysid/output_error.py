@@ -56,6 +56,13 @@ class TrialData:
     row_rad: NDArray[np.float64]
 
 
+_WHOLE_COUNT = {
+    "up": lambda count: np.ceil(count - 1e-6),
+    "down": lambda count: np.floor(count + 1e-6),
+    "nearest": np.rint,
+}
+
+
 def prepare(
     trial: Trial,
     reading: Readings,
@@ -70,19 +77,18 @@ def prepare(
     trial : Trial
     reading : Readings
     command_quantum_rad : float
-        Size of one count of the command; 0 if commands are not truncated.
-    rounding : {"up", "down"}, optional
-        Where truncation of the count moves the angle; None leaves the command as it is.
+        Size of one count of the command; 0 if commands are not made whole counts.
+    rounding : {"up", "down", "nearest"}, optional
+        Where making the count whole moves the angle; None leaves the command as it is.
     zero_rad : float, optional
         An angle that is a whole count; by default the rest position.
     """
     rest, start = trial.initial_command_rad, trial.send_time_s[0]
     command = trial.command_rad - rest
-    if command_quantum_rad > 0 and rounding in ("up", "down"):
+    if command_quantum_rad > 0 and rounding in _WHOLE_COUNT:
         zero = rest if zero_rad is None else zero_rad
         count = (trial.command_rad - zero) / command_quantum_rad
-        whole = np.ceil(count - 1e-6) if rounding == "up" else np.floor(count + 1e-6)
-        command = whole * command_quantum_rad + zero - rest
+        command = _WHOLE_COUNT[rounding](count) * command_quantum_rad + zero - rest
     stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
     steps = int(np.ceil(stop / TIME_STEP_S)) + 2
     edges = TIME_STEP_S * np.arange(steps + 1)

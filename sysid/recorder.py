@@ -1,15 +1,15 @@
 """Carry out a plan on a servo bus and write down what was sent and what was read, as it happens.
 
 `record` moves the robot to the start pose, runs the trials at a fixed rate, and returns to the
-start pose after each. Rows reach the file tick by tick, so that a recording that is interrupted,
-or killed, is a recording up to there. Whatever happens, the bus is closed at the end, and the
-torque switched off first if the bus still answers.
+start pose after each. Every command passes the safety guard, and what the guard made of it is what
+is written down. Rows reach the file tick by tick, so that a recording that is interrupted, or
+killed, is a recording up to there, and can be continued (`sysid.resume`). Whatever happens, the
+robot is parked and the bus closed at the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 
 from common.errors import BusError, InputError
 from hardware.bus import BusSample, ServoBus
+from hardware.guard import GuardedBus, guarded
+from hardware.loop import FixedRateLoop
 from sysid.excitation import Plan, TrialPlan, raised_cosine
 from sysid.recording import RecordingWriter
+from sysid.resume import Resume
 
 LOOP_PERIOD_S = 0.019
 """Default time between commands [s]: the rate of the recordings this project starts from."""
@@ -39,40 +42,6 @@ Progress = Callable[[float, float, str], None]
 """Called with seconds done, seconds in all, and what is going on."""
 
 
-@dataclass
-class LoopStatistics:
-    """How well the loop kept its rate.
-
-    Attributes
-    ----------
-    period_s : float
-        The rate that was asked for.
-    ticks : int
-        Commands sent.
-    missed_deadlines : int
-        Ticks left out because the one before took too long.
-    intervals_s : list of float
-        Time from each command to the next within a trial.
-    """
-
-    period_s: float
-    ticks: int = 0
-    missed_deadlines: int = 0
-    intervals_s: list[float] = field(default_factory=list)
-
-    def summary(self) -> dict[str, float]:
-        """Numbers for the recording's footer."""
-        measured = {}
-        if self.intervals_s:
-            measured = {
-                "mean_period_s": round(float(np.mean(self.intervals_s)), 7),
-                "sd_period_s": round(float(np.std(self.intervals_s)), 7),
-                "longest_period_s": round(float(np.max(self.intervals_s)), 7),
-            }
-        counts = {"ticks": self.ticks, "missed_deadlines": self.missed_deadlines}
-        return {"period_s": self.period_s} | counts | measured
-
-
 def record(
     bus: ServoBus,
     plan: Plan,
@@ -81,6 +50,7 @@ def record(
     loop_period_s: float = LOOP_PERIOD_S,
     metadata: dict[str, Any] | None = None,
     force: bool = False,
+    resume: Resume | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Carry out `plan` on `bus` and write the recording to `path`.
@@ -88,7 +58,7 @@ def record(
     Parameters
     ----------
     bus : ServoBus
-        Closed when this returns, whatever happened.
+        Guarded here if it is not yet. Closed when this returns, whatever happened.
     plan : Plan
     path : Path
         CSV file to write.
@@ -98,6 +68,8 @@ def record(
         More keys for the recording's header, such as the seed.
     force : bool
         Replace an existing file.
+    resume : Resume, optional
+        Continue the unfinished recording at `path` instead.
     progress : callable, optional
         See `Progress`.
 
@@ -111,22 +83,32 @@ def record(
     InputError
         If the plan names a joint the bus has not, or the file exists.
     BusError
-        If the bus gives no reading of where the robot is.
+        If the bus gives no reading of where the robot is; `SafetyStop` if the guard ended it.
     KeyboardInterrupt
-        On Ctrl-C, after the robot has returned to its start pose; the file has no footer then.
+        On Ctrl-C, after the robot was parked; the file has no footer then.
     """
+    guard = guarded(bus)
     try:
-        return _Session(bus, plan, loop_period_s, progress).run(path, metadata or {}, force)
+        session = _Session(guard, plan, loop_period_s, resume, progress)
+        return session.run(path, metadata or {}, force)
     finally:
-        bus.close()
+        guard.close()
 
 
 class _Session:
     """One recording in progress."""
 
-    def __init__(self, bus: ServoBus, plan: Plan, period_s: float, progress: Progress | None):
-        if not (np.isfinite(period_s) and period_s > 0):
-            raise InputError(f"loop_period_s is {period_s}; it must be a positive number.")
+    def __init__(
+        self,
+        bus: GuardedBus,
+        plan: Plan,
+        period_s: float,
+        resume: Resume | None,
+        progress: Progress | None,
+    ):
+        self._loop = FixedRateLoop(bus, period_s)
+        # the ways between the trials keep the rate too, but are not what is recorded
+        self._between = FixedRateLoop(bus, period_s)
         unknown = sorted({j for t in plan.trials for j in t.joints} - set(bus.joint_names))
         if unknown or not plan.trials:
             wrong = f"joint {unknown[0]} is not on the bus" if unknown else "it has no trials"
@@ -134,38 +116,42 @@ class _Session:
                 f"the plan cannot be carried out: {wrong}. "
                 f"The bus {bus.name} has {', '.join(bus.joint_names)}."
             )
-        self._bus, self._plan, self._period = bus, plan, period_s
+        self._bus, self._plan, self._resume = bus, plan, resume
         self._progress: Progress = progress or (lambda done, total, what: None)
         # a joint that the plan does not place stays where it is found
         self._start = np.array([plan.start_pose_rad.get(j, np.nan) for j in bus.joint_names])
         self._sent = self._start.copy()
         self._total_s = plan.duration_s
-        self._loop = LoopStatistics(period_s)
+        self._shift_s = 0.0
 
     def run(self, path: Path, metadata: dict[str, Any], force: bool) -> Path:
-        """Everything between opening the file and switching the torque off."""
-        bus = self._bus
+        """Everything between opening the file and parking the robot."""
+        bus, resume = self._bus, self._resume
         present = self._first_pose()
         self._start = np.where(np.isfinite(self._start), self._start, present)
         self._sent = present
-        rows = 0
-        with RecordingWriter(path, self._header(metadata), force) as writer:
-            try:
-                bus.torque(True)
-                self._progress(0.0, self._total_s, "moving to the start pose")
+        first, rows = 0, 0
+        if resume is None:
+            writer = RecordingWriter(path, self._header(metadata), force)
+        else:
+            first, rows = resume.next_trial, resume.rows
+            self._shift_s = resume.now_s() - bus.now()
+            writer = RecordingWriter.resumed(path, first)
+        with writer:
+            bus.torque(True)
+            self._progress(0.0, self._total_s, "moving to the start pose")
+            self._move_to_start()
+            done = sum(trial.duration_s for trial in self._plan.trials[:first])
+            for number, trial in enumerate(self._plan.trials[first:], first):
+                self._hold(REST_S)
+                rows += self._trial(number, trial, writer, done)
+                done += trial.duration_s
                 self._move_to_start()
-                done = 0.0
-                for number, trial in enumerate(self._plan.trials):
-                    self._hold(REST_S)
-                    rows += self._trial(number, trial, writer, done)
-                    done += trial.duration_s
-                    self._move_to_start()
-                writer.close({"rows": rows, "loop": self._loop.summary()})
-            except KeyboardInterrupt:
-                self._move_to_start()
-                raise
-            finally:
-                bus.torque(False)
+            writer.close(
+                {"rows": rows, "loop": self._loop.summary(), "guard": bus.report.summary()}
+            )
+            # at the start pose on purpose: that is where it stays
+            bus.park(self._start)
         return path
 
     def _header(self, metadata: dict[str, Any]) -> dict[str, Any]:
@@ -177,23 +163,25 @@ class _Session:
             "start_pose_rad": dict(
                 zip(self._bus.joint_names, map(float, self._start), strict=True)
             ),
-            "loop": {"period_s": self._period},
+            "loop": {"period_s": self._loop.period_s},
         } | metadata
 
     def _first_pose(self) -> NDArray[np.float64]:
         """Where the robot is; waits a little for the first polls."""
         bus, until = self._bus, self._bus.now() + _FIRST_READING_S
+        pose = np.full(len(bus.joint_names), np.nan)
         while True:
-            pose = bus.read().position_rad
+            reading = bus.read().position_rad
+            pose = np.where(np.isfinite(reading), reading, pose)
             if np.isfinite(pose).all():
-                return pose.copy()
+                return pose
             if bus.now() >= until:
                 silent = [n for n, x in zip(bus.joint_names, pose, strict=True) if np.isnan(x)]
                 raise BusError(
                     f"the bus {bus.name} gives no position of {', '.join(silent)}. Check that the "
                     "robot is on and its servos connected, then record again."
                 )
-            bus.sleep_until(bus.now() + self._period)
+            bus.sleep_until(bus.now() + self._loop.period_s)
 
     def _trial(self, number: int, trial: TrialPlan, writer: RecordingWriter, done: float) -> int:
         """One trial, recorded; returns its number of rows."""
@@ -202,26 +190,19 @@ class _Session:
         what = f"{', '.join(trial.joints[:3])}{' …' if len(trial.joints) > 3 else ''}"
         if np.isfinite(trial.frequency_hz):
             what += f" at {trial.frequency_hz:g} Hz"
-        start, tick, rows, last = bus.now(), 0, 0, None
-        while tick * self._period < trial.duration_s:
-            bus.sleep_until(start + tick * self._period)
-            elapsed = bus.now() - start
+        rows = 0
+        for elapsed in self._loop.ticks(trial.duration_s):
             goal = self._start.copy()
             # of the time it is, not of the time it should be: a late tick keeps the tone's phase
             goal[index] = trial.command(elapsed, self._start[index])
-            sent_s = bus.write(goal)
-            self._sent = goal
+            sent = bus.write(goal)
+            self._sent = sent.position_rad
             sample = bus.read()
-            writer.append(_rows(number, trial, index, sent_s, goal, sample))
+            writer.append(
+                _rows(number, trial, index, sent.time_s, self._sent, sample, self._shift_s)
+            )
             rows += len(index)
-            if last is not None:
-                self._loop.intervals_s.append(sent_s - last)
-            last = sent_s
-            self._loop.ticks += 1
             self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
-            due = int((bus.now() - start) / self._period)
-            self._loop.missed_deadlines += max(due - tick - 1, 0)
-            tick = max(tick + 1, due)
         return rows
 
     def _move_to_start(self) -> None:
@@ -232,19 +213,21 @@ class _Session:
             return
         # the fastest point of a raised cosine is pi/2 times its mean speed
         duration = max(RETURN_S, 0.5 * np.pi * farthest / GENTLE_RAD_S)
-        start = self._bus.now()
-        share = 0.0
-        while share < 1.0:
-            self._bus.sleep_until(self._bus.now() + self._period)
-            share = min((self._bus.now() - start) / duration, 1.0)
-            self._sent = origin + raised_cosine(np.array(share)) * way
-            self._bus.write(self._sent)
+        for elapsed in self._between.ticks(duration):
+            self._command(origin + raised_cosine(np.array(elapsed / duration)) * way)
+        self._command(self._start)
 
     def _hold(self, duration_s: float) -> None:
         """Rest at the start pose."""
-        self._sent = self._start.copy()
-        self._bus.write(self._sent)
-        self._bus.sleep_until(self._bus.now() + duration_s)
+        until = self._bus.now() + duration_s
+        for _ in self._between.ticks(duration_s):
+            self._command(self._start)
+        self._bus.sleep_until(until)
+
+    def _command(self, goal: NDArray[np.float64]) -> None:
+        """A command whose effect the guard watches and nobody records."""
+        self._sent = self._bus.write(goal).position_rad
+        self._bus.read()
 
 
 def _rows(
@@ -254,13 +237,14 @@ def _rows(
     sent_s: float,
     goal: NDArray[np.float64],
     sample: BusSample,
+    shift_s: float,
 ) -> list[dict[str, Any]]:
     """One row per moving joint."""
     rows = []
     for joint, i in zip(trial.joints, index, strict=True):
         row: dict[str, Any] = {
-            "send_time_s": sent_s,
-            "read_time_s": sample.time_s,
+            "send_time_s": sent_s + shift_s,
+            "read_time_s": float(sample.time_s[i]) + shift_s,
             "trial": number,
             "joint": joint,
             "frequency_hz": trial.frequency_hz,

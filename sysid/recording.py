@@ -153,7 +153,7 @@ def load(path: Path) -> Recording:
             f"{path} is the truth that belongs to {path.name.removesuffix('.truth.csv')}.csv, "
             "not a recording; give that one."
         )
-    text = _read(path)
+    text = read_text(path)
     parsed = parse(path, text)
     table, metadata, warnings = convert(path, parsed)
     table, more = check(path, table)
@@ -179,7 +179,7 @@ def newest_recording(folder: Path = FOLDER) -> Path:
     return max(found, key=lambda p: p.stat().st_mtime)
 
 
-def _read(path: Path) -> str:
+def read_text(path: Path) -> str:
     largest = 500e6
     try:
         if path.stat().st_size > largest:
@@ -232,6 +232,36 @@ class RecordingWriter:
         for key, value in (header | metadata).items():
             self._file.write(f"# {key}: {json.dumps(value, ensure_ascii=False)}\n")
         self._flush()
+
+    @classmethod
+    def resumed(cls, path: Path, trial: int) -> RecordingWriter:
+        """Go on writing an unfinished recording, from its trial `trial` on.
+
+        Rows of that trial that stand there already are kept and cancelled by a comment line; a
+        torn last line, which is no row, makes room.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read or written.
+        """
+        text = read_text(path)
+        whole = text[: text.rfind("\n") + 1]
+        lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
+        made = cls.__new__(cls)
+        made._columns = tuple(lines[0].split(",")) if lines else ()
+        made._synced = 0.0
+        try:
+            made._file = path.open("r+", encoding="utf-8", newline="\n")
+            made._file.seek(0, os.SEEK_END)
+            made._file.truncate(len(whole.encode()))
+            made._file.seek(0, os.SEEK_END)
+        except OSError as error:
+            raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+        at = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
+        made._file.write(f"# resumed: {json.dumps({'trial': trial, 'at': at})}\n")
+        made._flush()
+        return made
 
     def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
         """Write rows, each a dict of columns; the first decides which optional ones there are."""

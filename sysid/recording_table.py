@@ -60,7 +60,7 @@ def parse(path: Path, text: str) -> Parsed:
         For ragged rows, text where a number belongs, a broken or newer header.
     """
     lines = text.splitlines()
-    metadata = _header(path, lines)
+    metadata = header(path, lines)
     warnings: list[str] = []
     rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if not rows:
@@ -69,8 +69,15 @@ def parse(path: Path, text: str) -> Parsed:
     if len(set(columns)) != len(columns):
         raise InputError(f"{path}, line {rows[0][0]}: a column name stands twice. Rename one.")
     ours = "send_time_s" in columns
-    cells = list(csv.reader(io.StringIO("\n".join(line for _, line in rows[1:]))))
-    numbers = [n for n, _ in rows[1:]]
+    body = rows[1:]
+    cancelled = _cancelled(lines, columns, body) if ours else []
+    for trial, first, last in cancelled:
+        warnings.append(
+            f"trial {trial} was interrupted and recorded again; the second one is used."
+        )
+        body = [(n, line) for n, line in body if not first <= n <= last]
+    cells = list(csv.reader(io.StringIO("\n".join(line for _, line in body))))
+    numbers = [n for n, _ in body]
     # killed in the middle of a line: the last one has no end, or too few cells
     cut = bool(cells) and (len(cells[-1]) < len(columns) or (ours and not text.endswith("\n")))
     if cut:
@@ -162,7 +169,7 @@ def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
     )
 
 
-def _header(path: Path, lines: list[str]) -> dict[str, Any]:
+def header(path: Path, lines: list[str]) -> dict[str, Any]:
     metadata: dict[str, Any] = {}
     for n, line in enumerate(lines, 1):
         if not line.startswith("# ") or ": " not in line:
@@ -187,6 +194,28 @@ def _header(path: Path, lines: list[str]) -> dict[str, Any]:
             "this one reads up to 1. Upgrade."
         )
     return metadata
+
+
+def _cancelled(
+    lines: list[str], columns: list[str], rows: list[tuple[int, str]]
+) -> list[tuple[int, int, int]]:
+    """Trial, first and last line of rows that a line `# resumed` below them says are void."""
+    found = []
+    at = columns.index("trial") if "trial" in columns else -1
+    for n, line in enumerate(lines, 1):
+        if at < 0 or not line.startswith("# resumed: "):
+            continue
+        try:
+            trial = int(json.loads(line.partition(": ")[2])["trial"])
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+        void = [
+            k for k, row in rows
+            if k < n and len(cells := row.split(",")) > at and cells[at] == str(trial)
+        ]  # fmt: skip
+        if void:
+            found.append((trial, void[0], void[-1]))
+    return found
 
 
 def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:

@@ -11,8 +11,8 @@ import yaml
 from calibration_examples import calibration
 
 from common.errors import InputError
+from common.strict_yaml import dump
 from servo_models.calibration import load_calibration
-from servo_models.strict_yaml import dump
 
 
 @pytest.fixture

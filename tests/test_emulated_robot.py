@@ -49,7 +49,7 @@ def swing(bus: EmulatedBus, seconds: float, amplitude: float = 0.3, hertz: float
     for k in range(int(seconds / 0.019)):
         bus.sleep_until(start + k * 0.019)
         goal = POSE + amplitude * np.sin(2 * np.pi * hertz * (bus.now() - start))
-        ticks.append((bus.write(goal), goal, bus.read()))
+        ticks.append((bus.write(goal).time_s, goal, bus.read()))
     return ticks
 
 
@@ -296,7 +296,7 @@ def test_truth_files_say_every_parameter_and_every_read(tmp_path):
     assert tuple(table.columns) == TRUTH_COLUMNS
     assert len(table) == 12 * len(ticks)
     assert (table["reading_time_s"] <= table["read_time_s"]).all()
-    assert table["read_time_s"].unique().tolist() == [sample.time_s for _, _, sample in ticks]
+    assert table["read_time_s"].unique().tolist() == [sample.time_s[0] for _, _, sample in ticks]
     with pytest.raises(FileExistsRefusal):
         bus.write_truth(tmp_path / "sweep")
     bus.write_truth(tmp_path / "sweep", force=True)

@@ -14,7 +14,8 @@ import pytest
 
 from common.errors import BusError, FileExistsRefusal, InputError
 from common.joints import DEFAULT_POSE, JOINT_NAMES
-from hardware.bus import BusSample
+from hardware.bus import BusSample, Sent
+from hardware.limits import PositionLimits
 from sim import EmulatedBus, RobotSpec, draw_robot
 from sysid.command_playback import playback
 from sysid.excitation import LEAD_IN_S, Plan, plan
@@ -41,6 +42,7 @@ class ScriptedBus:
 
     def __init__(self, start: np.ndarray, slow_at: int = -1, fail_at: int = -1, raises=None):
         self.metadata = {"kind": "scripted"}
+        self.limits = PositionLimits.none(12)
         self.goal, self.time, self.calls = start.astype(float), 0.0, []
         self.written: list[tuple[float, np.ndarray]] = []
         self._slow_at, self._fail_at, self._raises = slow_at, fail_at, raises
@@ -58,14 +60,15 @@ class ScriptedBus:
         self.time += 0.055 if len(self.written) == self._slow_at else 0.0
         self.goal = position_rad.copy()
         self.written.append((self.time, self.goal))
-        return self.time
+        return Sent(self.time, self.goal)
 
     def read(self):
         self.time += 0.001
-        return BusSample(self.time, self.goal.copy(), np.arange(12))
+        return BusSample(np.full(12, self.time), self.goal.copy(), np.arange(12))
 
     def torque(self, on):
         self.calls.append(f"torque {on}")
+        return True
 
     def close(self):
         self.calls.append("close")

@@ -1,0 +1,33 @@
+"""What the commands that talk to a bus share: the joint map to use, and opening the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from cli import terminal
+from hardware.connect import BusAddress, open_guarded, parse_address
+from hardware.guard import GuardedBus
+from hardware.joint_map import JointMap, load_joint_map
+
+JOINTS_FILE = Path("joints.yaml")
+
+
+def chosen_map(text: str | None) -> JointMap | None:
+    """The joint map a user names (a file or a preset), else `joints.yaml` if it is here."""
+    if text is None and JOINTS_FILE.exists():
+        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.")
+        return load_joint_map(JOINTS_FILE)
+    if text is None:
+        return None
+    return load_joint_map(text)
+
+
+def connect(
+    address: BusAddress | str, joint_map: str | None, joints: Sequence[str] | None = None
+) -> GuardedBus:
+    """A guarded bus in servo coordinates, or a sentence about why not."""
+    if isinstance(address, str):
+        address = parse_address(address)
+    chosen = chosen_map(joint_map)
+    return open_guarded(address, chosen.per_servo() if chosen else None, joints)

@@ -1,0 +1,151 @@
+"""`emulate`: a robot without a robot, behind the real protocols."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+import yaml
+
+from cli import terminal
+from common.errors import InputError
+from common.files import write_text
+from hardware.esp32_bus import SOCKET
+from hardware.feetech_registers import BAUD_RATES, SCS0009, STS3215
+from hardware.joint_map import load_joint_map
+from sim.bus_faults import BusFaults
+from sim.emulated_robot import RobotSpec, draw_robot
+from sim.esp32_emulator import ProxyEmulator
+from sim.esp32_socket import ProxySocket
+from sim.feetech_emulator import FeetechEmulator
+from sim.feetech_pty import FeetechPty
+from sim.servo_bench import ServoBench
+
+
+@dataclass(frozen=True)
+class Common:
+    """What both emulators take."""
+
+    seed: int = 0
+    """Seed of the robot: its servos, its lost polls, its noise."""
+    faults: str = ""
+    """What goes wrong, as kind=probability per answer: lost=0.02,late=0.01,corrupted=0.01. Kinds:
+    lost, late, truncated, corrupted, duplicated, foreign, wrong-length, error-bits, frozen,
+    brown-out, unplugged, second-writer."""
+    by_hand: bool = False
+    """Someone swings the joints while they are limp, for trying calibrate-joints."""
+    truth: Path | None = None
+    """Write what the robot really is to this YAML file."""
+    force: bool = False
+    """Replace the file of --truth."""
+
+
+@dataclass(frozen=True)
+class Esp32(Common):
+    """The Mini Pupper 2's proxy: a socket, with the real one's quirks, in real time.
+
+    Example: pupper-sysid emulate esp32 --socket /tmp/pupper.socket
+    """
+
+    socket: Path = SOCKET
+    """Where to listen."""
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        rng = np.random.default_rng(self.seed)
+        bench = ServoBench(
+            draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0], self.by_hand
+        )
+        emulator = ProxyEmulator(bench, rng, BusFaults.parse(self.faults, rng))
+        server = ProxySocket(emulator, self.socket)
+        _write_truth(self, bench)
+        name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
+        _serve(server, f"Emulated Mini Pupper 2 at {self.socket}.", name)
+
+
+@dataclass(frozen=True)
+class Feetech(Common):
+    """A line of Feetech servos: a serial device, in real time, at the pace of its baud rate.
+
+    Example: pupper-sysid emulate feetech --model sts3215 --ids 1-12
+    """
+
+    model: Literal["sts3215", "scs0009"] = "sts3215"
+    """Which servos."""
+    ids: str = "1-12"
+    """Which of them are there: 1-12 or 4,5,6."""
+    baud: int | None = None
+    """Rate at which they listen; default 1000000 (STS3215) or 500000 (SCS0009)."""
+    link: Path | None = None
+    """A stable name for the device; survives being unplugged."""
+    echo: bool = False
+    """The adapter sends the host's own bytes back."""
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        rng = np.random.default_rng(self.seed)
+        series = STS3215 if self.model == "sts3215" else SCS0009
+        layout = load_joint_map("sts3215" if series is STS3215 else "mini_pupper_2_direct")
+        baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
+        if baud not in BAUD_RATES:
+            raise InputError(f"--baud {baud}: servos know {', '.join(map(str, BAUD_RATES))}.")
+        # read directly, a servo answers for the very moment: no polls in between, none lost
+        spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
+        bench = ServoBench(draw_robot(rng, spec), layout, rng.spawn(1)[0], self.by_hand)
+        emulator = FeetechEmulator(
+            bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
+            BusFaults.parse(self.faults, rng), self.echo,
+        )  # fmt: skip
+        server = FeetechPty(emulator, self.link or Path(tempfile.mkdtemp()) / "servos")
+        _write_truth(self, bench)
+        count = len(emulator.servos)
+        _serve(
+            server,
+            f"{count} emulated {series.name} at {server.device}, {baud} baud.",
+            f"feetech:{server.device}",
+        )
+
+
+Emulate = (
+    Annotated[Esp32, tyro.conf.subcommand("esp32")]
+    | Annotated[Feetech, tyro.conf.subcommand("feetech")]
+)
+
+
+def _write_truth(options: Common, bench: ServoBench) -> None:
+    if options.truth:
+        text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
+        write_text(options.truth, text, options.force)
+
+
+def _serve(server: ProxySocket | FeetechPty, what: str, name: str) -> None:
+    terminal.out.print(what, soft_wrap=True)
+    terminal.out.print(
+        f"In another terminal:\n  pupper-sysid sweep --freqs 1-10 --joints LF --bus {name}\n"
+        f"  pupper-sysid monitor --bus {name}\nCtrl-C ends it.",
+        soft_wrap=True,
+    )
+    try:
+        server.serve()
+    finally:
+        server.close()
+
+
+def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
+    """Ids that `text` names: 1-12, or 4,5,6."""
+    ids: list[int] = []
+    for part in (piece.strip() for piece in text.split(",")):
+        low, dash, high = part.partition("-")
+        if not low.isdecimal() or (dash and not high.isdecimal()):
+            raise InputError(f"--ids: '{part}' is no id. Write 1-12 or 4,5,6.")
+        ids += range(int(low), int(high if dash else low) + 1)
+    wrong = [i for i in ids if i not in known]
+    if wrong or not ids:
+        raise InputError(
+            f"--ids {text}: the emulated robot has the ids {min(known)} to {max(known)}."
+        )
+    return sorted(set(ids))

@@ -1,0 +1,192 @@
+"""Feetech servo series, by model number: what stands at which address, and in which byte order.
+
+Two series that look alike differ where it hurts: address 48 locks the EEPROM of one and limits the
+torque of the other. So nothing is addressed before a servo has said its model number, which both
+series keep at address 3 in their own byte order.
+
+Sources: the vendor's memory tables (wiki and ST3215 sheet), the Mini Pupper's firmware, LeRobot's
+tables; facts that disagree are left out. Current is only told by the STS series.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+BROADCAST_ID = 0xFE
+HIGHEST_ID = 253
+
+ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
+BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+"""By the number in the servo's baud register."""
+
+MODEL_ADDRESS = 3
+_SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
+
+
+@dataclass(frozen=True)
+class Register:
+    """A value in a servo's memory.
+
+    Attributes
+    ----------
+    address, size : int
+        Decimal address; 1 or 2 bytes.
+    sign_bit : int or None
+        Bit that says "negative" of a value stored as sign and magnitude.
+    """
+
+    address: int
+    size: int = 1
+    sign_bit: int | None = None
+
+
+_COMMON = {
+    "firmware_major": Register(0),
+    "firmware_minor": Register(1),
+    "model": Register(MODEL_ADDRESS, 2),
+    "id": Register(5),
+    "baud": Register(6),
+    "return_delay": Register(7),
+    "response_level": Register(8),
+    "min_angle": Register(9, 2),
+    "max_angle": Register(11, 2),
+    "max_temperature": Register(13),
+    "max_voltage": Register(14),
+    "min_voltage": Register(15),
+    "max_torque": Register(16, 2),
+    "p": Register(21),
+    "d": Register(22),
+    "i": Register(23),
+    "min_start_force": Register(24, 2),
+    "dead_zone_cw": Register(26),
+    "dead_zone_ccw": Register(27),
+    "torque_enable": Register(40),
+    "acceleration": Register(41),
+    "goal_time": Register(44, 2),
+    "goal_speed": Register(46, 2),
+    "speed": Register(58, 2, _SPEED_SIGN),
+    "load": Register(60, 2, _LOAD_SIGN),
+    "voltage": Register(62),
+    "temperature": Register(63),
+    "registered": Register(64),
+    "status": Register(65),
+    "moving": Register(66),
+}
+
+
+@dataclass(frozen=True)
+class Series:
+    """One family of servos.
+
+    Attributes
+    ----------
+    name : str
+    model : int
+        Model number that the servo reports.
+    big_endian : bool
+        Byte order inside a two-byte register.
+    counts : int
+        Of the whole range.
+    has_sync_read : bool
+    lock_address : int
+    registers : dict of str to Register
+    """
+
+    name: str
+    model: int
+    big_endian: bool
+    counts: int
+    has_sync_read: bool
+    lock_address: int
+    registers: dict[str, Register]
+
+    def word(self, value: int) -> bytes:
+        """Two bytes of a register, in this series' order; `value` must fit."""
+        return int(value).to_bytes(2, "big" if self.big_endian else "little")
+
+    def decode(self, name: str, memory: bytes, start: int = 0) -> int:
+        """Value of register `name` in `memory`, a copy of the servo's from address `start`."""
+        register = self.registers[name]
+        at = register.address - start
+        raw = memory[at : at + register.size]
+        if at < 0 or len(raw) != register.size:
+            raise IndexError(f"register {name} is not in memory {start}..{start + len(memory)}")
+        value = int.from_bytes(raw, "big" if self.big_endian else "little")
+        return signed(value, register.sign_bit)
+
+    def encode(self, name: str, value: int) -> bytes:
+        """Bytes of register `name`; the value must fit.
+
+        Raises
+        ------
+        OverflowError
+            If it does not.
+        """
+        register = self.registers[name]
+        if value < 0 and register.sign_bit is not None:
+            value = -value | 1 << register.sign_bit
+        return int(value).to_bytes(register.size, "big" if self.big_endian else "little")
+
+
+def signed(value: int, sign_bit: int | None) -> int:
+    """Number of a sign-and-magnitude value.
+
+    Examples
+    --------
+    >>> signed(0x8005, 15), signed(5, 15)
+    (-5, 5)
+    """
+    if sign_bit is None or not value >> sign_bit & 1:
+        return value
+    return -(value & (1 << sign_bit) - 1)
+
+
+SCS0009 = Series(
+    "SCS0009", 1284, True, 1024, False, 48,
+    _COMMON | {"goal": Register(42, 2), "position": Register(56, 2)},
+)  # fmt: skip
+STS3215 = Series(
+    "STS3215", 777, False, 4096, True, 55,
+    _COMMON
+    | {
+        "homing_offset": Register(31, 2, _OFFSET_SIGN),
+        "mode": Register(33),
+        "goal": Register(42, 2, 15),
+        "torque_limit": Register(48, 2),
+        "position": Register(56, 2, 15),
+        "current": Register(69, 2, 15),
+    },
+)  # fmt: skip
+SERIES = {series.model: series for series in (SCS0009, STS3215)}
+
+
+def series_of_model_bytes(raw: bytes) -> Series | None:
+    """The series whose model number stands in `raw` (2 bytes) in its own byte order.
+
+    Examples
+    --------
+    >>> series_of_model_bytes(bytes([0x09, 0x03])).name
+    'STS3215'
+    >>> series_of_model_bytes(bytes([0x05, 0x04])).name
+    'SCS0009'
+    """
+    for series in SERIES.values():
+        if raw == series.word(series.model):
+            return series
+    return None
+
+
+def error_words(status: int) -> str:
+    """The error bits of a status byte in words.
+
+    Examples
+    --------
+    >>> error_words(33)
+    'voltage, overload'
+    """
+    named = [word for bit, word in ERROR_BITS.items() if status & bit]
+    rest = status & ~int(np.bitwise_or.reduce(list(ERROR_BITS)))
+    return ", ".join([*named, *([f"unknown bits {rest:#04x}"] if rest else [])])

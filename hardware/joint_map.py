@@ -1,0 +1,357 @@
+"""Joint map: which servo moves which joint, and what its counts mean, as one YAML file.
+
+    joint_map = load_joint_map("mini_pupper_2")      # a preset, or Path("joints.yaml")
+    counts = joint_map.to_counts(angles)              # joints of the simulator -> servo counts
+    angles = joint_map.to_angles(counts)              # and back, by the same transform
+
+A servo's angle is `neutral_rad + sign * (count - centre - offset) / counts_per_rad`. On the Mini
+Pupper a push rod makes the third servo of a leg set the *absolute* angle of the calf, thigh + calf:
+`linkage: parallel knee` says so, and both directions go through `_servo_from_joint`.
+
+Two things are called angles here. In *joint* coordinates a calf is bent relative to its thigh, as
+in the simulator; a controller commands those. In *servo* coordinates (`joint_map.per_servo()`)
+each joint is one servo's angle, told as if the thigh stood at its neutral; a sweep commands those,
+so that one servo moves at a time and its readings are its own.
+
+Counts have a frame: a servo on a direct bus speaks raw counts, the robot's proxy speaks counts
+that its firmware has shifted by a stored calibration. A map of one frame is refused by a bus of
+the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from common.errors import InputError
+from common.files import write_text
+from common.joints import DEFAULT_POSE, JOINT_NAMES
+from common.strict_yaml import dump, place_text, read
+from hardware.limits import Coupling, PositionLimits
+
+SCHEMA = "pupper-sysid joint map"
+SCHEMA_VERSION = 1
+PRESETS = ("mini_pupper_2", "mini_pupper_2_300deg", "mini_pupper_2_direct", "sts3215")
+
+Frame = Literal["proxy", "raw"]
+Linkage = Literal["parallel knee", "none"]
+
+_FILE = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class JointEntry(BaseModel):
+    """One joint of the file."""
+
+    model_config = _FILE
+
+    id: int = Field(ge=0, le=253)
+    """Of the servo on its bus."""
+    sign: Literal[1, -1]
+    """Direction of the counts as the servo's angle grows."""
+    neutral_rad: float = Field(ge=-7, le=7)
+    """The servo's angle at its centre count plus offset: absolute for a calf on a push rod."""
+    counts_per_rad: float = Field(gt=1, lt=100_000)
+    offset_counts: int = Field(ge=-4096, le=4096)
+    """What this servo's horn is off by."""
+    limits_counts: tuple[int, int]
+    """Lowest and highest count the servo may be sent to."""
+    limits_rad: tuple[float, float]
+    """Lowest and highest angle of the simulator's joint."""
+    source: str
+    """Who says so: a preset's source, or the calibration that measured it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_are_pairs(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            data = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        return data
+
+    @model_validator(mode="after")
+    def _limits_are_ordered(self) -> JointEntry:
+        for name in ("limits_counts", "limits_rad"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} is [{low}, {high}]: the first must be the lower one")
+        return self
+
+
+class JointMapFile(BaseModel):
+    """The whole file."""
+
+    model_config = _FILE
+
+    schema_: Literal["pupper-sysid joint map"] = Field(alias="schema")
+    schema_version: Literal[1]
+    name: str
+    frame: Frame
+    counts: Literal[1024, 4096]
+    """Counts of the encoder's whole range; the centre is half of it."""
+    linkage: Linkage
+    source: str
+    joints: dict[str, JointEntry] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _names_and_ids(self) -> JointMapFile:
+        unknown = [j for j in self.joints if j not in JOINT_NAMES]
+        if unknown:
+            raise ValueError(f"{unknown[0]} is no joint; known are {', '.join(JOINT_NAMES)}")
+        ids: dict[int, str] = {}
+        for joint, entry in self.joints.items():
+            if entry.id in ids:
+                raise ValueError(f"{joint} and {ids[entry.id]} have the same id {entry.id}")
+            ids[entry.id] = joint
+            low, high = entry.limits_counts
+            if low < 0 or high > self.counts - 1:
+                raise ValueError(f"{joint}: limits_counts {[low, high]} leave 0..{self.counts - 1}")
+        return self
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """Servos of the joints `joint_names`, in the project's order; see the module's docstring."""
+
+    file: JointMapFile
+    joint_names: tuple[str, ...]
+    coordinates: Literal["joint", "servo"] = "joint"
+
+    @property
+    def frame(self) -> str:
+        """Of the counts: "proxy" or "raw"."""
+        return self.file.frame
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Servo ids, in the order of `joint_names`."""
+        return tuple(self._entry(j).id for j in self.joint_names)
+
+    def select(self, joints: Sequence[str]) -> JointMap:
+        """The map of some joints only.
+
+        Raises
+        ------
+        InputError
+            If a joint is not in the map, or a calf on a push rod comes without its thigh while
+            joint coordinates are asked for.
+        """
+        missing = [j for j in joints if j not in self.file.joints]
+        if missing:
+            raise InputError(
+                f"the joint map {self.file.name} has no {missing[0]}; "
+                f"it has {', '.join(self.file.joints)}."
+            )
+        if self.coordinates == "joint" and self.file.linkage != "none":
+            for calf in (j for j in joints if j.endswith("_calf")):
+                thigh = calf.replace("calf", "thigh")
+                if thigh not in joints:
+                    raise InputError(
+                        f"{calf} hangs on {thigh} by a push rod: use both, or neither."
+                    )
+        return replace(self, joint_names=tuple(j for j in JOINT_NAMES if j in joints))
+
+    def per_servo(self) -> JointMap:
+        """The same map in servo coordinates."""
+        return replace(self, coordinates="servo")
+
+    def counts_per_rad(self) -> NDArray[np.float64]:
+        """Counts per radian, shape (joints,)."""
+        return np.array([self._entry(j).counts_per_rad for j in self.joint_names])
+
+    def zero_rad(self) -> NDArray[np.float64]:
+        """Servo-coordinate angle of each joint's neutral count, shape (joints,) [rad]."""
+        neutral = self._neutral()
+        calf, thigh = self._legs()
+        neutral[calf] -= self._thigh_neutral(calf)
+        return neutral
+
+    def sign(self) -> NDArray[np.float64]:
+        """Direction of the counts, shape (joints,)."""
+        return np.array([float(self._entry(j).sign) for j in self.joint_names])
+
+    def to_counts(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Counts, not rounded, of angles, both shape (..., joints)."""
+        servo = self._servo_from_joint(np.asarray(position_rad, float), +1)
+        return self._zero_count() + self.sign() * self.counts_per_rad() * (servo - self._neutral())
+
+    def to_angles(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Angles of counts, both shape (..., joints); NaN stays NaN."""
+        counts = np.asarray(counts, float)
+        servo = self._neutral() + self.sign() * (counts - self._zero_count()) / (
+            self.counts_per_rad()
+        )
+        return self._servo_from_joint(servo, -1)
+
+    def clip_counts(self, counts: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Whole counts within the servos' limits: the last word before anything is packed."""
+        limits = np.array([self._entry(j).limits_counts for j in self.joint_names])
+        return np.clip(np.rint(counts), limits[:, 0], limits[:, 1]).astype(np.int64)
+
+    def position_limits(self) -> PositionLimits:
+        """Bounds of both the servos' counts and the joints' angles, in this map's coordinates."""
+        ends = np.array([self._entry(j).limits_counts for j in self.joint_names], float)
+        servo = (
+            self._neutral()[:, None]
+            + self.sign()[:, None]
+            * (ends - self._zero_count()[:, None])
+            / (self.counts_per_rad()[:, None])
+        )
+        servo.sort(axis=1)
+        joint = np.array([self._entry(j).limits_rad for j in self.joint_names])
+        calf, thigh = self._legs()
+        both = np.stack([np.maximum(servo, joint)[:, 0], np.minimum(servo, joint)[:, 1]], axis=1)
+        if not len(calf):
+            if self.coordinates == "servo" and self.file.linkage != "none":
+                # a calf without its thigh: the thigh is taken to rest at its neutral
+                alone = [i for i, j in enumerate(self.joint_names) if j.endswith("_calf")]
+                both[alone] = servo[alone] - self._thigh_neutral(alone)[:, None]
+            return PositionLimits(both[:, 0], both[:, 1])
+        if self.coordinates == "joint":
+            both[calf] = joint[calf]
+            other, sign = servo[calf], +1
+        else:
+            shift = self._thigh_neutral(calf)[:, None]
+            both[calf] = servo[calf] - shift
+            other, sign = joint[calf] - shift, -1
+        coupling = Coupling(calf, thigh, sign, other[:, 0], other[:, 1])
+        return PositionLimits(both[:, 0], both[:, 1], coupling)
+
+    def metadata(self) -> dict[str, Any]:
+        """What a recording should say of it."""
+        zero = self.zero_rad()
+        names = self.joint_names
+        return {
+            "joint_map": self.file.name,
+            "count_frame": self.frame,
+            "coordinates": self.coordinates,
+            "command_quantum_rad": {j: 1 / self._entry(j).counts_per_rad for j in names},
+            "command_rounding": dict.fromkeys(names, "nearest"),
+            "count_zero_rad": {j: float(z) for j, z in zip(names, zero, strict=True)},
+        }
+
+    def save(self, path: Path, force: bool = False) -> None:
+        """Write the map as YAML.
+
+        Raises
+        ------
+        FileExistsRefusal
+            If the file exists and `force` is not set.
+        """
+        data = self.file.model_dump(by_alias=True)
+        for entry in data["joints"].values():
+            for name in ("limits_counts", "limits_rad"):
+                entry[name] = list(entry[name])
+        write_text(path, dump(data), force)
+
+    def _entry(self, joint: str) -> JointEntry:
+        return self.file.joints[joint]
+
+    def _neutral(self) -> NDArray[np.float64]:
+        return np.array([self._entry(j).neutral_rad for j in self.joint_names])
+
+    def _thigh_neutral(self, calf: Sequence[int] | NDArray[np.intp]) -> NDArray[np.float64]:
+        """Neutral of the thighs that the calves at these indices hang on."""
+        thighs = (self.joint_names[i].replace("calf", "thigh") for i in calf)
+        return np.array(
+            [
+                self._entry(t).neutral_rad if t in self.file.joints else DEFAULT_POSE[t]
+                for t in thighs
+            ]
+        )
+
+    def _zero_count(self) -> NDArray[np.float64]:
+        offsets = np.array([float(self._entry(j).offset_counts) for j in self.joint_names])
+        return self.file.counts / 2 + offsets
+
+    def _legs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indices of the calves that hang on a thigh, and of those thighs."""
+        names = self.joint_names
+        pairs = [
+            (i, names.index(j.replace("calf", "thigh")))
+            for i, j in enumerate(names)
+            if j.endswith("_calf") and j.replace("calf", "thigh") in names
+        ]
+        if self.file.linkage == "none":
+            pairs = []
+        found = np.array(pairs, np.intp).reshape(-1, 2)
+        return found[:, 0], found[:, 1]
+
+    def _servo_from_joint(self, angle: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
+        """The linkage: servo angles of joint angles (+1), or joint angles of servo angles (-1)."""
+        angle = angle.copy()
+        if self.file.linkage == "none":
+            return angle
+        if self.coordinates == "servo":
+            calf = [i for i, j in enumerate(self.joint_names) if j.endswith("_calf")]
+            angle[..., calf] += direction * self._thigh_neutral(calf)
+        else:
+            calf, thigh = self._legs()
+            angle[..., calf] += direction * angle[..., thigh]
+        return angle
+
+
+def load_joint_map(path_or_preset: Path | str) -> JointMap:
+    """Read a joint map, or a preset by its name.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or if anything in it cannot be trusted.
+
+    Examples
+    --------
+    >>> pupper = load_joint_map("mini_pupper_2")
+    >>> standing = np.array([DEFAULT_POSE[j] for j in pupper.joint_names])
+    >>> pupper.clip_counts(pupper.to_counts(standing)).tolist() == [512] * 12
+    True
+    """
+    if isinstance(path_or_preset, str) and path_or_preset in PRESETS:
+        with resources.as_file(resources.files("hardware") / "presets") as folder:
+            return _load(folder / f"{path_or_preset}.yaml")
+    path = Path(path_or_preset)
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Presets of joint maps: {', '.join(PRESETS)}.")
+    return _load(path)
+
+
+def joint_map_from(data: dict[str, Any], name: str, lines: dict | None = None) -> JointMap:
+    """A joint map from plain data, as in the file.
+
+    Raises
+    ------
+    InputError
+        The sentence names the place and what is wrong with it.
+    """
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        raise InputError(
+            f"{name} is no joint map: it does not say `schema: {SCHEMA}` at the top. Make one with "
+            "`pupper-sysid calibrate-joints`."
+        )
+    version = data.get("schema_version")
+    if isinstance(version, int) and version > SCHEMA_VERSION:
+        raise InputError(
+            f"{name} was written by a newer version of pupper-sysid (schema_version {version}; "
+            f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
+        )
+    try:
+        file = JointMapFile.model_validate(data)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        place = tuple(p for p in fault["loc"] if isinstance(p, str | int))
+        line = (lines or {}).get(place)
+        at = f", line {line}" if line else ""
+        what = fault["msg"].removeprefix("Value error, ")
+        where = f": {place_text(place)}" if place else ""
+        raise InputError(f"{name}{at}{where}: {what[:1].lower()}{what[1:]}.") from error
+    return JointMap(file, tuple(j for j in JOINT_NAMES if j in file.joints))
+
+
+def _load(path: Path) -> JointMap:
+    data, lines = read(path)
+    return joint_map_from(data, str(path), lines)

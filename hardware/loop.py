@@ -1,0 +1,123 @@
+"""A control loop at a fixed rate that does not drift, and the account of how well it kept it.
+
+    loop = FixedRateLoop(bus, period_s=0.02)
+    for elapsed_s in loop.ticks(duration_s=5.0):
+        ...
+
+Tick `k` is due `k` periods after the start, whatever happened before; a tick that cannot start in
+time is left out and counted. `request_real_time_priority` asks the system to run this process
+first, and says in words whether it does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from common.errors import InputError, SafetyStop
+
+MOST_MISSES_IN_A_ROW = 10
+"""After so many ticks in a row without a timely one, nobody is in control of the robot."""
+
+
+class Timed(Protocol):
+    """What a loop needs of a bus."""
+
+    def now(self) -> float:
+        """Time [s]."""
+        ...
+
+    def sleep_until(self, time_s: float) -> None:
+        """Return when `now()` has reached `time_s`."""
+        ...
+
+
+@dataclass
+class FixedRateLoop:
+    """Ticks at a fixed rate.
+
+    Attributes
+    ----------
+    timed : Timed
+        Whose clock counts.
+    period_s : float
+        The rate that is asked for.
+    ticks_done : int
+    missed_deadlines : int
+        Ticks left out because the one before took too long.
+    starts_s : list of list of float
+        When each tick began, per call of `ticks`.
+    """
+
+    timed: Timed
+    period_s: float
+    most_misses: int = MOST_MISSES_IN_A_ROW
+    ticks_done: int = 0
+    missed_deadlines: int = 0
+    starts_s: list[list[float]] = field(default_factory=list)
+
+    def __post_init__(self):
+        if not (np.isfinite(self.period_s) and self.period_s > 0):
+            raise InputError(f"loop_period_s is {self.period_s}; it must be a positive number.")
+
+    def ticks(self, duration_s: float) -> Iterator[float]:
+        """Seconds since the first tick, at every tick for `duration_s`.
+
+        Raises
+        ------
+        SafetyStop
+            If the loop has missed `most_misses` deadlines in a row.
+        """
+        timed, start, tick, late = self.timed, self.timed.now(), 0, 0
+        starts: list[float] = []
+        self.starts_s.append(starts)
+        while tick * self.period_s < duration_s:
+            timed.sleep_until(start + tick * self.period_s)
+            began = timed.now()
+            starts.append(began)
+            yield began - start
+            self.ticks_done += 1
+            due = int((timed.now() - start) / self.period_s)
+            missed = max(due - tick - 1, 0)
+            self.missed_deadlines += missed
+            late = late + missed if missed else 0
+            if late >= self.most_misses:
+                raise SafetyStop(
+                    f"the loop missed {late} deadlines of {1e3 * self.period_s:.1f} ms in a row: "
+                    "this host is too slow or too busy to be in control. Stop other programs, or "
+                    "choose a lower --rate."
+                )
+            tick = max(tick + 1, due)
+
+    def summary(self) -> dict[str, float]:
+        """Numbers for the recording's footer, in seconds."""
+        counts = {"ticks": self.ticks_done, "missed_deadlines": self.missed_deadlines}
+        gaps = np.concatenate([np.diff(s) for s in self.starts_s] or [[]])
+        if not len(gaps):
+            return {"period_s": self.period_s} | counts
+        jitter = np.abs(gaps - self.period_s)
+        return (
+            {"period_s": self.period_s}
+            | counts
+            | {
+                "mean_period_s": round(float(gaps.mean()), 7),
+                "sd_period_s": round(float(gaps.std()), 7),
+                "longest_period_s": round(float(gaps.max()), 7),
+                "jitter_p99_s": round(float(np.percentile(jitter, 99)), 7),
+            }
+        )
+
+
+def request_real_time_priority() -> str:
+    """Ask for real-time scheduling of this process; returns what came of it, in words."""
+    if not hasattr(os, "sched_setscheduler"):
+        return "normal priority: this system has no real-time scheduling"
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    except OSError:
+        return "normal priority: real-time scheduling is not allowed to this user"
+    return "real-time priority (SCHED_FIFO)"

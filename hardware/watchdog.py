@@ -1,0 +1,191 @@
+"""A small second process that parks the robot when the first one is killed, or hangs.
+
+Neither the robot's proxy nor a servo notices that its host has died: the last goal is held for
+ever, with full torque. So whoever drives a robot starts a `Watchdog` and calls `beat` often. When
+the pipe between the two ends without a goodbye, or when the beat stops for a second, the watchdog
+ends what is left of the driver, opens the bus itself, stops the joints, takes them back to the
+pose the robot was found in, and switches the torque off.
+
+    python -m hardware.watchdog          (started by `Watchdog`, never by hand)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import BusError, PupperError
+from hardware.joint_map import JointMap, joint_map_from
+
+if TYPE_CHECKING:
+    from hardware.connect import BusAddress
+
+HANG_S = 1.0
+"""Without a beat for so long, the driver counts as hung."""
+PARK_WITHIN_S = 0.5
+"""The way back takes at most this long, so that all is over within a second."""
+
+_BEAT_S = 0.05
+_OPEN_WITHIN_S = 0.4
+_START_WITHIN_S = 20.0
+
+
+class Watchdog:
+    """The driver's end: starts the process and keeps it quiet.
+
+    Parameters
+    ----------
+    address : BusAddress
+    joint_map : JointMap or None
+    joints : sequence of str or None
+        As given to `open_bus`.
+
+    Raises
+    ------
+    BusError
+        If the process does not start.
+    """
+
+    def __init__(
+        self, address: BusAddress, joint_map: JointMap | None, joints: Sequence[str] | None
+    ):
+        orders = {
+            "kind": address.kind,
+            "where": address.where,
+            "baud": address.baud,
+            "map": joint_map.file.model_dump(mode="json", by_alias=True) if joint_map else None,
+            "coordinates": joint_map.coordinates if joint_map else None,
+            "joints": list(joints) if joints else None,
+            "driver": os.getpid(),
+        }
+        root = str(Path(__file__).resolve().parents[1])
+        path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+        # a session of its own: Ctrl-C at the terminal is for the driver
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "hardware.watchdog"], stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, start_new_session=True, env=os.environ | {"PYTHONPATH": path},
+        )  # fmt: skip
+        self._beaten = 0.0
+        self._say(orders)
+        assert self._process.stdout is not None
+        ready, _, _ = select.select([self._process.stdout], [], [], _START_WITHIN_S)
+        if not ready or self._process.stdout.readline() != b"ready\n":
+            self._process.kill()
+            raise BusError(
+                "the watchdog process did not start, and without it nobody would park the robot "
+                "if this one died. Check the machine's load and memory, then try again."
+            )
+
+    def arm(self, pose_rad: NDArray[np.float64]) -> None:
+        """The torque is on: from now on beats are expected; `pose_rad` is where to park."""
+        self._say({"arm": [float(x) for x in pose_rad]})
+
+    def disarm(self) -> None:
+        """The torque is off: there is nothing to watch over."""
+        self._say({"disarm": True})
+
+    def beat(self) -> None:
+        """Someone is in control; cheap enough for every tick."""
+        now = time.monotonic()
+        if now - self._beaten > _BEAT_S:
+            self._beaten = now
+            self._say({"beat": True})
+
+    def close(self) -> None:
+        """Say goodbye; may be called twice."""
+        self._say({"bye": True})
+        pipe = self._process.stdin
+        with contextlib.suppress(OSError):
+            if pipe is not None and not pipe.closed:
+                pipe.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+
+    def _say(self, message: dict[str, Any]) -> None:
+        pipe = self._process.stdin
+        if pipe is None or pipe.closed:
+            return
+        with contextlib.suppress(OSError):
+            pipe.write(json.dumps(message).encode() + b"\n")
+            pipe.flush()
+
+
+def main() -> None:
+    """The other end: wait, and park if need be."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    orders = json.loads(sys.stdin.buffer.readline())
+    # everything that parking needs is loaded now, not when it is urgent
+    import hardware.connect  # noqa: F401
+
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    pipe, heard, pose = sys.stdin.fileno(), b"", None
+    last = time.monotonic()
+    while True:
+        ready, _, _ = select.select([pipe], [], [], 0.1)
+        if ready:
+            data = os.read(pipe, 65_536)
+            last = time.monotonic()
+            *lines, heard = (heard + data).split(b"\n")
+            for line in lines:
+                message = json.loads(line)
+                if "bye" in message:
+                    return
+                if "arm" in message:
+                    pose = message["arm"]
+                if "disarm" in message:
+                    pose = None
+            if not data:
+                break
+        elif pose is not None and time.monotonic() - last > HANG_S:
+            with contextlib.suppress(OSError):
+                os.kill(orders["driver"], signal.SIGKILL)
+            break
+    if pose is not None:
+        park(orders, np.array(pose))
+
+
+def park(orders: dict[str, Any], pose_rad: NDArray[np.float64]) -> None:
+    """Open the bus that the driver has left, and park the robot."""
+    from hardware.connect import BusAddress, open_bus
+    from hardware.guard import GuardedBus, GuardLimits
+
+    joint_map = joint_map_from(orders["map"], "the joint map") if orders["map"] else None
+    if joint_map is not None and orders["coordinates"] == "servo":
+        joint_map = joint_map.per_servo()
+    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
+    limits = GuardLimits(park_within_s=PARK_WITHIN_S)
+    until = time.monotonic() + _OPEN_WITHIN_S
+    while True:
+        try:
+            bus = GuardedBus(open_bus(address, joint_map, orders["joints"]), limits)
+            break
+        except PupperError:
+            # the driver's lock goes with its last thread, which can take a moment
+            if time.monotonic() > until:
+                return
+            time.sleep(0.02)
+    try:
+        bus.torque(True)
+        bus.park(pose_rad)
+    except PupperError:
+        bus.bus.torque(False)
+    finally:
+        bus.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Continue a recording that was cut short: which trial comes next, and what time it is there.
+
+A trial is finished if its rows reach its end; the first unfinished one is recorded again from its
+start. Time goes on as it did on the wall: the file's last row was written when the file was last
+changed.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.errors import InputError
+from sysid.excitation import Plan
+from sysid.recording import TITLE, read_text
+from sysid.recording_table import header, parse
+
+_LEAST_PAUSE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Where an unfinished recording goes on.
+
+    Attributes
+    ----------
+    next_trial : int
+        Number of the first trial to record.
+    rows : int
+        Rows of the finished trials.
+    last_time_s : float
+        Of the file's last row, on the recording's clock.
+    written_at : float
+        `time.time()` of that row.
+    """
+
+    next_trial: int
+    rows: int
+    last_time_s: float
+    written_at: float
+
+    def now_s(self) -> float:
+        """The present time on the recording's clock [s]."""
+        return self.last_time_s + max(time.time() - self.written_at, _LEAST_PAUSE_S)
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    """Header of an unfinished recording, from which its plan can be made again.
+
+    Raises
+    ------
+    InputError
+        If it is no recording of ours, was finished, or does not say what was planned.
+    """
+    text = read_text(path)
+    if not text.startswith(TITLE):
+        raise InputError(f"{path} is no recording of pupper-sysid; only those can be continued.")
+    metadata = header(path, text.splitlines())
+    if "completed" in metadata:
+        raise InputError(f"{path} was recorded to its end; there is nothing to continue.")
+    if not isinstance(metadata.get("sweep"), dict):
+        raise InputError(
+            f"{path} does not say what was planned (an older version wrote it). Record it again."
+        )
+    return metadata
+
+
+def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
+    """Where `plan`, partly carried out in the recording at `path`, goes on.
+
+    Raises
+    ------
+    InputError
+        If the recording cannot be read.
+    """
+    written_at = path.stat().st_mtime
+    text = read_text(path)
+    whole = text[: text.rfind("\n") + 1]
+    if sum(bool(line.strip()) and line[0] != "#" for line in whole.splitlines()) < 2:
+        return Resume(0, 0, 0.0, written_at)
+    table = parse(path, whole).table
+    last = float(np.nanmax(table[["send_time_s", "read_time_s"]].to_numpy()))
+    rows = 0
+    for number, trial in enumerate(plan.trials):
+        times = table["send_time_s"].to_numpy()[table["trial"].to_numpy() == number]
+        if (
+            not len(times)
+            or np.nanmax(times) - np.nanmin(times) < trial.duration_s - 2.5 * period_s
+        ):
+            return Resume(number, rows, last, written_at)
+        rows += len(times)
+    return Resume(len(plan.trials), rows, last, written_at)
