@@ -121,6 +121,14 @@ def fresh_rows(trial: Trial) -> NDArray[np.int64]:
     return valid[changed]
 
 
+def _read_before(trial: Trial) -> NDArray[np.float64]:
+    """For each row, when the last reading before it was read; NaN for the first one."""
+    here = np.isfinite(trial.position_rad)
+    at = np.where(here, np.arange(len(here)), -1)
+    last = np.concatenate([[-1], np.maximum.accumulate(at)[:-1]])
+    return np.where(last >= 0, trial.read_time_s[last], np.nan)
+
+
 def quantum(trials: Sequence[Trial]) -> float:
     """Size of one count [rad]: the greatest common divisor of all changes; 0 if there is none."""
     steps = np.concatenate([np.abs(np.diff(t.position_rad)) for t in trials])
@@ -226,7 +234,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
     """
     rows = fresh_rows(trial)
     read = trial.read_time_s
-    before = read[rows - 1] if len(rows) else np.zeros(0)
+    before = _read_before(trial)[rows]
     if lattice.kind == "every read":
         rows = np.flatnonzero(np.isfinite(trial.position_rad))
         return Readings(rows, read[rows], trial.position_rad[rows], read.copy(), 0.0)
@@ -269,9 +277,10 @@ class _Stretch:
 
 def _stretches(trial: Trial, step: float) -> list[_Stretch]:
     """Cut a trial into stretches short enough for one strict lattice each."""
-    read, rows = trial.read_time_s, fresh_rows(trial)
+    read, rows, before = trial.read_time_s, fresh_rows(trial), _read_before(trial)
     moving = np.flatnonzero(moving_rows(trial, step))
-    same = np.setdiff1d(moving[(moving > 0) & np.isfinite(trial.position_rad[moving])], rows)
+    known = np.isfinite(trial.position_rad) & np.isfinite(before)
+    same = np.setdiff1d(moving[known[moving]], rows)
     parts = max(1, int(np.ceil((read[-1] - read[0]) / _STRETCH_S)))
     edges = np.linspace(read[0], read[-1], parts + 1)
     found = []
@@ -280,7 +289,7 @@ def _stretches(trial: Trial, step: float) -> list[_Stretch]:
         if len(own) >= 8:
             found.append(
                 _Stretch(
-                    trial.number, start, stop, read[own - 1], read[own], read[held - 1], read[held]
+                    trial.number, start, stop, before[own], read[own], before[held], read[held]
                 )
             )
     return found
@@ -433,7 +442,7 @@ def _moving_fresh(trials: Sequence[Trial]) -> tuple[int, int]:
     for trial in trials:
         if len(trial.read_time_s) < 3:
             continue
-        rows = np.flatnonzero(moving_rows(trial, step))
+        rows = np.flatnonzero(moving_rows(trial, step) & np.isfinite(trial.position_rad))
         moving += len(rows)
         fresh += len(np.intersect1d(rows, fresh_rows(trial)))
     return moving, fresh
@@ -445,7 +454,7 @@ def _loss(trials: Sequence[Trial], phases: Sequence[_Phase]) -> tuple[float, flo
     polls = successes = 0
     for trial in trials:
         rows, read, speed = fresh_rows(trial), trial.read_time_s, _speed(trial)
-        middle = 0.5 * (read[rows - 1] + read[rows])
+        middle = 0.5 * (_read_before(trial)[rows] + read[rows])
         for phase in (p for p in phases if p.trial == trial.number):
             first = int(np.ceil((phase.start_s - phase.phase_s) / phase.period_s))
             last = int(np.floor((phase.stop_s - phase.phase_s) / phase.period_s))
