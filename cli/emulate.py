@@ -17,6 +17,7 @@ from common.files import write_text
 from hardware.esp32_bus import SOCKET
 from hardware.feetech_registers import BAUD_RATES, SCS0009, STS3215
 from hardware.joint_map import load_joint_map
+from hardware.loop import request_real_time_priority
 from sim.bus_faults import BusFaults
 from sim.emulated_robot import RobotSpec, draw_robot
 from sim.esp32_emulator import ProxyEmulator
@@ -58,8 +59,9 @@ class Esp32(Common):
         """Serve until Ctrl-C."""
         rng = np.random.default_rng(self.seed)
         bench = ServoBench(
-            draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0], self.by_hand
-        )
+            draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0], self.by_hand,
+            keep_log=False,
+        )  # fmt: skip
         emulator = ProxyEmulator(bench, rng, BusFaults.parse(self.faults, rng))
         server = ProxySocket(emulator, self.socket)
         _write_truth(self, bench)
@@ -95,7 +97,9 @@ class Feetech(Common):
             raise InputError(f"--baud {baud}: servos know {', '.join(map(str, BAUD_RATES))}.")
         # read directly, a servo answers for the very moment: no polls in between, none lost
         spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
-        bench = ServoBench(draw_robot(rng, spec), layout, rng.spawn(1)[0], self.by_hand)
+        bench = ServoBench(
+            draw_robot(rng, spec), layout, rng.spawn(1)[0], self.by_hand, keep_log=False
+        )
         emulator = FeetechEmulator(
             bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
             BusFaults.parse(self.faults, rng), self.echo,
@@ -129,6 +133,8 @@ def _serve(server: ProxySocket | FeetechPty, what: str, name: str) -> None:
         f"  pupper-sysid monitor --bus {name}\nCtrl-C ends it.",
         soft_wrap=True,
     )
+    # bytes that come late from a servo look like a slow servo
+    request_real_time_priority()
     try:
         server.serve()
     finally:

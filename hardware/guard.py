@@ -53,9 +53,10 @@ class GuardLimits:
     astray_rad: float = 0.35
     """A joint at rest must be nearer than this to its goal, `astray_after_s` after it got there."""
     astray_after_s: float = 0.8
-    load: float = 0.85
-    """Mean share of full duty over `load_over_s`. The servo's own protection: 0.8 for 2 s."""
-    load_over_s: float = 1.5
+    load: float = 0.8
+    """Share of full duty that may not be exceeded for `load_for_s` without a break; a fast tone
+    exceeds it now and then. The servo's own protection comes at 0.8 for 2 s."""
+    load_for_s: float = 1.5
     temperature_c: float = 65.0
     """The servo's own limits are 70 to 80 °C."""
     voltage_v: tuple[float, float] | None = None
@@ -318,7 +319,7 @@ class _Watch:
         self._names, self._limits = bus.joint_names, limits
         band: Any = limits.voltage_v or bus.metadata.get("voltage_band_v")
         self._band = tuple(band) if band else None
-        self._keep_s = max(limits.frozen_after_s, limits.load_over_s, limits.astray_after_s) + 0.2
+        self._keep_s = max(limits.frozen_after_s, limits.load_for_s, limits.astray_after_s) + 0.2
         self.forget(bus.now())
 
     def forget(self, now_s: float) -> None:
@@ -447,17 +448,16 @@ class _Watch:
             )
 
     def _strained(self, now: float) -> None:
-        since = now - self._limits.load_over_s
+        since = now - self._limits.load_for_s
         if not self._loads or self._loads[0][0] > since:
             return
         loads = np.abs(np.array([x for t, x in self._loads if t >= since]))
-        some = np.isfinite(loads).any(axis=0)
-        mean = np.zeros(len(self._names))
-        mean[some] = np.nanmean(loads[:, some], axis=0)
-        k = int(np.argmax(mean))
-        if mean[k] > self._limits.load:
+        least = np.where(np.isfinite(loads), loads, np.inf).min(axis=0)
+        strained = np.flatnonzero((least > self._limits.load) & np.isfinite(least))
+        if len(strained):
+            k = int(strained[0])
             raise SafetyStop(
-                f"{self._names[k]} has worked at {100 * mean[k]:.0f} % of full duty for "
-                f"{self._limits.load_over_s:.1f} s. Something holds it, or the motion is too much "
+                f"{self._names[k]} has worked at {100 * least[k]:.0f} % of full duty or more for "
+                f"{self._limits.load_for_s:.1f} s. Something holds it, or the motion is too much "
                 "for it: free it, or use a smaller --amplitude."
             )

@@ -4,7 +4,8 @@
 
 Some faults happen to single answers (lost, late, truncated, corrupted, duplicated, foreign, wrong
 length), some to a servo for a while (error bits, frozen, brown-out), some to the line itself
-(unplugged, a second writer). `log` keeps what was done and when.
+(unplugged, a second writer). `counts` and `ended`
+keep account.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ ANSWER_KINDS = (
 STATE_KINDS = ("error-bits", "frozen", "brown-out", "unplugged", "second-writer")
 KINDS = (*ANSWER_KINDS, *STATE_KINDS)
 
-STATE_LASTS_S = 0.2
 _LATE_S = (0.004, 0.06)
 
 
@@ -35,13 +35,19 @@ class BusFaults:
     rates : dict of str to float
         Probability per answer, for each of `KINDS`.
     rng : numpy.random.Generator
+    lasts_s : float
+        How long those last that are no single answer.
     counts : dict of str to int
         How many were injected.
+    ended : list of (str, float)
+        Kind and end of those that last, on the emulator's clock.
     """
 
     rates: dict[str, float]
     rng: np.random.Generator
+    lasts_s: float = 0.2
     counts: dict[str, int] = field(default_factory=dict)
+    ended: list[tuple[str, float]] = field(default_factory=list)
 
     def __post_init__(self):
         for kind, rate in self.rates.items():

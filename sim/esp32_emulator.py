@@ -16,7 +16,7 @@ import struct
 import numpy as np
 
 from hardware import esp32_datagrams as datagrams
-from sim.bus_faults import STATE_LASTS_S, BusFaults
+from sim.bus_faults import BusFaults
 from sim.poll_schedule import PollSchedule
 from sim.servo_bench import ServoBench
 
@@ -91,13 +91,14 @@ class ProxyEmulator:
         # any status bit makes the firmware drop the answer: the servo's feedback freezes
         if kind in ("frozen", "error-bits"):
             self._refresh(now)
-            self._stuck_until[servo] = now + STATE_LASTS_S
+            self._stuck_until[servo] = now + self.faults.lasts_s
         elif kind == "brown-out":
             self._refresh(now)
-            self._stuck_until[:] = now + STATE_LASTS_S
-            self._deaf_until = max(self._deaf_until, now + STATE_LASTS_S)
+            self._stuck_until[:] = now + self.faults.lasts_s
+            self._deaf_until = max(self._deaf_until, now + self.faults.lasts_s)
+            self.faults.ended.append((kind, now + self.faults.lasts_s))
         elif kind == "unplugged":
-            self.unplug_for_s = STATE_LASTS_S
+            self.unplug_for_s = self.faults.lasts_s
         elif kind == "second-writer":
             self._refresh(now)
             goal = np.clip(self._counts + self.rng.integers(-8, 9, 12), 1, datagrams.HIGHEST_COUNT)
@@ -139,5 +140,5 @@ class ProxyEmulator:
                 self._loads[servo] = self.bench.load(k)
                 self._measured[servo] = at
         block = tuple(int(c) for c in self._counts)
-        if not self.history or self.history[-1][1] != block:
+        if self.bench.keep_log and (not self.history or self.history[-1][1] != block):
             self.history.append((self._time, block))

@@ -114,6 +114,7 @@ class ProxySocket:
         time.sleep(self.emulator.unplug_for_s)
         self.emulator.unplug_for_s = 0.0
         self._listen()
+        self.emulator.faults.ended.append(("unplugged", self.now()))
 
     def _listen(self) -> None:
         self._server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -25,7 +25,7 @@ from hardware.feetech_registers import (
     WRITE,
     Series,
 )
-from sim.bus_faults import STATE_LASTS_S, BusFaults, with_wrong_length
+from sim.bus_faults import BusFaults, with_wrong_length
 from sim.servo_bench import AMBIENT_C, ServoBench
 
 MEMORY_BYTES = 80
@@ -212,15 +212,16 @@ class FeetechEmulator:
         kind = self.faults.draw()
         servo = self.servos[servo_id]
         if kind == "frozen":
-            servo.frozen_until = at + STATE_LASTS_S
+            servo.frozen_until = at + self.faults.lasts_s
             servo.frozen_count = self.bench.count(self.bench.index_of_id[servo_id], at)
         elif kind == "error-bits":
-            servo.faulty_until = at + STATE_LASTS_S
+            servo.faulty_until = at + self.faults.lasts_s
             servo.error = int(self._rng.choice([1, 2, 4, 8, 32, 33]))
         elif kind == "brown-out":
-            self._brown_out_until = at + STATE_LASTS_S
+            self._brown_out_until = at + self.faults.lasts_s
+            self.faults.ended.append((kind, self._brown_out_until))
         elif kind == "unplugged":
-            self.unplug_for_s = STATE_LASTS_S
+            self.unplug_for_s = self.faults.lasts_s
         return kind
 
     def _second_writer(self, byte_s: float) -> list[tuple[float, bytes]]:
@@ -241,7 +242,8 @@ class FeetechEmulator:
         servo = self.servos[servo_id]
         frozen = at < servo.frozen_until
         count = servo.frozen_count if frozen else self.bench.count(k, at)
-        self.readings.append((at, servo_id, count))
+        if self.bench.keep_log:
+            self.readings.append((at, servo_id, count))
         self._set(servo_id, "position", count)
         self._set(servo_id, "load", self.bench.load(k))
         self._set(servo_id, "voltage", round(10 * self.bench.supply_v))

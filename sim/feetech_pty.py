@@ -101,6 +101,7 @@ class FeetechPty:
         time.sleep(self.emulator.unplug_for_s)
         self.emulator.unplug_for_s = 0.0
         self._plug()
+        self.emulator.faults.ended.append(("unplugged", self.now()))
 
     def _baud(self) -> int | None:
         """Rate that the host has set; None if it is one that has no name."""

@@ -33,6 +33,8 @@ class ServoBench:
         Reading noise.
     by_hand : bool
         Whether someone swings the joints while they are limp.
+    keep_log : bool
+        Whether goals and readings are remembered: for proofs, not for a robot that runs for days.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class ServoBench:
         joint_map: JointMap,
         rng: np.random.Generator,
         by_hand: bool = False,
+        keep_log: bool = True,
     ):
         self.robot, self.map = robot, joint_map.select(JOINT_NAMES).per_servo()
         self._rng, self._by_hand = rng, by_hand
@@ -52,14 +55,15 @@ class ServoBench:
         self._scale = self.map.sign() * self.map.counts_per_rad()
         self._zero = self.map.to_counts(np.zeros(len(JOINT_NAMES)))
         self.index_of_id = {i: k for k, i in enumerate(self.map.ids)}
-        self.supply_v = SUPPLY_V
+        self.supply_v, self.keep_log = SUPPLY_V, keep_log
         self.commands: list[tuple[float, int, int]] = []
         """Every change of a goal: time, index, count."""
 
     def command(self, index: int, time_s: float, count: int) -> None:
         """Goal of one servo from `time_s` on, which must not go backwards."""
         self._servos[index].command(time_s, (count - self._zero[index]) / self._scale[index])
-        self.commands.append((time_s, index, count))
+        if self.keep_log:
+            self.commands.append((time_s, index, count))
 
     def torque(self, index: int, time_s: float, on: bool) -> None:
         """Hold the present position, or go limp."""

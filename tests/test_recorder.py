@@ -113,11 +113,12 @@ def test_other_joints_rest_and_moves_between_trials_are_gentle(tmp_path):
     recorded = load(tmp_path / "a.csv").trials("LF_hip")[0].send_time_s
     inside = (times >= recorded[0] - 1e-9) & (times <= recorded[-1] + 1e-9)
     np.testing.assert_allclose(goals[inside][:, 1:], np.tile(POSE[1:], (inside.sum(), 1)))
-    before = times < recorded[0]
+    before = times < recorded[0] - 1e-9
     way = np.abs(np.diff(goals[before], axis=0, prepend=[POSE + 0.5])).max(axis=1)
     allowed = GENTLE_RAD_S * np.diff(times[before], prepend=0.0)
     assert (way <= 1.01 * allowed + 1e-12).all() and way.max() > 0.5 * GENTLE_RAD_S * PERIOD
-    assert recorded[0] - times[before][-1] >= REST_S - 1e-9
+    resting = np.abs(goals[before] - POSE).max(axis=1) < 1e-12
+    assert recorded[0] - times[before][np.argmax(resting)] >= REST_S - 1e-9
     np.testing.assert_allclose(goals[-1], POSE, atol=1e-12)
     assert np.abs(np.diff(goals[~before & ~inside], axis=0)).max() <= 1.1 * PERIOD
     assert bus.calls == ["torque True", "torque False", "close"]
@@ -141,13 +142,14 @@ def test_a_late_tick_is_counted_and_the_tone_keeps_its_phase(tmp_path):
 
 @pytest.mark.parametrize("raises", [KeyboardInterrupt(), BusError("cable out")])
 def test_an_interrupted_recording_keeps_its_rows_and_switches_the_torque_off(tmp_path, raises):
-    bus = ScriptedBus(POSE, fail_at=60, raises=raises)
+    at_rest = round(REST_S / PERIOD + 0.5)  # written before the trial, not recorded
+    bus = ScriptedBus(POSE, fail_at=at_rest + 60, raises=raises)
     with pytest.raises(type(raises)):
         record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=PERIOD)
     assert bus.calls[-2:] == ["torque False", "close"]
     recording = load(tmp_path / "a.csv")
     assert "completed" not in recording.metadata
-    assert len(recording.table) == 60 - 1  # the first write is the rest before the trial
+    assert len(recording.table) == 60
     if isinstance(raises, KeyboardInterrupt):
         np.testing.assert_allclose(bus.written[-1][1], POSE, atol=1e-12)
 

@@ -1,0 +1,38 @@
+"""Emulated robots behind the real protocols, in this process, for the benchmarks."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from hardware.feetech_registers import STS3215
+from hardware.joint_map import load_joint_map
+from sim.bus_faults import BusFaults
+from sim.emulated_robot import RobotSpec, draw_robot
+from sim.esp32_emulator import ProxyEmulator
+from sim.esp32_socket import ProxySocket
+from sim.feetech_emulator import FeetechEmulator
+from sim.feetech_pty import FeetechPty
+from sim.servo_bench import ServoBench
+
+KINDS = ("feetech", "esp32")
+
+
+def serve(kind: str, folder: Path, seed: int, faults: BusFaults | None = None):
+    """A running server of one emulated robot, and what to write after --bus."""
+    rng = np.random.default_rng(seed)
+    if kind == "esp32":
+        layout, robot = load_joint_map("mini_pupper_2"), draw_robot(rng)
+        bench = ServoBench(robot, layout, rng.spawn(1)[0])
+        server = ProxySocket(ProxyEmulator(bench, rng, faults), folder / "socket")
+        name = f"esp32:{folder / 'socket'}"
+    else:
+        # read directly, a servo answers for the very moment: no polls in between, none lost
+        robot = draw_robot(rng, RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0))
+        bench = ServoBench(robot, load_joint_map("sts3215"), rng.spawn(1)[0])
+        server = FeetechPty(FeetechEmulator(bench, STS3215, rng, faults=faults), folder / "servos")
+        name = f"feetech:{folder / 'servos'}"
+    threading.Thread(target=server.serve, daemon=True).start()
+    return server, name

@@ -1,0 +1,128 @@
+"""Kill the recorder at random moments: what is lost, is the robot parked, does it go on?
+
+An emulated robot runs in this process behind the real protocol; `pupper-sysid sweep` records from
+it, is killed with SIGKILL, and is told to `--resume`, again and again, until the recording is
+complete; then the next recording begins. At the end every complete recording is calibrated and
+compared with the truth.
+
+    .venv/bin/python benchmarks/kill_anywhere.py --kills 100
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from emulators import KINDS, serve
+
+from common.joints import JOINT_NAMES
+from sim.servo_bench import ServoBench
+from sysid.calibrate import dead_times
+from sysid.recording import load
+
+JOINT = "LF_hip"
+TRANSPORT_S = {"feetech": 0.0005, "esp32": 0.001}
+"""From sending to the servo: 47 bytes at 1 Mbaud; half a tick of the firmware."""
+SWEEP = ("sweep", "--joints", JOINT, "--freqs", "2,3,5", "--duration", "3")
+
+
+def limp(bench: ServoBench) -> bool:
+    """Whether no servo holds."""
+    return not any(bench.is_on(k) for k in range(len(JOINT_NAMES)))
+
+
+def campaign(kind: str, kills: int, seed: int, folder: Path) -> dict:
+    """Kill `kills` sweeps on one kind of bus."""
+    rng = np.random.default_rng(seed)
+    server, bus = serve(kind, folder, seed)
+    bench = server.emulator.bench
+    start = None
+    parked, silence, away, unreadable, complete = [], [], [], 0, []
+    path, number, driven = folder / "sweep0.csv", 0, 0
+    while len(parked) < kills:
+        arguments = ["--resume", str(path)] if path.exists() else ["--bus", bus, "--out", str(path)]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "cli.pupper_sysid", *SWEEP, *arguments],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        # at any moment from the first torque on; a sweep takes about 14 s
+        while limp(bench) and process.poll() is None:
+            time.sleep(0.005)
+        driven += 1
+        if start is None:
+            start = [bench.angle(k, server.now()) for k in range(len(JOINT_NAMES))]
+        wait = float(rng.uniform(0.0, 9.0))
+        try:
+            process.wait(wait)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            killed, wall = time.monotonic(), time.time()
+            process.wait()
+            was_on = not limp(bench)
+            while not limp(bench) and time.monotonic() - killed < 10:
+                time.sleep(0.002)
+            if was_on:
+                parked.append(time.monotonic() - killed)
+                at = server.now()
+                away.append(max(abs(bench.angle(k, at) - start[k]) for k in range(len(start))))
+                if path.exists():
+                    silence.append(wall - path.stat().st_mtime)
+            try:
+                if path.exists() and sum(1 for x in path.open() if x[0].isdigit()) > 20:
+                    load(path)
+            except Exception as error:
+                unreadable += 1
+                print("unreadable:", path, error)
+            time.sleep(0.3)  # its watchdog lets go of the bus
+            continue
+        error = process.stderr.read().decode() if process.stderr else ""
+        if process.returncode != 0:
+            raise SystemExit(f"{path}: the sweep ended with {process.returncode}: {error}")
+        complete.append(path)
+        number += 1
+        path = folder / f"sweep{number}.csv"
+    server.stop()
+    return {
+        "parked": np.array(parked), "silence": np.array(silence), "away": np.array(away),
+        "unreadable": unreadable, "complete": complete, "bench": bench, "runs": driven,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Run it, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    print(
+        "| bus | kills | parked after s: median | worst | rad from where it was found: worst "
+        "| last row before the kill s: median | worst | files that do not read "
+        "| recordings completed by resuming | their dead time interval holds the truth |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for kind in KINDS:
+        with tempfile.TemporaryDirectory(prefix="kill") as name:
+            result = campaign(kind, options.kills // 2, options.seed, Path(name))
+            p, s = result["parked"], result["silence"]
+            robot = result["bench"].robot
+            true = robot.servos[JOINT_NAMES.index(JOINT)].actuator.delay_s
+            held = 0
+            for path in result["complete"]:
+                found = dead_times([load(path)], seed=0)[JOINT].dead_time
+                held += found.low <= true + TRANSPORT_S[kind] <= found.high
+            done = len(result["complete"])
+            print(
+                f"| {kind} | {len(p)} | {np.median(p):.2f} | {p.max():.2f} "
+                f"| {max(result['away']):.3f} | {np.median(s):.2f} | {s.max():.2f} "
+                f"| {result['unreadable']} | {done} | {held} of {done} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

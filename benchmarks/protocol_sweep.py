@@ -1,0 +1,133 @@
+"""Sweep all twelve joints over each protocol emulator; compare what is found with the truth.
+
+The recorder runs here and talks through the pseudo-terminal or the socket, in real time. The truth
+of a joint's lag is that of a servo with the true parameters which gets the goals at the very times
+at which the emulator's servo got them, without noise and every millisecond, as in
+`lag_accuracy.py`.
+
+    .venv/bin/python benchmarks/protocol_sweep.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from emulators import KINDS, serve
+
+from common.joints import DEFAULT_POSE, JOINT_NAMES
+from hardware.connect import open_bus, parse_address
+from hardware.guard import GuardedBus
+from hardware.loop import request_real_time_priority
+from sim.free_air_servo import FreeAirServo
+from sysid.calibrate import calibrate
+from sysid.delay import tone_lags, tone_weights
+from sysid.excitation import plan
+from sysid.poll_lattice import Readings, find_poll_lattice, readings
+from sysid.recorder import record
+from sysid.recording import Recording, load
+from sysid.tone import tone_response
+
+
+def sweep(kind: str, seed: int, joints: list[str], frequencies: list[float], seconds: float):
+    """The recording of one robot, the server, and bus time minus emulator time."""
+    with tempfile.TemporaryDirectory(prefix="sweep") as name:
+        server, where = serve(kind, Path(name), seed)
+        bus = GuardedBus(open_bus(parse_address(where)))
+        shift = bus.now() - server.now()
+        speed = bus.metadata["speed_limit_rad_s"]
+        rate = bus.metadata.get("poll_rate_hz", 1 / 0.02685)
+        made = plan("sine", joints, frequencies, 0.3, seconds, 0.019, speed, rate)
+        recording = load(record(bus, made, Path(name) / "sweep.csv"))
+        server.stop()
+    return recording, server, shift
+
+
+def true_motion(server, joint: str, shift: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the joint truly was, every millisecond on the bus's clock."""
+    bench, k = server.emulator.bench, JOINT_NAMES.index(joint)
+    servo = FreeAirServo(bench.robot.servos[k].actuator, DEFAULT_POSE[joint])
+    goals = [(at, count) for at, index, count in bench.commands if index == k]
+    scale, zero = bench.map.sign() * bench.map.counts_per_rad(), bench.map.to_counts(np.zeros(12))
+    times = np.arange(0.0, goals[-1][0] + 0.2, 1e-3)
+    position, upcoming = np.empty(len(times)), 0
+    for n, now in enumerate(times):
+        while upcoming < len(goals) and goals[upcoming][0] <= now:
+            at, count = goals[upcoming]
+            servo.command(at, (count - zero[k]) / scale[k])
+            upcoming += 1
+        position[n] = servo.position_at(float(now))
+    return times + shift, position
+
+
+def true_lag(recording: Recording, server, joint: str, shift: float) -> float:
+    """The lag of the true motion, averaged as the estimator averages [s]."""
+    time, position = true_motion(server, joint, shift)
+    trials = recording.trials(joint)
+    lattice = find_poll_lattice(trials)
+    tones, clean = [], []
+    for trial in trials:
+        tone = tone_response(trial, readings(trial, lattice), np.random.default_rng(0), draws=2)
+        inside = (time >= trial.send_time_s[0]) & (time <= trial.send_time_s[-1])
+        t, x = time[inside], position[inside]
+        moved = Readings(np.arange(len(t)), t, x, t, 0.0)
+        if tone is not None:
+            tones.append(tone)
+            clean.append(tone_response(trial, moved, np.random.default_rng(0), draws=2))
+    lags = tone_lags(
+        np.array([c.response for c in clean]), np.array([t.frequency_hz for t in tones])
+    )
+    return float(np.average(lags, weights=tone_weights(tones)))
+
+
+def main() -> None:
+    """Run it, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--joints", type=int, default=12)
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    request_real_time_priority()
+    frequencies = [1.0, 2.0, 3.0, 5.0, 7.0, 10.0]
+    joints = list(JOINT_NAMES[: options.joints])
+    print("| bus | joint | lag ms | 90 % interval | true lag | dead time ms | 90 % interval "
+          "| true | held RMSE mrad | missing % |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for kind in KINDS:
+        recording, server, shift = sweep(kind, options.seed, joints, frequencies, options.seconds)
+        missing = recording.table.groupby("joint")["position_rad"].apply(lambda x: x.isna().mean())
+        found = calibrate([recording], seed=0)
+        errors, inside, dead = [], 0, 0
+        for joint in joints:
+            result = found[joint]
+            lag, delay = result.budget.lag, result.dead_time
+            truth = true_lag(recording, server, joint, shift)
+            own = server.emulator.bench.robot.servos[JOINT_NAMES.index(joint)].actuator.delay_s
+            errors.append(lag.value - truth)
+            inside += lag.low <= truth <= lag.high
+            dead += delay.low <= own <= delay.high
+            print(
+                f"| {kind} | {joint} | {1e3 * lag.value:.1f} "
+                f"| {1e3 * lag.low:.1f} … {1e3 * lag.high:.1f} | {1e3 * truth:.1f} "
+                f"| {1e3 * delay.value:.1f} | {1e3 * delay.low:.1f} … {1e3 * delay.high:.1f} "
+                f"| {1e3 * own:.1f} "
+                f"| {1e3 * result.rungs['delayed_pd'].scores.held:.1f} "
+                f"| {100 * missing[joint]:.1f} |",
+                flush=True,
+            )
+        print(
+            f"\n{kind}: lag bias {1e3 * np.mean(errors):+.2f} ms, worst "
+            f"{1e3 * np.abs(errors).max():.2f} ms; {inside} of {len(joints)} lag intervals and "
+            f"{dead} of {len(joints)} dead-time intervals hold the truth.\n",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
