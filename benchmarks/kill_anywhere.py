@@ -13,12 +13,11 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-from emulators import KINDS, serve
+from emulators import KINDS, served
 
 from common.joints import JOINT_NAMES
 from sim.servo_bench import ServoBench
@@ -36,10 +35,9 @@ def limp(bench: ServoBench) -> bool:
     return not any(bench.is_on(k) for k in range(len(JOINT_NAMES)))
 
 
-def campaign(kind: str, kills: int, seed: int, folder: Path) -> dict:
+def campaign(server, bus: str, folder: Path, kills: int, seed: int) -> dict:
     """Kill `kills` sweeps on one kind of bus."""
     rng = np.random.default_rng(seed)
-    server, bus = serve(kind, folder, seed)
     bench = server.emulator.bench
     start = None
     parked, silence, away, unreadable, complete = [], [], [], 0, []
@@ -86,7 +84,6 @@ def campaign(kind: str, kills: int, seed: int, folder: Path) -> dict:
         complete.append(path)
         number += 1
         path = folder / f"sweep{number}.csv"
-    server.stop()
     return {
         "parked": np.array(parked), "silence": np.array(silence), "away": np.array(away),
         "unreadable": unreadable, "complete": complete, "bench": bench, "runs": driven,
@@ -106,8 +103,8 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for kind in KINDS:
-        with tempfile.TemporaryDirectory(prefix="kill") as name:
-            result = campaign(kind, options.kills // 2, options.seed, Path(name))
+        with served(kind, options.seed) as (server, bus, folder):
+            result = campaign(server, bus, folder, options.kills // 2, options.seed)
             p, s = result["parked"], result["silence"]
             robot = result["bench"].robot
             true = robot.servos[JOINT_NAMES.index(JOINT)].actuator.delay_s

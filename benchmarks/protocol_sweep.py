@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from emulators import KINDS, serve
+from emulators import KINDS, served
 
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.connect import open_bus, parse_address
@@ -37,15 +35,13 @@ from sysid.tone import tone_response
 
 def sweep(kind: str, seed: int, joints: list[str], frequencies: list[float], seconds: float):
     """The recording of one robot, the server, and bus time minus emulator time."""
-    with tempfile.TemporaryDirectory(prefix="sweep") as name:
-        server, where = serve(kind, Path(name), seed)
+    with served(kind, seed) as (server, where, folder):
         bus = GuardedBus(open_bus(parse_address(where)))
         shift = bus.now() - server.now()
         speed = bus.metadata["speed_limit_rad_s"]
         rate = bus.metadata.get("poll_rate_hz", 1 / 0.02685)
         made = plan("sine", joints, frequencies, 0.3, seconds, 0.019, speed, rate)
-        recording = load(record(bus, made, Path(name) / "sweep.csv"))
-        server.stop()
+        recording = load(record(bus, made, folder / "sweep.csv"))
     return recording, server, shift
 
 

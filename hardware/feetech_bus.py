@@ -6,8 +6,9 @@ Goals go out to all servos in one frame. Readings come back in one exchange wher
 (STS), or one servo after the other (SCS). A servo that did not answer has no reading; one that
 keeps silent is asked less often, so that the others keep their rate.
 
-The length of the question is its number: successive readings ask for 8, 9, 10, 11 bytes in turn,
-so that an answer that comes too late is seen to belong to an earlier question.
+The length of the question is its number: successive readings ask for 6, 7, … 11 bytes in turn, so
+that an answer that comes too late is seen to belong to an earlier question. Voltage and temperature
+are not in the shortest ones and stand as they were last read.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ VOLT_SCALE = 0.1
 SPEED_LIMIT_RAD_S = 7.5
 """What a user would know of the servo before measuring it [rad/s]."""
 
-_FIRST, _SHORTEST, _LENGTHS = 56, 8, 4  # position, speed, load, voltage, temperature, …
+_FIRST, _SHORTEST, _LENGTHS = 56, 6, 6  # position, speed, load; voltage; temperature; …
 _FASTEST_RAD_S = 20.0  # no servo of this size turns faster, so a reading that did is not one
 _SLACK_RAD = 0.05
 _SILENT_AFTER = 3
@@ -61,6 +62,8 @@ class _Servo:
     last_count: int = -1
     doubtful_s: float = -np.inf
     doubtful_count: int = -1
+    voltage_v: float = np.nan
+    temperature_c: float = np.nan
 
 
 class FeetechBus:
@@ -175,8 +178,11 @@ class FeetechBus:
                 continue
             time_s[k], count[k], status[k] = at, reported, reply.frame.code
             load[k] = LOAD_SCALE * servo.series.decode("load", memory, _FIRST)
-            volts[k] = VOLT_SCALE * servo.series.decode("voltage", memory, _FIRST)
-            temperature[k] = servo.series.decode("temperature", memory, _FIRST)
+            if len(memory) > 6:
+                servo.voltage_v = VOLT_SCALE * servo.series.decode("voltage", memory, _FIRST)
+            if len(memory) > 7:
+                servo.temperature_c = float(servo.series.decode("temperature", memory, _FIRST))
+            volts[k], temperature[k] = servo.voltage_v, servo.temperature_c
         position = self._map.to_angles(np.where(count < 0, np.nan, count))
         return BusSample(time_s, position, count, volts, temperature, load, status)
 

@@ -43,8 +43,9 @@ RETURN_DELAY_S = 0.00051
 """Longest that a servo may be set to wait before it answers (254 units of 2 µs)."""
 
 _POLL_S = 0.001
-_REOPEN_S = 0.02
+_REOPEN_S = 0.01
 _MODEL = 3
+_ATTEMPTS = 4
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class FeetechLine:
         self.patience_s = REPLY_TIMEOUT_S
         self._port = _sdk_port(device, baud)
         self._packets = _sdk().protocol_packet_handler()
-        self._retry_s = 0.0
+        self._retry_s = self._busy_s = 0.0
         try:
             self._port.openPort()
         except PORT_ERRORS as error:
@@ -135,6 +136,8 @@ class FeetechLine:
         ok = self._guarded(
             lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
         )
+        # the port takes the bytes at once; the wire does not
+        self._busy_s = before + len(self._port.sent) * self._byte_s()
         if ok and self.echoes:  # or the echo would come between the next question and its answer
             self._arrived(len(self._port.sent))
         return before if ok else float("nan")
@@ -161,7 +164,7 @@ class FeetechLine:
         found: dict[int, int | Series] = {}
         for servo in servos:
             # a first frame can be lost to whatever was on the line before us
-            for _ in range(2 if len(servos) <= 16 else 1):
+            for _ in range(_ATTEMPTS):
                 model = self.model(servo)
                 if model is not None:
                     found[servo] = model
@@ -219,7 +222,7 @@ class FeetechLine:
         reader = FrameReader(lambda frame_id, length: frame_id in wanted and length == size + 2)
         answer = size + 6
         wire = (asked + len(servos) * answer) * self._byte_s()
-        deadline = before + wire + len(servos) * RETURN_DELAY_S + self.patience_s
+        deadline = max(before, self._busy_s) + wire + len(servos) * RETURN_DELAY_S + self.patience_s
         owed = self._port.sent if self.echoes else b""
         found: dict[int, tuple[Frame, float]] = {}
         contradicted: set[int] = set()
@@ -236,11 +239,13 @@ class FeetechLine:
             with contextlib.suppress(*PORT_ERRORS):
                 self._port.shut()
             self._port.is_open = False
-        after = time.monotonic()
-        # answers come in the order of asking, evenly; arrival in the host is blurred by its buffers
-        share = (after - before) / max(len(servos), 1)
+        # answers come in the order of asking, evenly; each arrival is blurred by the host's buffers
+        begin = max(before, self._busy_s) + asked * self._byte_s()
+        last = max((k for k, servo in enumerate(servos) if servo in found), default=0)
+        after = max((arrived for _, arrived in found.values()), default=begin)
+        share = max(after - begin, 0.0) / (last + 1)
         return {
-            servo: Reply(found[servo][0], before + k * share, before + (k + 1) * share)
+            servo: Reply(found[servo][0], begin + k * share, begin + (k + 1) * share)
             for k, servo in enumerate(servos)
             if servo in found and servo not in contradicted
         }

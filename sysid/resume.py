@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import InputError
 from sysid.excitation import Plan
@@ -20,6 +21,24 @@ from sysid.recording import TITLE, read_text
 from sysid.recording_table import header, parse
 
 _LEAST_PAUSE_S = 0.5
+
+
+class Request(BaseModel):
+    """What was asked for, as `sweep` writes it into the header."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    bus: str
+    joint_map: str | None
+    real_time: bool
+    seed: int
+    loop_period_s: float = Field(gt=0)
+    kind: str
+    joints: list[str]
+    frequencies_hz: list[float]
+    amplitude_rad: float
+    duration_s: float | None
+    playback: str | None
 
 
 @dataclass(frozen=True)
@@ -62,10 +81,20 @@ def header_of(path: Path) -> dict[str, Any]:
     metadata = header(path, text.splitlines())
     if "completed" in metadata:
         raise InputError(f"{path} was recorded to its end; there is nothing to continue.")
-    if not isinstance(metadata.get("sweep"), dict):
+    request = metadata.get("sweep")
+    if request is None:
         raise InputError(
             f"{path} does not say what was planned (an older version wrote it). Record it again."
         )
+    try:
+        Request.model_validate(request)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        where = ".".join(map(str, ("sweep", *fault["loc"])))
+        raise InputError(
+            f"{path}, header, {where}: {fault['msg']}; what was planned there is not what this "
+            "version plans. Record it again."
+        ) from error
     return metadata
 
 
