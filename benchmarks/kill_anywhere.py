@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from emulators import KINDS, served
 
-from common.joints import JOINT_NAMES
+from common.joints import DEFAULT_POSE, JOINT_NAMES
 from sim.servo_bench import ServoBench
 from sysid.calibrate import dead_times
 from sysid.recording import load
@@ -31,15 +31,17 @@ SWEEP = ("sweep", "--joints", JOINT, "--freqs", "2,3,5", "--duration", "3")
 
 
 def limp(bench: ServoBench) -> bool:
-    """Whether no servo holds."""
-    return not any(bench.is_on(k) for k in range(len(JOINT_NAMES)))
+    """Whether the servo that is swept has been let go."""
+    return not bench.is_on(JOINT_NAMES.index(JOINT))
 
 
 def campaign(server, bus: str, folder: Path, kills: int, seed: int) -> dict:
     """Kill `kills` sweeps on one kind of bus."""
     rng = np.random.default_rng(seed)
     bench = server.emulator.bench
-    start = None
+    for k in range(len(JOINT_NAMES)):
+        bench.torque(k, server.now(), False)
+    start = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
     parked, silence, away, unreadable, complete = [], [], [], 0, []
     path, number, driven = folder / "sweep0.csv", 0, 0
     while len(parked) < kills:
@@ -48,12 +50,10 @@ def campaign(server, bus: str, folder: Path, kills: int, seed: int) -> dict:
             [sys.executable, "-m", "cli.pupper_sysid", *SWEEP, *arguments],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip
-        # at any moment from the first torque on; a sweep takes about 14 s
-        while limp(bench) and process.poll() is None:
+        # at any moment from the first row or, resumed, from the first torque on
+        while (limp(bench) or not path.exists()) and process.poll() is None:
             time.sleep(0.005)
         driven += 1
-        if start is None:
-            start = [bench.angle(k, server.now()) for k in range(len(JOINT_NAMES))]
         wait = float(rng.uniform(0.0, 9.0))
         try:
             process.wait(wait)

@@ -38,7 +38,9 @@ SPEED_LIMIT_RAD_S = 7.5
 _POWER_EVERY_S = 0.5
 _RECONNECT_S = 0.01
 _LARGEST_REPLY = 64
+_MOST_STALE = 16
 _SAME_READINGS = 3
+_TORQUE_TRIES = 5
 
 Answer = TypeVar("Answer")
 
@@ -146,7 +148,11 @@ class Esp32Bus:
             known = present > 0
             self._goal[known] = present[known]
         self._on[:] = on
-        return any(self._send_goals() or self._pause() for _ in range(5))
+        for _ in range(_TORQUE_TRIES):
+            if self._send_goals():
+                return True
+            time.sleep(_RECONNECT_S)
+        return False
 
     def goals(self) -> NDArray[np.float64]:
         """Unknown: the proxy does not tell what it was last told."""
@@ -178,7 +184,10 @@ class Esp32Bus:
 
     def _send_goals(self) -> bool:
         request = datagrams.set_position(self._on, self._goal)
-        return self._exchange(request) == datagrams.ACKNOWLEDGED or self._disconnect()
+        acknowledged = self._exchange(request) == datagrams.ACKNOWLEDGED
+        if not acknowledged:
+            self._disconnect()
+        return acknowledged
 
     def _ask(self, opcode: int, parse: Callable[[bytes], Answer | None]) -> Answer | None:
         reply = self._exchange(datagrams.request(opcode))
@@ -193,15 +202,21 @@ class Esp32Bus:
         if not self._connected():
             return None
         assert self._socket is not None
+        reply = b""
         try:
-            while select.select([self._socket], [], [], 0)[0]:
-                if not self._socket.recv(_LARGEST_REPLY):  # an answer to an earlier question
-                    return self._disconnect() or None
+            # what is there already answers an earlier question
+            for _ in range(_MOST_STALE):
+                if not select.select([self._socket], [], [], 0)[0]:
+                    break
+                self._socket.recv(_LARGEST_REPLY)
             self._socket.sendall(request)
             reply = self._socket.recv(_LARGEST_REPLY)
         except OSError:  # time-outs too
-            reply = b""
-        return reply or self._disconnect() or None
+            pass
+        if not reply:
+            self._disconnect()
+            return None
+        return reply
 
     def _connected(self) -> bool:
         """Whether there is a connection; makes a new one if it is time to try."""
@@ -220,16 +235,11 @@ class Esp32Bus:
         self._socket = made
         return True
 
-    def _disconnect(self) -> bool:
-        """Drop the connection; always False."""
+    def _disconnect(self) -> None:
+        """Drop the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-        return False
-
-    def _pause(self) -> bool:
-        time.sleep(_RECONNECT_S)
-        return False
 
 
 def _own(path: Path) -> int:

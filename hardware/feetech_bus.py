@@ -267,7 +267,9 @@ class FeetechBus:
         good = not np.isfinite(servo.last_s) or reachable(servo.last_s, servo.last_count)
         if not good:
             # twice the same story is believed: then the earlier reading was the wrong one
-            good = reachable(servo.doubtful_s, servo.doubtful_count) and at > servo.doubtful_s
+            good = bool(np.isfinite(servo.doubtful_s)) and reachable(
+                servo.doubtful_s, servo.doubtful_count
+            )
             servo.doubtful_s, servo.doubtful_count = at, count
         if good:
             servo.last_s, servo.last_count = at, count

@@ -47,7 +47,7 @@ class Frame:
         return HEADER + body + bytes([checksum(body)])
 
 
-def checksum(body: bytes) -> int:
+def checksum(body: bytes | bytearray) -> int:
     """Of all bytes from ID to the last parameter."""
     return ~sum(body) & 0xFF
 

@@ -1,4 +1,4 @@
-"""A serial line with Feetech servos: requests out through the vendor's SDK, replies in through ours.
+"""A serial line with Feetech servos: requests go out through the vendor's SDK, replies come to us.
 
 The SDK (`scservo_sdk`) builds and sends every frame. Its port and its receiver are replaced, for
 reasons that were measured on version 1.0.0: it keeps byte order in a module global, waits 34 ms
@@ -303,7 +303,7 @@ def _sdk_port(device: str, baud: int) -> Any:
 
         def writePort(self, packet: Any) -> int:
             self.sent = bytes(packet)
-            return self.ser.write(self.sent)
+            return self.ser.write(self.sent) or 0
 
         def setPacketTimeout(self, packet_length: int) -> None:
             """Not used: each exchange of `FeetechLine` has its own deadline."""

@@ -41,7 +41,8 @@ def cut(path, trial: int, rows: int, torn: str = "") -> None:
 
 
 @pytest.mark.parametrize(
-    ("trial", "rows", "torn"), [(1, 30, ""), (1, 30, "7.123,7.1"), (0, 5, ""), (2, 10, "12"), (0, 0, "")]
+    ("trial", "rows", "torn"),
+    [(1, 30, ""), (1, 30, "7.123,7.1"), (0, 5, ""), (2, 10, "12"), (0, 0, "")],
 )
 def test_a_cut_recording_is_continued_to_its_end(whole, trial, rows, torn):
     complete = load(whole).table

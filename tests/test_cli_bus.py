@@ -1,0 +1,147 @@
+"""The commands that talk to a bus, as a user meets them: the emulators behind real ports."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from servo_servers import moving_servos, on_a_port, still_servos
+
+from cli.pupper_sysid import main
+from hardware.feetech_registers import SCS0009
+from sysid.recording import load
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT = ("--freqs", "3", "--duration", "1")
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, and stderr on one line, of one command."""
+    try:
+        main([str(a) for a in arguments])
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    said = capsys.readouterr()
+    return code, said.out, " ".join(said.err.split())
+
+
+def test_scan_says_who_is_there_at_which_rate(capsys):
+    with on_a_port(still_servos(SCS0009, ids=[4, 7], baud=500_000)) as port:
+        code, out, _ = run(capsys, "scan", "--bus", f"feetech:{port.device}", "--json")
+    found = json.loads(out)
+    assert code == 0 and found["baud"] == 500_000
+    assert [s["id"] for s in found["servos"]] == [4, 7]
+    first = found["servos"][0]
+    assert (first["model"], first["firmware"], first["gains"]) == ("SCS0009", "0.16", [15, 15, 0])
+    assert (first["voltage_v"], first["limits"], first["errors"]) == (7.4, [20, 1003], "")
+
+
+def test_scan_of_a_silent_line_says_what_to_check(capsys):
+    with on_a_port(still_servos(ids=[])) as port:
+        code, _, err = run(capsys, "scan", "--bus", f"feetech:{port.device}@1000000")
+    assert code == 1 and "nobody answers at 1000000 baud" in err and "power" in err
+
+
+def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
+    with on_a_port(moving_servos(ids=[5])) as port:
+        bus = f"feetech:{port.device}"
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--joints", "LF_thigh", "--bus", bus, "--out", "a.csv"
+        )
+    assert code == 0, err
+    recording = load(Path("a.csv"))
+    bus = recording.metadata["bus"]
+    assert recording.joints == ["LF_thigh"] and bus["baud"] == 1_000_000
+    assert bus["servos"]["LF_thigh"]["p"] == 32 and bus["servos"]["LF_thigh"]["return_delay"] == 250
+    assert recording.metadata["completed"]["guard"]["clipped"] == 0
+    assert {"voltage_v", "temperature_c", "load"} <= set(recording.table.columns)
+    # at 3 Hz and 0.3 rad the servo follows: it moved by most of what it was told
+    trial = recording.trials("LF_thigh")[0]
+    assert abs(trial.command_rad - 0.785).max() == pytest.approx(0.3, abs=0.01)
+    assert abs(trial.position_rad - 0.785).max() > 0.2
+
+
+def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
+    with on_a_port(still_servos(ids=[4])) as port:
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--joints", "LF", "--bus", f"feetech:{port.device}"
+        )
+    assert code == 1 and "LF_thigh (id 5), LF_calf (id 6) does not answer" in err
+    assert not list(Path().glob("recordings/*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("sweep", "--bus", "usb"), "write emulated, esp32"),
+        (("sweep", "--bus", "feetech:/dev/ttyUSB0@fast"), "'fast' is no baud rate"),
+        (("sweep", "--bus", "esp32", "--truth"), "only a new recording of the emulated robot"),
+        (("sweep", "--bus", "esp32", "--real-time"), "knows no other time"),
+        (("sweep", "--joint-map", "sts3215"), "has its own"),
+        (("sweep", "--resume", "nothing.csv"), "does not exist"),
+        (("emulate", "feetech", "--ids", "1-20"), "has the ids 1 to 12"),
+        (("emulate", "feetech", "--baud", "7"), "servos know 1000000"),
+        (("emulate", "esp32", "--faults", "gremlins=1"), "'gremlins' is not known"),
+        (("emulate", "esp32", "--faults", "lost=2"), "is no probability"),
+        (("emulate", "esp32", "--faults", "lost"), "is not kind=probability"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, says):
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and says in err and out == ""
+
+
+@pytest.mark.parametrize(
+    ("bus", "says"),
+    [
+        ("feetech:/dev/no-such-port", "There is no such device"),
+        ("esp32:/tmp/no-such-folder-here/socket", "cannot be opened"),
+        ("esp32:nobody.socket", "nobody answers there"),
+    ],
+)
+def test_a_bus_that_is_not_there_says_what_to_check(capsys, bus, says):
+    code, _, err = run(capsys, "sweep", *SHORT, "--bus", bus)
+    assert code == 1 and says in err
+
+
+def test_a_map_of_the_other_frame_is_refused(capsys):
+    with on_a_port(still_servos()) as port:
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--bus", f"feetech:{port.device}",
+            "--joint-map", "mini_pupper_2",
+        )  # fmt: skip
+    assert code == 2 and "a direct bus speaks raw ones" in err and "calibrate-joints" in err
+
+
+@pytest.mark.parametrize("kind", ["feetech", "esp32"])
+def test_an_emulator_says_what_to_type_and_ends_on_request(tmp_path, kind):
+    place = ("--link", "s") if kind == "feetech" else ("--socket", "s")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cli.pupper_sysid", "emulate", kind, *place, "--truth", "t.yaml"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+    )  # fmt: skip
+    until = time.monotonic() + 30
+    while not (tmp_path / "s").exists():
+        assert time.monotonic() < until and process.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=10)
+    assert "pupper-sysid sweep --freqs 1-10 --joints LF --bus" in out
+    assert process.returncode == 1 and "Stopped." in err and "Traceback" not in err
+    assert not (tmp_path / "s").exists(), "it leaves nothing behind"
+    truth = yaml.safe_load((tmp_path / "t.yaml").read_text())
+    assert truth["joints"]["LF_hip"]["actuator"]["delay_s"] > 0

@@ -1,0 +1,155 @@
+"""A robot whose driver dies or hangs is parked by the watchdog; one that is left well is let be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.joints import JOINT_NAMES
+from hardware.connect import open_guarded, parse_address
+from hardware.feetech_registers import STS3215
+from hardware.joint_map import load_joint_map
+from sim.emulated_robot import RobotSpec, draw_robot
+from sim.esp32_emulator import ProxyEmulator
+from sim.esp32_socket import ProxySocket
+from sim.feetech_emulator import FeetechEmulator
+from sim.feetech_pty import FeetechPty
+from sim.servo_bench import ServoBench
+from sysid.recording import load
+
+ROOT = Path(__file__).resolve().parents[1]
+
+DRIVER = """
+import sys, time
+import numpy as np
+from hardware.connect import open_guarded, parse_address
+bus = open_guarded(parse_address(sys.argv[1]))
+pose = bus.read().position_rad
+while not np.isfinite(pose).all():
+    pose = bus.read().position_rad
+bus.torque(True)
+start = bus.now()
+print("driving", flush=True)
+while True:
+    goal = pose + 0.3 * np.sin(2 * np.pi * 0.5 * (bus.now() - start))
+    bus.write(goal)
+    bus.read()
+    bus.sleep_until(bus.now() + 0.02)
+"""
+
+
+@pytest.fixture(params=["feetech", "esp32"])
+def robot(request):
+    """A served emulated robot: server and address."""
+    rng = np.random.default_rng(3)
+    with tempfile.TemporaryDirectory(prefix="w") as name:
+        folder = Path(name)
+        if request.param == "esp32":
+            bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
+            server = ProxySocket(ProxyEmulator(bench, rng), folder / "s")
+            address = f"esp32:{folder / 's'}"
+        else:
+            made = draw_robot(rng, RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0))
+            bench = ServoBench(made, load_joint_map("sts3215"), rng.spawn(1)[0])
+            server = FeetechPty(FeetechEmulator(bench, STS3215, rng), folder / "t")
+            address = f"feetech:{folder / 't'}"
+        thread = threading.Thread(target=server.serve, daemon=True)
+        thread.start()
+        yield server, address
+        server.stop()
+        thread.join(5)
+        server.close()
+
+
+def limp(server) -> bool:
+    bench = server.emulator.bench
+    return not any(bench.is_on(k) for k in range(len(JOINT_NAMES)))
+
+
+def angles(server) -> np.ndarray:
+    bench, now = server.emulator.bench, server.now()
+    return np.array([bench.angle(k, now) for k in range(len(JOINT_NAMES))])
+
+
+def wait_for(condition, seconds: float) -> float:
+    """How long it took until `condition()` held."""
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < seconds, "it never happened"
+        time.sleep(0.005)
+    return time.monotonic() - start
+
+
+def drive(address: str) -> subprocess.Popen:
+    process = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, address], stdout=subprocess.PIPE, cwd=ROOT
+    )
+    assert process.stdout is not None and process.stdout.readline() == b"driving\n"
+    return process
+
+
+def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second(robot):
+    server, address = robot
+    found = angles(server)
+    process = drive(address)
+    time.sleep(0.5)  # a quarter of its swing: farthest out
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    took = wait_for(lambda: limp(server), 5.0)
+    assert took < 1.5  # a second on an idle machine; tests share theirs
+    np.testing.assert_allclose(angles(server), found, atol=0.06)
+
+
+def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
+    server, address = robot
+    process = drive(address)
+    os.kill(process.pid, signal.SIGSTOP)
+    took = wait_for(lambda: limp(server), 6.0)
+    assert 0.9 < took < 3.5
+    assert process.wait(2.0) == -signal.SIGKILL
+
+
+def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
+    server, address = robot
+    bus = open_guarded(parse_address(address))
+    while not np.isfinite(bus.read().position_rad).all():
+        time.sleep(0.02)
+    bus.torque(True)
+    bus.close()
+    assert limp(server)
+    commands = len(server.emulator.bench.commands)
+    time.sleep(0.3)
+    assert len(server.emulator.bench.commands) == commands
+
+
+def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp_path):
+    server, address = robot
+    path = tmp_path / "a.csv"
+    command = [
+        sys.executable, "-m", "cli.pupper_sysid", "sweep", "--joints", "LF_hip", "--freqs", "3",
+        "--duration", "2",
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        [*command, "--bus", address, "--out", str(path)], cwd=ROOT, stderr=subprocess.PIPE
+    )
+    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 40, 30.0)
+    process.terminate()
+    said = process.communicate(timeout=10)[1].decode()
+    assert process.returncode == 1 and "Stopped." in said and "Traceback" not in said
+    # on a serial line only the named joint is driven, and so only it is let go
+    assert not server.emulator.bench.is_on(JOINT_NAMES.index("LF_hip"))
+    assert "completed" not in load(path).metadata
+    done = subprocess.run(
+        [*command, "--resume", str(path)], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert "completed" in load(path).metadata
