@@ -6,6 +6,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from hardware.feetech_registers import STS3215
 from hardware.joint_map import load_joint_map
 from sim.bus_faults import BusFaults
+from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import RobotSpec, draw_robot
 from sim.esp32_emulator import ProxyEmulator
 from sim.esp32_socket import ProxySocket
@@ -23,6 +25,22 @@ from sim.servo_bench import ServoBench
 KINDS = ("feetech", "esp32")
 
 
+SPECS = {
+    "esp32": RobotSpec(),
+    # read directly, a servo answers for the very moment: no polls in between, none lost
+    "feetech": RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0),
+}
+
+
+def in_process(kind: str, seed: int) -> EmulatedBus:
+    """The same robot as `served`, without a protocol and in virtual time."""
+    rng = np.random.default_rng(seed)
+    robot = draw_robot(rng, SPECS[kind])
+    if kind == "feetech":
+        robot = replace(robot, spec=replace(SPECS[kind], quantum_rad=2 * np.pi / 4096))
+    return EmulatedBus(robot, rng)
+
+
 @contextmanager
 def served(
     kind: str, seed: int, faults: BusFaults | None = None
@@ -31,16 +49,16 @@ def served(
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory(prefix="robot") as name:
         folder = Path(name)
+        robot = draw_robot(rng, SPECS[kind])
+        layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+        bench = ServoBench(robot, layout, rng.spawn(1)[0])
         if kind == "esp32":
-            bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
             server = ProxySocket(ProxyEmulator(bench, rng, faults), folder / "socket")
             where = f"esp32:{folder / 'socket'}"
         else:
-            # read directly, a servo answers for the very moment: no polls in between, none lost
-            robot = draw_robot(rng, RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0))
-            bench = ServoBench(robot, load_joint_map("sts3215"), rng.spawn(1)[0])
-            emulator = FeetechEmulator(bench, STS3215, rng, faults=faults)
-            server = FeetechPty(emulator, folder / "servos")
+            server = FeetechPty(
+                FeetechEmulator(bench, STS3215, rng, faults=faults), folder / "servos"
+            )
             where = f"feetech:{folder / 'servos'}"
         thread = threading.Thread(target=server.serve, daemon=True)
         thread.start()

@@ -28,7 +28,7 @@ from emulators import KINDS, served
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.bus import BusSample
 from hardware.connect import open_bus, parse_address
-from hardware.loop import request_real_time_priority
+from hardware.loop import real_time_priority
 from sim.bus_faults import ANSWER_KINDS, STATE_KINDS, BusFaults
 
 POSE = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
@@ -159,7 +159,6 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=500, help="faults of each kind on each bus")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    request_real_time_priority()
     print("| bus | fault | injected | readings | missing % | wrong but called good | exceptions "
           "| recovery ms: median | worst |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|")
@@ -192,4 +191,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with real_time_priority():
+        main()

@@ -17,16 +17,16 @@ import time
 from pathlib import Path
 
 import numpy as np
-from emulators import KINDS, served
+from emulators import KINDS, in_process, served
 
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from sim.servo_bench import ServoBench
-from sysid.calibrate import dead_times
-from sysid.recording import load
+from sysid.calibrate import calibrate
+from sysid.excitation import plan
+from sysid.recorder import record
+from sysid.recording import Recording, load
 
 JOINT = "LF_hip"
-TRANSPORT_S = {"feetech": 0.0005, "esp32": 0.001}
-"""From sending to the servo: 47 bytes at 1 Mbaud; half a tick of the firmware."""
 SWEEP = ("sweep", "--joints", JOINT, "--freqs", "2,3,5", "--duration", "3")
 
 
@@ -99,26 +99,28 @@ def main() -> None:
     print(
         "| bus | kills | parked after s: median | worst | rad from where it was found: worst "
         "| last row before the kill s: median | worst | files that do not read "
-        "| recordings completed by resuming | their dead time interval holds the truth |"
+        "| recordings completed by resuming | their dead time ms | never interrupted, in process |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for kind in KINDS:
         with served(kind, options.seed) as (server, bus, folder):
             result = campaign(server, bus, folder, options.kills // 2, options.seed)
             p, s = result["parked"], result["silence"]
-            robot = result["bench"].robot
-            true = robot.servos[JOINT_NAMES.index(JOINT)].actuator.delay_s
-            held = 0
-            for path in result["complete"]:
-                found = dead_times([load(path)], seed=0)[JOINT].dead_time
-                held += found.low <= true + TRANSPORT_S[kind] <= found.high
-            done = len(result["complete"])
+            delays = [1e3 * delay_s(load(path)) for path in result["complete"]]
+            made = plan("sine", [JOINT], [2.0, 3.0, 5.0], duration_s=3.0)
+            plain = load(record(in_process(kind, options.seed), made, folder / "plain.csv"))
             print(
                 f"| {kind} | {len(p)} | {np.median(p):.2f} | {p.max():.2f} "
                 f"| {max(result['away']):.3f} | {np.median(s):.2f} | {s.max():.2f} "
-                f"| {result['unreadable']} | {done} | {held} of {done} |",
+                f"| {result['unreadable']} | {len(delays)} "
+                f"| {', '.join(f'{d:.1f}' for d in delays)} | {1e3 * delay_s(plain):.1f} |",
                 flush=True,
             )
+
+
+def delay_s(recording: Recording) -> float:
+    """Dead time of the calibrated model [s]."""
+    return calibrate([recording], seed=0)[JOINT].dead_time.value
 
 
 if __name__ == "__main__":

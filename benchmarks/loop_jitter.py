@@ -22,7 +22,7 @@ from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.clock import HostClock
 from hardware.connect import open_guarded, parse_address
 from hardware.guard import GuardedBus
-from hardware.loop import FixedRateLoop, request_real_time_priority
+from hardware.loop import FixedRateLoop, real_time_priority
 
 PERIOD_S = 0.02
 POSE = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
@@ -57,8 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     options = parser.parse_args()
-    priority = request_real_time_priority()
-    with tempfile.TemporaryDirectory(prefix="jitter") as name:
+    with tempfile.TemporaryDirectory(prefix="jitter") as name, real_time_priority() as priority:
         link = Path(name) / "servos"
         emulator = subprocess.Popen(
             [sys.executable, "-m", "cli.pupper_sysid", "emulate", "feetech", "--link", str(link)],

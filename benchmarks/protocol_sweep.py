@@ -3,7 +3,9 @@
 The recorder runs here and talks through the pseudo-terminal or the socket, in real time. The truth
 of a joint's lag is that of a servo with the true parameters which gets the goals at the very times
 at which the emulator's servo got them, without noise and every millisecond, as in
-`lag_accuracy.py`.
+`lag_accuracy.py`. Beside it stands what the same robot gives without a protocol, in process and in
+virtual time. (The dead time is that of a model with steps of 2 ms, which answers a little sooner
+than the emulator's servos with steps of 1 ms; so it comes out longer, on either way.)
 
     .venv/bin/python benchmarks/protocol_sweep.py
 """
@@ -17,12 +19,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from emulators import KINDS, served
+from emulators import KINDS, in_process, served
 
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.connect import open_bus, parse_address
 from hardware.guard import GuardedBus
-from hardware.loop import request_real_time_priority
+from hardware.loop import real_time_priority
 from sim.free_air_servo import FreeAirServo
 from sysid.calibrate import calibrate
 from sysid.delay import tone_lags, tone_weights
@@ -34,7 +36,7 @@ from sysid.tone import tone_response
 
 
 def sweep(kind: str, seed: int, joints: list[str], frequencies: list[float], seconds: float):
-    """The recording of one robot, the server, and bus time minus emulator time."""
+    """Recordings with and without the protocol, the server, and bus time minus emulator time."""
     with served(kind, seed) as (server, where, folder):
         bus = GuardedBus(open_bus(parse_address(where)))
         shift = bus.now() - server.now()
@@ -42,7 +44,8 @@ def sweep(kind: str, seed: int, joints: list[str], frequencies: list[float], sec
         rate = bus.metadata.get("poll_rate_hz", 1 / 0.02685)
         made = plan("sine", joints, frequencies, 0.3, seconds, 0.019, speed, rate)
         recording = load(record(bus, made, folder / "sweep.csv"))
-    return recording, server, shift
+        plain = load(record(in_process(kind, seed), made, folder / "plain.csv"))
+    return recording, plain, server, shift
 
 
 def true_motion(server, joint: str, shift: float) -> tuple[np.ndarray, np.ndarray]:
@@ -89,41 +92,45 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    request_real_time_priority()
     frequencies = [1.0, 2.0, 3.0, 5.0, 7.0, 10.0]
     joints = list(JOINT_NAMES[: options.joints])
-    print("| bus | joint | lag ms | 90 % interval | true lag | dead time ms | 90 % interval "
-          "| true | held RMSE mrad | missing % |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("| bus | joint | lag ms | 90 % interval | true lag | in process | dead time ms "
+          "| in process | true | held RMSE mrad | in process | missing % |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     for kind in KINDS:
-        recording, server, shift = sweep(kind, options.seed, joints, frequencies, options.seconds)
+        recording, plain, server, shift = sweep(
+            kind, options.seed, joints, frequencies, options.seconds
+        )
         missing = recording.table.groupby("joint")["position_rad"].apply(lambda x: x.isna().mean())
-        found = calibrate([recording], seed=0)
-        errors, inside, dead = [], 0, 0
+        found, without = calibrate([recording], seed=0), calibrate([plain], seed=0)
+        errors, inside, apart = [], 0, []
         for joint in joints:
-            result = found[joint]
+            result, other = found[joint], without[joint]
             lag, delay = result.budget.lag, result.dead_time
             truth = true_lag(recording, server, joint, shift)
             own = server.emulator.bench.robot.servos[JOINT_NAMES.index(joint)].actuator.delay_s
             errors.append(lag.value - truth)
             inside += lag.low <= truth <= lag.high
-            dead += delay.low <= own <= delay.high
+            apart.append(delay.value - other.dead_time.value)
             print(
                 f"| {kind} | {joint} | {1e3 * lag.value:.1f} "
                 f"| {1e3 * lag.low:.1f} … {1e3 * lag.high:.1f} | {1e3 * truth:.1f} "
-                f"| {1e3 * delay.value:.1f} | {1e3 * delay.low:.1f} … {1e3 * delay.high:.1f} "
-                f"| {1e3 * own:.1f} "
+                f"| {1e3 * other.budget.lag.value:.1f} | {1e3 * delay.value:.1f} "
+                f"| {1e3 * other.dead_time.value:.1f} | {1e3 * own:.1f} "
                 f"| {1e3 * result.rungs['delayed_pd'].scores.held:.1f} "
+                f"| {1e3 * other.rungs['delayed_pd'].scores.held:.1f} "
                 f"| {100 * missing[joint]:.1f} |",
                 flush=True,
             )
         print(
             f"\n{kind}: lag bias {1e3 * np.mean(errors):+.2f} ms, worst "
-            f"{1e3 * np.abs(errors).max():.2f} ms; {inside} of {len(joints)} lag intervals and "
-            f"{dead} of {len(joints)} dead-time intervals hold the truth.\n",
+            f"{1e3 * np.abs(errors).max():.2f} ms; {inside} of {len(joints)} lag intervals hold "
+            f"the truth. Dead time against in process: {1e3 * np.mean(apart):+.2f} ms on average, "
+            f"{1e3 * np.abs(apart).max():.2f} ms at most.\n",
             flush=True,
         )
 
 
 if __name__ == "__main__":
-    main()
+    with real_time_priority():
+        main()

@@ -17,7 +17,7 @@ from common.files import write_text
 from hardware.esp32_bus import SOCKET
 from hardware.feetech_registers import BAUD_RATES, SCS0009, STS3215
 from hardware.joint_map import load_joint_map
-from hardware.loop import request_real_time_priority
+from hardware.loop import real_time_priority
 from sim.bus_faults import BusFaults
 from sim.emulated_robot import RobotSpec, draw_robot
 from sim.esp32_emulator import ProxyEmulator
@@ -133,10 +133,9 @@ def _serve(server: ProxySocket | FeetechPty, what: str, name: str) -> None:
         f"  pupper-sysid monitor --bus {name}\nCtrl-C ends it.",
         soft_wrap=True,
     )
-    # bytes that come late from a servo look like a slow servo
-    request_real_time_priority()
     try:
-        server.serve()
+        with real_time_priority():  # bytes that come late would look like a slow servo
+            server.serve()
     finally:
         server.close()
 

@@ -17,8 +17,10 @@ import tyro
 
 from cli.analyse import Bode, Delay, Doctor
 from cli.calibrate import Calibrate
+from cli.calibrate_joints import CalibrateJoints
 from cli.emulate import Emulate
 from cli.export import Export
+from cli.monitor import Monitor
 from cli.report import Report
 from cli.scan import Scan
 from cli.sweep import Sweep
@@ -27,6 +29,8 @@ from common.errors import PupperError
 
 Command = (
     Annotated[Scan, tyro.conf.subcommand("scan")]
+    | Annotated[Monitor, tyro.conf.subcommand("monitor")]
+    | Annotated[CalibrateJoints, tyro.conf.subcommand("calibrate-joints")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Delay, tyro.conf.subcommand("delay")]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,18 +13,18 @@ import numpy as np
 
 from cli import terminal
 from cli.buses import connect
-from common.errors import InputError
+from common.errors import BusError, InputError
 from common.files import refuse_overwrite
 from common.joints import select_joints
 from hardware.bus import ServoBus
-from hardware.loop import request_real_time_priority
+from hardware.loop import real_time_priority
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import draw_robot
 from sysid.command_playback import playback
 from sysid.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan, start_pose
 from sysid.recorder import LOOP_PERIOD_S, record
 from sysid.recording import FOLDER
-from sysid.resume import header_of, resume_point
+from sysid.resume import footer, header_of, resume_point
 
 EMULATED = "emulated"
 
@@ -99,12 +101,26 @@ class Sweep:
                 f"Continuing {path} at trial {resume.next_trial + 1} of {len(chosen.trials)}."
             )
         started = time.perf_counter()
-        with terminal.seconds_progress("recording", chosen.duration_s) as advance:
-            record(
-                bus, chosen, path, loop_period_s=request["loop_period_s"],
-                metadata={"seed": request["seed"], "sweep": request, "priority": self._priority()},
-                force=self.force, resume=resume, progress=advance,
-            )  # fmt: skip
+        existed = path.exists()
+        try:
+            with (
+                _priority(request) as priority,
+                terminal.seconds_progress("recording", chosen.duration_s) as advance,
+            ):
+                record(
+                    bus, chosen, path, loop_period_s=request["loop_period_s"],
+                    metadata={"seed": request["seed"], "sweep": request, "priority": priority},
+                    force=self.force, resume=resume, progress=advance,
+                )  # fmt: skip
+        except (BusError, KeyboardInterrupt):
+            if path.exists() and (resume or not existed or self.force):
+                terminal.err.print(
+                    f"What was recorded is in {path}; go on with\n"
+                    f"  pupper-sysid sweep --resume {path}",
+                    soft_wrap=True,
+                )
+            raise
+        terminal.warn(_guard_warnings(path))
         written = [path]
         if self.truth and isinstance(bus, EmulatedBus):
             written += bus.write_truth(stem, self.force)
@@ -129,13 +145,6 @@ class Sweep:
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
         }
-
-    def _priority(self) -> str:
-        if self.bus == EMULATED and not self.real_time:
-            return "none: virtual time"
-        said = request_real_time_priority()
-        terminal.err.print(f"Control loop at {said}.")
-        return said
 
     def _say(
         self, request: dict[str, Any], chosen: Plan, written: list[Path], elapsed: float
@@ -194,3 +203,31 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
         bus.metadata.get("poll_rate_hz", POLL_RATE_HZ),
         dict(zip(bus.joint_names, map(float, room), strict=True)),
     )  # fmt: skip
+
+
+@contextmanager
+def _priority(request: dict[str, Any]) -> Iterator[str]:
+    if request["bus"] == EMULATED and not request["real_time"]:
+        yield "none: virtual time"
+        return
+    with real_time_priority() as said:
+        terminal.err.print(f"Control loop at {said}.")
+        yield said
+
+
+def _guard_warnings(path: Path) -> list[str]:
+    """What a user should know of what the guard did to the commands."""
+    did = footer(path).get("guard", {})
+    found = []
+    if did.get("clipped"):
+        found.append(
+            f"{did['clipped']} commands were outside the joints' limits and were held at them."
+        )
+    if did.get("slowed"):
+        found.append(
+            f"{did['slowed']} commands came later than asked, at the guard's speed and acceleration "
+            "limits; the recording holds what was sent."
+        )
+    if did.get("unsent"):
+        found.append(f"{did['unsent']} commands could not be sent; the servos kept the last goal.")
+    return found

@@ -70,7 +70,10 @@ def warn(sentences) -> None:
 
 def table(title: str, *columns: str) -> Table:
     """An empty table in the house style; the first column is left-aligned text."""
-    made = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    made = Table(
+        title=title, title_justify="left", title_style="bold", box=None, pad_edge=False,
+        min_width=min(len(title), out.width),  # or a long title is broken to a small table's width
+    )  # fmt: skip
     for k, column in enumerate(columns):
         made.add_column(column, justify="left" if k == 0 else "right", no_wrap=k == 0)
     return made

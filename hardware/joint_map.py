@@ -166,10 +166,7 @@ class JointMap:
 
     def zero_rad(self) -> NDArray[np.float64]:
         """Servo-coordinate angle of each joint's neutral count, shape (joints,) [rad]."""
-        neutral = self._neutral()
-        calf, thigh = self._legs()
-        neutral[calf] -= self._thigh_neutral(calf)
-        return neutral
+        return self.per_servo().to_angles(self._zero_count())
 
     def sign(self) -> NDArray[np.float64]:
         """Direction of the counts, shape (joints,)."""
@@ -206,11 +203,14 @@ class JointMap:
         joint = np.array([self._entry(j).limits_rad for j in self.joint_names])
         calf, thigh = self._legs()
         both = np.stack([np.maximum(servo, joint)[:, 0], np.minimum(servo, joint)[:, 1]], axis=1)
+        if self.coordinates == "servo" and self.file.linkage != "none":
+            # a calf without its thigh: the thigh is taken to rest at its neutral
+            calves = (i for i, j in enumerate(self.joint_names) if j.endswith("_calf"))
+            alone = [i for i in calves if i not in calf]
+            own = servo[alone] - self._thigh_neutral(alone)[:, None]
+            both[alone, 0] = np.maximum(own, joint[alone])[:, 0]
+            both[alone, 1] = np.minimum(own, joint[alone])[:, 1]
         if not len(calf):
-            if self.coordinates == "servo" and self.file.linkage != "none":
-                # a calf without its thigh: the thigh is taken to rest at its neutral
-                alone = [i for i, j in enumerate(self.joint_names) if j.endswith("_calf")]
-                both[alone] = servo[alone] - self._thigh_neutral(alone)[:, None]
             return PositionLimits(both[:, 0], both[:, 1])
         if self.coordinates == "joint":
             both[calf] = joint[calf]
@@ -346,9 +346,11 @@ def joint_map_from(data: dict[str, Any], name: str, lines: dict | None = None) -
         place = tuple(p for p in fault["loc"] if isinstance(p, str | int))
         line = (lines or {}).get(place)
         at = f", line {line}" if line else ""
-        what = fault["msg"].removeprefix("Value error, ")
+        message = fault["msg"]
+        what = message.removeprefix("Value error, ")  # ours, which may begin with a joint's name
+        what = message[:1].lower() + message[1:] if what == message else what
         where = f": {place_text(place)}" if place else ""
-        raise InputError(f"{name}{at}{where}: {what[:1].lower()}{what[1:]}.") from error
+        raise InputError(f"{name}{at}{where}: {what}.") from error
     return JointMap(file, tuple(j for j in JOINT_NAMES if j in file.joints))
 
 

@@ -5,14 +5,15 @@
         ...
 
 Tick `k` is due `k` periods after the start, whatever happened before; a tick that cannot start in
-time is left out and counted. `request_real_time_priority` asks the system to run this process
-first, and says in words whether it does.
+time is left out and counted. `real_time_priority` asks the system to run this process first, and
+says in words whether it does.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -112,12 +113,23 @@ class FixedRateLoop:
         )
 
 
-def request_real_time_priority() -> str:
-    """Ask for real-time scheduling of this process; returns what came of it, in words."""
+@contextmanager
+def real_time_priority() -> Iterator[str]:
+    """Real-time scheduling of this process for as long as the block; yields what came of it.
+
+    Processes that it starts are scheduled normally: a busy one would starve the whole machine.
+    """
     if not hasattr(os, "sched_setscheduler"):
-        return "normal priority: this system has no real-time scheduling"
+        yield "normal priority: this system has no real-time scheduling"
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
     except OSError:
-        return "normal priority: real-time scheduling is not allowed to this user"
-    return "real-time priority (SCHED_FIFO)"
+        yield "normal priority: real-time scheduling is not allowed to this user"
+        return
+    try:
+        yield "real-time priority (SCHED_FIFO)"
+    finally:
+        with suppress(OSError):  # an ordinary user may not take the flag back, which does no harm
+            os.sched_setscheduler(0, *before)

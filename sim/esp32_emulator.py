@@ -27,6 +27,7 @@ STAND_UP_S = 4.0
 LOW_VOLTAGE_V = 4.0
 
 _SET = struct.Struct("<BB12B12H")
+_CENTRE = 512
 _AT_REST_IMU = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
 
 
@@ -59,6 +60,7 @@ class ProxyEmulator:
         self._measured = np.full(servos, -np.inf)
         self._stuck_until = np.full(servos, -np.inf)
         self._deaf_until = -np.inf
+        self._calibration = np.zeros(servos, int)
         self._time = 0.0
         self.unplug_for_s = 0.0
         """Set by a fault: the proxy shall die and come back after so long."""
@@ -115,6 +117,8 @@ class ProxyEmulator:
     def _obey(self, torque: tuple[int, ...], counts: tuple[int, ...], now: float) -> None:
         """A setpoint reaches the servos with the firmware's next tick."""
         if torque[0] == datagrams.SAVE_CALIBRATION:
+            # the present goals become the new centre; then the firmware stands up anew
+            self._calibration += _CENTRE - np.array(counts)
             self._deaf_until = now + STAND_UP_S
             for k in self._index:
                 self.bench.torque(k, now, False)
@@ -122,10 +126,11 @@ class ProxyEmulator:
         if now < self._deaf_until or self.bench.supply_v < LOW_VOLTAGE_V:
             return
         at = math.ceil(now / TICK_S) * TICK_S
-        for k, on, count in zip(self._index, torque, counts, strict=True):
+        raw = np.clip(np.array(counts) - self._calibration, 0, datagrams.HIGHEST_COUNT)
+        for k, on, count in zip(self._index, torque, raw, strict=True):
             if on == datagrams.TORQUE_ON:
                 self.bench.torque(k, at, True)
-                self.bench.command(k, at, min(count, datagrams.HIGHEST_COUNT))
+                self.bench.command(k, at, int(count))
             elif on == datagrams.TORQUE_OFF:
                 self.bench.torque(k, at, False)
 
@@ -136,7 +141,8 @@ class ProxyEmulator:
         for servo, k in enumerate(self._index):
             at = measured[k]
             if at > self._measured[servo] and at >= 0 and at >= self._stuck_until[servo]:
-                self._counts[servo] = max(self.bench.count(k, at), 1)
+                calibrated = self.bench.count(k, at) + self._calibration[servo]
+                self._counts[servo] = min(max(calibrated, 1), datagrams.HIGHEST_COUNT)
                 self._loads[servo] = self.bench.load(k)
                 self._measured[servo] = at
         block = tuple(int(c) for c in self._counts)

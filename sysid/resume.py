@@ -7,6 +7,7 @@ changed.
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,16 +99,27 @@ def header_of(path: Path) -> dict[str, Any]:
     return metadata
 
 
+def footer(path: Path) -> dict[str, Any]:
+    """What a finished recording says of how it went; empty if it was not finished."""
+    return header(path, read_text(path).splitlines()).get("completed", {})
+
+
 def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
     """Where `plan`, partly carried out in the recording at `path`, goes on.
 
     Raises
     ------
     InputError
-        If the recording cannot be read.
+        If the recording cannot be read, or was made with another plan.
     """
     written_at = path.stat().st_mtime
     text = read_text(path)
+    planned = header(path, text.splitlines()).get("excitation")
+    if planned != json.loads(json.dumps(dict(plan.description))):
+        raise InputError(
+            f"{path} was recorded with another plan than its header gives today: the played file, "
+            "the joint map or the limits have changed since. Record it again."
+        )
     whole = text[: text.rfind("\n") + 1]
     if sum(bool(line.strip()) and line[0] != "#" for line in whole.splitlines()) < 2:
         return Resume(0, 0, 0.0, written_at)

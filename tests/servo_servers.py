@@ -30,7 +30,9 @@ class StillBench(ServoBench):
 
     def __init__(self, layout: str):
         rng = np.random.default_rng(0)
-        super().__init__(draw_robot(rng, exact_spec()), load_joint_map(layout), rng)
+        # the proxy polls; a direct bus measures when it is asked
+        spec = RobotSpec(loss=0.0) if layout == LAYOUTS["proxy"] else exact_spec()
+        super().__init__(draw_robot(rng, spec), load_joint_map(layout), rng)
         self.id_of_index = {k: i for i, k in self.index_of_id.items()}
         self.counts = {i: self.map.file.counts // 2 for i in self.index_of_id}
         self.loads = dict.fromkeys(self.index_of_id, 0)

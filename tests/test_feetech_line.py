@@ -19,21 +19,20 @@ from servo_servers import (
 )
 
 from common.errors import BusError, InputError
-from hardware import feetech_line
+from hardware import feetech_line, scan
 from hardware.feetech_bus import FeetechBus, open_line
 from hardware.feetech_frames import Frame
 from hardware.feetech_line import FeetechLine
 from hardware.feetech_registers import SCS0009, STS3215
 from hardware.joint_map import JointMap, joint_map_from, load_joint_map
-from hardware.scan import scan_line
 from sim.servo_bench import ServoBench
 
 POSITION = 56
-PATIENT_S = 0.04
+PATIENT_S = 0.4
 
 
 @pytest.fixture(autouse=True)
-def patience(monkeypatch, request):
+def patience(monkeypatch):
     """The servos share this process and a busy machine; tests of time put the true one back."""
     monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", PATIENT_S)
 
@@ -82,7 +81,7 @@ def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
 
 
 def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
-    late = iter([0.06])
+    late = iter([0.2])
 
     def answer(request: Frame) -> list[tuple[float, bytes]]:
         delay = next(late, 0.0)
@@ -92,26 +91,23 @@ def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
         line = FeetechLine(server.device, 1_000_000)
         line.patience_s = 0.02
         assert position(line, 1) is None
-        time.sleep(0.08)
+        time.sleep(0.25)
         line.patience_s = PATIENT_S
         assert position(line, 1) == 123
         line.close()
 
 
 def test_b5_3_a_late_reply_that_comes_during_the_next_read_has_another_length():
-    late = iter([0.03])
+    counts = iter([900, 123])
 
     def answer(request: Frame) -> list[tuple[float, bytes]]:
-        delay = next(late, 0.0)
-        count = STS3215.word(900 if delay else 123)
-        here = raw(1, count + bytes(request.data[1] - 2))
-        return [(delay or 0.03, here)]
+        return [(0.1, raw(1, STS3215.word(next(counts)) + bytes(request.data[1] - 2)))]
 
     with on_a_port(Scripted(answer)) as server:
         line = FeetechLine(server.device, 1_000_000)
-        line.patience_s = 0.015
+        line.patience_s = 0.02
         assert line.read(1, POSITION, 8) is None
-        line.patience_s = 0.2
+        line.patience_s = 0.5
         reply = line.read(1, POSITION, 9)
         assert reply and STS3215.decode("position", reply.frame.data, POSITION) == 123
         line.close()
@@ -160,7 +156,9 @@ def test_b5_5_a_servo_that_falls_silent_has_no_reading_instead_of_its_last_one()
         sample = bus.read()
         bus.close()
     silent = np.array([j == "LF_thigh" for j in bus.joint_names])
-    assert np.isnan(sample.position_rad[silent]).all() and (sample.position_count[silent] == -1).all()
+    assert (
+        np.isnan(sample.position_rad[silent]).all() and (sample.position_count[silent] == -1).all()
+    )
     assert np.isfinite(sample.position_rad[~silent]).all()
 
 
@@ -185,7 +183,7 @@ def test_b5_6_an_adapter_that_was_pulled_and_plugged_in_again_is_found_again():
     with on_a_port(servos) as server:
         bus = FeetechBus(server.device, 1_000_000)
         bus.line.patience_s = 0.01
-        assert np.isfinite(bus.read().position_rad).all()
+        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
         servos.unplug_for_s = 0.3
         assert wait_until(lambda: bool(np.isnan(bus.read().position_rad).all()))
         assert np.isnan(bus.write(np.array([0, 0.8, -0.8] * 4)).time_s)
@@ -254,7 +252,6 @@ def test_b5_10_an_echoing_adapter_is_recognised_and_its_echo_is_no_answer(series
     with on_a_port(servos) as server:
         bus = FeetechBus(server.device, 1_000_000)
         assert bus.metadata["echo"] is True
-        bus.line.patience_s = 0.1
         for count in (500, 510):
             bench_of(servos).counts = dict.fromkeys(range(1, 13), count)
             assert bus.write(bus.read().position_rad).time_s > 0
@@ -290,10 +287,11 @@ def test_b5_12_a_ping_is_one_question_of_six_bytes():
 
 
 def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.15)
+    monkeypatch.setattr(scan, "HIGHEST_ID", 8)
     servos = still_servos(SCS0009, ids=[3, 7])
     with on_a_port(servos) as server:
-        rate, reports = scan_line(server.device, 1_000_000)
+        rate, reports = scan.scan_line(server.device, 1_000_000)
     assert rate == 1_000_000
     assert [(r.id, r.model, r.gains, r.limits) for r in reports] == [
         (3, "SCS0009", (15, 15, 0), (20, 1003)),
@@ -363,7 +361,7 @@ def test_the_time_of_a_reply_lies_within_its_exchange():
 
 
 def test_a_500000_baud_scs_line_is_found_without_naming_the_rate(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)
     with on_a_port(still_servos(SCS0009, baud=500_000)) as server:
         bus = FeetechBus(server.device)
         assert bus.metadata["baud"] == 500_000
@@ -456,7 +454,7 @@ def test_what_is_written_is_read_back_within_friction_and_rounding(series):
     assert isinstance(bench, ServoBench)
     # dry friction holds a servo at most friction / stiffness off its goal
     truth = [s.actuator for s in bench.robot.servos]
-    off = np.array([t.friction_loss / t.stiffness for t in truth], float)
+    off = np.array([float(np.divide(t.friction_loss, t.stiffness)) for t in truth])
     assert (np.abs(goal - start) > 0.05).all()
     assert (np.abs(sample.position_rad - goal) <= off + 1.01 / bench.map.counts_per_rad()).all()
     assert sample.voltage_v is not None and sample.voltage_v.tolist() == [7.4] * 12
@@ -468,7 +466,7 @@ def test_torque_off_lets_all_go_and_on_holds_them_where_they_are():
     with on_a_port(servos) as server:
         bus = FeetechBus(server.device, 1_000_000)
         assert bus.torque(False)
-        assert bench.torques == [(i, False) for i in load_joint_map("sts3215").ids]
+        assert dict(bench.torques) == dict.fromkeys(range(1, 13), False)
         # somebody moves the robot while it is limp
         bench.counts = {i: 2000 + i for i in range(1, 13)}
         bench.torques.clear()
@@ -482,11 +480,11 @@ def test_torque_says_so_when_one_servo_did_not_confirm():
     servos = still_servos()
     with on_a_port(servos) as server:
         bus = FeetechBus(server.device, 1_000_000)
-        bus.line.patience_s = 0.02
+        bus.line.patience_s = 0.1
         del servos.servos[5]
         assert not bus.torque(False)
         bus.close()
-    assert len(bench_of(servos).torques) == 11
+    assert {i for i, _ in bench_of(servos).torques} == set(range(1, 13)) - {5}
 
 
 def test_the_goals_that_stand_in_the_servos_can_be_read():
@@ -503,14 +501,15 @@ def test_the_goals_that_stand_in_the_servos_can_be_read():
 def test_a_count_no_servo_can_have_reached_is_no_reading_unless_it_is_told_twice():
     servos = still_servos(ids=[4])
     bench: StillBench = bench_of(servos)
+    bench.counts[4] = 10
     with on_a_port(servos) as server:
         bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
-        assert bus.read().position_count.tolist() == [2048]
-        bench.counts[4] = 300
+        assert bus.read().position_count.tolist() == [10]
+        bench.counts[4] = 4090
         counts = [int(bus.read().position_count[0]) for _ in range(2)]
         bus.close()
-    # 1748 counts are 2.7 rad, and no servo turns them within the milliseconds between two reads
-    assert counts == [-1, 300]
+    # 4080 counts are 6.3 rad, and no servo turns them within the milliseconds between two reads
+    assert counts == [-1, 4090]
 
 
 def test_error_bits_come_with_the_reading():

@@ -53,7 +53,9 @@ def golden(name: str) -> bytes:
 class SdkClient:
     """The vendor's SDK as its manual uses it, with nothing of ours."""
 
-    def __init__(self, device: str, end: int):
+    def __init__(self, device: str, end: int, monkeypatch: pytest.MonkeyPatch):
+        # the SDK's 34 ms are too few on a busy machine that plays the servos too
+        monkeypatch.setattr(scservo_sdk.port_handler, "LATENCY_TIMER", 200)
         self.port = scservo_sdk.PortHandler(device)
         self.handler = scservo_sdk.PacketHandler(end)
         assert self.port.openPort() and self.port.setBaudRate(1_000_000)
@@ -67,22 +69,24 @@ def byte_order_is_put_back() -> Iterator[None]:
 
 
 @pytest.fixture
-def sts() -> Iterator[tuple[Listening, SdkClient]]:
-    yield from talking(STS3215, 0)
+def sts(monkeypatch) -> Iterator[tuple[Listening, SdkClient]]:
+    yield from talking(STS3215, 0, monkeypatch)
 
 
 @pytest.fixture
-def scs() -> Iterator[tuple[Listening, SdkClient]]:
-    yield from talking(SCS0009, 1)
+def scs(monkeypatch) -> Iterator[tuple[Listening, SdkClient]]:
+    yield from talking(SCS0009, 1, monkeypatch)
 
 
-def talking(series: Series, end: int) -> Iterator[tuple[Listening, SdkClient]]:
+def talking(
+    series: Series, end: int, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Listening, SdkClient]]:
     servos = still_servos(series)
     bench_of(servos).counts |= {1: 2053, 2: 1000} if series is STS3215 else {3: 502}
     bench_of(servos).loads[3] = -55
     servos.servos[3].memory[58:60] = series.encode("speed", -20)
     with on_a_port(servos) as server:
-        client = SdkClient(server.device, end)
+        client = SdkClient(server.device, end, monkeypatch)
         yield servos, client
         client.port.closePort()
 
@@ -206,7 +210,7 @@ def test_our_line_sends_the_golden_bytes(series, end):
     servos = still_servos(series)
     with on_a_port(servos) as server:
         line = FeetechLine(server.device, 1_000_000)
-        line.patience_s = 0.1  # the servos share this process and a busy machine
+        line.patience_s = 0.4  # the servos share this process and a busy machine
         asked = {
             "ping 1": lambda: line.ping(1),
             "read model 1": lambda: line.model(1),
@@ -336,14 +340,14 @@ def test_a_real_servo_of_the_bench_is_where_its_goal_was_after_a_second():
     there = STS3215.decode("position", FrameReader().feed(answer)[0].data, 56)
     truth = bench.robot.servos[bench.index_of_id[4]].actuator
     # dry friction holds the servo at most friction / stiffness off its goal
-    off = truth.friction_loss / truth.stiffness * bench.map.counts_per_rad()[0] + 1
+    off = np.divide(truth.friction_loss, truth.stiffness) * bench.map.counts_per_rad()[0] + 1
     assert abs(there - 2148) <= float(np.asarray(off))
 
 
 def test_no_parser_trips_over_two_thousand_mutated_frames():
     script = Path(__file__).resolve().parents[1] / "benchmarks" / "fuzz_parsers.py"
     ran = subprocess.run(
-        [sys.executable, str(script), "--frames", "2000", "--seed", "1"],
+        [sys.executable, str(script), "--frames", "2000", "--seed", "1", "--hang-s", "5"],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,6 +102,19 @@ def test_what_cannot_be_continued_is_refused_in_a_sentence(tmp_path, capsys, tex
         run("sweep", "--resume", str(path))
     assert end.value.code == 2 and says in " ".join(capsys.readouterr().err.split())
     assert path.read_text() == text
+
+
+def test_a_played_file_that_has_changed_is_not_played_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{0.05 * k},{0.01 * (k % 5)}" for k in range(60)]
+    Path("gait.csv").write_text("time_s,LF_hip\n" + "\n".join(rows) + "\n")
+    play = ("sweep", "--playback", "gait.csv", "--joints", "LF_hip", "--out", "a.csv")
+    run(*play)
+    cut(Path("a.csv"), 0, 40)
+    Path("gait.csv").write_text("time_s,LF_hip\n" + "\n".join(rows[:-1]) + "\n")
+    with pytest.raises(SystemExit) as end:
+        run("sweep", "--resume", "a.csv")
+    assert end.value.code == 2 and "another plan" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_header_holds_all_that_was_asked_for(whole):

@@ -1,0 +1,330 @@
+"""From what servos say while a person moves a limp robot, to a joint map of that robot.
+
+    travel = Travel(joints=12, counts=1024)          # one `add` per reading
+    new = calibrated(start, Measured(offsets, limits), "2026-11-21")
+
+Three things are measured, all in counts. The *offset* of a servo's horn is where the middle pose
+lies, less the centre of the encoder. The *limits* are the ends of a joint's travel, drawn in by a
+margin. The *scale* (counts per radian) is checked by moving one joint through a known angle; it is
+the one number on which published sources disagree, so limits stay in counts whatever it is.
+
+Nothing here talks to a bus or to a person: `cli.calibrate_joints` does both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import InputError
+from hardware.joint_map import JointMap, JointMapFile, joint_map_from
+
+MARGIN = 0.02
+"""Share of the travel by which limits stay away from each end."""
+SMALLEST_TRAVEL = 40 / 1024
+"""Share of the encoder's range; whoever moved a joint less has not moved it through its range."""
+SCALE_AGREES = 0.03
+"""A scale measured by hand is not known better: 2 degrees of 90 are 2.2 %."""
+STILL = 8 / 1024
+"""Share of the encoder's range by which a held joint may stray while it is measured."""
+
+_FAR_OFFSET_DEG = 30.0
+_WHOLE_RANGE_DEG = (150.0, 400.0)  # no servo of this kind has less or more
+_KNOWN_SCALES = {
+    1024: {
+        "550/pi, the vendor's library": 550 / np.pi,
+        "1024 counts over 300 degrees, the SCS0009's data sheet": 1024 / np.radians(300),
+    },
+    4096: {"4096 counts over 360 degrees, the STS3215's data sheet": 4096 / (2 * np.pi)},
+}
+_SIDES = {
+    "hip": ("foot to the robot's left", "foot to the robot's right"),
+    "thigh": ("knee behind the hip", "knee ahead of the hip"),
+    "calf": ("foot behind the knee", "foot ahead of the knee"),
+}
+_MARK = " Calibrated by calibrate-joints"
+
+
+class Travel:
+    """Lowest and highest counts seen so far.
+
+    An extreme counts once two successive readings have been there: the checksum of a serial frame
+    lets one garbled frame in 256 by, and a joint at the end of its travel stands still anyway.
+
+    Parameters
+    ----------
+    joints : int
+    counts : int
+        Of the encoder's whole range.
+
+    Attributes
+    ----------
+    now, low, high : ndarray of int, shape (joints,)
+        -1 where nothing has been read.
+    wrapped : ndarray of bool, shape (joints,)
+        Whether the counts jumped from one end of the encoder to the other.
+
+    Examples
+    --------
+    >>> travel = Travel(1, 1024)
+    >>> for count in (500, 300, 300, 700, 710, 40, 600):  # 40 is a garbled reading
+    ...     travel.add(np.array([count]))
+    >>> travel.low.tolist(), travel.high.tolist()
+    ([300], [700])
+    """
+
+    def __init__(self, joints: int, counts: int):
+        self.counts = counts
+        self.now, self._before = np.full(joints, -1), np.full(joints, -1)
+        self.low, self.high = np.full(joints, -1), np.full(joints, -1)
+        self.wrapped = np.zeros(joints, bool)
+
+    def add(self, count: NDArray[np.int64]) -> None:
+        """Take in one reading, shape (joints,); -1 where there is none."""
+        here = count >= 0
+        sure = here & (self.now >= 0)
+        lower, higher = np.maximum(count, self.now), np.minimum(count, self.now)
+        self.low = np.where(
+            sure, np.where(self.low < 0, lower, np.minimum(self.low, lower)), self.low
+        )
+        self.high = np.where(sure, np.maximum(self.high, higher), self.high)
+        half = self.counts / 2
+        stayed = (np.abs(count - self._before) > half) & (np.abs(self.now - self._before) > half)
+        self.wrapped |= sure & (self._before >= 0) & stayed
+        self._before = np.where(here, self.now, self._before)
+        self.now = np.where(here, count, self.now)
+
+    def forget(self, joint: int) -> None:
+        """Start anew with one joint."""
+        self.low[joint] = self.high[joint] = self._before[joint] = -1
+        self.wrapped[joint] = False
+
+    def refusals(self, names: tuple[str, ...]) -> dict[str, str]:
+        """Why the travel of a joint is no measurement of its limits, by joint."""
+        least = SMALLEST_TRAVEL * self.counts
+        why: dict[str, str] = {}
+        for k, name in enumerate(names):
+            low, high = int(self.low[k]), int(self.high[k])
+            if low < 0:
+                why[name] = "did not answer"
+            elif self.wrapped[k]:
+                why[name] = (
+                    f"went over the end of its encoder (0 and {self.counts - 1} are neighbours "
+                    "there); its horn must be mounted nearer to the middle"
+                )
+            elif low == high:
+                why[name] = f"did not move from count {low}"
+            elif high - low < least:
+                why[name] = f"moved by {high - low} counts only; {least:.0f} are the least"
+        return why
+
+    def cut_off(self, names: tuple[str, ...]) -> list[str]:
+        """Joints whose travel ran into an end of the encoder, so that its own end was not seen."""
+        at_end = (self.low == 0) | (self.high >= self.counts - 1)
+        return [name for name, cut in zip(names, at_end, strict=True) if cut]
+
+
+def middle_pose_in_words(file: JointMapFile, joints: tuple[str, ...]) -> str:
+    """The pose in which the servos of `joints` stand at their neutral, a line per kind of joint."""
+    degrees = {n: round(np.degrees(file.joints[n].neutral_rad)) for n in joints}
+    lines = []
+    for kind, (positive, negative) in _SIDES.items():
+        mine = {n: d for n, d in degrees.items() if n.endswith(kind)}
+        for angle in sorted(set(mine.values())):
+            same = [n for n, d in mine.items() if d == angle]
+            who = f"every {kind}" if len(same) == len(mine) else ", ".join(same)
+            side = positive if angle > 0 else negative
+            serial_calf = kind == "calf" and file.linkage == "none"
+            zero = "in line with its thigh" if serial_calf else "straight down"
+            how = f"{abs(angle)} degrees from {zero}, {side}" if angle else zero
+            lines.append(f"  {who}: {how}")
+    if file.linkage != "none" and {45, -45} <= set(degrees.values()):
+        lines.append("The knees are at a right angle then, the feet below the hips.")
+    lines.append("Every servo's horn is then in the middle of its range.")
+    return "\n".join(lines)
+
+
+def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean count of held joints, and how far they strayed meanwhile.
+
+    Parameters
+    ----------
+    readings : ndarray of int, shape (readings, joints)
+        -1 where a reading is missing.
+
+    Returns
+    -------
+    mean, strayed : ndarray, shape (joints,)
+        NaN where a joint was never read. `strayed` is from the lowest to the highest reading.
+    """
+    known = np.where(readings < 0, np.nan, readings.astype(float))
+    mean, strayed = np.full((2, readings.shape[1]), np.nan)
+    some = np.isfinite(known).any(axis=0)
+    mean[some] = np.nanmean(known[:, some], axis=0)
+    strayed[some] = np.nanmax(known[:, some], axis=0) - np.nanmin(known[:, some], axis=0)
+    return mean, strayed
+
+
+def offset_counts(mean_count: float, counts: int) -> int:
+    """What a horn is off by: the count of the middle pose less the encoder's centre.
+
+    Examples
+    --------
+    >>> offset_counts(530.4, 1024)
+    18
+    """
+    return round(mean_count - counts / 2)
+
+
+def limits_within(low: int, high: int) -> tuple[int, int]:
+    """Limits that stay `MARGIN` of the travel away from both of its ends.
+
+    Examples
+    --------
+    >>> limits_within(200, 800)  # 2 % of 600 counts are 12
+    (212, 788)
+    """
+    margin = MARGIN * (high - low)
+    return int(np.ceil(low + margin)), int(np.floor(high - margin))
+
+
+def counts_per_rad(from_count: float, to_count: float, angle_deg: float) -> float:
+    """Scale of a servo that was turned through a known angle, in either direction.
+
+    Examples
+    --------
+    >>> round(counts_per_rad(512, 512 - 275, 90), 2)  # 275 counts for pi/2 are 550/pi
+    175.07
+    """
+    return float(abs(to_count - from_count) / np.radians(angle_deg))
+
+
+def scales_agree(measured: float, stated: float) -> bool:
+    """Whether a scale measured by hand gives no reason to doubt the stated one."""
+    return abs(measured / stated - 1) <= SCALE_AGREES
+
+
+def is_plausible_scale(measured: float, counts: int) -> bool:
+    """Whether the encoder's whole range would be an angle that such servos have."""
+    low, high = _WHOLE_RANGE_DEG
+    return low <= np.degrees(counts / measured) <= high if measured > 0 else False
+
+
+def known_scale_near(measured: float, counts: int) -> str | None:
+    """The published scale that a measured one agrees with best, in words; None if none does."""
+    near = {
+        name: abs(measured / scale - 1)
+        for name, scale in _KNOWN_SCALES[counts].items()
+        if scales_agree(measured, scale)
+    }
+    return min(near, key=lambda name: near[name]) if near else None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a calibration found.
+
+    Attributes
+    ----------
+    offset_counts : mapping of joint to int
+        Of all joints that were calibrated.
+    limits_counts : mapping of joint to (int, int)
+        Of those that were moved through their range; the others keep the starting map's, which
+        move along with the offset.
+    scale_joint : str or None
+        The joint on which the scale was checked; None if it was not.
+    counts_per_rad : float or None
+        What was measured there.
+    use_scale : bool
+        Whether all joints take the measured scale; else each keeps that of the starting map.
+    """
+
+    offset_counts: Mapping[str, int]
+    limits_counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    scale_joint: str | None = None
+    counts_per_rad: float | None = None
+    use_scale: bool = False
+
+
+def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
+    """The starting map with what was measured; `limits_rad`, signs and ids stay.
+
+    Raises
+    ------
+    InputError
+        If a joint would have no room left, or the map would not be valid.
+    """
+    data = start.model_dump(by_alias=True)
+    data["name"] = f"{start.name.partition(', calibrated ')[0]}, calibrated {date}"
+    data["source"] = f"{start.source.partition(_MARK)[0].rstrip('. ')}.{_MARK} {date}."
+    for joint, entry in data["joints"].items():
+        said: list[str] = []
+        if joint in measured.offset_counts:
+            said = _place(entry, joint, start, measured)
+        if measured.scale_joint and measured.counts_per_rad:
+            on = f"measured on {measured.scale_joint}"
+            if measured.use_scale:
+                entry["counts_per_rad"] = float(measured.counts_per_rad)
+                said.append(f"counts_per_rad {on}")
+            elif said:
+                said.append(f"counts_per_rad of {start.name} ({on}: {measured.counts_per_rad:.1f})")
+        if joint in measured.offset_counts:
+            entry["source"] = f"calibrate-joints {date}, {', '.join(said)}"
+        elif said:
+            before = entry["source"].partition("; calibrate-joints ")[0]
+            entry["source"] = f"{before}; calibrate-joints {date}, {', '.join(said)}"
+    return joint_map_from(data, "the new joint map")
+
+
+def doubts(new: JointMap, joints: Mapping[str, int]) -> list[str]:
+    """What a person should look at again before trusting the offsets and limits of `joints`."""
+    sentences, far = [], []
+    file, bounds = new.file, new.per_servo().position_limits()
+    for k, joint in enumerate(new.joint_names):
+        if joint not in joints:
+            continue
+        entry = file.joints[joint]
+        zero = file.counts // 2 + entry.offset_counts
+        degrees = abs(float(np.degrees(entry.offset_counts / entry.counts_per_rad)))
+        low, high = entry.limits_counts
+        if degrees > _FAR_OFFSET_DEG:
+            far.append(f"{joint} {entry.offset_counts:+d} ({degrees:.0f}°)")
+        if not low <= zero <= high:
+            sentences.append(
+                f"{joint}: its middle (count {zero}) lies outside its limits {low} to {high}. "
+                "Either the pose was not the middle one or it was not moved through its range."
+            )
+        elif bounds.low_rad[k] >= bounds.high_rad[k]:
+            sentences.append(
+                f"{joint}: its limits in counts and its limits_rad have no angle in common. Check "
+                "the pose, and the sign in the joint map."
+            )
+    if far:
+        sentences.append(
+            f"{', '.join(far)}: that many counts lie between the middle pose and the encoder's "
+            "centre. The horn sits teeth away from where it should, or the pose was not the "
+            "middle one."
+        )
+    return sentences
+
+
+def _place(entry: dict, joint: str, start: JointMapFile, measured: Measured) -> list[str]:
+    """Set offset and limits of one entry; what to say of them."""
+    shift = measured.offset_counts[joint] - entry["offset_counts"]
+    entry["offset_counts"] = measured.offset_counts[joint]
+    if joint in measured.limits_counts:
+        entry["limits_counts"] = measured.limits_counts[joint]
+        return ["offset measured", "limits measured"]
+    # the ends of the leg are where they were as seen from the middle pose
+    low, high = entry["limits_counts"]
+    entry["limits_counts"] = (max(low + shift, 0), min(high + shift, start.counts - 1))
+    if entry["limits_counts"][0] >= entry["limits_counts"][1]:
+        raise InputError(
+            f"{joint}: with its middle at count {start.counts // 2 + entry['offset_counts']} the "
+            f"limits of {start.name} leave the encoder. Mount its horn nearer to the middle, or "
+            "move it through its range so that its limits are measured."
+        )
+    return ["offset measured", f"limits of {start.name}, moved by the offset"]
