@@ -60,7 +60,8 @@ class Tally:
         """As a line of the table."""
         return (
             f"| {self.parser} | {self.frames} | {self.accepted} | {self.exceptions} | "
-            f"{self.hangs} | {1e3 * self.slowest_s:.2f} | {1e3 * self.slowest_cpu_s:.2f} | {self.wrong} | {self.missed} |"
+            f"{self.hangs} | {1e3 * self.slowest_s:.2f} | {1e3 * self.slowest_cpu_s:.2f} | "
+            f"{self.wrong} | {self.missed} |"
         )
 
     @property
