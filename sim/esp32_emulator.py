@@ -15,6 +15,7 @@ import struct
 
 import numpy as np
 
+from common.errors import InputError
 from hardware import esp32_datagrams as datagrams
 from sim.bus_faults import BusFaults
 from sim.poll_schedule import PollSchedule
@@ -41,12 +42,19 @@ class ProxyEmulator:
     rng : numpy.random.Generator
         Lost polls, and what a quirk answers.
     faults : BusFaults, optional
+
+    Raises
+    ------
+    InputError
+        If the robot's readings are not polled.
     """
 
     def __init__(
         self, bench: ServoBench, rng: np.random.Generator, faults: BusFaults | None = None
     ):
         spec = bench.robot.spec
+        if not spec.poll_period_s > 0:
+            raise InputError("emulated proxy: poll_period_s is 0, and the firmware always polls.")
         self.bench, self.rng = bench, rng
         self.faults = faults or BusFaults({}, rng)
         phase = np.array([s.poll_phase_s for s in bench.robot.servos])
@@ -118,7 +126,8 @@ class ProxyEmulator:
         """A setpoint reaches the servos with the firmware's next tick."""
         if torque[0] == datagrams.SAVE_CALIBRATION:
             # the present goals become the new centre; then the firmware stands up anew
-            self._calibration += _CENTRE - np.array(counts)
+            shifted = self._calibration + _CENTRE - np.array(counts)
+            self._calibration = np.clip(shifted, -_CENTRE, _CENTRE - 1)
             self._deaf_until = now + STAND_UP_S
             for k in self._index:
                 self.bench.torque(k, now, False)

@@ -107,6 +107,7 @@ class FeetechEmulator:
             }  # fmt: skip
             for name, value in settings.items():
                 self._set(servo_id, name, value)
+            memory[series.lock_address] = 1
             k = bench.index_of_id[servo_id]
             self._set(servo_id, "goal", bench.count(k, 0.0))
 
