@@ -244,7 +244,10 @@ def fuzz_proxy(tally: Tally, frames: int, rng: random.Random, physics: bool = Fa
         if setpoint and data[2] == 99:
             deaf_until = now + 4.0
             expected = [("torque", s, 0) for s in SERVOS]
-            offsets = [o + 512 - c for o, c in zip(offsets, _words(data[14:]), strict=True)]
+            offsets = [
+                sorted((-512, o + 512 - c, 511))[1]
+                for o, c in zip(offsets, _words(data[14:]), strict=True)
+            ]
         elif setpoint and now >= deaf_until:
             expected = list(_setpoint_effects(data, offsets))
         else:

@@ -77,9 +77,10 @@ def campaign(server, bus: str, folder: Path, kills: int, seed: int) -> dict:
                 unreadable += 1
                 print("unreadable:", path, error)
             time.sleep(0.3)  # its watchdog lets go of the bus
-            continue
+            if not path.exists() or "# completed" not in path.read_text():
+                continue
         error = process.stderr.read().decode() if process.stderr else ""
-        if process.returncode != 0:
+        if process.returncode > 0:
             raise SystemExit(f"{path}: the sweep ended with {process.returncode}: {error}")
         complete.append(path)
         number += 1

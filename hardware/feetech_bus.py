@@ -46,6 +46,7 @@ SPEED_LIMIT_RAD_S = 7.5
 _FIRST, _SHORTEST, _LENGTHS = 56, 6, 6  # position, speed, load; voltage; temperature; …
 _FASTEST_RAD_S = 20.0  # no servo of this size turns faster, so a reading that did is not one
 _SLACK_RAD = 0.05
+_TORQUE_TRIES = 3
 _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
 _CHUNK = 16
@@ -187,28 +188,8 @@ class FeetechBus:
         return BusSample(time_s, position, count, volts, temperature, load, status)
 
     def torque(self, on: bool) -> bool:
-        """Hold the present pose, or let all servos go limp; every servo is asked to confirm."""
-        done = True
-        for servo in self._servos:
-            told = False
-            for _ in range(3):
-                if on:
-                    # or it would jump to whatever goal it was left with
-                    here = self.line.read(servo.id, _FIRST, 2)
-                    if here is None:
-                        continue
-                    goal = servo.series.registers["goal"]
-                    present = servo.series.decode("position", here.frame.data, _FIRST)
-                    top = servo.series.counts - 1
-                    present = servo.series.encode("goal", int(np.clip(present, 0, top)))
-                    if not self.line.write(servo.id, goal.address, present):
-                        continue
-                address = servo.series.registers["torque_enable"].address
-                told = self.line.write(servo.id, address, bytes([int(on)]))
-                if told:
-                    break
-            done = done and told
-        return done
+        """Hold the present pose, or let all servos go limp; every servo is asked whether it is."""
+        return all([any(self._torque(s, on) for _ in range(_TORQUE_TRIES)) for s in self._servos])
 
     def goals(self) -> NDArray[np.float64]:
         """The goals that stand in the servos, as angles; NaN where none was read."""
@@ -223,6 +204,25 @@ class FeetechBus:
     def close(self) -> None:
         """Release the port; the servos keep what they were told."""
         self.line.close()
+
+    def _torque(self, servo: _Servo, on: bool) -> bool:
+        """One try with one servo."""
+        registers = servo.series.registers
+        if on:
+            # or it would jump to whatever goal it was left with
+            here = self.line.read(servo.id, _FIRST, 2)
+            if here is None:
+                return False
+            present = servo.series.decode("position", here.frame.data, _FIRST)
+            present = int(np.clip(present, 0, servo.series.counts - 1))
+            goal = servo.series.encode("goal", present)
+            if not self.line.write(servo.id, registers["goal"].address, goal):
+                return False
+        address = registers["torque_enable"].address
+        self.line.write(servo.id, address, bytes([int(on)]))
+        # an acknowledgement could be a late one, a value that was read cannot
+        now = self.line.read(servo.id, address, 1)
+        return now is not None and now.frame.data == bytes([int(on)])
 
     def _send_goals(self, counts: NDArray[np.int64]) -> float:
         values = {

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 
-from cli.pupper_sysid import main
 from servo_models.calibration import load_calibration
 from sysid.recording import load
 
@@ -22,17 +22,6 @@ SWEEP = ROOT / "data" / "samples" / "sweep.csv"
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of one command."""
-    try:
-        main([str(a) for a in arguments])
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, said.err
 
 
 def test_delay_json_is_one_object_with_the_documented_keys(capsys):

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import run
 from servo_servers import moving_servos, on_a_port, still_servos
 
-from cli.pupper_sysid import main
 from hardware.feetech_registers import SCS0009
 from sysid.recording import load
 
@@ -24,17 +24,6 @@ SHORT = ("--freqs", "3", "--duration", "1")
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, and stderr on one line, of one command."""
-    try:
-        main([str(a) for a in arguments])
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, " ".join(said.err.split())
 
 
 def test_scan_says_who_is_there_at_which_rate(capsys):

@@ -7,10 +7,10 @@ import re
 
 import numpy as np
 import pytest
+from command_line import run
 from servo_servers import StillBench, bench_of, on_a_port, on_a_socket, still_servos
 
 from cli.monitor import Watched
-from cli.pupper_sysid import main
 from hardware import esp32_datagrams as datagrams
 from hardware.bus import BusSample
 from hardware.feetech_frames import FrameReader
@@ -19,17 +19,6 @@ from sim.bus_faults import BusFaults
 from sim.esp32_emulator import ProxyEmulator
 
 _READ = 2
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, and stderr on one line, of one command."""
-    try:
-        main([str(a) for a in arguments])
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, " ".join(said.err.split())
 
 
 @pytest.fixture(autouse=True)

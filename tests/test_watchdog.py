@@ -7,22 +7,18 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from servo_servers import moving_servos, on_a_port, on_a_socket
 
 from common.joints import JOINT_NAMES
 from hardware.connect import open_guarded, parse_address
-from hardware.feetech_registers import STS3215
 from hardware.joint_map import load_joint_map
-from sim.emulated_robot import RobotSpec, draw_robot
+from sim.emulated_robot import draw_robot
 from sim.esp32_emulator import ProxyEmulator
-from sim.esp32_socket import ProxySocket
-from sim.feetech_emulator import FeetechEmulator
-from sim.feetech_pty import FeetechPty
 from sim.servo_bench import ServoBench
 from sysid.recording import load
 
@@ -50,24 +46,16 @@ while True:
 @pytest.fixture(params=["feetech", "esp32"])
 def robot(request):
     """A served emulated robot: server and address."""
+    if request.param == "feetech":
+        with on_a_port(moving_servos()) as server:
+            yield server, f"feetech:{server.device}"
+        return
     rng = np.random.default_rng(3)
+    bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
     with tempfile.TemporaryDirectory(prefix="w") as name:
-        folder = Path(name)
-        if request.param == "esp32":
-            bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
-            server = ProxySocket(ProxyEmulator(bench, rng), folder / "s")
-            address = f"esp32:{folder / 's'}"
-        else:
-            made = draw_robot(rng, RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0))
-            bench = ServoBench(made, load_joint_map("sts3215"), rng.spawn(1)[0])
-            server = FeetechPty(FeetechEmulator(bench, STS3215, rng), folder / "t")
-            address = f"feetech:{folder / 't'}"
-        thread = threading.Thread(target=server.serve, daemon=True)
-        thread.start()
-        yield server, address
-        server.stop()
-        thread.join(5)
-        server.close()
+        path = Path(name) / "s"
+        with on_a_socket(ProxyEmulator(bench, rng), path) as server:
+            yield server, f"esp32:{path}"
 
 
 def limp(server) -> bool:
