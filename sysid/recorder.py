@@ -150,8 +150,6 @@ class _Session:
             writer.close(
                 {"rows": rows, "loop": self._loop.summary(), "guard": bus.report.summary()}
             )
-            # at the start pose on purpose: that is where it stays
-            bus.park(self._start)
         return path
 
     def _header(self, metadata: dict[str, Any]) -> dict[str, Any]:

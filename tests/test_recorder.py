@@ -119,8 +119,9 @@ def test_other_joints_rest_and_moves_between_trials_are_gentle(tmp_path):
     assert (way <= 1.01 * allowed + 1e-12).all() and way.max() > 0.5 * GENTLE_RAD_S * PERIOD
     resting = np.abs(goals[before] - POSE).max(axis=1) < 1e-12
     assert recorded[0] - times[before][np.argmax(resting)] >= REST_S - 1e-9
-    np.testing.assert_allclose(goals[-1], POSE, atol=1e-12)
-    assert np.abs(np.diff(goals[~before & ~inside], axis=0)).max() <= 1.1 * PERIOD
+    np.testing.assert_allclose(goals[-1], POSE + 0.5, atol=1e-12, err_msg="where it was found")
+    # parking ticks every 20 ms and a read takes 1 ms
+    assert np.abs(np.diff(goals[~before & ~inside], axis=0)).max() <= 1.01 * GENTLE_RAD_S * 0.021
     assert bus.calls == ["torque True", "torque False", "close"]
 
 
