@@ -98,37 +98,14 @@ class FeetechBus:
         joint_map: JointMap | None = None,
         joints: Sequence[str] | None = None,
     ):
-        some = joint_map or load_joint_map("sts3215")  # all presets of this layout share the ids
-        some = some.select(joints) if joints else some
-        self.line, found = open_line(device, baud, some.ids)
+        # all presets of this layout share the ids
+        wanted = joint_map or load_joint_map("sts3215").per_servo()
+        wanted = wanted.select(joints) if joints else wanted
+        self.line, found = open_line(device, baud, wanted.ids)
         try:
-            unknown = {i: m for i, m in found.items() if isinstance(m, int)}
-            if unknown:
-                servo, model = next(iter(unknown.items()))
-                raise BusError(
-                    f"{device}: servo {servo} says model number {model}, which is not known; "
-                    f"known are {known_models()}. Registers differ between series, so it is left "
-                    "alone."
-                )
-            series = {i: s for i, s in found.items() if isinstance(s, Series)}
-            self._map = _fitting(joint_map, series, device)
-            answering = [
-                j
-                for j, i in zip(some.joint_names, some.ids, strict=True)
-                if i in series and (joints is None or j in joints)
-            ]
-            silent = [
-                f"{j} (id {i})"
-                for j, i in zip(some.joint_names, some.ids, strict=True)
-                if joints is not None and i not in series
-            ]
-            if silent or not answering:
-                raise BusError(
-                    f"{device}: {', '.join(silent) or 'no servo of the joint map'} does not answer "
-                    f"at {self.line.baud} baud. Check power and wiring, and see who is there with "
-                    f"`pupper-sysid scan --bus feetech:{device}`."
-                )
-            self._map = self._map.select(answering)
+            series = _known(found, device)
+            names = _answering(wanted, series, joints is not None, self.line)
+            self._map = _fitting(joint_map, series, device).select(names)
             self._servos = [_Servo(i, series[i]) for i in self._map.ids]
             self._clock = HostClock()
             self._turn = 0
@@ -345,6 +322,33 @@ def memory_of(line: FeetechLine, servo: int) -> bytes | None:
             return None
         memory += reply.frame.data
     return memory
+
+
+def _known(found: dict[int, int | Series], device: str) -> dict[int, Series]:
+    """Series of the servos found; refused if one is of a series nobody knows the registers of."""
+    for servo, model in found.items():
+        if not isinstance(model, Series):
+            raise BusError(
+                f"{device}: servo {servo} says model number {model}, which is not known; known are "
+                f"{known_models()}. Registers differ between series, so it is left alone."
+            )
+    return {i: s for i, s in found.items() if isinstance(s, Series)}
+
+
+def _answering(
+    wanted: JointMap, series: dict[int, Series], all_of_them: bool, line: FeetechLine
+) -> list[str]:
+    """Joints of `wanted` whose servos answer; refused if none does, or not `all_of_them`."""
+    servos = dict(zip(wanted.joint_names, wanted.ids, strict=True))
+    answering = [j for j, i in servos.items() if i in series]
+    silent = [f"{j} (id {i})" for j, i in servos.items() if i not in series]
+    if (silent and all_of_them) or not answering:
+        raise BusError(
+            f"{line.device}: {', '.join(silent)} does not answer at {line.baud} baud. Check power "
+            "and wiring, name the --joints that are there, and see who is with "
+            f"`pupper-sysid scan --bus feetech:{line.device}`."
+        )
+    return answering
 
 
 def _fitting(joint_map: JointMap | None, series: dict[int, Series], device: str) -> JointMap:

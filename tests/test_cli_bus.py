@@ -62,6 +62,18 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert abs(trial.position_rad - 0.785).max() > 0.2
 
 
+def test_a_calf_can_be_swept_without_its_thigh(capsys):
+    with on_a_port(moving_servos(ids=[6])) as port:
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--joints", "LF_calf", "--bus", f"feetech:{port.device}",
+            "--out", "a.csv",
+        )  # fmt: skip
+    assert code == 0, err
+    assert load(Path("a.csv")).metadata["bus"]["count_zero_rad"]["LF_calf"] == pytest.approx(
+        -1.5708, abs=1e-4
+    )
+
+
 def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
     with on_a_port(still_servos(ids=[4])) as port:
         code, _, err = run(
