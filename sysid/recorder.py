@@ -138,15 +138,18 @@ class _Session:
             self._shift_s = resume.now_s() - bus.now()
             writer = RecordingWriter.resumed(path, first)
         with writer:
-            bus.torque(True)
-            self._progress(0.0, self._total_s, "moving to the start pose")
-            self._move_to_start()
-            done = sum(trial.duration_s for trial in self._plan.trials[:first])
-            for number, trial in enumerate(self._plan.trials[first:], first):
-                self._hold(REST_S)
-                rows += self._trial(number, trial, writer, done)
-                done += trial.duration_s
+            try:
+                bus.torque(True)
+                self._progress(0.0, self._total_s, "moving to the start pose")
                 self._move_to_start()
+                done = sum(trial.duration_s for trial in self._plan.trials[:first])
+                for number, trial in enumerate(self._plan.trials[first:], first):
+                    self._hold(REST_S)
+                    rows += self._trial(number, trial, writer, done)
+                    done += trial.duration_s
+                    self._move_to_start()
+            finally:
+                bus.park()  # before the disk may take its time
             writer.close(
                 {"rows": rows, "loop": self._loop.summary(), "guard": bus.report.summary()}
             )

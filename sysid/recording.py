@@ -14,8 +14,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -225,13 +227,13 @@ class RecordingWriter:
         except OSError as error:
             raise InputError(f"{path} cannot be written: {error.strerror}.") from error
         self._columns: tuple[str, ...] = ()
-        self._synced = 0.0
         created = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
         header = {"schema_version": SCHEMA_VERSION, "created": created, "versions": versions()}
-        self._file.write(f"{TITLE}\n")
-        for key, value in (header | metadata).items():
-            self._file.write(f"# {key}: {json.dumps(value, ensure_ascii=False)}\n")
-        self._flush()
+        self._keep_synced()
+        lines = [
+            f"# {k}: {json.dumps(v, ensure_ascii=False)}" for k, v in (header | metadata).items()
+        ]
+        self._write([TITLE, *lines])
 
     @classmethod
     def resumed(cls, path: Path, trial: int) -> RecordingWriter:
@@ -250,7 +252,6 @@ class RecordingWriter:
         lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
         made = cls.__new__(cls)
         made._columns = tuple(lines[0].split(",")) if lines else ()
-        made._synced = 0.0
         try:
             made._file = path.open("r+", encoding="utf-8", newline="\n")
             made._file.seek(0, os.SEEK_END)
@@ -259,30 +260,29 @@ class RecordingWriter:
         except OSError as error:
             raise InputError(f"{path} cannot be written: {error.strerror}.") from error
         at = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
-        made._file.write(f"# resumed: {json.dumps({'trial': trial, 'at': at})}\n")
-        made._flush()
+        made._keep_synced()
+        made._write([f"# resumed: {json.dumps({'trial': trial, 'at': at})}"])
         return made
 
     def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
         """Write rows, each a dict of columns; the first decides which optional ones there are."""
         rows = [rows] if isinstance(rows, dict) else rows
+        lines = []
         if rows and not self._columns:
             optional = [c for c in OPTIONAL_COLUMNS if c in rows[0]]
             self._columns = (*REQUIRED_COLUMNS, *optional)
-            self._file.write(",".join(self._columns) + "\n")
-        for row in rows:
-            self._file.write(",".join(_cell(c, row[c]) for c in self._columns) + "\n")
-        self._flush()
+            lines.append(",".join(self._columns))
+        self._write([*lines, *(",".join(_cell(c, row[c]) for c in self._columns) for row in rows)])
 
     def close(self, completed: dict[str, Any] | None = None) -> None:
         """Close the file; `completed` becomes its footer. May be called twice."""
         if self._file.closed:
             return
-        if completed is not None:
-            self._file.write(f"# completed: {json.dumps(completed, ensure_ascii=False)}\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
+        try:
+            if completed is not None:
+                self._write([f"# completed: {json.dumps(completed, ensure_ascii=False)}"])
+        finally:
+            self._end()
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -290,11 +290,36 @@ class RecordingWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _flush(self) -> None:
-        self._file.flush()
-        if time.monotonic() - self._synced > _SYNC_S:
+    def _write(self, lines: Sequence[str]) -> None:
+        try:
+            self._file.writelines(f"{line}\n" for line in lines)
+            self._file.flush()
+        except OSError as error:
+            self._end()
+            raise InputError(
+                f"{self._file.name} cannot be written: {error.strerror}. Make room; what is there "
+                "can be continued with `pupper-sysid sweep --resume`."
+            ) from error
+
+    def _end(self) -> None:
+        self._closing.set()
+        self._syncer.join()
+        with suppress(OSError):
             os.fsync(self._file.fileno())
-            self._synced = time.monotonic()
+        with suppress(OSError):
+            self._file.close()
+
+    def _keep_synced(self) -> None:
+        """Bring rows to the disk once a second, in a thread: a memory card can take seconds."""
+        self._closing = threading.Event()
+
+        def sync() -> None:
+            while not self._closing.wait(_SYNC_S):
+                with suppress(OSError):  # the next write will say so
+                    os.fsync(self._file.fileno())
+
+        self._syncer = threading.Thread(target=sync, daemon=True)
+        self._syncer.start()
 
 
 _DECIMALS = {"send_time_s": 6, "read_time_s": 6, "command_rad": 7, "position_rad": 7}

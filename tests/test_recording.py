@@ -1,5 +1,8 @@
 """Recordings: what is written is read back, and what cannot be used is refused in a sentence."""
 
+import threading
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -22,6 +25,15 @@ def write(tmp_path, lines, header=HEADER, top=("# pupper-sysid recording", "# sc
     path = tmp_path / "log.csv"
     path.write_text("\n".join([*top, header, *lines, '# completed: {"rows": 1}', ""]))
     return path
+
+
+def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_thread():
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    before = threading.active_count()
+    with pytest.raises(InputError, match="No space left"):
+        RecordingWriter(Path("/dev/full"), {}, force=True)
+    assert threading.active_count() == before
 
 
 def test_what_the_writer_writes_load_reads_back(tmp_path):
