@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cli import terminal
-from hardware.connect import BusAddress, open_guarded, parse_address
+from hardware.connect import open_guarded, parse_address
 from hardware.guard import GuardedBus
 from hardware.joint_map import JointMap, load_joint_map
 
@@ -23,11 +23,8 @@ def chosen_map(text: str | None) -> JointMap | None:
     return load_joint_map(text)
 
 
-def connect(
-    address: BusAddress | str, joint_map: str | None, joints: Sequence[str] | None = None
-) -> GuardedBus:
-    """A guarded bus in servo coordinates, or a sentence about why not."""
-    if isinstance(address, str):
-        address = parse_address(address)
+def connect(bus: str, joint_map: str | None, joints: Sequence[str] | None = None) -> GuardedBus:
+    """The bus that a user names, guarded and in servo coordinates."""
+    address = parse_address(bus)
     chosen = chosen_map(joint_map)
     return open_guarded(address, chosen.per_servo() if chosen else None, joints)

@@ -225,8 +225,8 @@ def _guard_warnings(path: Path) -> list[str]:
         )
     if did.get("slowed"):
         found.append(
-            f"{did['slowed']} commands came later than asked, at the guard's speed and acceleration "
-            "limits; the recording holds what was sent."
+            f"{did['slowed']} commands came later than asked, at the guard's speed and "
+            "acceleration limits; the recording holds what was sent."
         )
     if did.get("unsent"):
         found.append(f"{did['unsent']} commands could not be sent; the servos kept the last goal.")

@@ -1,5 +1,5 @@
 """Move real servos safely and read them honestly."""
 
-from hardware.bus import BusSample, ServoBus
+from hardware.bus import BusSample, Sent, ServoBus
 
-__all__ = ["BusSample", "ServoBus"]
+__all__ = ["BusSample", "Sent", "ServoBus"]

@@ -14,11 +14,9 @@ from common.errors import InputError
 from hardware.bus import ServoBus
 from hardware.esp32_bus import SOCKET, Esp32Bus
 from hardware.feetech_bus import FeetechBus
-from hardware.guard import GuardedBus, GuardLimits
+from hardware.guard import GuardedBus
 from hardware.joint_map import JointMap
 from hardware.watchdog import Watchdog
-
-KINDS = ("esp32", "feetech")
 
 
 @dataclass(frozen=True)
@@ -79,10 +77,7 @@ def open_bus(
 
 
 def open_guarded(
-    address: BusAddress,
-    joint_map: JointMap | None = None,
-    joints: Sequence[str] | None = None,
-    limits: GuardLimits | None = None,
+    address: BusAddress, joint_map: JointMap | None = None, joints: Sequence[str] | None = None
 ) -> GuardedBus:
     """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
     bus = open_bus(address, joint_map, joints)
@@ -91,4 +86,4 @@ def open_guarded(
     except BaseException:
         bus.close()
         raise
-    return GuardedBus(bus, limits, watchdog)
+    return GuardedBus(bus, watchdog=watchdog)

@@ -102,7 +102,3 @@ class FrameReader:
                 start = whole
         del buffer[:start]
         return found
-
-    def reset(self) -> None:
-        """Forget what has not become a frame."""
-        self._buffer.clear()

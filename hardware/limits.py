@@ -47,11 +47,6 @@ class PositionLimits:
     high_rad: NDArray[np.float64]
     coupling: Coupling | None = None
 
-    @classmethod
-    def none(cls, joints: int) -> PositionLimits:
-        """No bounds at all, for emulated servos that cannot break."""
-        return cls(np.full(joints, -np.inf), np.full(joints, np.inf))
-
     def clip(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
         """The nearest allowed goals, shape (joints,); a thigh takes precedence over its calf."""
         allowed = np.clip(position_rad, self.low_rad, self.high_rad)

@@ -29,7 +29,6 @@ from sim.bus_faults import BusFaults, with_wrong_length
 from sim.servo_bench import AMBIENT_C, ServoBench
 
 MEMORY_BYTES = 80
-BROWN_OUT_V = 3.6
 
 _SETTINGS = {
     "SCS0009": {

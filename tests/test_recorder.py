@@ -42,7 +42,7 @@ class ScriptedBus:
 
     def __init__(self, start: np.ndarray, slow_at: int = -1, fail_at: int = -1, raises=None):
         self.metadata = {"kind": "scripted"}
-        self.limits = PositionLimits.none(12)
+        self.limits = PositionLimits(np.full(12, -np.inf), np.full(12, np.inf))
         self.goal, self.time, self.calls = start.astype(float), 0.0, []
         self.written: list[tuple[float, np.ndarray]] = []
         self._slow_at, self._fail_at, self._raises = slow_at, fail_at, raises
