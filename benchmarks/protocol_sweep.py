@@ -91,13 +91,14 @@ def main() -> None:
     parser.add_argument("--joints", type=int, default=12)
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--bus", choices=KINDS, help="only this one")
     options = parser.parse_args()
     frequencies = [1.0, 2.0, 3.0, 5.0, 7.0, 10.0]
     joints = list(JOINT_NAMES[: options.joints])
     print("| bus | joint | lag ms | 90 % interval | true lag | in process | dead time ms "
           "| in process | true | held RMSE mrad | in process | missing % |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|---|---|---|")
-    for kind in KINDS:
+    for kind in (options.bus,) if options.bus else KINDS:
         recording, plain, server, shift = sweep(
             kind, options.seed, joints, frequencies, options.seconds
         )

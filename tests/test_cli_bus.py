@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from command_line import run
@@ -56,10 +57,11 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert bus["servos"]["LF_thigh"]["p"] == 32 and bus["servos"]["LF_thigh"]["return_delay"] == 250
     assert recording.metadata["completed"]["guard"]["clipped"] == 0
     assert {"voltage_v", "temperature_c", "load"} <= set(recording.table.columns)
-    # at 3 Hz and 0.3 rad the servo follows: it moved by most of what it was told
+    # at 3 Hz and 0.3 rad the servo follows: it moved by most of what it was told (a loaded machine
+    # may miss a reading)
     trial = recording.trials("LF_thigh")[0]
     assert abs(trial.command_rad - 0.785).max() == pytest.approx(0.3, abs=0.01)
-    assert abs(trial.position_rad - 0.785).max() > 0.2
+    assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
 
 
 def test_a_calf_can_be_swept_without_its_thigh(capsys):
