@@ -23,6 +23,7 @@ from cli.export import Export
 from cli.monitor import Monitor
 from cli.report import Report
 from cli.scan import Scan
+from cli.sindy import Sindy
 from cli.sweep import Sweep
 from cli.terminal import err
 from common.errors import PupperError
@@ -36,6 +37,7 @@ Command = (
     | Annotated[Delay, tyro.conf.subcommand("delay")]
     | Annotated[Bode, tyro.conf.subcommand("bode")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Sindy, tyro.conf.subcommand("sindy")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Emulate, tyro.conf.subcommand("emulate")]

@@ -100,7 +100,7 @@ class DelayedPD:
     Parameters
     ----------
     parameters : DelayedPDParameters
-        Their broadcast shape is the model's batch.
+        Their broadcast shape is the model's batch, until `reset` widens it.
     time_step_s : float
         Time step [s]; commands and positions are at this step.
 
@@ -124,13 +124,18 @@ class DelayedPD:
         self.parameters = parameters
         self.time_step_s = float(time_step_s)
         self._values = values
-        self.batch = np.broadcast_shapes(*(v.shape for v in values.values()))
+        self._own = np.broadcast_shapes(*(v.shape for v in values.values()))
         self._nsample = int(np.floor(np.max(values["delay_s"]) / time_step_s)) + 2
-        self.reset(np.zeros(self.batch))
+        self.reset(np.zeros(self._own))
 
     def reset(self, position: ArrayLike) -> None:
-        """Rest at `position` [rad], which has been the command for as long as the delay."""
-        position = np.broadcast_to(np.asarray(position, float), self.batch)
+        """Rest at `position` [rad], which has been the command for as long as the delay.
+
+        The batch becomes the shape to which `position` and the parameters broadcast.
+        """
+        position = np.asarray(position, float)
+        self.batch = np.broadcast_shapes(position.shape, self._own)
+        position = np.broadcast_to(position, self.batch)
         self._position = position.copy()
         self._velocity = np.zeros(self.batch)
         self._setpoint = position.copy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 class ServoModel(Protocol):
@@ -17,14 +17,14 @@ class ServoModel(Protocol):
 
     time_step_s: float
 
-    def reset(self, position: NDArray[np.float64]) -> None:
+    def reset(self, position: ArrayLike) -> None:
         """Rest at `position`, with that position as the only command ever given."""
         ...
 
-    def step(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+    def step(self, command: ArrayLike) -> NDArray[np.floating]:
         """Advance one time step under `command`; returns the position after it."""
         ...
 
-    def rollout(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rollout(self, commands: ArrayLike) -> NDArray[np.floating]:
         """Positions after each of `commands`, shape (steps, *batch), from the present state."""
         ...

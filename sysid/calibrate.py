@@ -196,6 +196,19 @@ def dead_times(
     return _each_joint(_dead_time, recordings, joints, seed, None, workers, progress)
 
 
+def prepare_joints(
+    recordings: Sequence[Recording],
+    joints: Sequence[str] | None = None,
+    seed: int = 0,
+    workers: int = 2,
+) -> dict[str, PreparedJoint]:
+    """Every joint's trials on the physics clock, and the noise of its readings; nothing fitted.
+
+    Parameters and errors as for `calibrate`.
+    """
+    return _each_joint(_prepare, recordings, joints, seed, None, workers, None)
+
+
 def _each_joint(
     work: Callable[[_Task], Any],
     recordings: Sequence[Recording],
@@ -256,7 +269,7 @@ def joint_rng(seed: int, joint: str) -> np.random.Generator:
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class PreparedJoint:
     """One joint, measured and ready to fit."""
 
     rng: np.random.Generator
@@ -266,7 +279,7 @@ class _Prepared:
     noise_rad: float
 
 
-def _prepare(task: _Task) -> _Prepared:
+def _prepare(task: _Task) -> PreparedJoint:
     rng = joint_rng(task.seed, task.joint)
     lattice = find_poll_lattice(task.trials)
     budget = lag_budget(task.joint, task.trials, rng, lattice)
@@ -279,24 +292,24 @@ def _prepare(task: _Task) -> _Prepared:
     step = quantum(task.trials)
     # fits of a noise-free servo still meet rounding: a third of a count
     noise = max(budget.noise_rad, step / 3, 1e-4) if np.isfinite(budget.noise_rad) else 0.012
-    return _Prepared(rng, budget, data, step, noise)
+    return PreparedJoint(rng, budget, data, step, noise)
 
 
 def _dead_time(task: _Task) -> DeadTime:
     ready, model = _prepare(task), rung(PREFERRED)
-    (best,) = _fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.rng, {})
+    (best,) = fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.rng, {})
     dead_time, best = _profile(model, ready.data, ready.noise_rad, best)
     return DeadTime(ready.budget, dead_time, ready.quantum_rad, float(best.values[-1]))
 
 
 def _calibrate_joint(task: _Task) -> JointCalibrationResult:
     ready = _prepare(task)
-    data, noise, folds = ready.data, ready.noise_rad, _folds(ready.data)
+    data, noise, folds = ready.data, ready.noise_rad, leave_one_out_folds(ready.data)
     rungs: dict[str, RungResult] = {}
     best: dict[str, list[Fit]] = {}
     dead_time = Interval(*[float("nan")] * 3)
     for model in LADDER:
-        best[model.name] = _fit_with_folds(model, data, folds, noise, ready.rng, best)
+        best[model.name] = fit_with_folds(model, data, folds, noise, ready.rng, best)
         if model.name == PREFERRED:
             dead_time, best[PREFERRED][0] = _profile(model, data, noise, best[PREFERRED][0])
         rungs[model.name] = _result(model, best[model.name], data, folds, noise)
@@ -315,7 +328,7 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
 # ------------------------------------------------------------------------------- fitting
 
 
-def _folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
+def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
     """Which trials remain when each frequency is left out; by trial where there are no tones."""
     labels = [
         round(d.frequency_hz, 2) if d.frequency_hz > 0 else float(n) for n, d in enumerate(data)
@@ -330,18 +343,19 @@ def _folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
     return {name: tuple(label != name for label in labels) for name in picked}
 
 
-def _fit_with_folds(
+def fit_with_folds(
     model: Rung,
     data: tuple[TrialData, ...],
     folds: dict[float, tuple[bool, ...]],
     noise: float,
     rng: np.random.Generator,
     lower: dict[str, list[Fit]],
+    more_starts: NDArray | None = None,
 ) -> list[Fit]:
     """Best fit to all trials, then to each fold, each from starts of its own.
 
     A fold never starts from the fit to all trials: that would leave the optimum of the held-out
-    frequency within reach.
+    frequency within reach. `more_starts` (problems, starts, parameters) join the global ones.
     """
     everything = Problem(data, (True,) * len(data), noise, {})
     problems = [everything, *(replace(everything, use=use) for use in folds.values())]
@@ -350,20 +364,22 @@ def _fit_with_folds(
             [np.insert(f.values, -1, gap) for gap in (0.002, 0.008, 0.025)]
             for f in lower[PREFERRED]
         ]
-        return _best_of(model, problems, np.array(starts), 15)
+        return best_of(model, problems, np.array(starts), 15)
     # few tones leave many local optima: start from more places
     keep, final = (12, 3) if len(problems) <= 5 else (4, 2)
     starts = global_starts(model, problems, rng, 256, keep)
+    if more_starts is not None:
+        starts, keep = np.concatenate([starts, more_starts], axis=1), keep + more_starts.shape[1]
     flat = [p for p in problems for _ in range(keep)]
     early = fit(model, flat, starts.reshape(-1, starts.shape[-1]), 8)
     top = []
     for i in range(len(problems)):
         own = sorted(early[i * keep : (i + 1) * keep], key=lambda f: f.cost)[:final]
         top.append([f.values for f in own])
-    return _best_of(model, problems, np.array(top), 20)
+    return best_of(model, problems, np.array(top), 20)
 
 
-def _best_of(
+def best_of(
     model: Rung, problems: Sequence[Problem], starts: NDArray, iterations: int
 ) -> list[Fit]:
     """Fit every problem from each of its starts, shape (problems, starts, parameters)."""
@@ -378,7 +394,7 @@ def _profile(
 ) -> tuple[Interval, Fit]:
     """Dead time with its profile-likelihood interval, and the best fit met on the way."""
     everything = Problem(data, (True,) * len(data), noise, {})
-    residual = _fresh_residuals(model, best.values, data)
+    residual = fresh_residuals(model, best.values, data)
     threshold = 0.5 * float(chi2.ppf(LEVEL, 1)) * _effective(residual)
     fits, lowest, delays = [best], best, np.array([best.values[0]])
     for _ in range(3):
@@ -438,7 +454,7 @@ def _effective(residuals: Sequence[NDArray]) -> float:
 # ------------------------------------------------------------------------------- scoring
 
 
-def _fresh_residuals(model: Rung, values: NDArray, data: Sequence[TrialData]) -> list[NDArray]:
+def fresh_residuals(model: Rung, values: NDArray, data: Sequence[TrialData]) -> list[NDArray]:
     track = positions(model, [(values[None], data)])[0][:, 0]
     return [look_up(track[:, n], t.sample_step) - t.sample_rad for n, t in enumerate(data)]
 
@@ -499,8 +515,8 @@ def _result(
     held_out = {}
     for (name, use), fold in zip(folds.items(), fits[1:], strict=True):
         left = tuple(d for d, used in zip(data, use, strict=True) if not used)
-        held_out[name] = np.concatenate(_fresh_residuals(model, fold.values, left))
-    residual = _fresh_residuals(model, best.values, data)
+        held_out[name] = np.concatenate(fresh_residuals(model, fold.values, left))
+    residual = fresh_residuals(model, best.values, data)
     # soft-L1 works in units of the noise; its covariance is for residuals of that size
     inflation = _effective(residual) * max(1.0, _rms(residual) ** 2 / noise**2)
     sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))

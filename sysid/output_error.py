@@ -84,11 +84,7 @@ def prepare(
         An angle that is a whole count; by default the rest position.
     """
     rest, start = trial.initial_command_rad, trial.send_time_s[0]
-    command = trial.command_rad - rest
-    if command_quantum_rad > 0 and rounding in _WHOLE_COUNT:
-        zero = rest if zero_rad is None else zero_rad
-        count = (trial.command_rad - zero) / command_quantum_rad
-        command = _WHOLE_COUNT[rounding](count) * command_quantum_rad + zero - rest
+    command = whole_counts(trial, command_quantum_rad, rounding, zero_rad) - rest
     stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
     steps = int(np.ceil(stop / TIME_STEP_S)) + 2
     edges = TIME_STEP_S * np.arange(steps + 1)
@@ -106,6 +102,17 @@ def prepare(
         to_step(np.where(np.isfinite(reading.held_time_s), reading.held_time_s, start)),
         to_step(trial.send_time_s), trial.position_rad - rest,
     )  # fmt: skip
+
+
+def whole_counts(
+    trial: Trial, quantum_rad: float, rounding: str | None, zero_rad: float | None
+) -> NDArray[np.float64]:
+    """Commands as the bus sends them [rad]; parameters as for `prepare`."""
+    if quantum_rad <= 0 or rounding not in _WHOLE_COUNT:
+        return trial.command_rad
+    zero = trial.initial_command_rad if zero_rad is None else zero_rad
+    count = (trial.command_rad - zero) / quantum_rad
+    return _WHOLE_COUNT[rounding](count) * quantum_rad + zero
 
 
 @dataclass(frozen=True)

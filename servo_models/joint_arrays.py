@@ -1,0 +1,113 @@
+"""What the learned servo models share: joints on the first axis inside, on the last one outside.
+
+Inside, arrays are (joints, environments, …), so that one matrix product per joint serves all
+environments; outside they are (*environments, joints), as everywhere in this project.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from common.errors import InputError
+
+
+class JointArrays:
+    """Parameters per joint, normalisation, and the way in and out of the inner layout.
+
+    Parameters
+    ----------
+    joints : sequence of str
+    time_step_s : float
+    parameters : mapping of str to ndarray
+        Each with the joints on its first axis; `bound` may be infinite, all else is finite.
+
+    Raises
+    ------
+    InputError
+        If a shape does not fit the joints, a number is not finite, or a scale is not positive.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[str],
+        time_step_s: float,
+        parameters: Mapping[str, NDArray[np.floating]],
+    ):
+        if not (np.isfinite(time_step_s) and time_step_s > 0):
+            raise InputError(f"A servo model's time step is {time_step_s}; it must be positive.")
+        self.joints = tuple(joints)
+        self.time_step_s = float(time_step_s)
+        self.parameters = {k: np.ascontiguousarray(v, np.float32) for k, v in parameters.items()}
+        for name, value in self.parameters.items():
+            if value.ndim == 0 or len(value) != len(self.joints):
+                raise InputError(
+                    f"A servo model's {name} has shape {value.shape}; its first axis must be the "
+                    f"{len(self.joints)} joints."
+                )
+            if np.isnan(value).any() or (name != "bound" and np.isinf(value).any()):
+                raise InputError(
+                    f"A servo model's {name} holds NaN or infinite numbers: its training failed "
+                    "or the file was damaged. Fit it again."
+                )
+        for name in ("command_center", "command_scale", "position_center", "position_scale"):
+            self._need(name, ())
+        for name in ("command_scale", "position_scale", "bound"):
+            if name in self.parameters and not (self.parameters[name] > 0).all():
+                raise InputError(f"A servo model's {name} must be positive. Fit it again.")
+        self._environments: tuple[int, ...] = ()
+
+    def _shape(self, name: str, axes: int) -> tuple[int, ...]:
+        if name not in self.parameters or self.parameters[name].ndim != axes:
+            raise InputError(f"A servo model needs {name} with {axes} axes. Fit it again.")
+        return self.parameters[name].shape
+
+    def _need(self, name: str, shape: tuple[int, ...]) -> None:
+        expected = (len(self.joints), *shape)
+        if name not in self.parameters or self.parameters[name].shape != expected:
+            found = self.parameters[name].shape if name in self.parameters else "nothing"
+            raise InputError(
+                f"A servo model needs {name} of shape {expected}; found {found}. Fit it again."
+            )
+
+    def _enter(self, position: ArrayLike) -> NDArray[np.float32]:
+        """Take the environments' shape from `position`, and arrange it."""
+        shape = np.shape(position)
+        if not shape or shape[-1] != len(self.joints):
+            raise InputError(
+                f"A servo model of {len(self.joints)} joints was given positions of shape {shape}; "
+                "the last axis must be the joints."
+            )
+        self._environments = shape[:-1]
+        return self._arrange(position)
+
+    def _arrange(self, value: ArrayLike) -> NDArray[np.float32]:
+        """(*environments, joints) to (joints, environments)."""
+        full = np.broadcast_to(
+            np.asarray(value, np.float32), (*self._environments, len(self.joints))
+        )
+        return full.reshape(-1, len(self.joints)).T
+
+    def _normal_command(self, command: NDArray) -> NDArray[np.float32]:
+        p = self.parameters
+        return (command - p["command_center"][:, None]) / p["command_scale"][:, None]
+
+    def _normal_position(self, position: NDArray) -> NDArray[np.float32]:
+        p = self.parameters
+        return (position - p["position_center"][:, None]) / p["position_scale"][:, None]
+
+    def _leave(self, normal: NDArray) -> NDArray[np.float32]:
+        """Normalised (joints, environments) to positions (*environments, joints) [rad]."""
+        p = self.parameters
+        position = normal * p["position_scale"][:, None] + p["position_center"][:, None]
+        return position.T.reshape(*self._environments, len(self.joints))
+
+    def _leave_all(self, normal: NDArray) -> NDArray[np.float32]:
+        """Normalised (joints, environments, steps) to (steps, *environments, joints) [rad]."""
+        p = self.parameters
+        position = normal * p["position_scale"][:, None, None] + p["position_center"][:, None, None]
+        return np.moveaxis(position, (0, 2), (2, 0)).reshape(
+            normal.shape[-1], *self._environments, len(self.joints)
+        )

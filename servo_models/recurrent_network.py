@@ -1,0 +1,125 @@
+"""RecurrentNetwork: where a servo will be, from a memory of all it was told (LSTM).
+
+As `CommandNetwork`, but what corrects the linear filter is a long short-term memory network
+(Hochreiter and Schmidhuber 1997, with forget gates), several of them, whose outputs are averaged:
+
+    i, f, o = sigmoid(…), g = tanh(…) of  input · weight_input + hidden · weight_hidden + bias
+    cell = f * cell + i * g,   hidden = o * tanh(cell)
+    position = centre + spread * (fir · x + fir_bias + bound * tanh(mean(hidden · out) / bound))
+
+Its memory starts empty and is filled by `warm_up` steps at the position it rests at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from servo_models.command_network import Parameters, bounded
+from servo_models.joint_arrays import JointArrays
+
+
+class RecurrentNetwork(JointArrays):
+    """FIR filter and bounded LSTM, per joint. See the module's text.
+
+    Parameters
+    ----------
+    joints : sequence of str
+    time_step_s : float
+    parameters : mapping of str to ndarray
+        As for `CommandNetwork`, and with members m, inputs n and hidden units h:
+        `weight_input` (joints, m, n, 4 h), `weight_hidden` (joints, m, h, 4 h), `bias`
+        (joints, m, 4 h) for the gates i, f, g, o; `weight_out` (joints, m, h), `bias_out`
+        (joints,).
+    feedback : bool
+        Whether the network's last input is the position predicted last.
+    warm_up : int
+        Steps at rest that fill the memory after a reset.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit each other, or a number is not finite.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[str],
+        time_step_s: float,
+        parameters: Parameters,
+        feedback: bool = False,
+        warm_up: int = 16,
+    ):
+        super().__init__(joints, time_step_s, parameters)
+        self.feedback, self.warm_up = feedback, warm_up
+        self.taps = self._shape("fir", 2)[1]
+        _, members, hidden, gates = self._shape("weight_hidden", 4)
+        self._need("weight_hidden", (members, gates // 4, gates))
+        self._need("weight_input", (members, 1 + feedback, gates))
+        self._need("bias", (members, gates))
+        self._need("weight_out", (members, hidden))
+        for name in ("bias_out", "fir_bias", "bound"):
+            self._need(name, ())
+        self._memory = (members, hidden)
+        self.reset(np.zeros(len(self.joints)))
+
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""
+        here = self._enter(position)
+        members, hidden = self._memory
+        shape = (len(self.joints), members, here.shape[1], hidden)
+        self._hidden, self._cell = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        rest = self._normal_command(here)
+        self._history = np.repeat(rest[..., None], self.taps, axis=-1)
+        at_rest = self._normal_position(here)
+        for _ in range(self.warm_up):
+            self._last = at_rest
+            self._advance(rest)
+        self._last = at_rest
+
+    def step(self, command: ArrayLike) -> NDArray[np.float32]:
+        """Advance one time step under `command` [rad]; returns the position after it [rad]."""
+        self._advance(self._normal_command(self._arrange(command)))
+        return self._leave(self._last)
+
+    def rollout(self, commands: ArrayLike) -> NDArray[np.float32]:
+        """Positions [rad] after each command, shape (steps, *environments, joints)."""
+        return np.stack([self.step(command) for command in np.asarray(commands, np.float32)])
+
+    def one_step(
+        self, commands: NDArray[np.floating], position: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Positions after each command when the last position is measured instead of predicted.
+
+        Parameters and result as for `CommandNetwork.one_step`.
+        """
+        out = []
+        for command, here in zip(commands, position, strict=True):
+            self._last = self._normal_position(self._arrange(here))
+            out.append(self.step(command))
+        return np.stack(out)
+
+    def _advance(self, newest: NDArray) -> None:
+        """One step of all memories; leaves the normalised position in `_last`."""
+        p = self.parameters
+        self._history[..., 1:] = self._history[..., :-1]
+        self._history[..., 0] = newest
+        seen = newest[..., None]
+        if self.feedback:
+            seen = np.concatenate([seen, self._last[..., None]], axis=-1)
+        gates = np.matmul(seen[:, None], p["weight_input"])
+        gates += np.matmul(self._hidden, p["weight_hidden"])
+        gates += p["bias"][:, :, None]
+        i, f, g, o = np.split(gates, 4, axis=-1)
+        self._cell = _sigmoid(f) * self._cell + _sigmoid(i) * np.tanh(g)
+        self._hidden = _sigmoid(o) * np.tanh(self._cell)
+        out = np.einsum("jmeh,jmh->je", self._hidden, p["weight_out"]) / self._memory[0]
+        out += p["bias_out"][:, None]
+        linear = np.matmul(self._history, p["fir"][..., None])[..., 0] + p["fir_bias"][:, None]
+        self._last = linear + bounded(out, p["bound"][:, None])
+
+
+def _sigmoid(x: NDArray) -> NDArray:
+    return 0.5 + 0.5 * np.tanh(0.5 * x)  # no overflow, whatever the sign

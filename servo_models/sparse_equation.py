@@ -1,0 +1,312 @@
+"""SparseEquation: a servo as one short, readable equation of motion, found by `sysid.sindy`.
+
+    q̈ = stiffness · e + saturated_stiffness · sat(e, e₀)
+        − damping · q̇ − drag · q̇|q̇| − friction · sign(q̇),      e = u(t − delay) − q
+
+`u` is the command, `q` the position, sat(e, e₀) is e clipped to ±e₀. A term whose coefficient is
+zero is absent. All is per unit of inertia, because free-air positions say no more. Each term is a
+part of a servo: `stiffness` is its proportional controller; `saturated_stiffness` the same with a
+limit on the motor's voltage, reached at an error of e₀; `damping` back-EMF and derivative action,
+`drag` what grows with the square of speed; `friction` is dry and stops the servo altogether where
+the drive is weaker than it.
+
+`integrate` is the only arithmetic: the fit, the class and the tests all run it. Damping and drag
+act on the mean of the speeds before and after a step, so that the numbers are those of the
+equation above; a fully implicit step, MuJoCo's, adds step · damping / 2 to the inertia, 8 % for a
+hobby servo, and `DelayedPD` so much to its numbers. Friction removes at most the velocity there
+is: it holds the servo still and never makes it chatter (as in time-stepping contact solvers:
+D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic
+collisions and Coulomb friction", 1996). As in `DelayedPD` a step answers the command and the error
+at its beginning, so the delay holds half a time step, 1 ms, of integration.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from common.errors import InputError
+from servo_models.delayed_pd import TIME_STEP_S, fractional_shift
+
+
+class Coefficient(NamedTuple):
+    """Unit and meaning of one number of the equation."""
+
+    unit: str
+    meaning: str
+
+
+COEFFICIENTS: dict[str, Coefficient] = {
+    "stiffness_per_s2": Coefficient("s⁻²", "stiffness: acceleration per radian of error"),
+    "saturated_stiffness_per_s2": Coefficient(
+        "s⁻²", "stiffness with a limited drive: acceleration per radian of error, up to e₀"
+    ),
+    "saturation_error_rad": Coefficient("rad", "e₀: the error at which the drive is at its limit"),
+    "damping_per_s": Coefficient("s⁻¹", "damping and back-EMF: deceleration per rad/s"),
+    "drag_per_rad": Coefficient("rad⁻¹", "drag: deceleration per (rad/s)²"),
+    "friction_rad_s2": Coefficient(
+        "rad/s²", "dry (Coulomb) friction: deceleration at any speed; holds the servo when at rest"
+    ),
+}
+"""The numbers of the equation, by name; each name ends in its unit."""
+
+_NEVER = {"saturation_error_rad": np.inf}  # every other coefficient is 0 when absent
+
+
+class SparseEquation:
+    """A servo that moves by the equation in the module's text; a `ServoModel`.
+
+    Parameters
+    ----------
+    coefficients : mapping of str to array_like
+        Names of `COEFFICIENTS`; those left out are absent from the equation.
+    delay_s : array_like
+        From a command's arrival to its first effect [s].
+    offset_rad : array_like
+        Added to every position returned [rad]: what the servo's readings show beside the angle
+        that it controls.
+    time_step_s : float
+        Time step [s]; commands and positions are at this step.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, a number is negative or not finite, or the time step is too long for
+        the stiffness: the integration would explode.
+
+    Examples
+    --------
+    >>> servo = SparseEquation({"stiffness_per_s2": 2500.0, "damping_per_s": 100.0}, delay_s=0.02)
+    >>> servo.reset(0.0)
+    >>> float(servo.rollout(np.ones(500))[-1].round(6))
+    1.0
+    """
+
+    def __init__(
+        self,
+        coefficients: Mapping[str, ArrayLike],
+        delay_s: ArrayLike,
+        offset_rad: ArrayLike = 0.0,
+        time_step_s: float = TIME_STEP_S,
+    ):
+        if not (np.isfinite(time_step_s) and time_step_s > 0):
+            raise InputError(f"SparseEquation: time_step_s is {time_step_s}; it must be positive.")
+        for name in coefficients:
+            if name not in COEFFICIENTS:
+                near = difflib.get_close_matches(name, COEFFICIENTS, 1, 0.3)
+                hint = (
+                    f"did you mean {near[0]}?" if near else f"known are {', '.join(COEFFICIENTS)}."
+                )
+                raise InputError(f"SparseEquation: there is no coefficient {name}; {hint}")
+        values = {name: np.asarray(value, float) for name, value in coefficients.items()}
+        self.delay_s = np.asarray(delay_s, float)
+        self.offset_rad = np.asarray(offset_rad, float)
+        for name, value in [*values.items(), ("delay_s", self.delay_s)]:
+            infinite = np.isinf(value).any() and name not in _NEVER
+            if np.isnan(value).any() or np.min(value) < 0 or infinite:
+                raise InputError(f"SparseEquation: {name} is {value}; it must be 0 or positive.")
+        if not np.isfinite(self.offset_rad).all():
+            raise InputError(f"SparseEquation: offset_rad is {self.offset_rad}; it must be finite.")
+        self.coefficients = values
+        self.time_step_s = h = float(time_step_s)
+        # the roots of y₊ − 2y + y₋ = −h² · stiffness · y leave the unit circle there
+        spring = sum(values.get(n, 0.0) for n in ("stiffness_per_s2", "saturated_stiffness_per_s2"))
+        if np.max(h * h * spring) >= 4.0:
+            raise InputError(
+                f"SparseEquation: steps of {1e3 * h:g} ms are too long for a stiffness of "
+                f"{np.max(spring):g} s⁻²; use {1e3 * TIME_STEP_S:g} ms."
+            )
+        self._own = np.broadcast_shapes(
+            *(v.shape for v in values.values()), self.delay_s.shape, self.offset_rad.shape
+        )
+        self._nsample = int(np.floor(np.max(self.delay_s) / h)) + 2
+        self.reset(np.zeros(self._own))
+
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], which has been the command for as long as the delay.
+
+        The batch becomes the shape to which `position` and the coefficients broadcast.
+        """
+        position = np.asarray(position, float)
+        self.batch = np.broadcast_shapes(position.shape, self._own)
+        self._position = np.broadcast_to(position, self.batch).copy()
+        self._velocity = np.zeros(self.batch)
+        self._past = np.broadcast_to(position, (self._nsample, *self.batch)).copy()
+
+    def step(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Advance one time step under `command` [rad]; returns the position after it."""
+        return self.rollout(np.broadcast_to(np.asarray(command, float), self.batch)[None])[0]
+
+    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
+        """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
+        commands = np.asarray(commands, float)
+        if commands.ndim == 1:  # one series for the whole batch
+            commands = commands.reshape(-1, *[1] * len(self.batch))
+        commands = np.broadcast_to(commands, (len(commands), *self.batch))
+        history = np.concatenate([self._past, commands])
+        self._past = history[len(history) - self._nsample :].copy()
+        delay = np.broadcast_to(self.delay_s / self.time_step_s, self.batch).reshape(-1)
+        delayed = fractional_shift(history.reshape(len(history), -1), len(commands), delay)
+        positions, state = integrate(
+            delayed.reshape(commands.shape),
+            (self._position, self._velocity),
+            self.coefficients,
+            self.time_step_s,
+        )
+        self._position, self._velocity = state
+        return positions + self.offset_rad
+
+
+def integrate(
+    delayed: NDArray[np.float64],
+    state: tuple[NDArray, NDArray],
+    coefficients: Mapping[str, NDArray],
+    time_step_s: float,
+    out: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray]]:
+    """Step the equation through commands that have already been delayed.
+
+    Parameters
+    ----------
+    delayed : ndarray, shape (steps, *batch)
+        Commands as they take effect [rad].
+    state : (position, velocity), each of shape batch
+    coefficients : mapping of str to ndarray
+        Names of `COEFFICIENTS`, each broadcastable to batch; those left out cost no time.
+    time_step_s : float
+    out : ndarray, optional
+        Where the positions go; may be `delayed` itself.
+
+    Returns
+    -------
+    positions : ndarray, shape (steps, *batch)
+    state : the state after the last step
+    """
+    h, batch = time_step_s, delayed.shape[1:]
+
+    def flat(value: ArrayLike) -> NDArray:  # one contiguous axis: the fastest for small steps
+        return np.ascontiguousarray(np.broadcast_to(value, batch), dtype=float).reshape(-1)
+
+    def part(name: str, scale: float) -> NDArray | None:
+        return flat(coefficients[name]) * scale if name in coefficients else None
+
+    spring, limited = part("stiffness_per_s2", h), part("saturated_stiffness_per_s2", h)
+    drag, friction = part("drag_per_rad", 0.5 * h), part("friction_rad_s2", h)
+    limit = flat(coefficients.get("saturation_error_rad", np.inf))
+    low_limit, low_friction = -limit, None if friction is None else -friction
+    damping = 0.5 * h * flat(coefficients.get("damping_per_s", 0.0))
+    positions = np.empty(delayed.shape) if out is None else out
+    flat_positions = positions.reshape(len(delayed), -1)
+    delayed = delayed.reshape(len(delayed), -1)
+    position, velocity = (flat(x).copy() for x in state)
+    error, work, loss = (np.empty_like(position) for _ in range(3))
+    # numpy.clip costs five times minimum + maximum on small arrays, hence the pairs below
+    for k in range(len(delayed)):
+        np.subtract(delayed[k], position, out=error)
+        loss[:] = damping
+        if drag is not None:
+            np.abs(velocity, out=work)
+            work *= drag
+            loss += work
+        np.multiply(velocity, loss, out=work)
+        velocity -= work
+        if spring is not None:
+            np.multiply(spring, error, out=work)
+            velocity += work
+        if limited is not None:
+            np.minimum(error, limit, out=work)
+            np.maximum(work, low_limit, out=work)
+            work *= limited
+            velocity += work
+        if friction is not None and low_friction is not None:
+            np.minimum(velocity, friction, out=work)
+            np.maximum(work, low_friction, out=work)
+            velocity -= work
+        loss += 1.0
+        velocity /= loss
+        np.multiply(velocity, h, out=work)
+        position += work
+        flat_positions[k] = position
+    return positions, (position.reshape(batch), velocity.reshape(batch))
+
+
+# ------------------------------------------------------------------------------- in words
+
+
+def equation(coefficients: Mapping[str, float], delay_s: float) -> str:
+    """The equation with its numbers and units, on one line; all numbers are scalars.
+
+    Examples
+    --------
+    >>> equation({"stiffness_per_s2": 9120.0, "friction_rad_s2": 118.4}, delay_s=0.0246)
+    'q̈ = 9 120 s⁻² · e − 118 rad/s² · sign(q̇),  e = u(t − 24.6 ms) − q'
+    """
+    limit = digits(coefficients.get("saturation_error_rad", np.inf))
+    shapes = {
+        "stiffness_per_s2": "+ {} · e",
+        "saturated_stiffness_per_s2": f"+ {{}} · sat(e, {limit} rad)",
+        "damping_per_s": "− {} · q̇",
+        "drag_per_rad": "− {} · q̇|q̇|",
+        "friction_rad_s2": "− {} · sign(q̇)",
+    }
+    parts = [
+        shape.format(f"{digits(coefficients[name])} {COEFFICIENTS[name].unit}")
+        for name, shape in shapes.items()
+        if coefficients.get(name)
+    ]
+    right = " ".join(parts).removeprefix("+ ")
+    return f"q̈ = {right or '0'},  e = u(t − {digits(1e3 * delay_s)} ms) − q"
+
+
+def explain(
+    coefficients: Mapping[str, float],
+    delay_s: float,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+) -> list[str]:
+    """One line per number: value, unit, meaning; `ranges` adds what it becomes on part of the data.
+
+    Examples
+    --------
+    >>> explain({"stiffness_per_s2": 9120.0}, delay_s=0.0246)[0]
+    '9 120 s⁻²: stiffness: acceleration per radian of error'
+    """
+    lines = []
+    rows = [(name, value, *COEFFICIENTS[name]) for name, value in coefficients.items()]
+    delay = ("delay_s", delay_s, "s", "delay from a command's arrival to its first effect")
+    for name, value, unit, meaning in [*rows, delay]:
+        low, high = (ranges or {}).get(name, (value, value))
+        around = f" ({digits(low)} … {digits(high)} with one frequency left out)"
+        lines.append(f"{digits(value)} {unit}: {meaning}{around if low < high else ''}")
+    # only where the drive ends and one term alone brakes is there a top speed
+    limited = {"saturated_stiffness_per_s2", "saturation_error_rad", "damping_per_s"}
+    if limited <= set(coefficients) and not {"stiffness_per_s2", "drag_per_rad"} & set(
+        coefficients
+    ):
+        drive = coefficients["saturated_stiffness_per_s2"] * coefficients["saturation_error_rad"]
+        net, damping = drive - coefficients.get("friction_rad_s2", 0), coefficients["damping_per_s"]
+        if net > 0:
+            lines.append(
+                f"so its full drive is {digits(drive)} rad/s², and its top speed (drive − friction)"
+                f" / damping = {digits(net / damping)} rad/s"
+            )
+    return lines
+
+
+def digits(value: float) -> str:
+    """A number with three significant digits, thousands set apart.
+
+    Examples
+    --------
+    >>> digits(9123.4), digits(0.04567), digits(118.0), digits(2.0)
+    ('9 120', '0.0457', '118', '2')
+    """
+    if not np.isfinite(value) or value == 0:
+        return "∞" if np.isinf(value) else f"{value:g}"
+    places = 2 - int(np.floor(np.log10(abs(value))))
+    rounded = round(float(value), places)
+    text = f"{rounded:,.{max(places, 0)}f}".replace(",", " ")
+    return text.rstrip("0").rstrip(".") if "." in text else text

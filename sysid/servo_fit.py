@@ -1,0 +1,383 @@
+"""Fit servo models of all joints, score them on data they have not seen, beside honest baselines.
+
+The caller says which part is for training and which for testing, or that each group (loop, tone) is
+to be left out in turn. Whatever is chosen on the way (ridge, weight decay, length of training) is
+chosen by groups held out of the training part. The linear filter and DelayedPD are always fitted to
+the same part and scored on the same readings, and so is "it stays where it was".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import InputError
+from servo_models.interface import ServoModel
+from sysid import servo_scores as scores
+from sysid.network_fit import Learned, fit_network, past_ticks
+from sysid.physics_fit import (
+    delayed_pd_fits,
+    delayed_pd_model,
+    sindy_fits,
+    sindy_model,
+)
+from sysid.published_networks import fit_published
+from sysid.recording import Recording
+from sysid.servo_data import ServoData, servo_data
+from sysid.servo_samples import Part, Samples, chosen, in_stretches, merged_groups, samples
+
+
+@dataclass(frozen=True)
+class Split:
+    """What is for training and what for testing; None: every group is left out in turn.
+
+    Attributes
+    ----------
+    name : str
+        In words.
+    train, test : Part or None
+    """
+
+    name: str
+    train: Part | None = None
+    test: Part | None = None
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One model on the test part.
+
+    Attributes
+    ----------
+    errors : dict of str to Errors
+    interval : (float, float)
+        90 % interval of the mean over joints of the free-run RMS [rad].
+    """
+
+    errors: dict[str, scores.Errors]
+    interval: tuple[float, float]
+
+    def free_run(self, joint: str) -> float:
+        """RMS of a joint in free run [rad]."""
+        return scores.rms(self.errors[joint].free_run)
+
+    @property
+    def mean(self) -> float:
+        """Mean over joints of the RMS in free run [rad]."""
+        return float(np.mean([self.free_run(j) for j in self.errors]))
+
+
+@dataclass(frozen=True)
+class ServoFit:
+    """A fitted model with all that is known of it.
+
+    Attributes
+    ----------
+    model : ServoModel
+        Fitted to the whole training part (to everything, where groups were left out in turn).
+    parameters : dict of str to ndarray
+        Its arrays, for a model file.
+    scored : dict of str to Scored
+        Under the name of the architecture, "linear" and "delayed-pd".
+    persistence, repeatability : dict of str to float
+        Per joint [rad].
+    band : dict of str to (float, float)
+        Noise [rad] and timing [s] of the predictive band, from readings held out of the fit.
+    coverage : float
+        Share of the test readings inside the 90 % band.
+    difference : (float, float, float)
+        Model less linear model, mean RMS [rad], and its 90 % interval.
+    """
+
+    arch: str
+    preset: str
+    data: ServoData
+    split: Split
+    model: ServoModel
+    parameters: dict[str, NDArray[np.floating]]
+    choices: dict[str, float]
+    scored: dict[str, Scored]
+    persistence: dict[str, float]
+    repeatability: dict[str, float]
+    band: dict[str, tuple[float, float]]
+    coverage: float
+    difference: tuple[float, float, float]
+    readings: dict[str, int]
+    notes: tuple[str, ...]
+    tracks: scores.Tracks
+
+    @property
+    def verdict(self) -> str:
+        """Whether it was worth it, in words."""
+        name, (gain, low, high) = self.arch.upper(), self.difference
+        linear = self.scored["linear"].mean
+        span = f"({100 * gain / linear:+.0f} %, 90 % interval {100 * low / linear:+.0f} to "
+        span += f"{100 * high / linear:+.0f} %)"
+        if self.arch == "fir":
+            return "This is the linear model itself."
+        if high < 0:
+            said = f"The {name} is better than the linear model on this data {span}."
+        elif low > 0:
+            said = f"The {name} is worse than the linear model on this data {span}."
+        else:
+            said = f"The {name} is not better than the linear model on this data {span}."
+        floor = _mean(list(self.repeatability.values()))
+        if np.isfinite(floor):
+            said += (
+                f" The robot repeats itself to {1e3 * floor:.1f} mrad; the model is "
+                f"{1e3 * (self.scored[self.arch].mean - floor):.1f} mrad above that."
+            )
+        return said
+
+
+def fit_servo(
+    recordings: Sequence[Recording],
+    joints: Sequence[str],
+    arch: str = "mlp",
+    preset: str = "default",
+    split: Split | None = None,
+    mode: str = "auto",
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> ServoFit:
+    """Fit and score one kind of model.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    joints : sequence of str
+    arch : {"fir", "mlp", "lstm", "delayed-pd", "sindy"}
+    preset : {"default", "paper"}
+        `paper` trains an MLP or LSTM as published: shown its last position, one step ahead.
+    split : Split, optional
+        By default every group is left out in turn.
+    mode : {"auto", "fresh", "all"}
+        Which readings count, see `sysid.servo_data`.
+    seed : int
+    progress : callable, optional
+        Called with what is being done and the share of it that is done.
+
+    Raises
+    ------
+    InputError
+        If the data cannot support a fit; the sentence says why.
+    """
+    if preset == "paper" and arch not in ("mlp", "lstm"):
+        raise InputError(f"--preset paper has an mlp and an lstm; there is no published {arch}.")
+    data = servo_data(recordings, joints, mode)
+    split, notes = split or Split("each group left out in turn"), []
+    whole: Part = split.train or (lambda number, elapsed, group: np.ones(len(number), bool))
+    present = {
+        int(g) for j in joints for r in data.runs[j] for g in r.group[r.readings.rows][chosen(r, whole)]
+    }
+    if len(present) < 2:
+        only = data.groups[next(iter(present))] if present else "nothing"
+        notes.append(
+            f"There is one group to learn from ({only}), so models are chosen by holding out "
+            "stretches of it. Record more loops or tones to know how they generalise."
+        )
+        data = in_stretches(data, whole)
+    data = merged_groups(data)
+    if split.test is None:
+        folds = [(_without(g), _only(g)) for g in range(len(data.groups))]
+    else:
+        folds = [(split.train or whole, split.test)]
+        if not any(chosen(r, split.test).any() for j in joints for r in data.runs[j]):
+            raise InputError(f"There is nothing to test on: {split.name}. Check loops and times.")
+    say = progress or (lambda what, share: None)
+    ready = samples(data, whole, past_ticks(data.period_s))
+    readings = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
+
+    linear = fit_network("fir", joints, data.period_s, ready, seed)
+    say("DelayedPD", 0.0)
+    physics = [delayed_pd_model(v, data.period_s) for v in _physics("delayed-pd", data, folds, seed)]
+    ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say)
+    notes += ours.notes
+    few = ours.weights_per_joint
+    if few and few > min(readings.values()):
+        notes.append(
+            f"Each joint's model has {few:,} weights and {min(readings.values()):,} readings: what "
+            "holds it together is weight decay, chosen by held-out groups."
+        )
+    scored = {
+        "linear": _score(_fold_models(linear, folds, split), folds, data, seed),
+        "delayed-pd": _score(physics, folds, data, seed),
+    }
+    scored[arch] = _score(ours.folds, folds, data, seed)
+    held_out = ours.held_out or scored[arch].errors
+    bands = {j: scores.band(e) for j, e in held_out.items()}
+    low, high = scores.interval(scored[arch].errors, seed, scored["linear"].errors)
+    test: Part = split.test or (lambda number, elapsed, group: group >= 0)
+    return ServoFit(
+        arch, preset, data, split, ours.model, ours.parameters, ours.choices, scored,
+        scores.persistence(data, test), scores.repeatability(data, test), bands,
+        _coverage(scored[arch].errors, bands),
+        (scored[arch].mean - scored["linear"].mean, low, high), readings, tuple(notes),
+        scores.tracks(ours.model, data),
+    )  # fmt: skip
+
+
+def to_json(fit: ServoFit, elapsed_s: float) -> dict[str, Any]:
+    """Object of `fit-servo --json`."""
+    joints = {j: _joint_json(fit, j) for j in fit.data.joints}
+    keys = [k for k, v in next(iter(joints.values())).items() if isinstance(v, float)]
+    mean = {k: _mean([entry[k] for entry in joints.values()]) for k in keys}
+    ours, linear = fit.scored[fit.arch], fit.scored["linear"]
+    return {
+        "arch": fit.arch,
+        "preset": fit.preset,
+        "elapsed_s": elapsed_s,
+        "split": fit.split.name,
+        "readings_counted": fit.data.modes,
+        "groups": list(fit.data.groups),
+        "time_step_s": fit.data.period_s,
+        "choices": fit.choices,
+        "mean": mean
+        | {
+            "rmse_free_run_interval_rad": list(ours.interval),
+            "linear_interval_rad": list(linear.interval),
+            "difference_to_linear_interval_rad": list(fit.difference[1:]),
+            "coverage_of_90_percent_band": fit.coverage,
+        },
+        "joints": joints,
+        "verdict": fit.verdict,
+        "notes": list(fit.notes),
+    }
+
+
+def _joint_json(fit: ServoFit, joint: str) -> dict[str, float]:
+    own = fit.scored[fit.arch].errors[joint]
+    noise, timing = fit.band[joint]
+    return {
+        "rmse_one_step_rad": scores.rms(own.one_step),
+        "rmse_free_run_rad": scores.rms(own.free_run),
+        "rmse_held_rad": scores.rms(own.held),
+        "rmse_raw_rad": scores.rms(own.raw),
+        "linear_rmse_rad": fit.scored["linear"].free_run(joint),
+        "delayed_pd_rmse_rad": fit.scored["delayed-pd"].free_run(joint),
+        "persistence_rmse_rad": fit.persistence[joint],
+        "repeatability_rad": fit.repeatability[joint],
+        "band_noise_rad": noise,
+        "band_timing_s": timing,
+    }
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+# ------------------------------------------------------------------------------- fitting
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """What `_fit` makes: the model, one per fold, and what is left of held-out groups."""
+
+    model: ServoModel
+    parameters: dict[str, NDArray[np.floating]]
+    folds: list[ServoModel]
+    choices: dict[str, float]
+    held_out: dict[str, scores.Errors] | None
+    weights_per_joint: int
+    notes: list[str]
+
+
+def _fit(
+    arch: str,
+    preset: str,
+    data: ServoData,
+    ready: Samples,
+    whole: Part,
+    folds: list[tuple[Part, Part]],
+    split: Split,
+    seed: int,
+    say: Callable[[str, float], None],
+) -> _Fitted:
+    if arch in ("delayed-pd", "sindy"):
+        build = delayed_pd_model if arch == "delayed-pd" else sindy_model
+        same = split.test is not None  # the one fold is the whole training part
+        parts = folds if same else [(whole, whole), *folds]
+        values = _physics(arch, data, parts, seed)
+        models: list[ServoModel] = [build(v, data.period_s) for v in values]
+        return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0, [])
+    if preset == "paper":
+        found = [
+            fit_published(arch, data, part, seed, lambda share: say(f"{arch} as published", share))
+            for part in ([f[0] for f in folds] + ([] if split.test is not None else [whole]))
+        ]
+        size = sum(v[0].size for k, v in found[-1].parameters.items() if "weight" in k or "bias" in k)
+        return _Fitted(
+            found[-1], found[-1].parameters, list(found[: len(folds)]), {}, None, size, []
+        )
+    fit = fit_network(
+        arch, data.joints, data.period_s, ready, seed, nested=split.test is None,
+        progress=lambda done, steps: say(arch, done / steps),
+    )  # fmt: skip
+    held = [
+        scores.errors(m, scores.tracks(m, data), data, _both(whole, _only(g)))
+        for g, m in fit.held_out.items()
+    ]
+    notes = ["Training was stopped early; the best so far was kept."] if fit.interrupted else []
+    size = sum(
+        v[0].size for k, v in fit.model.parameters.items() if k.startswith(("weight", "bias", "fir"))
+    )
+    return _Fitted(
+        fit.model, fit.model.parameters, _fold_models(fit, folds, split), fit.choices,
+        scores.pooled(held) if held else None, size if arch != "fir" else 0, notes,
+    )  # fmt: skip
+
+
+def _fold_models(fit: Any, folds: list[tuple[Part, Part]], split: Split) -> list[ServoModel]:
+    if split.test is not None:
+        return [fit.model]
+    return [fit.held_out[g] for g in range(len(folds))]
+
+
+def _physics(
+    arch: str, data: ServoData, folds: list[tuple[Part, Part]], seed: int
+) -> list[dict[str, NDArray[np.float64]]]:
+    fits = delayed_pd_fits if arch == "delayed-pd" else sindy_fits
+    return fits(data, [train for train, _ in folds], seed)
+
+
+def _score(
+    models: Sequence[ServoModel | Learned],
+    folds: list[tuple[Part, Part]],
+    data: ServoData,
+    seed: int,
+) -> Scored:
+    parts = [
+        scores.errors(model, scores.tracks(model, data), data, test)
+        for model, (_, test) in zip(models, folds, strict=True)
+    ]
+    found = scores.pooled(parts)
+    return Scored(found, scores.interval(found, seed))
+
+
+def _coverage(
+    found: dict[str, scores.Errors], bands: dict[str, tuple[float, float]]
+) -> float:
+    inside, total = 0, 0
+    for joint, e in found.items():
+        noise, timing = bands[joint]
+        half = 1.645 * np.sqrt(noise**2 + (timing * e.speed) ** 2)
+        inside, total = inside + int(np.sum(np.abs(e.free_run) <= half)), total + len(half)
+    return inside / max(total, 1)
+
+
+def _only(group: int) -> Part:
+    return lambda number, elapsed, groups: groups == group
+
+
+def _without(group: int) -> Part:
+    return lambda number, elapsed, groups: (groups != group) & (groups >= 0)
+
+
+def _both(a: Part, b: Part) -> Part:
+    return lambda number, elapsed, group: a(number, elapsed, group) & b(number, elapsed, group)
+
