@@ -18,8 +18,10 @@ import tyro
 from cli.analyse import Bode, Delay, Doctor
 from cli.calibrate import Calibrate
 from cli.calibrate_joints import CalibrateJoints
+from cli.compare import Compare
 from cli.emulate import Emulate
 from cli.export import Export
+from cli.fit_servo import FitServo
 from cli.monitor import Monitor
 from cli.report import Report
 from cli.scan import Scan
@@ -38,6 +40,8 @@ Command = (
     | Annotated[Bode, tyro.conf.subcommand("bode")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Sindy, tyro.conf.subcommand("sindy")]
+    | Annotated[FitServo, tyro.conf.subcommand("fit-servo")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Emulate, tyro.conf.subcommand("emulate")]

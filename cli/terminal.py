@@ -104,6 +104,21 @@ def progress(label: str, total: int) -> Iterator[Any]:
         yield advance
 
 
+@contextmanager
+def share_progress(label: str) -> Iterator[Any]:
+    """A progress bar over shares of stages; yields `advance(what, share)`."""
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(), console=err, disable=not err.is_terminal, transient=True,
+    ) as bar:  # fmt: skip
+        task = bar.add_task(label, total=1.0)
+
+        def advance(what: str, share: float) -> None:
+            bar.update(task, completed=share, description=f"{label}: {what}")
+
+        yield advance
+
+
 def need_positive(name: str, value: float) -> None:
     """Refuse an option that must be positive."""
     if not (math.isfinite(value) and value > 0):

@@ -49,10 +49,10 @@ def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def versions() -> dict[str, str]:
-    """Versions of this project and of the libraries that shape its numbers."""
+def versions(*more: str) -> dict[str, str]:
+    """Versions of this project and of the libraries that shape its numbers, `more` included."""
     found = {}
-    for name in (PACKAGE, "numpy", "scipy", "mujoco"):
+    for name in (PACKAGE, "numpy", "scipy", "mujoco", *more):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

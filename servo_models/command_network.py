@@ -70,19 +70,23 @@ class CommandNetwork(JointArrays):
             raise InputError(f"A servo network must end in one output; this one has {width}.")
         self._need("fir_bias", ())
         self._need("bound", ())
+        self._transposed = [
+            np.ascontiguousarray(np.swapaxes(self.parameters[f"weight_{n}"], 1, 2))
+            for n in range(self._depth)
+        ]
         self.reset(np.zeros(len(self.joints)))
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""
         here = self._enter(position)
-        self._history = np.repeat(self._normal_command(here)[..., None], self.taps, axis=-1)
+        self._history = np.repeat(self._normal_command(here)[:, None], self.taps, axis=1)
         self._last = self._normal_position(here)
 
     def step(self, command: ArrayLike) -> NDArray[np.float32]:
         """Advance one time step under `command` [rad]; returns the position after it [rad]."""
         newest = self._normal_command(self._arrange(command))
-        self._history[..., 1:] = self._history[..., :-1]
-        self._history[..., 0] = newest
+        self._history[:, 1:] = self._history[:, :-1]
+        self._history[:, 0] = newest
         self._last = self._forward(self._history, self._last)
         return self._leave(self._last)
 
@@ -91,14 +95,16 @@ class CommandNetwork(JointArrays):
         commands = np.asarray(commands, np.float32)
         if self.feedback:
             return np.stack([self.step(c) for c in commands])
-        given = np.stack([self._normal_command(self._arrange(c)) for c in commands], axis=-1)
+        given = np.stack([self._normal_command(self._arrange(c)) for c in commands], axis=1)
         # newest first in the history, oldest first in time: one axis that can be windowed
-        time = np.concatenate([self._history[..., ::-1], given], axis=-1)
-        windows = np.lib.stride_tricks.sliding_window_view(time, self.taps, axis=-1)[..., 1:, ::-1]
-        joints, environments, steps, taps = windows.shape
-        out = self._forward(windows.reshape(joints, environments * steps, taps), self._last)
-        self._history = np.ascontiguousarray(time[..., : -self.taps - 1 : -1])
-        return self._leave_all(out.reshape(joints, environments, steps))
+        time = np.concatenate([self._history[:, ::-1], given], axis=1)
+        windows = np.lib.stride_tricks.sliding_window_view(time, self.taps, axis=1)[:, 1:, :, ::-1]
+        joints, steps, environments, taps = windows.shape
+        x = np.moveaxis(windows, -1, 1).reshape(joints, taps, steps * environments)
+        out = self._forward(x, self._last).reshape(joints, steps, environments)
+        self._history = np.ascontiguousarray(time[:, : -self.taps - 1 : -1])
+        self._last = out[:, -1]
+        return self._leave_all(np.moveaxis(out, 1, 2))
 
     def one_step(
         self, commands: NDArray[np.floating], position: NDArray[np.floating]
@@ -122,18 +128,21 @@ class CommandNetwork(JointArrays):
         return np.stack(out)
 
     def _forward(self, x: NDArray, last: NDArray) -> NDArray[np.float32]:
-        """Normalised positions (joints, n) from normalised commands (joints, n, taps)."""
+        """Normalised positions (joints, n) from normalised commands (joints, taps, n)."""
         p = self.parameters
-        linear = np.matmul(x, p["fir"][..., None])[..., 0] + p["fir_bias"][:, None]
+        out = np.matmul(p["fir"][:, None], x)[:, 0] + p["fir_bias"][:, None]
         if not self._depth:
-            return linear
-        h = np.concatenate([x, last[..., None]], axis=-1) if self.feedback else x
-        for layer in range(self._depth):
-            h = np.matmul(h, p[f"weight_{layer}"])
-            h += p[f"bias_{layer}"][:, None]
-            if layer < self._depth - 1:
-                np.maximum(h, 0.0, out=h)
-        return linear + bounded(h[..., 0], p["bound"][:, None])
+            return out
+        # joint by joint, so that a layer of many environments stays in the processor's cache
+        for j in range(len(self.joints)):
+            h = np.concatenate([x[j], last[j, None]]) if self.feedback else x[j]
+            for layer in range(self._depth):
+                h = self._transposed[layer][j] @ h
+                h += p[f"bias_{layer}"][j, :, None]
+                if layer < self._depth - 1:
+                    np.maximum(h, 0.0, out=h)
+            out[j] += bounded(h[0], p["bound"][j])
+        return out
 
 
 def bounded(value: NDArray, bound: NDArray) -> NDArray:

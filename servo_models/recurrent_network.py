@@ -5,7 +5,7 @@ As `CommandNetwork`, but what corrects the linear filter is a long short-term me
 
     i, f, o = sigmoid(…), g = tanh(…) of  input · weight_input + hidden · weight_hidden + bias
     cell = f * cell + i * g,   hidden = o * tanh(cell)
-    position = centre + spread * (fir · x + fir_bias + bound * tanh(mean(hidden · out) / bound))
+    position = centre + spread * (fir · x + fir_bias + mean(bound * tanh(hidden · out / bound)))
 
 Its memory starts empty and is filled by `warm_up` steps at the position it rests at.
 """
@@ -32,7 +32,7 @@ class RecurrentNetwork(JointArrays):
         As for `CommandNetwork`, and with members m, inputs n and hidden units h:
         `weight_input` (joints, m, n, 4 h), `weight_hidden` (joints, m, h, 4 h), `bias`
         (joints, m, 4 h) for the gates i, f, g, o; `weight_out` (joints, m, h), `bias_out`
-        (joints,).
+        (joints, m).
     feedback : bool
         Whether the network's last input is the position predicted last.
     warm_up : int
@@ -60,7 +60,8 @@ class RecurrentNetwork(JointArrays):
         self._need("weight_input", (members, 1 + feedback, gates))
         self._need("bias", (members, gates))
         self._need("weight_out", (members, hidden))
-        for name in ("bias_out", "fir_bias", "bound"):
+        self._need("bias_out", (members,))
+        for name in ("fir_bias", "bound"):
             self._need(name, ())
         self._memory = (members, hidden)
         self.reset(np.zeros(len(self.joints)))
@@ -115,10 +116,9 @@ class RecurrentNetwork(JointArrays):
         i, f, g, o = np.split(gates, 4, axis=-1)
         self._cell = _sigmoid(f) * self._cell + _sigmoid(i) * np.tanh(g)
         self._hidden = _sigmoid(o) * np.tanh(self._cell)
-        out = np.einsum("jmeh,jmh->je", self._hidden, p["weight_out"]) / self._memory[0]
-        out += p["bias_out"][:, None]
+        out = np.einsum("jmeh,jmh->jme", self._hidden, p["weight_out"]) + p["bias_out"][..., None]
         linear = np.matmul(self._history, p["fir"][..., None])[..., 0] + p["fir_bias"][:, None]
-        self._last = linear + bounded(out, p["bound"][:, None])
+        self._last = linear + bounded(out, p["bound"][:, None, None]).mean(axis=1)
 
 
 def _sigmoid(x: NDArray) -> NDArray:

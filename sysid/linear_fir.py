@@ -84,6 +84,9 @@ def fit_linear(
     for j in range(joints):
         for n, left_out in enumerate(sets):
             use = learns_from(data, left_out)[j]
+            if not use.any():  # of a joint with no other group: the mean, which is zero
+                residual[j, :, :, n] = data.target[j]
+                continue
             a = np.column_stack([x[j][use], np.ones(int(use.sum()))])
             w, r = _robust(a, data.target[j][use].astype(float), ridge)
             fir[j, n], bias[j, n] = w[:-1] * fade, w[-1]

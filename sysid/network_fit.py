@@ -21,7 +21,7 @@ from sysid.servo_samples import Samples, training_sets
 from sysid.servo_training import LSTM, MLP, Checkpoint, train
 
 Learned = CommandNetwork | RecurrentNetwork
-_LSTM_MEMORY_S = 0.5
+_LSTM_MEMORY_S = 1.5
 _AS_GOOD = 0.01  # of the logarithm of the error: one percent
 
 
@@ -190,7 +190,7 @@ def _build(
         "bound": linear.scale[:, n],
     }  # fmt: skip
     if "weight_hidden" in weights:
-        parameters |= weights | {"bias_out": weights["bias_out"].mean(1)}
+        parameters |= weights
         return RecurrentNetwork(joints, period_s, parameters, warm_up=data.past)
     if weights:
         members, units = weights["bias_0"].shape[1:]

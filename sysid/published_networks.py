@@ -176,5 +176,5 @@ def _lstm(
     return {
         "weight_input": v["weight_input"][:, None], "weight_hidden": v["weight_hidden"][:, None],
         "bias": v["bias"], "weight_out": v["weight_out"][:, None, :, 0],
-        "bias_out": v["bias_out"][:, 0, 0],
+        "bias_out": v["bias_out"][:, 0],
     }  # fmt: skip

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from common.errors import InputError
 from sysid.calibrate import Truncation, joint_trials
 from sysid.output_error import TrialData, prepare, whole_counts
-from sysid.poll_lattice import Readings, find_poll_lattice, readings
+from sysid.poll_lattice import Readings, find_poll_lattice, fresh_rows, readings
 from sysid.recording import Recording, Trial
 
 MODES = ("auto", "fresh", "all")
@@ -189,21 +189,22 @@ def look_up(track: NDArray[np.floating], tick: NDArray[np.float64]) -> NDArray[n
 
 
 def _common_period(recordings: Sequence[Recording]) -> float:
-    periods = {r.name: r.loop_period_s for r in recordings}
-    period = float(np.median(list(periods.values())))
-    for name, own in periods.items():
-        if not abs(own / period - 1) < _SAME_RATE:
-            raise InputError(
-                f"Recordings of different rates cannot be pooled: {name} has a command every "
-                f"{1e3 * own:.1f} ms, others every {1e3 * period:.1f} ms. Fit them one by one."
-            )
-    return period
+    periods = sorted((r.loop_period_s, r.name) for r in recordings)
+    (shortest, fast), (longest, slow) = periods[0], periods[-1]
+    if not longest / shortest - 1 < _SAME_RATE:
+        raise InputError(
+            f"Recordings of different rates cannot be pooled: {fast} has a command every "
+            f"{1e3 * shortest:.1f} ms, {slow} every {1e3 * longest:.1f} ms. Fit them one by one."
+        )
+    return float(np.median([p for p, _ in periods]))
 
 
 def _joint_runs(
     recordings: Sequence[Recording], joint: str, mode: str, period: float, labels: dict[str, int]
 ) -> tuple[list[Run], str]:
     trials, _ = joint_trials(recordings, joint)
+    if not trials:
+        raise InputError(f"{joint} was not recorded. Leave it out with --joints.")
     lattice = find_poll_lattice(trials)
     if mode == "auto":
         mode = "fresh" if 1 - _fresh_while_moving(trials) > _HELD_FRACTION else "all"
@@ -234,17 +235,18 @@ def _fresh_while_moving(trials: Sequence[Trial]) -> float:
     changed, moving = 0, 0
     for t in trials:
         move = np.abs(np.diff(t.command_rad, prepend=t.initial_command_rad)) > 0.005
-        move = np.convolve(move, np.ones(3), "same") > 0
-        change = np.diff(t.position_rad, prepend=np.nan) != 0
-        changed, moving = changed + int(np.sum(change & move)), moving + int(np.sum(move))
+        move = np.convolve(move, np.ones(3))[1:-1] > 0
+        move &= np.isfinite(t.position_rad)
+        changed, moving = changed + int(move[fresh_rows(t)].sum()), moving + int(move.sum())
     return changed / max(moving, 1)
 
 
 def _all_rows(trial: Trial, timed: Readings) -> Readings:
     rows = np.flatnonzero(np.isfinite(trial.position_rad))
     return replace(
-        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows]
-    )
+        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows],
+        held_time_s=trial.read_time_s,
+    )  # fmt: skip
 
 
 _ROWS = ("send_time_s", "read_time_s", "command_rad", "position_rad")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from common.errors import InputError
 from servo_models.interface import ServoModel
+from servo_models.recurrent_network import RecurrentNetwork
 from sysid import servo_scores as scores
 from sysid.network_fit import Learned, fit_network, past_ticks
 from sysid.physics_fit import (
@@ -109,6 +110,16 @@ class ServoFit:
     readings: dict[str, int]
     notes: tuple[str, ...]
     tracks: scores.Tracks
+
+    @property
+    def feedback(self) -> bool:
+        """Whether the model is shown the position it predicted last."""
+        return isinstance(self.model, Learned) and self.model.feedback
+
+    @property
+    def warm_up(self) -> int:
+        """Steps at rest that an LSTM needs after a reset; 0 for others."""
+        return self.model.warm_up if isinstance(self.model, RecurrentNetwork) else 0
 
     @property
     def verdict(self) -> str:

@@ -52,8 +52,8 @@ class Recipe:
     patience: int
 
 
-MLP = Recipe(32, 4, (0.1, 0.3, 1.0, 3.0), 300, 5e-3, 50, 4)
-LSTM = Recipe(16, 2, (0.3, 3.0), 300, 5e-3, 50, 3)
+MLP = Recipe(20, 4, (0.1, 0.3, 1.0, 3.0), 400, 5e-3, 100, 2)
+LSTM = Recipe(16, 2, (0.1, 1.0), 200, 5e-3, 50, 3)
 
 
 @dataclass(frozen=True)
