@@ -57,20 +57,19 @@ class Compare:
         if self.json:
             terminal.print_json(made | {"written": str(self.plot)})
             return
-        names = list(made["models"])
+        names, models = list(made["models"]), list(made["models"].values())
         shown = terminal.table(
             "RMS error in free run, mrad", "joint", *names, "stays put", "robot repeats"
         )
         for joint in joints:
             shown.add_row(
                 joint,
-                *(terminal.ms(made["models"][n]["joints"][joint]["rmse_free_run_rad"]) for n in names),
+                *(terminal.ms(m["joints"][joint]["rmse_free_run_rad"]) for m in models),
                 terminal.ms(found.persistence[joint]), terminal.ms(found.repeatability[joint]),
             )  # fmt: skip
         if len(joints) > 1:
             shown.add_row(
-                "mean", *(terminal.ms(made["models"][n]["mean"]["rmse_free_run_rad"]) for n in names),
-                style="bold",
+                "mean", *(terminal.ms(m["mean"]["rmse_free_run_rad"]) for m in models), style="bold"
             )  # fmt: skip
         terminal.out.print(shown)
         for title, key in (

@@ -1,4 +1,4 @@
-"""`export`: a calibration or a recording in a form that other programs read."""
+"""`export`: a calibration, a recording or a servo model in a form that other programs read."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from sysid.recording import load
 
 @dataclass(frozen=True)
 class Export:
-    """Write a calibration, a preset or a recording as a tidy table.
+    """Write a calibration, a preset, a recording or a servo model for other programs.
 
     Example: pupper-sysid export calibrated.yaml --to csv --out calibrated.csv
+
+    Example: pupper-sysid export servo/ --to onnx --out servo.onnx
     """
 
     source: tyro.conf.Positional[str]
-    """calibrated.yaml, the name of a preset (paper, release), or a recording."""
-    to: Literal["csv"] = "csv"
-    """Format: csv."""
+    """calibrated.yaml, the name of a preset (paper, release), a recording, or a servo model's
+    folder."""
+    to: Literal["csv", "onnx", "torchscript"] = "csv"
+    """Format: csv, a tidy table, of all; onnx and torchscript of learned servo models."""
     out: Path | None = None
-    """File to write; by default the source's name with the format's ending, beside it."""
+    """File to write; by default the source's name with the format's ending, in this folder."""
     force: bool = False
     """Replace the file if it exists."""
     json: bool = False
@@ -36,20 +39,44 @@ class Export:
     def run(self) -> None:
         """Convert and write."""
         path = Path(self.source)
-        if self.source in PRESETS or path.suffix.lower() in (".yaml", ".yml"):
-            found = load_calibration(self.source)
-        elif path.suffix.lower() == ".csv":
-            found = load(path)
-            terminal.warn(found.warnings)
+        if self.source not in PRESETS and path.is_dir():
+            target = self._servo_model(path)
         else:
-            raise InputError(
-                f"{self.source}: neither a calibration (.yaml), nor a recording (.csv), nor one of "
-                f"the presets {', '.join(PRESETS)}."
-            )
-        ending = ".tidy.csv" if path.suffix.lower() == ".csv" else ".csv"
-        target = self.out or Path(path.name).with_suffix(ending)
-        to_csv(found, target, self.force)
+            target = self._table(path)
         if self.json:
             terminal.print_json({"written": str(target)})
         else:
             terminal.err.print(f"Wrote {target}.")
+
+    def _servo_model(self, folder: Path) -> Path:
+        from servo_models.servo_file import load_servo_model
+        from sysid.servo_export import ENDINGS, export_servo_model
+
+        saved = load_servo_model(folder)
+        # not with_suffix: a folder may be called servo-0.5
+        target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
+        export_servo_model(saved, self.to, target, self.force)
+        return target
+
+    def _table(self, path: Path) -> Path:
+        if path.name in ("contract.json", "weights.safetensors"):
+            raise InputError(f"{self.source} is part of a servo model; give its folder.")
+        kind = path.suffix.lower()
+        if self.source not in PRESETS and kind not in (".yaml", ".yml", ".csv"):
+            raise InputError(
+                f"{self.source}: neither a calibration (.yaml), nor a recording (.csv), nor the "
+                f"folder of a servo model, nor one of the presets {', '.join(PRESETS)}."
+            )
+        if self.to != "csv":
+            raise InputError(
+                f"{self.source} cannot become {self.to}: only a learned servo model can, a folder "
+                "that `pupper-sysid fit-servo` wrote. Export it with `--to csv`."
+            )
+        if self.source in PRESETS or kind != ".csv":
+            found = load_calibration(self.source)
+        else:
+            found = load(path)
+            terminal.warn(found.warnings)
+        target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
+        to_csv(found, target, self.force)
+        return target

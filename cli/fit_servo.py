@@ -20,7 +20,7 @@ from servo_models.servo_file import CONTRACT
 class FitServo:
     """Fit a model per joint that predicts, from commands alone, where the servo is.
 
-    Example: pupper-sysid fit-servo recordings/playback.csv --arch mlp --train-loops 0,1 --test-loops 2
+    Example: pupper-sysid fit-servo recordings/walk.csv --train-loops 0,1 --test-loops 2
     """
 
     recordings: tyro.conf.Positional[tuple[Path, ...]] = ()

@@ -31,6 +31,8 @@ class Report:
     """Folder to write; by default reports/ and the first recording's name."""
     calibration: Path | None = None
     """Calibration made from these recordings: its numbers and its seed are used."""
+    servo: tuple[str, ...] = ()
+    """Servo models of fit-servo to show on these recordings, beside the calibration."""
     force: bool = False
     """Replace files of a report that is there already."""
     json: bool = False
@@ -68,8 +70,14 @@ class Report:
                     responses[joint] = frequency_response(joint, trials, rng, result.budget.lattice)
                 advance(joint)
         made = made or to_calibration(results, recordings, seed)
+        more = []
+        if self.servo:
+            from sysid.servo_compare import compare
+            from sysid.servo_report import servo_section
+
+            more.append(servo_section(compare(recordings, joints, self.servo, seed=seed)))
         written = write_report(
-            folder, recordings, results, made, examinations, responses, self.force
+            folder, recordings, results, made, examinations, responses, self.force, more
         )
         if self.json:
             terminal.print_json(

@@ -42,11 +42,11 @@ class AtControlRate:
         """Rest at `position`, as `model` does."""
         self.model.reset(position)
 
-    def step(self, command: ArrayLike) -> NDArray[np.float64]:
+    def step(self, command: ArrayLike) -> NDArray[np.floating]:
         """Advance one command; returns the position at its end [rad]."""
         return self.rollout(np.asarray(command, float)[None])[0]
 
-    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
+    def rollout(self, commands: ArrayLike) -> NDArray[np.floating]:
         """Positions [rad] at the end of each command."""
         held = np.repeat(np.asarray(commands, float), self.count, axis=0)
         return self.model.rollout(held)[self.count - 1 :: self.count] + self.offset_rad

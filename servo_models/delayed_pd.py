@@ -146,7 +146,7 @@ class DelayedPD:
         command = np.broadcast_to(np.asarray(command, float), self.batch)
         return self.rollout(command[None])[0]
 
-    def rollout(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
         """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
         commands = np.asarray(commands, float)
         commands = np.broadcast_to(commands, (len(commands), *self.batch))

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,13 +30,20 @@ from servo_models.command_network import CommandNetwork
 from servo_models.control_rate import AtControlRate, substeps
 from servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from servo_models.recurrent_network import RecurrentNetwork
-from servo_models.sparse_equation import SparseEquation
+from servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
 SCHEMA_VERSION = 1
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 ARCHITECTURES = ("fir", "mlp", "lstm", "delayed-pd", "sindy")
 _SAME_RATE = 0.02
 _LARGEST_BYTES = 50_000_000
+_LONGEST_DELAY_S = 1.0
+_MAY_BE_INFINITE = ("effort_limit", "velocity_limit", "saturation_error_rad")
+
+_LINEAR = frozenset(
+    "command_center command_scale position_center position_scale bound fir fir_bias".split()
+)
+_RECURRENT = frozenset(("weight_input", "weight_hidden", "bias", "weight_out", "bias_out"))
 
 Model = CommandNetwork | RecurrentNetwork | AtControlRate
 
@@ -97,10 +104,14 @@ class Contract(_Strict):
     arch: Literal["fir", "mlp", "lstm", "delayed-pd", "sindy"]
     preset: str
     created: str
-    time_step_s: Annotated[float, Field(gt=0, le=1)]
+    time_step_s: Annotated[float, Field(ge=1e-4, le=1)]
     inputs: Annotated[tuple[str, ...], Field(strict=False)]
-    output: str = "position_rad, one time step after the newest command"
-    units: str = "radians of the simulator frame, seconds"
+    output: Literal["position_rad, one time step after the newest command"] = (
+        "position_rad, one time step after the newest command"
+    )
+    units: Literal["radians of the simulator frame, seconds"] = (
+        "radians of the simulator frame, seconds"
+    )
     feedback: bool
     warm_up: Annotated[int, Field(ge=0, le=1000)] = 0
     joints: Annotated[dict[str, JointContract], Field(min_length=1)]
@@ -124,7 +135,7 @@ class SavedModel:
     path: Path
 
 
-def input_names(parameters: dict[str, NDArray], feedback: bool) -> tuple[str, ...]:
+def input_names(parameters: Mapping[str, NDArray], feedback: bool) -> tuple[str, ...]:
     """Names of a model's inputs, in order: commands newest first, then a predicted position."""
     taps = parameters["fir"].shape[1] if "fir" in parameters else 1
     names = ["command_rad[t]", *(f"command_rad[t-{k}]" for k in range(1, taps))]
@@ -132,7 +143,7 @@ def input_names(parameters: dict[str, NDArray], feedback: bool) -> tuple[str, ..
 
 
 def save_servo_model(
-    folder: Path, parameters: dict[str, NDArray], contract: dict[str, Any], force: bool = False
+    folder: Path, parameters: Mapping[str, NDArray], contract: dict[str, Any], force: bool = False
 ) -> Contract:
     """Write a model.
 
@@ -150,15 +161,16 @@ def save_servo_model(
     Raises
     ------
     InputError
-        If there is a model already, or it cannot be written.
+        If there is a model already, if it is none that could be read back, or if it cannot be
+        written.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; a servo model is a folder. Choose another --out.")
     for name in (CONTRACT, WEIGHTS):
         refuse_overwrite(folder / name, force)
     data = save_tensors({k: np.ascontiguousarray(v) for k, v in parameters.items()})
-    whole = Contract(**contract, weights_sha256=hashlib.sha256(data).hexdigest())
-    build(whole, parameters)  # what cannot be read back is not written
+    whole = _validated({**contract, "weights_sha256": hashlib.sha256(data).hexdigest()}, folder)
+    _build(whole, parameters, folder)  # what cannot be read back is not written
     write_bytes(folder / WEIGHTS, data, force)
     text = json.dumps(whole.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
     write_text(folder / CONTRACT, text + "\n", force)
@@ -210,53 +222,104 @@ def load_servo_model(
         )
     try:
         parameters = load_tensors(data)
-    except (SafetensorError, KeyError, ValueError) as error:
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / WEIGHTS} is no safetensors file: {error}.") from error
-    index = [names.index(j) for j in wanted]
-    for name, value in parameters.items():
-        if value.ndim == 0 or len(value) != len(names) or value.dtype.kind != "f":
-            raise InputError(
-                f"{folder / WEIGHTS}: {name} is no array of {len(names)} joints' numbers. "
-                "Fit again."
-            )
-    chosen = {k: v[index] for k, v in parameters.items()}
-    kept = contract.model_copy(update={"joints": {j: contract.joints[j] for j in wanted}})
-    try:
-        return SavedModel(build(kept, chosen), kept, chosen, folder)
-    except (KeyError, InputError) as error:
-        what = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{folder}: {what}") from error
+    model = _build(contract, parameters, folder)
+    if wanted != names:
+        index = [names.index(j) for j in wanted]
+        parameters = {k: v[index] for k, v in parameters.items()}
+        contract = contract.model_copy(update={"joints": {j: contract.joints[j] for j in wanted}})
+        model = build(contract, parameters)
+    return SavedModel(model, contract, parameters, folder)
 
 
-def build(contract: Contract, parameters: dict[str, NDArray]) -> Model:
-    """The model of a contract and its arrays."""
+def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
+    """The model of a contract and its arrays.
+
+    Raises
+    ------
+    InputError
+        If the arrays are not those of the contract's architecture, joints and inputs, or hold
+        numbers that no model can have.
+    """
     joints, step = tuple(contract.joints), contract.time_step_s
-    if contract.arch in ("fir", "mlp"):
+    _check_names(contract.arch, set(parameters))
+    for name, value in parameters.items():
+        fits = value.ndim > 0 and value.size > 0 and value.dtype.kind == "f"
+        if not fits or len(value) != len(joints):
+            raise InputError(
+                f"{name} is no array of numbers of {len(joints)} joints (shape {value.shape}, "
+                f"type {value.dtype}). Fit again."
+            )
+    if "fir" in parameters and parameters["fir"].ndim != 2:
+        raise InputError(f"fir has shape {parameters['fir'].shape}; it needs 2 axes. Fit again.")
+    bound = parameters.get("bound", np.zeros(1))
+    if np.isinf(bound).any() and np.isfinite(bound).any():
+        raise InputError("bound is infinite for some joints only. Fit again.")
+    if contract.inputs != input_names(parameters, contract.feedback):
+        raise InputError(
+            f"its arrays take {', '.join(input_names(parameters, contract.feedback))}, but its "
+            f"{CONTRACT} says {', '.join(contract.inputs)}. Fit again."
+        )
+    if contract.arch in ("fir", "mlp", "lstm"):
+        if "weight_hidden" in parameters:
+            return RecurrentNetwork(joints, step, parameters, contract.feedback, contract.warm_up)
         return CommandNetwork(joints, step, parameters, contract.feedback)
-    if contract.arch == "lstm":
-        return RecurrentNetwork(joints, step, parameters, contract.feedback, contract.warm_up)
     count = substeps(step)
     values = {k: np.asarray(v, float) for k, v in parameters.items()}
     for name, value in values.items():
-        if np.isnan(value).any():
-            raise InputError(f"{name} holds NaN: its fit failed or the file was damaged.")
+        if value.shape != (len(joints),):
+            raise InputError(f"{name} has shape {value.shape}; it must be one number per joint.")
+        if np.isnan(value).any() or (name not in _MAY_BE_INFINITE and np.isinf(value).any()):
+            raise InputError(
+                f"{name} holds NaN or infinite numbers: its fit failed or the file was damaged."
+            )
+    if (values["delay_s"] > _LONGEST_DELAY_S).any():
+        raise InputError(f"delay_s is more than {_LONGEST_DELAY_S:g} s. Fit again.")
+    offset = values.pop("offset_rad")
     if contract.arch == "delayed-pd":
-        offset = values.pop("offset_rad")
         return AtControlRate(DelayedPD(DelayedPDParameters(**values), step / count), count, offset)
-    delay, offset = values.pop("delay_s"), values.pop("offset_rad")
+    delay = values.pop("delay_s")
     return AtControlRate(SparseEquation(values, delay, offset, step / count), count)
+
+
+def _build(contract: Contract, parameters: Mapping[str, NDArray], folder: Path) -> Model:
+    try:
+        return build(contract, parameters)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from error
+
+
+def _check_names(arch: str, found: set[str]) -> None:
+    """Refuse missing arrays, and those of another architecture, which would be left unused."""
+    required, optional = set(_LINEAR), frozenset[str]()
+    if arch == "delayed-pd":
+        required = {f.name for f in fields(DelayedPDParameters)} | {"offset_rad"}
+    elif arch == "sindy":
+        required, optional = {"delay_s", "offset_rad"}, frozenset(COEFFICIENTS)
+    elif arch == "mlp":
+        depth = sum(name.startswith("weight_") for name in found)
+        required |= {f"{kind}_{n}" for kind in ("weight", "bias") for n in range(depth)}
+    elif arch == "lstm" and found != _LINEAR:  # training that was ended at once leaves the filter
+        required |= _RECURRENT
+    missing, foreign = sorted(required - found), sorted(found - required - optional)
+    if missing or foreign:
+        what = f"{missing[0]} is missing" if missing else f"{foreign[0]} is none of its arrays"
+        raise InputError(f"the weights are not those of a model of type {arch}: {what}. Fit again.")
 
 
 def _read_contract(folder: Path) -> Contract:
     path = folder / CONTRACT
-    if not path.exists():
+    try:
+        found = json.loads(_read(path))
+    except FileNotFoundError:
         raise InputError(
             f"{folder} holds no servo model ({CONTRACT} is missing). "
             "Make one with `pupper-sysid fit-servo --out NAME`."
-        )
-    try:
-        found = json.loads(_read(path))
-    except (ValueError, RecursionError) as error:
+        ) from None
+    except RecursionError:
+        raise InputError(f"{path} is no JSON: it is nested too deeply. Fit again.") from None
+    except ValueError as error:
         raise InputError(f"{path} is no JSON: {error}. Copy it again, or fit again.") from error
     if not isinstance(found, dict) or found.get("schema") != "pupper-servo-model":
         raise InputError(f"{path} is no servo model's contract. Give a folder of `fit-servo`.")
@@ -266,12 +329,19 @@ def _read_contract(folder: Path) -> Contract:
             f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
             f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
         )
+    return _validated(found, path)
+
+
+def _validated(found: dict[str, Any], path: Path) -> Contract:
     try:
         contract = Contract.model_validate(found)
     except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
+        # a misspelt key is also a missing one; the misspelling says more
+        faults = error.errors(include_url=False)
+        fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
         place = ".".join(str(p) for p in fault["loc"])
-        raise InputError(f"{path}: {place}: {fault['msg']}. Fit the model again.") from error
+        said = "unknown entry" if fault["type"] == "extra_forbidden" else fault["msg"]
+        raise InputError(f"{path}: {place}: {said}. Fit the model again.") from error
     unknown = [j for j in contract.joints if j not in JOINT_NAMES]
     if unknown:
         raise InputError(f"{path}: {unknown[0]} is no joint. Use {', '.join(JOINT_NAMES)}.")
@@ -280,8 +350,12 @@ def _read_contract(folder: Path) -> Contract:
 
 def _read(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device never ends
+            raise InputError(f"{path} is no regular file. Fit the model again.")
         if path.stat().st_size > _LARGEST_BYTES:
             raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB: no servo model.")
         return path.read_bytes()
     except OSError as error:
+        if path.name == CONTRACT and isinstance(error, FileNotFoundError | NotADirectoryError):
+            raise FileNotFoundError(path) from None
         raise InputError(f"{path} cannot be read: {error.strerror}. Fit the model again.") from None

@@ -71,7 +71,7 @@ def to_csv(source: Calibration | Recording, path: Path | None = None, force: boo
 def _calibration(calibration: Calibration) -> str:
     header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
     buffer = io.StringIO()
-    buffer.write(_comments("pupper-sysid calibration table", header))
+    buffer.write(comments("pupper-sysid calibration table", header))
     # text is quoted so that a '#' in a sentence is no comment to whoever reads the table
     table = csv.writer(buffer, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
     buffer.write(",".join(CALIBRATION_COLUMNS) + "\n")
@@ -113,13 +113,14 @@ def _recording(recording: Recording) -> str:
     header["exported_from"] = {"name": recording.name, "sha256": recording.sha256}
     if recording.warnings:
         header["warnings_when_exported"] = list(recording.warnings)
-    text = _comments(TITLE.removeprefix("# "), header)
+    text = comments(TITLE.removeprefix("# "), header)
     table = recording.table.astype({"trial": int})
     text += table.to_csv(columns=columns, index=False, lineterminator="\n")
     return text + (f"# completed: {_json(completed)}\n" if completed is not None else "")
 
 
-def _comments(title: str, entries: dict[str, Any]) -> str:
+def comments(title: str, entries: dict[str, Any]) -> str:
+    """Comment lines that open a table: a title, then `# key: JSON value` of each entry."""
     return "\n".join([f"# {title}", *(f"# {k}: {_json(v)}" for k, v in entries.items()), ""])
 
 

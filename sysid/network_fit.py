@@ -1,9 +1,9 @@
 """Fit linear filters, MLPs and LSTMs of all joints, and decide by held-out groups which to keep.
 
 A fit gives one model for the whole training part and one per held-out group: the latter have never
-seen their group, so their errors on it are honest, both for choosing (weight decay, length of
-training, length of history) and for saying how sure the model is. With `nested`, even the choice
-made for a group's model was made without that group.
+seen their group, so their errors on it are honest, both for choosing (ridge, weight decay,
+length of training) and for saying how sure the model is. With `nested`, even the weight decay and
+the length of training of a group's model were chosen without that group.
 """
 
 from __future__ import annotations
@@ -78,6 +78,7 @@ def fit_network(
         Called with steps done and steps in all.
     """
     groups = [int(g) for g in np.unique(data.group[data.used]) if g >= 0]
+    nested = nested and len(groups) > 2  # a pair of two would leave nothing to learn from
     sets = training_sets(groups, nested and kind != "fir")
     linear, ridge = _best_linear(data, groups, sets, period_s)
     choices: dict[str, float] = {"ridge": ridge}
@@ -92,7 +93,10 @@ def fit_network(
     }
     for outer in groups if nested else []:
         purposes[outer] = [
-            (n, g) for n, s in enumerate(sets) for g in s if len(s) == 2 and outer in s and g != outer
+            (n, g)
+            for n, s in enumerate(sets)
+            for g in s
+            if len(s) == 2 and outer in s and g != outer
         ]
     checkpoints: list[dict[str, NDArray]] = []
     steps_done: list[int] = []
@@ -191,7 +195,7 @@ def _build(
     }  # fmt: skip
     if "weight_hidden" in weights:
         parameters |= weights
-        return RecurrentNetwork(joints, period_s, parameters, warm_up=data.past)
+        return RecurrentNetwork(joints, period_s, parameters, warm_up=data.past + 1)
     if weights:
         members, units = weights["bias_0"].shape[1:]
         count = linear.fir.shape[-1]

@@ -57,10 +57,15 @@ def delayed_pd_fits(
         v = np.array([f.values for f in best[own]]).T
         found.append(
             {
-                "delay_s": v[0], "stiffness": v[1], "damping": v[2], "friction_loss": v[3],
-                "effort_limit": v[4], "velocity_limit": v[5], "armature": np.ones_like(v[0]),
+                "delay_s": v[0],
+                "stiffness": v[1],
+                "damping": v[2],
+                "friction_loss": v[3],
+                "effort_limit": v[4],
+                "velocity_limit": v[5],
+                "armature": np.ones_like(v[0]),
                 "offset_rad": v[6] + np.array(shifts[own]),
-            }  # fmt: skip
+            }
         )
     return found
 

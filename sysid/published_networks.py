@@ -3,16 +3,17 @@
 "Reinforcement Learning on Cost-Constrained Quadrupedal Hardware" (Mini Pupper 2), section on servo
 models and its released code: per joint, displacements from the standing pose in plain radians;
 the MLP sees the last 5 commands and the last position (6 → 32 → 32 → 1, ReLU), the LSTM (of which
-no code was released: 32 units are assumed) the newest command and the last position. Both learn the
-next position one step ahead from measured ones, by mean squared error and Adam, and then have to run
+no code was released: 32 units are assumed) the newest command and the last position. Both learn
+the next position one step ahead from measured ones, by mean squared error and Adam, and then have
+to run
 on their own predictions. The released code keeps the weights that do best on the test loop; here
 training simply ends, so that nothing is selected on it.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -44,7 +45,7 @@ def fit_published(
     InputError
         If the joints were not recorded together for the LSTM, or trials are too short.
     """
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(seed)
     trials = [_trials(data, joint, part) for joint in data.joints]
     joints = len(trials)
@@ -101,7 +102,7 @@ def _mlp(
     x, y = table[..., :-1], table[..., -1:]
     sizes = (_COMMANDS + 1, _UNITS, _UNITS, 1)
     layers = []
-    for a, b in zip(sizes[:-1], sizes[1:], strict=True):  # torch.nn.Linear's own initialisation
+    for a, b in pairwise(sizes):  # torch.nn.Linear's own initialisation
         bound = a**-0.5
         layers += [
             (2 * torch.rand(len(rows), a, b, generator=generator) - 1) * bound,

@@ -100,6 +100,7 @@ def write_report(
     examinations: Sequence[tuple[str, Examination]],
     responses: Mapping[str, FrequencyResponse],
     force: bool = False,
+    more: Sequence[Section] = (),
 ) -> WrittenReport:
     """Write the report's page, figures and tables into `folder`.
 
@@ -118,6 +119,8 @@ def write_report(
         Joints without tones are left out.
     force : bool
         Replace files that exist.
+    more : sequence of Section
+        Placed before what to record next.
 
     Raises
     ------
@@ -126,6 +129,7 @@ def write_report(
         one cannot be written.
     """
     page = sections(recordings, results, calibration, examinations, responses)
+    page[-2:-2] = more
     html = render(_title(recordings), _subtitle(results, calibration), page)
     pictures = {folder / "figures" / f"{p.name}.png": p.png for s in page for p in s.figures}
     csvs = {

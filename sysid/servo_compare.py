@@ -93,8 +93,8 @@ def compare(
         if band:
             bands[name] = band
         notes += [
-            f"{given} was fitted to {inputs[h]}: its errors here flatter it. Its contract has those "
-            "on unseen data."
+            f"{given} was fitted to {inputs[h]}: its errors here flatter it. Its contract has "
+            "those on unseen data."
             for h in used
             if h in inputs
         ]

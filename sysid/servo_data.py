@@ -10,8 +10,8 @@ before while the servo moves) only fresh ones, each at its own time; otherwise e
 stands in the log.
 
 Trials that follow each other without a pause, like the loops of a playback, are one run: the servo
-did get those commands. Nothing is carried over a pause, and every reading knows its group (its loop,
-or its tone), so that whole groups can be held out.
+did get those commands. Nothing is carried over a pause, and every reading knows its group (its
+loop, or its tone), so that whole groups can be held out.
 """
 
 from __future__ import annotations
@@ -182,7 +182,9 @@ def look_up(track: NDArray[np.floating], tick: NDArray[np.float64]) -> NDArray[n
     """Values of `track`, one per tick, at fractional ticks; NaN where the tick is NaN."""
     index, weight = look_up_weights(np.nan_to_num(tick))
     four = np.clip(index[:, None] + np.arange(-1, 3), 0, len(track) - 1)
-    return np.where(np.isfinite(tick), np.sum(np.asarray(track, float)[four] * weight, axis=1), np.nan)
+    return np.where(
+        np.isfinite(tick), np.sum(np.asarray(track, float)[four] * weight, axis=1), np.nan
+    )
 
 
 # ------------------------------------------------------------------------------- runs

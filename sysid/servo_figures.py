@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -14,17 +16,20 @@ _LINES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
 
 
 @styled
-def compare_figure(found: Comparison) -> Figure:
+def compare_figure(found: Comparison, joints: Sequence[str] | None = None) -> Figure:
     """One panel per joint: the liveliest seconds of its recording.
 
     Parameters
     ----------
     found : Comparison
+    joints : sequence of str, optional
+        Which; by default all.
     """
     data = found.data
-    figure, panels = axes_column(len(data.joints), 0.7 + 1.75 * len(data.joints))
+    shown = list(data.joints if joints is None else joints)
+    figure, panels = axes_column(len(shown), 0.7 + 1.75 * len(shown))
     names = [n for n in found.tracks if n != LINEAR]
-    for axes, joint in zip(panels, data.joints, strict=True):
+    for axes, joint in zip(panels, shown, strict=True):
         index, low, high = _liveliest(data, joint)
         run = data.runs[joint][index]
         ticks = np.arange(low, high)
@@ -40,12 +45,19 @@ def compare_figure(found: Comparison) -> Figure:
             colour = _COLOURS[n % len(_COLOURS)]
             error = 1e3 * np.sqrt(np.mean(found.errors[name][joint].free_run ** 2))
             label = f"{name}, {error:.1f} mrad"
-            axes.plot(time, track[low:high], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label)
+            axes.plot(
+                time, track[low:high], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label
+            )
             band = found.bands.get(name, {}).get(joint)
             if band and n == 0:
                 half = band_half_width(band, track, data.period_s)[low:high]
                 axes.fill_between(
-                    time, track[low:high] - half, track[low:high] + half, color=colour, alpha=0.15, lw=0
+                    time,
+                    track[low:high] - half,
+                    track[low:high] + half,
+                    color=colour,
+                    alpha=0.15,
+                    lw=0,
                 )
         axes.set_title(joint)
         axes.set_ylabel("rad")

@@ -8,7 +8,7 @@ the same part and scored on the same readings, and so is "it stays where it was"
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,7 +99,7 @@ class ServoFit:
     data: ServoData
     split: Split
     model: ServoModel
-    parameters: dict[str, NDArray[np.floating]]
+    parameters: Mapping[str, NDArray[np.floating]]
     choices: dict[str, float]
     scored: dict[str, Scored]
     persistence: dict[str, float]
@@ -183,7 +183,10 @@ def fit_servo(
     split, notes = split or Split("each group left out in turn"), []
     whole: Part = split.train or (lambda number, elapsed, group: np.ones(len(number), bool))
     present = {
-        int(g) for j in joints for r in data.runs[j] for g in r.group[r.readings.rows][chosen(r, whole)]
+        int(g)
+        for j in joints
+        for r in data.runs[j]
+        for g in r.group[r.readings.rows][chosen(r, whole)]
     }
     if len(present) < 2:
         only = data.groups[next(iter(present))] if present else "nothing"
@@ -205,7 +208,9 @@ def fit_servo(
 
     linear = fit_network("fir", joints, data.period_s, ready, seed)
     say("DelayedPD", 0.0)
-    physics = [delayed_pd_model(v, data.period_s) for v in _physics("delayed-pd", data, folds, seed)]
+    physics = [
+        delayed_pd_model(v, data.period_s) for v in _physics("delayed-pd", data, folds, seed)
+    ]
     ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say)
     notes += ours.notes
     few = ours.weights_per_joint
@@ -290,7 +295,7 @@ class _Fitted:
     """What `_fit` makes: the model, one per fold, and what is left of held-out groups."""
 
     model: ServoModel
-    parameters: dict[str, NDArray[np.floating]]
+    parameters: Mapping[str, NDArray[np.floating]]
     folds: list[ServoModel]
     choices: dict[str, float]
     held_out: dict[str, scores.Errors] | None
@@ -321,7 +326,9 @@ def _fit(
             fit_published(arch, data, part, seed, lambda share: say(f"{arch} as published", share))
             for part in ([f[0] for f in folds] + ([] if split.test is not None else [whole]))
         ]
-        size = sum(v[0].size for k, v in found[-1].parameters.items() if "weight" in k or "bias" in k)
+        size = sum(
+            v[0].size for k, v in found[-1].parameters.items() if "weight" in k or "bias" in k
+        )
         return _Fitted(
             found[-1], found[-1].parameters, list(found[: len(folds)]), {}, None, size, []
         )
@@ -335,7 +342,9 @@ def _fit(
     ]
     notes = ["Training was stopped early; the best so far was kept."] if fit.interrupted else []
     size = sum(
-        v[0].size for k, v in fit.model.parameters.items() if k.startswith(("weight", "bias", "fir"))
+        v[0].size
+        for k, v in fit.model.parameters.items()
+        if k.startswith(("weight", "bias", "fir"))
     )
     return _Fitted(
         fit.model, fit.model.parameters, _fold_models(fit, folds, split), fit.choices,
@@ -370,9 +379,7 @@ def _score(
     return Scored(found, scores.interval(found, seed))
 
 
-def _coverage(
-    found: dict[str, scores.Errors], bands: dict[str, tuple[float, float]]
-) -> float:
+def _coverage(found: dict[str, scores.Errors], bands: dict[str, tuple[float, float]]) -> float:
     inside, total = 0, 0
     for joint, e in found.items():
         noise, timing = bands[joint]
@@ -391,4 +398,3 @@ def _without(group: int) -> Part:
 
 def _both(a: Part, b: Part) -> Part:
     return lambda number, elapsed, group: a(number, elapsed, group) & b(number, elapsed, group)
-

@@ -18,6 +18,7 @@ from sysid.servo_data import Run, ServoData, look_up_weights
 
 WINDOW = 48
 
+_FEWEST = 10
 _STRETCHES = 3
 _MEMORY_S = 0.5
 
@@ -101,7 +102,7 @@ def in_stretches(data: ServoData, part: Part) -> ServoData:
         memory = int(np.ceil(_MEMORY_S / data.period_s))
         group = np.full(len(run.number), -1)
         for n, rows in enumerate(np.array_split(inside, _STRETCHES)):
-            group[rows[memory if n else 0 :]] = n
+            group[rows[min(memory, len(rows) // 2) if n else 0 :]] = n
         return replace(run, group=group)
 
     runs = {j: tuple(cut(run) for run in found) for j, found in data.runs.items()}
@@ -137,7 +138,9 @@ def samples(data: ServoData, part: Part, past: int) -> Samples:
     InputError
         If a joint's commands do not move, or it has too few readings.
     """
-    parts = {j: [_windows(run, chosen(run, part), past) for run in data.runs[j]] for j in data.joints}
+    parts = {
+        j: [_windows(run, chosen(run, part), past) for run in data.runs[j]] for j in data.joints
+    }
     norm = {k: np.zeros(len(data.joints)) for k in (
         "command_center", "command_scale", "position_center", "position_scale")}  # fmt: skip
     for n, joint in enumerate(data.joints):
@@ -172,9 +175,10 @@ def samples(data: ServoData, part: Part, past: int) -> Samples:
 
 
 def _check(joint: str, command: NDArray, position: NDArray) -> None:
-    if len(position) < 20:
+    if len(position) < _FEWEST:
         raise InputError(
-            f"{joint}: only {len(position)} readings to learn from; even a linear model needs 20. "
+            f"{joint}: only {len(position)} readings to learn from; even a linear model needs "
+            f"{_FEWEST}. "
             "Record longer, or train on more of it."
         )
     if np.std(command) < 1e-3:
@@ -189,7 +193,11 @@ def _windows(run: Run, use: NDArray[np.bool_], past: int) -> tuple[NDArray, ...]
     ticks = len(run.command_rad)
     starts = np.arange(0, ticks + 1, WINDOW)
     padded = np.concatenate(
-        [np.full(past + 1, run.initial_rad), run.command_rad, np.full(WINDOW + 2, run.command_rad[-1])]
+        [
+            np.full(past + 1, run.initial_rad),
+            run.command_rad,
+            np.full(WINDOW + 2, run.command_rad[-1]),
+        ]
     )
     command = np.stack([padded[s : s + past + WINDOW + 2] for s in starts])
     floor, weight = look_up_weights(run.tick)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from servo_models.command_network import CommandNetwork
 from servo_models.interface import ServoModel
 from servo_models.recurrent_network import RecurrentNetwork
-from sysid.servo_data import Run, ServoData, look_up
+from sysid.servo_data import ServoData, look_up
 from sysid.servo_samples import Part, chosen, chosen_rows
 
 _BLOCK_S = 0.5
@@ -66,12 +66,11 @@ def tracks(model: ServoModel, data: ServoData) -> Tracks:
     }
 
 
-def errors(
-    model: ServoModel, found: Tracks, data: ServoData, part: Part
-) -> dict[str, Errors]:
+def errors(model: ServoModel, found: Tracks, data: ServoData, part: Part) -> dict[str, Errors]:
     """Errors of a model on a part of the data, given its free run from `tracks`."""
-    feedback = isinstance(model, CommandNetwork | RecurrentNetwork) and model.feedback
-    ahead = _one_step_tracks(model, data) if feedback else None
+    ahead = None
+    if isinstance(model, CommandNetwork | RecurrentNetwork) and model.feedback:
+        ahead = _one_step_tracks(model, data)
     made = {}
     for joint in data.joints:
         parts = []
@@ -85,8 +84,9 @@ def errors(
                 step = look_up(ahead[joint][n], np.round(run.tick)) - run.position_rad
             speed = np.gradient(track) / data.period_s
             seconds = run.reading_elapsed_s
+            alone = run.trial.joint if _alone(data) else ""
             names = [
-                (run.trial.joint if len(data.runs) and _alone(data) else "", int(t), int(s / _BLOCK_S))
+                (alone, int(t), int(s / _BLOCK_S))
                 for t, s in zip(run.number[run.readings.rows], seconds, strict=True)
             ]
             held = look_up(track, run.held_tick) - run.trial.position_rad
@@ -109,13 +109,15 @@ def pooled(parts: Sequence[dict[str, Errors]]) -> dict[str, Errors]:
     """Errors on several parts, each from a model that has not seen it, as one."""
     return {
         joint: Errors(
-            *(np.concatenate([getattr(p[joint], f) for p in parts])
-              for f in ("free_run", "one_step", "speed")),
-            [b for p in parts for b in p[joint].block],
-            *(np.concatenate([getattr(p[joint], f) for p in parts]) for f in ("held", "raw")),
+            free_run=np.concatenate([p[joint].free_run for p in parts]),
+            one_step=np.concatenate([p[joint].one_step for p in parts]),
+            speed=np.concatenate([p[joint].speed for p in parts]),
+            block=[b for p in parts for b in p[joint].block],
+            held=np.concatenate([p[joint].held for p in parts]),
+            raw=np.concatenate([p[joint].raw for p in parts]),
         )
         for joint in parts[0]
-    }  # fmt: skip
+    }
 
 
 def rms(values: ArrayLike) -> float:
@@ -128,9 +130,7 @@ def persistence(data: ServoData, part: Part) -> dict[str, float]:
     """RMS [rad] of "it stays where it was last read", per joint."""
     found = {}
     for joint in data.joints:
-        moves = [
-            np.diff(r.position_rad, prepend=np.nan)[chosen(r, part)] for r in data.runs[joint]
-        ]
+        moves = [np.diff(r.position_rad, prepend=np.nan)[chosen(r, part)] for r in data.runs[joint]]
         every = np.concatenate(moves)
         found[joint] = rms(every[np.isfinite(every)])
     return found
@@ -176,7 +176,7 @@ def interval(
     def drawn(models: dict[str, Errors]) -> NDArray[np.float64]:
         means = []
         for e in models.values():
-            index = np.array([place[b] for b in e.block])
+            index = np.array([place[b] for b in e.block], int)
             total = np.bincount(index, e.free_run**2, len(blocks))
             count = np.bincount(index, minlength=len(blocks))
             with np.errstate(invalid="ignore"):
@@ -235,7 +235,7 @@ def _stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
 def _one_step_tracks(model: CommandNetwork | RecurrentNetwork, data: ServoData) -> Tracks:
     commands, start, position = _stacked(data)
     model.reset(start)
-    out = np.concatenate([start[None], model.one_step(commands, position)])
+    out = np.concatenate([start[None], model.one_step(commands, position).astype(float)])
     return {
         joint: [out[: len(r.command_rad) + 1, e, n] for e, r in enumerate(data.runs[joint])]
         for n, joint in enumerate(data.joints)

@@ -1,14 +1,13 @@
 """Train the networks of all joints, all held-out folds and all candidates in one computation.
 
-Every network corrects a linear filter (`sysid.linear_fir`) that was fitted to the same readings, and
-is scored at the readings' own times in free run: it sees commands only, so its one-step and its
+Every network corrects a linear filter (`sysid.linear_fir`) fitted to the same readings, and is
+scored at the readings' own times in free run: it sees commands only, so its one-step and its
 free-run errors are the same thing and cannot come apart. Candidates differ in weight decay and in
 how long they were trained; which is kept is decided by groups that were held out.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -109,7 +108,7 @@ def train(
     bool
         Whether it was interrupted.
     """
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(seed)
     batches = np.random.default_rng(seed)
     shape = (len(data.command), len(sets), len(recipe.decays), recipe.members)
@@ -123,27 +122,32 @@ def train(
     optimiser = torch.optim.Adam(weights.values(), recipe.learning_rate)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, recipe.steps)
     every = _tensors(data, linear, sets)
-    readings = every["learns"].sum((-1, -2))[:, :, None, None]  # per joint and set
+    readings = every["learns"].sum((-1, -2)).clamp(min=1)[:, :, None, None]  # per joint and set
     decay = torch.tensor(recipe.decays)[:, None] / (recipe.units * readings)
     per_step = max(1, _ROWS_PER_STEP // WINDOW)
 
-    def error_of(part: dict[str, torch.Tensor]) -> torch.Tensor:
+    def error_of(part: dict[str, torch.Tensor], averaged: bool = False) -> torch.Tensor:
         """Model minus reading, shape (joints, sets, decays, members, windows, readings)."""
         out = forward(weights, part["command"], fade, data.past)
         bound = part["bound"][:, :, None, None, None, None]
+        if averaged and kind == "mlp":  # its members run as one wide layer within one bound
+            out = out.mean(3, keepdim=True)
         out = bound * torch.tanh(out / bound)
+        out = out.mean(3, keepdim=True) if averaged else out
         joints, *_, windows, outputs = out.shape
         flat = out.reshape(joints, -1, windows, outputs)
         index = part["index"][:, None].expand(-1, flat.shape[1], -1, -1)
         four = torch.stack([torch.gather(flat, 3, index + k) for k in range(4)], dim=-1)
-        seen = (four * part["weight"][:, None]).sum(-1).reshape(*shape, windows, -1)
+        seen = (four * part["weight"][:, None]).sum(-1).reshape(*out.shape[:4], windows, -1)
         return seen - part["residual"][:, :, None, None]
 
     def checkpoint(step: int) -> Checkpoint:
         parts = []
         with torch.no_grad():
             for low in range(0, data.windows, 4 * per_step):
-                found = error_of(_some(every, slice(low, low + 4 * per_step))).mean(3)
+                found = error_of(_some(every, slice(low, low + 4 * per_step)), averaged=True)[
+                    :, :, :, 0
+                ]
                 parts.append(found.permute(0, 3, 4, 1, 2).numpy())
             now = {k: w.detach().numpy().copy() for k, w in weights.items()}
         return Checkpoint(step, np.concatenate(parts, axis=1), now)
@@ -204,7 +208,9 @@ def _some(every: dict[str, torch.Tensor], chosen) -> dict[str, torch.Tensor]:
 # ------------------------------------------------------------------------------- networks
 
 
-def _mlp(shape, units: int, fade: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+def _mlp(
+    shape, units: int, fade: torch.Tensor, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
     def normal(*size: int, sd: float) -> torch.Tensor:
         return sd * torch.randn(*shape, *size, generator=generator)
 
@@ -233,7 +239,9 @@ def _mlp_forward(
     return out.reshape(joints, sets, decays, members, windows, outputs)
 
 
-def _lstm(shape, units: int, fade: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+def _lstm(
+    shape, units: int, fade: torch.Tensor, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
     def uniform(*size: int) -> torch.Tensor:
         return (2 * torch.rand(*shape, *size, generator=generator) - 1) * units**-0.5
 

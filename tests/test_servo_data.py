@@ -332,8 +332,8 @@ def test_rows_without_a_group_stay_without_one_when_groups_are_merged():
 
 
 def test_too_few_readings_and_commands_that_do_not_move_are_refused():
-    few = servo_data([recording(trial(0, 0.0, sine(19), sine(19)))], [JOINT], "all")
-    with pytest.raises(InputError, match=f"{JOINT}: only 19 readings"):
+    few = servo_data([recording(trial(0, 0.0, sine(9), sine(9)))], [JOINT], "all")
+    with pytest.raises(InputError, match=f"{JOINT}: only 9 readings"):
         samples(few, everything, past=6)
     still = servo_data([recording(trial(0, 0.0, np.zeros(50), sine(50)))], [JOINT], "all")
     with pytest.raises(InputError, match=f"{JOINT}: its commands hardly change"):
@@ -401,7 +401,7 @@ def test_a_burst_of_outliers_does_not_tilt_the_filter():
     fir, bias = physical(data, fit_linear(data, [frozenset()], P, ridge=1e-9))
     # least squares would move the bias by 5 % of 50 noise, Huber by about 5 % of 1.5 noise
     assert abs(bias - TRUE_BIAS) < 0.25 * noise
-    # and each coefficient by 50 sqrt(0.05 / n) / 0.3 noise, where its own error is 1 / (0.3 sqrt(n))
+    # and each coefficient by 50 sqrt(0.05 / n) / 0.3 noise; its own error is 1 / (0.3 sqrt(n))
     error = np.sqrt(np.mean((fir - TRUE_FIR) ** 2))
     assert error < 1.5 * noise / (0.3 * np.sqrt(1200))
 

@@ -1,0 +1,131 @@
+"""How much data does a servo model need? Error against samples, on the emulated robot.
+
+A walking-like command (sums of sines of random frequency, amplitude and phase, 0.5 to 4 Hz) is
+played on two joints of the emulated robot, loop after loop, none like another. Models are fitted to
+the first so many rows and scored, in free run, on loops none of them saw. The paper guesses that
+its LSTM would overtake its MLP with thousands of samples; this is the test.
+
+    .venv/bin/python benchmarks/servo_data_curve.py --out data_curve.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import pandas as pd
+from emulators import in_process
+
+from common.joints import DEFAULT_POSE
+from sysid.command_playback import playback
+from sysid.excitation import LEAD_IN_S
+from sysid.figure_style import BLUE, GREEN, INK, RED, axes_column, save, styled
+from sysid.recorder import record
+from sysid.recording import Recording, load
+from sysid.servo_fit import Split, fit_servo
+
+JOINTS = ("LF_hip", "LF_calf")
+PERIOD_S, LOOP_ROWS = 0.02, 500
+SIZES = (30, 100, 390, 1000, 5000, 20000)
+MODELS = (("fir", "default"), ("delayed-pd", "default"), ("mlp", "default"), ("lstm", "default"),
+          ("mlp", "paper"))  # fmt: skip
+
+
+def commands(rng: np.random.Generator, loops: int) -> pd.DataFrame:
+    """Rows of `loops` loops of LOOP_ROWS commands each."""
+    t = PERIOD_S * np.arange(LOOP_ROWS)
+    columns: dict[str, list] = {
+        "time_s": [],
+        "loop": [],
+        **{f"{j}_command_rad": [] for j in JOINTS},
+    }
+    for loop in range(loops):
+        columns["time_s"].append(t + loop * (LOOP_ROWS * PERIOD_S + 1.0))
+        columns["loop"].append(np.full(LOOP_ROWS, loop))
+        for joint in JOINTS:
+            f, a = rng.uniform(0.5, 4.0, 5), rng.uniform(0.02, 0.12, 5)
+            phase = rng.uniform(0, 2 * np.pi, 5)
+            wave = (a * np.sin(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
+            columns[f"{joint}_command_rad"].append(
+                DEFAULT_POSE[joint] + wave - wave[0] * np.exp(-t / 0.3)
+            )
+    return pd.DataFrame({k: np.concatenate(v) for k, v in columns.items()})
+
+
+def recorded(seed: int, loops: int, folder: Path) -> Recording:
+    """The emulated robot's recording of random commands."""
+    file = folder / "commands.csv"
+    commands(np.random.default_rng(seed), loops).to_csv(file, index=False)
+    plan = playback(file, list(JOINTS))
+    return load(record(in_process("esp32", seed), plan, folder / "recording.csv"))
+
+
+def main() -> None:
+    """Run it, print a table, draw a picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("data_curve.png"))
+    parser.add_argument("--sizes", type=int, nargs="*", default=SIZES)
+    options = parser.parse_args()
+    most = max(options.sizes)
+    test_loops = 6
+    with tempfile.TemporaryDirectory() as name:
+        recording = recorded(options.seed, -(-most // LOOP_ROWS) + test_loops, Path(name))
+    last = -(-most // LOOP_ROWS)
+    found: dict[tuple[str, str], list[float]] = {m: [] for m in MODELS}
+    print(
+        "| samples per joint | " + " | ".join(_title(m) for m in MODELS) + " | linear (baseline) |"
+    )
+    print("|---|" + "---|" * (len(MODELS) + 1))
+    for size in options.sizes:
+        whole, rest = divmod(size, LOOP_ROWS)
+        stop = LEAD_IN_S + recording.loop_period_s * rest
+
+        def train(number, elapsed, group, whole=whole, stop=stop):
+            moving = elapsed >= LEAD_IN_S  # a loop starts with a stretch at rest, which says little
+            return moving & ((number < whole) | ((number == whole) & (elapsed < stop)))
+
+        split = Split(f"first {size} rows", train, lambda number, elapsed, group: number >= last)
+        cells, baseline = [], float("nan")
+        for model in MODELS:
+            started = time.perf_counter()
+            fit = fit_servo([recording], JOINTS, *model, split, seed=options.seed)
+            error = fit.scored[model[0]].mean
+            baseline = fit.scored["linear"].mean
+            found[model].append(error)
+            cells.append(f"{1e3 * error:.1f} ({time.perf_counter() - started:.0f} s)")
+        print(f"| {size} | " + " | ".join(cells) + f" | {1e3 * baseline:.1f} |", flush=True)
+    save(curve_figure(list(options.sizes), found), options.out, force=True)
+
+
+def _title(model: tuple[str, str]) -> str:
+    name = {"fir": "FIR", "delayed-pd": "DelayedPD"}.get(model[0], model[0].upper())
+    return name + (", as published" if model[1] == "paper" else "")
+
+
+@styled
+def curve_figure(sizes: list[int], found: dict[tuple[str, str], list[float]]):
+    """Error against samples, one line per model."""
+    figure, (axes,) = axes_column(1, 3.6)
+    looks = zip("os^Dv", (INK, GREEN, BLUE, RED, "#56B4E9"), ("-", "-", "-", "-", ":"), strict=True)
+    for (model, errors), (mark, colour, line) in zip(found.items(), looks, strict=True):
+        axes.loglog(
+            sizes, 1e3 * np.array(errors), marker=mark, color=colour, ls=line, label=_title(model)
+        )
+    axes.set_xlabel("samples per joint")
+    axes.set_ylabel("error in free run [mrad]")
+    axes.set_xticks(sizes, [str(s) for s in sizes])
+    axes.minorticks_off()
+    axes.legend()
+    return figure
+
+
+if __name__ == "__main__":
+    main()

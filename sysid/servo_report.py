@@ -1,0 +1,71 @@
+"""The report's section on servo models: what `compare` finds, as table and pictures."""
+
+from __future__ import annotations
+
+from sysid import servo_scores as scores
+from sysid.figure_style import png
+from sysid.report import Picture, Section
+from sysid.report_tables import Column, Table
+from sysid.servo_compare import LINEAR, Comparison
+from sysid.servo_figures import compare_figure
+
+
+def servo_section(found: Comparison) -> Section:
+    """Section of a comparison of servo models on the report's recordings."""
+    rows = [
+        {
+            "joint": joint,
+            "model": name,
+            "rmse_free_run_rad": scores.rms(errors[joint].free_run),
+            "rmse_held_rad": scores.rms(errors[joint].held),
+            "rmse_raw_rad": scores.rms(errors[joint].raw),
+            "rmse_one_step_rad": scores.rms(errors[joint].one_step),
+            "persistence_rmse_rad": found.persistence[joint],
+            "repeatability_rad": found.repeatability[joint],
+            "band_noise_rad": found.bands.get(name, {}).get(joint, (float("nan"),) * 2)[0],
+            "band_timing_s": found.bands.get(name, {}).get(joint, (float("nan"),) * 2)[1],
+        }
+        for joint in found.data.joints
+        for name, errors in found.errors.items()
+    ]
+    columns = (
+        Column("joint", lambda row: row["joint"], "key"),
+        Column("model", lambda row: row["model"], "words"),
+        *(
+            Column(heading, lambda row, key=key: _mrad(row[key]))
+            for heading, key in (
+                ("free run, mrad", "rmse_free_run_rad"),
+                ("through the hold", "rmse_held_rad"),
+                ("rows as logged", "rmse_raw_rad"),
+                ("one step", "rmse_one_step_rad"),
+                ("stays put", "persistence_rmse_rad"),
+                ("robot repeats", "repeatability_rad"),
+            )
+        ),
+    )
+    pictures = [
+        Picture(
+            f"servo_{joint}",
+            f"{joint}: models in free run, commands only. The shaded band is where the first "
+            "model expects nine readings in ten, from its errors on data held out of its fit; it "
+            "widens with speed, because a polled reading's time is uncertain.",
+            png(compare_figure(found, [joint])),
+        )
+        for joint in found.data.joints
+    ]
+    return Section(
+        "servo",
+        "Servo models",
+        text=[
+            "How far each model is from the readings when it is shown commands only. "
+            f"“{LINEAR}” predicts each group from a filter fitted to the others; “stays put” is "
+            "the reading before, which makes no prediction at all."
+        ],
+        figures=pictures,
+        tables=[Table("servo_models", "Error of the servo models", columns, tuple(rows))],
+        notes=found.notes,
+    )
+
+
+def _mrad(value: float) -> str:
+    return f"{1e3 * value:.1f}" if value == value else "–"
