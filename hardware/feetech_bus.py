@@ -46,7 +46,8 @@ SPEED_LIMIT_RAD_S = 7.5
 _FIRST, _SHORTEST, _LENGTHS = 56, 6, 6  # position, speed, load; voltage; temperature; …
 _FASTEST_RAD_S = 20.0  # no servo of this size turns faster, so a reading that did is not one
 _SLACK_RAD = 0.05
-_TORQUE_TRIES = 3
+_TORQUE_ON_TRIES, _TORQUE_OFF_TRIES = 10, 3
+_GOAL_TRIES = 3
 _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
 _CHUNK = 16
@@ -166,16 +167,19 @@ class FeetechBus:
 
     def torque(self, on: bool) -> bool:
         """Hold the present pose, or let all servos go limp; every servo is asked whether it is."""
-        return all([any(self._torque(s, on) for _ in range(_TORQUE_TRIES)) for s in self._servos])
+        tries = _TORQUE_ON_TRIES if on else _TORQUE_OFF_TRIES  # going limp must not wait
+        return all([any(self._torque(s, on) for _ in range(tries)) for s in self._servos])
 
     def goals(self) -> NDArray[np.float64]:
         """The goals that stand in the servos, as angles; NaN where none was read."""
         counts = np.full(len(self._servos), np.nan)
         for k, servo in enumerate(self._servos):
             goal = servo.series.registers["goal"]
-            reply = self.line.read(servo.id, goal.address, goal.size)
-            if reply:
-                counts[k] = servo.series.decode("goal", reply.frame.data, goal.address)
+            for _ in range(_GOAL_TRIES):
+                reply = self.line.read(servo.id, goal.address, goal.size)
+                if reply:
+                    counts[k] = servo.series.decode("goal", reply.frame.data, goal.address)
+                    break
         return self._map.to_angles(counts)
 
     def close(self) -> None:

@@ -24,6 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from common.errors import InputError
 from servo_models.joint_arrays import JointArrays
 
+_FEW = 16
+"""Environments up to which all joints go through one call, because calls cost more than work."""
+
 Parameters = Mapping[str, NDArray[np.floating]]
 
 
@@ -70,23 +73,31 @@ class CommandNetwork(JointArrays):
             raise InputError(f"A servo network must end in one output; this one has {width}.")
         self._need("fir_bias", ())
         self._need("bound", ())
-        self._transposed = [
-            np.ascontiguousarray(np.swapaxes(self.parameters[f"weight_{n}"], 1, 2))
-            for n in range(self._depth)
-        ]
+        # relu(h + b) = max(h, -b) + b: the one pass over a layer; b moves on to the next bias
+        self._layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+        carried = np.zeros((len(self.joints), self.taps + feedback), np.float32)
+        for n in range(self._depth):
+            weight = self.parameters[f"weight_{n}"]
+            bias = self.parameters[f"bias_{n}"] + np.matmul(carried[:, None], weight)[:, 0]
+            self._layers.append((np.ascontiguousarray(np.swapaxes(weight, 1, 2)), -bias[..., None]))
+            carried = bias
         self.reset(np.zeros(len(self.joints)))
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""
         here = self._enter(position)
-        self._history = np.repeat(self._normal_command(here)[:, None], self.taps, axis=1)
+        # room for as many new commands as are remembered: moving the rest is seldom needed
+        self._room = np.empty((len(self.joints), 2 * self.taps, here.shape[1]), np.float32)
+        self._remember(np.repeat(self._normal_command(here)[:, None], self.taps, axis=1))
         self._last = self._normal_position(here)
+        self._work = [np.empty((len(w[0]), here.shape[1]), np.float32) for w, _ in self._layers]
 
     def step(self, command: ArrayLike) -> NDArray[np.float32]:
         """Advance one time step under `command` [rad]; returns the position after it [rad]."""
-        newest = self._normal_command(self._arrange(command))
-        self._history[:, 1:] = self._history[:, :-1]
-        self._history[:, 0] = newest
+        if self._newest == 0:
+            self._remember(self._history.copy())
+        self._newest -= 1
+        self._room[:, self._newest] = self._normal_command(self._arrange(command))
         self._last = self._forward(self._history, self._last)
         return self._leave(self._last)
 
@@ -102,7 +113,7 @@ class CommandNetwork(JointArrays):
         joints, steps, environments, taps = windows.shape
         x = np.moveaxis(windows, -1, 1).reshape(joints, taps, steps * environments)
         out = self._forward(x, self._last).reshape(joints, steps, environments)
-        self._history = np.ascontiguousarray(time[:, : -self.taps - 1 : -1])
+        self._remember(time[:, : -self.taps - 1 : -1])
         self._last = out[:, -1]
         return self._leave_all(np.moveaxis(out, 1, 2))
 
@@ -133,16 +144,33 @@ class CommandNetwork(JointArrays):
         out = np.matmul(p["fir"][:, None], x)[:, 0] + p["fir_bias"][:, None]
         if not self._depth:
             return out
+        if x.shape[-1] <= _FEW:
+            h = np.concatenate([x, last[:, None]], axis=1) if self.feedback else x
+            for weight, low in self._layers[:-1]:
+                h = np.maximum(np.matmul(weight, h), low)
+            weight, low = self._layers[-1]
+            return out + bounded((np.matmul(weight, h) - low)[:, 0], p["bound"][:, None])
+        correction = np.empty_like(out)
         # joint by joint, so that a layer of many environments stays in the processor's cache
+        work = self._work if x.shape[-1] == self._work[0].shape[-1] else [None] * self._depth
         for j in range(len(self.joints)):
             h = np.concatenate([x[j], last[j, None]]) if self.feedback else x[j]
-            for layer in range(self._depth):
-                h = self._transposed[layer][j] @ h
-                h += p[f"bias_{layer}"][j, :, None]
-                if layer < self._depth - 1:
-                    np.maximum(h, 0.0, out=h)
-            out[j] += bounded(h[0], p["bound"][j])
+            for n, (weight, low) in enumerate(self._layers):
+                h = np.matmul(weight[j], h, out=work[n])
+                if n < self._depth - 1:
+                    np.maximum(h, low[j], out=h)
+            np.subtract(h[0], self._layers[-1][1][j, 0], out=correction[j])
+        out += bounded(correction, p["bound"][:, None])
         return out
+
+    @property
+    def _history(self) -> NDArray[np.float32]:
+        """Normalised commands (joints, taps, environments), newest first."""
+        return self._room[:, self._newest : self._newest + self.taps]
+
+    def _remember(self, history: NDArray) -> None:
+        self._newest = self.taps
+        self._room[:, self.taps :] = history
 
 
 def bounded(value: NDArray, bound: NDArray) -> NDArray:

@@ -254,7 +254,7 @@ def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
     if "fir" in parameters and parameters["fir"].ndim != 2:
         raise InputError(f"fir has shape {parameters['fir'].shape}; it needs 2 axes. Fit again.")
     bound = parameters.get("bound", np.zeros(1))
-    if np.isinf(bound).any() and np.isfinite(bound).any():
+    if np.isinf(bound).any() and not np.isinf(bound).all() and not np.isnan(bound).any():
         raise InputError("bound is infinite for some joints only. Fit again.")
     if contract.inputs != input_names(parameters, contract.feedback):
         raise InputError(
