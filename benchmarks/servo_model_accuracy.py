@@ -1,7 +1,7 @@
 """Servo models on the real walk: error of each kind, time to fit, time per control step.
 
-Fits on loops 0 and 1 of `playback_lstm_25hz.csv`, scores on loop 2 in free run (raw rows, mean of 12
-joints); then times one control step of 12 joints and of 1,024 environments x 12 joints on one
+Fits on loops 0 and 1 of `playback_lstm_25hz.csv`, scores on loop 2 in free run (raw rows, mean of
+12 joints); then times one control step of 12 joints and of 1,024 environments x 12 joints on one
 thread, beside the bare matrix products of the same layers in the same run.
 
     .venv/bin/python benchmarks/servo_model_accuracy.py [--paper-lstm]
@@ -98,9 +98,8 @@ def main() -> None:
     for name, sizes in ((("mlp", "default"), (1, 1024)), (("lstm", "default"), (1,))):
         for environments in sizes:
             own, bare = step_times(kept[name], environments)
-            print(
-                f"| {name[0]} | {environments} | {own:.3f} | {'–' if bare is None else f'{bare:.3f}'} |"
-            )
+            beside = "–" if bare is None else f"{bare:.3f}"
+            print(f"| {name[0]} | {environments} | {own:.3f} | {beside} |")
 
 
 if __name__ == "__main__":

@@ -115,8 +115,13 @@ class Readings:
 
 
 def fresh_rows(trial: Trial) -> NDArray[np.int64]:
-    """Indices of the rows whose value differs from the last value before them."""
+    """Indices of the rows whose value differs from the last value before them.
+
+    Where the servo itself answers each read, every row is fresh.
+    """
     valid = np.flatnonzero(np.isfinite(trial.position_rad))
+    if trial.direct:
+        return valid[1:]
     changed = np.flatnonzero(np.diff(trial.position_rad[valid]) != 0) + 1
     return valid[changed]
 
@@ -173,7 +178,9 @@ def find_poll_lattice(
     nothing = PollLattice("unresolved", nan, nan, nan, nan, nan, nan, fraction)
     loop = _loop_period(trials)
     moving, moving_fresh = _moving_fresh(trials)
-    if moving and moving_fresh / moving >= _ALL_FRESH:
+    # a servo that sticks repeats itself, too: who was asked settles it better than what was said
+    direct = bool(trials) and all(t.direct for t in trials)
+    if direct or (moving and moving_fresh / moving >= _ALL_FRESH):
         return replace(nothing, kind="every read")
     step = max(quantum(trials), 1e-6)
     stretches = [s for t in trials if len(t.read_time_s) > 3 for s in _stretches(t, step)]

@@ -60,6 +60,8 @@ class Trial:
         Raw counts where the bus has them, -1 where missing.
     initial_command_rad : float
         Command in force before the first row.
+    direct : bool
+        Whether the servo itself answered each read, so that no reading can be an old one.
     """
 
     joint: str
@@ -71,6 +73,7 @@ class Trial:
     position_rad: NDArray[np.float64]
     position_count: NDArray[np.int64] | None
     initial_command_rad: float
+    direct: bool = False
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,8 @@ class Recording:
     @cached_property
     def _trials(self) -> dict[str, list[Trial]]:
         rest = self.metadata.get("start_pose_rad") or {}
+        bus = self.metadata.get("bus")
+        direct = isinstance(bus, dict) and bus.get("kind") == "feetech"
         found: dict[str, list[Trial]] = {}
         for _, rows in self.table.groupby(["joint", "trial"], sort=True):
             columns = {c: rows[c].to_numpy() for c in rows.columns}
@@ -133,6 +138,7 @@ class Recording:
                     columns["position_rad"],
                     None if count is None else np.nan_to_num(count, nan=-1).astype(np.int64),
                     float(rest.get(joint, columns["command_rad"][0])),
+                    direct,
                 )
             )
         return found

@@ -209,7 +209,8 @@ def _joint_runs(
         raise InputError(f"{joint} was not recorded. Leave it out with --joints.")
     lattice = find_poll_lattice(trials)
     if mode == "auto":
-        mode = "fresh" if 1 - _fresh_while_moving(trials) > _HELD_FRACTION else "all"
+        held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION
+        mode = "fresh" if held and not all(t.direct for t in trials) else "all"
     timed = iter([readings(t, lattice) for t in trials])
     runs = []
     for recording in recordings:
