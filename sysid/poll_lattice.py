@@ -121,7 +121,7 @@ def fresh_rows(trial: Trial) -> NDArray[np.int64]:
     """
     valid = np.flatnonzero(np.isfinite(trial.position_rad))
     if trial.direct:
-        return valid[1:]
+        return valid
     changed = np.flatnonzero(np.diff(trial.position_rad[valid]) != 0) + 1
     return valid[changed]
 
