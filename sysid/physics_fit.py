@@ -21,7 +21,8 @@ from sysid.poll_lattice import quantum
 from sysid.servo_data import ServoData
 from sysid.servo_samples import Part, chosen
 
-_CANDIDATES, _KEPT, _FINAL = 128, 6, 2
+_CANDIDATES = 256
+_MANY = 10  # problems; fewer are started from more places, since few tones have many local optima
 
 
 def delayed_pd_fits(
@@ -43,12 +44,13 @@ def delayed_pd_fits(
             problems.append(Problem(trials, (True,) * len(trials), noise, {}))
             shifts.append(_truncation_shift(data, joint))
     rng = np.random.default_rng(seed)
-    starts = global_starts(model, problems, rng, _CANDIDATES, _KEPT)
-    flat = [p for p in problems for _ in range(_KEPT)]
+    kept, final = (12, 3) if len(problems) <= _MANY else (6, 2)
+    starts = global_starts(model, problems, rng, _CANDIDATES, kept)
+    flat = [p for p in problems for _ in range(kept)]
     early = fit(model, flat, starts.reshape(-1, starts.shape[-1]), 8)
     top = [
-        [f.values for f in sorted(early[i : i + _KEPT], key=lambda f: f.cost)[:_FINAL]]
-        for i in range(0, len(early), _KEPT)
+        [f.values for f in sorted(early[i : i + kept], key=lambda f: f.cost)[:final]]
+        for i in range(0, len(early), kept)
     ]
     best = best_of(model, problems, np.array(top), 20)
     found = []
