@@ -117,27 +117,6 @@ class CommandNetwork(JointArrays):
         self._last = out[:, -1]
         return self._leave_all(np.moveaxis(out, 1, 2))
 
-    def one_step(
-        self, commands: NDArray[np.floating], position: NDArray[np.floating]
-    ) -> NDArray[np.float32]:
-        """Positions after each command when the last position is measured instead of predicted.
-
-        Parameters
-        ----------
-        commands : ndarray, shape (steps, joints)
-        position : ndarray, shape (steps, joints)
-            Measured when each command was given [rad].
-
-        Returns
-        -------
-        ndarray, shape (steps, joints)
-        """
-        out = []
-        for command, here in zip(commands, position, strict=True):
-            self._last = self._normal_position(self._arrange(here))
-            out.append(self.step(command))
-        return np.stack(out)
-
     def _forward(self, x: NDArray, last: NDArray) -> NDArray[np.float32]:
         """Normalised positions (joints, n) from normalised commands (joints, taps, n)."""
         p = self.parameters

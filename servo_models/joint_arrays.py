@@ -58,6 +58,32 @@ class JointArrays:
             if name in self.parameters and not (self.parameters[name] > 0).all():
                 raise InputError(f"A servo model's {name} must be positive. Fit it again.")
         self._environments: tuple[int, ...] = ()
+        self._last = np.zeros((len(self.joints), 1), np.float32)  # normalised position
+
+    def step(self, command: ArrayLike) -> NDArray[np.float32]:
+        """Advance one time step under `command` [rad]; returns the position after it [rad]."""
+        raise NotImplementedError
+
+    def one_step(
+        self, commands: NDArray[np.floating], position: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Positions after each command when the last position is measured instead of predicted.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (steps, joints)
+        position : ndarray, shape (steps, joints)
+            Measured when each command was given [rad].
+
+        Returns
+        -------
+        ndarray, shape (steps, joints)
+        """
+        out = []
+        for command, here in zip(commands, position, strict=True):
+            self._last = self._normal_position(self._arrange(here))
+            out.append(self.step(command))
+        return np.stack(out)
 
     def _shape(self, name: str, axes: int) -> tuple[int, ...]:
         if name not in self.parameters or self.parameters[name].ndim != axes:

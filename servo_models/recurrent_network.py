@@ -89,19 +89,6 @@ class RecurrentNetwork(JointArrays):
         """Positions [rad] after each command, shape (steps, *environments, joints)."""
         return np.stack([self.step(command) for command in np.asarray(commands, np.float32)])
 
-    def one_step(
-        self, commands: NDArray[np.floating], position: NDArray[np.floating]
-    ) -> NDArray[np.float32]:
-        """Positions after each command when the last position is measured instead of predicted.
-
-        Parameters and result as for `CommandNetwork.one_step`.
-        """
-        out = []
-        for command, here in zip(commands, position, strict=True):
-            self._last = self._normal_position(self._arrange(here))
-            out.append(self.step(command))
-        return np.stack(out)
-
     def _advance(self, newest: NDArray) -> None:
         """One step of all memories; leaves the normalised position in `_last`."""
         p = self.parameters
