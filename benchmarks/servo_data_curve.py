@@ -24,18 +24,26 @@ import pandas as pd
 from emulators import in_process
 
 from common.joints import DEFAULT_POSE
+from servo_models.interface import ServoModel
+from sysid import servo_scores as scores
 from sysid.command_playback import playback
 from sysid.excitation import LEAD_IN_S
 from sysid.figure_style import BLUE, GREEN, INK, RED, axes_column, save, styled
+from sysid.network_fit import fit_network, past_ticks
+from sysid.physics_fit import delayed_pd_fits, delayed_pd_model
+from sysid.published_networks import fit_published
 from sysid.recorder import record
 from sysid.recording import Recording, load
-from sysid.servo_fit import Split, fit_servo
+from sysid.servo_data import ServoData, servo_data
+from sysid.servo_samples import Part, grouped, merged_groups, samples
 
 JOINTS = ("LF_hip", "LF_calf")
 PERIOD_S, LOOP_ROWS = 0.02, 500
 SIZES = (30, 100, 390, 1000, 5000, 20000)
+TEST_LOOPS = 6
+PUBLISHED_MOST = 5000  # samples; the published recipe's epochs take hours beyond
 MODELS = (("fir", "default"), ("delayed-pd", "default"), ("mlp", "default"), ("lstm", "default"),
-          ("mlp", "paper"))  # fmt: skip
+          ("mlp", "paper"), ("lstm", "paper"))  # fmt: skip
 
 
 def commands(rng: np.random.Generator, loops: int) -> pd.DataFrame:
@@ -67,6 +75,16 @@ def recorded(seed: int, loops: int, folder: Path) -> Recording:
     return load(record(in_process("esp32", seed), plan, folder / "recording.csv"))
 
 
+def fitted(arch: str, preset: str, data: ServoData, part: Part, seed: int) -> ServoModel:
+    """One kind of model of every joint, fitted to a part."""
+    if preset == "paper":
+        return fit_published(arch, data, part, seed)
+    if arch == "delayed-pd":
+        return delayed_pd_model(delayed_pd_fits(data, [part], seed)[0], data.period_s)
+    ready = samples(data, part, past_ticks(data.period_s))
+    return fit_network(arch, data.joints, data.period_s, ready, seed).model
+
+
 def main() -> None:
     """Run it, print a table, draw a picture."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -74,39 +92,43 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("data_curve.png"))
     parser.add_argument("--sizes", type=int, nargs="*", default=SIZES)
     options = parser.parse_args()
-    most = max(options.sizes)
-    test_loops = 6
+    last = -(-max(options.sizes) // LOOP_ROWS)  # first loop of the test
     with tempfile.TemporaryDirectory() as name:
-        recording = recorded(options.seed, -(-most // LOOP_ROWS) + test_loops, Path(name))
-    last = -(-most // LOOP_ROWS)
+        recording = recorded(options.seed, last + TEST_LOOPS, Path(name))
     found: dict[tuple[str, str], list[float]] = {m: [] for m in MODELS}
-    print(
-        "| samples per joint | " + " | ".join(_title(m) for m in MODELS) + " | linear (baseline) |"
-    )
-    print("|---|" + "---|" * (len(MODELS) + 1))
+    print("| samples per joint | " + " | ".join(_title(m) for m in MODELS) + " |")
+    print("|---|" + "---|" * len(MODELS))
     for size in options.sizes:
-        whole, rest = divmod(size, LOOP_ROWS)
+        loops, rest = divmod(size, LOOP_ROWS)
         stop = LEAD_IN_S + recording.loop_period_s * rest
 
-        def train(number, elapsed, group, whole=whole, stop=stop):
+        def first(number, elapsed, group, loops=loops, stop=stop):
             moving = elapsed >= LEAD_IN_S  # a loop starts with a stretch at rest, which says little
-            return moving & ((number < whole) | ((number == whole) & (elapsed < stop)))
+            return moving & ((number < loops) | ((number == loops) & (elapsed < stop)))
 
-        split = Split(f"first {size} rows", train, lambda number, elapsed, group: number >= last)
-        cells, baseline = [], float("nan")
+        def unseen(number, elapsed, group):
+            return number >= last
+
+        data, _ = grouped(servo_data([recording], JOINTS), first)
+        data = merged_groups(data)
+        cells = []
         for model in MODELS:
+            if model[1] == "paper" and size > PUBLISHED_MOST:
+                found[model].append(float("nan"))
+                cells.append("-")
+                continue
             started = time.perf_counter()
-            fit = fit_servo([recording], JOINTS, *model, split, seed=options.seed)
-            error = fit.scored[model[0]].mean
-            baseline = fit.scored["linear"].mean
-            found[model].append(error)
-            cells.append(f"{1e3 * error:.1f} ({time.perf_counter() - started:.0f} s)")
-        print(f"| {size} | " + " | ".join(cells) + f" | {1e3 * baseline:.1f} |", flush=True)
+            fit = fitted(*model, data, first, options.seed)
+            seconds = time.perf_counter() - started
+            errors = scores.errors(fit, scores.tracks(fit, data), data, unseen)
+            found[model].append(float(np.mean([scores.rms(e.free_run) for e in errors.values()])))
+            cells.append(f"{1e3 * found[model][-1]:.1f} ({seconds:.0f} s)")
+        print(f"| {size} | " + " | ".join(cells) + " |", flush=True)
     save(curve_figure(list(options.sizes), found), options.out, force=True)
 
 
 def _title(model: tuple[str, str]) -> str:
-    name = {"fir": "FIR", "delayed-pd": "DelayedPD"}.get(model[0], model[0].upper())
+    name = {"fir": "linear", "delayed-pd": "DelayedPD"}.get(model[0], model[0].upper())
     return name + (", as published" if model[1] == "paper" else "")
 
 
@@ -114,7 +136,9 @@ def _title(model: tuple[str, str]) -> str:
 def curve_figure(sizes: list[int], found: dict[tuple[str, str], list[float]]):
     """Error against samples, one line per model."""
     figure, (axes,) = axes_column(1, 3.6)
-    looks = zip("os^Dv", (INK, GREEN, BLUE, RED, "#56B4E9"), ("-", "-", "-", "-", ":"), strict=True)
+    looks = zip(
+        "os^Dv>", (INK, GREEN, BLUE, RED, BLUE, RED), ("-", "-", "-", "-", ":", ":"), strict=True
+    )
     for (model, errors), (mark, colour, line) in zip(found.items(), looks, strict=True):
         axes.loglog(
             sizes, 1e3 * np.array(errors), marker=mark, color=colour, ls=line, label=_title(model)

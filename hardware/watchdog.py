@@ -12,6 +12,7 @@ pose the robot was found in, and switches the torque off.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import select
@@ -128,7 +129,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     orders = json.loads(sys.stdin.buffer.readline())
     # everything that parking needs is loaded now, not when it is urgent
-    import hardware.connect  # noqa: F401
+    importlib.import_module("hardware.connect")
 
     sys.stdout.write("ready\n")
     sys.stdout.flush()

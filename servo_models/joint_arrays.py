@@ -6,6 +6,7 @@ environments; outside they are (*environments, joints), as everywhere in this pr
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from common.errors import InputError
 
 
-class JointArrays:
+class JointArrays(ABC):
     """Parameters per joint, normalisation, and the way in and out of the inner layout.
 
     Parameters
@@ -60,9 +61,9 @@ class JointArrays:
         self._environments: tuple[int, ...] = ()
         self._last = np.zeros((len(self.joints), 1), np.float32)  # normalised position
 
+    @abstractmethod
     def step(self, command: ArrayLike) -> NDArray[np.float32]:
         """Advance one time step under `command` [rad]; returns the position after it [rad]."""
-        raise NotImplementedError
 
     def one_step(
         self, commands: NDArray[np.floating], position: NDArray[np.floating]

@@ -25,7 +25,7 @@ from sysid import servo_scores as scores
 from sysid.network_fit import fit_network, past_ticks
 from sysid.recording import Recording
 from sysid.servo_data import ServoData, servo_data
-from sysid.servo_samples import Part, in_stretches, merged_groups, samples
+from sysid.servo_samples import everything, grouped, merged_groups, only, samples
 
 LINEAR = "linear, fitted here"
 
@@ -81,7 +81,6 @@ def compare(
         If a model cannot be read, or is for another rate or other joints.
     """
     data = merged_groups(servo_data(recordings, joints, mode))
-    whole: Part = lambda number, elapsed, group: np.ones(len(number), bool)  # noqa: E731
     found: dict[str, ServoModel] = {}
     bands, notes = {}, []
     inputs = {r.sha256: r.name for r in recordings}
@@ -100,12 +99,12 @@ def compare(
         ]
     tracks = {name: scores.tracks(model, data) for name, model in found.items()}
     errors = {
-        name: scores.errors(model, tracks[name], data, whole) for name, model in found.items()
+        name: scores.errors(model, tracks[name], data, everything) for name, model in found.items()
     }
-    tracks[LINEAR], errors[LINEAR] = _linear(data, whole, seed)
+    tracks[LINEAR], errors[LINEAR] = _linear(data, seed)
     return Comparison(
-        data, tracks, errors, bands, scores.persistence(data, whole),
-        scores.repeatability(data, whole), tuple(notes),
+        data, tracks, errors, bands, scores.persistence(data, everything),
+        scores.repeatability(data, everything), tuple(notes),
     )  # fmt: skip
 
 
@@ -170,18 +169,15 @@ def calibrated(calibration: Calibration, joints: Sequence[str], period_s: float)
     return AtControlRate(model, count, np.array(offset))
 
 
-def _linear(
-    data: ServoData, whole: Part, seed: int
-) -> tuple[scores.Tracks, dict[str, scores.Errors]]:
+def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores.Errors]]:
     """The linear baseline, each group by a filter fitted to the others."""
-    groups = {int(g) for found in data.runs.values() for r in found for g in r.group}
-    cut = data if len(groups) > 1 else in_stretches(data, whole)
-    ready = samples(cut, whole, past_ticks(data.period_s))
+    cut, _ = grouped(data, everything)
+    ready = samples(cut, everything, past_ticks(data.period_s))
     fit = fit_network("fir", data.joints, data.period_s, ready, seed)
-    parts = []
-    for group, model in fit.held_out.items():
-        only: Part = lambda number, elapsed, own, group=group: own == group  # noqa: E731
-        parts.append(scores.errors(model, scores.tracks(model, cut), cut, only))
+    parts = [
+        scores.errors(model, scores.tracks(model, cut), cut, only(group))
+        for group, model in fit.held_out.items()
+    ]
     return scores.tracks(fit.model, data), scores.pooled(parts)
 
 

@@ -29,7 +29,17 @@ from sysid.physics_fit import (
 from sysid.published_networks import fit_published
 from sysid.recording import Recording
 from sysid.servo_data import ServoData, servo_data
-from sysid.servo_samples import Part, Samples, chosen, in_stretches, merged_groups, samples
+from sysid.servo_samples import (
+    Part,
+    Samples,
+    chosen,
+    everything,
+    grouped,
+    merged_groups,
+    only,
+    samples,
+    without,
+)
 
 
 @dataclass(frozen=True)
@@ -180,38 +190,31 @@ def fit_servo(
     if preset == "paper" and arch not in ("mlp", "lstm"):
         raise InputError(f"--preset paper has an mlp and an lstm; there is no published {arch}.")
     data = servo_data(recordings, joints, mode)
-    split, notes = split or Split("each group left out in turn"), []
-    whole: Part = split.train or (lambda number, elapsed, group: np.ones(len(number), bool))
-    present = {
-        int(g)
-        for j in joints
-        for r in data.runs[j]
-        for g in r.group[r.readings.rows][chosen(r, whole)]
-    }
-    if len(present) < 2:
-        only = data.groups[next(iter(present))] if present else "nothing"
-        notes.append(
-            f"There is one group to learn from ({only}), so models are chosen by holding out "
-            "stretches of it. Record more loops or tones to know how they generalise."
-        )
-        data = in_stretches(data, whole)
+    split = split or Split("each group left out in turn")
+    notes: list[str] = []
+    whole = split.train or everything
+    data, note = grouped(data, whole)
+    notes += [note] if note else []
     data = merged_groups(data)
     if split.test is None:
-        folds = [(_without(g), _only(g)) for g in range(len(data.groups))]
+        folds = [(without(g), only(g)) for g in range(len(data.groups))]
     else:
-        folds = [(split.train or whole, split.test)]
+        folds = [(whole, split.test)]
         if not any(chosen(r, split.test).any() for j in joints for r in data.runs[j]):
             raise InputError(f"There is nothing to test on: {split.name}. Check loops and times.")
     say = progress or (lambda what, share: None)
     ready = samples(data, whole, past_ticks(data.period_s))
     readings = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
 
-    linear = fit_network("fir", joints, data.period_s, ready, seed)
-    say("DelayedPD", 0.0)
-    physics = [
-        delayed_pd_model(v, data.period_s) for v in _physics("delayed-pd", data, folds, seed)
-    ]
     ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say)
+    linear = physics = ours.folds
+    if arch != "fir":
+        fir = fit_network("fir", joints, data.period_s, ready, seed)
+        linear = _fold_models(fir, folds, split)
+    if arch != "delayed-pd":
+        say("DelayedPD", 0.0)
+        found = _physics("delayed-pd", data, folds, seed)
+        physics = [delayed_pd_model(v, data.period_s) for v in found]
     notes += ours.notes
     few = ours.weights_per_joint
     if few and few > min(readings.values()):
@@ -220,7 +223,7 @@ def fit_servo(
             "holds it together is weight decay, chosen by held-out groups."
         )
     scored = {
-        "linear": _score(_fold_models(linear, folds, split), folds, data, seed),
+        "linear": _score(linear, folds, data, seed),
         "delayed-pd": _score(physics, folds, data, seed),
     }
     scored[arch] = _score(ours.folds, folds, data, seed)
@@ -337,7 +340,7 @@ def _fit(
         progress=lambda done, steps: say(arch, done / steps),
     )  # fmt: skip
     held = [
-        scores.errors(m, scores.tracks(m, data), data, _both(whole, _only(g)))
+        scores.errors(m, scores.tracks(m, data), data, _both(whole, only(g)))
         for g, m in fit.held_out.items()
     ]
     notes = ["Training was stopped early; the best so far was kept."] if fit.interrupted else []
@@ -386,14 +389,6 @@ def _coverage(found: dict[str, scores.Errors], bands: dict[str, tuple[float, flo
         half = 1.645 * np.sqrt(noise**2 + (timing * e.speed) ** 2)
         inside, total = inside + int(np.sum(np.abs(e.free_run) <= half)), total + len(half)
     return inside / max(total, 1)
-
-
-def _only(group: int) -> Part:
-    return lambda number, elapsed, groups: groups == group
-
-
-def _without(group: int) -> Part:
-    return lambda number, elapsed, groups: (groups != group) & (groups >= 0)
 
 
 def _both(a: Part, b: Part) -> Part:

@@ -26,6 +26,23 @@ Part = Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], NDA
 """What belongs to a part (training, test), by trial number, time in the trial [s] and group."""
 
 
+def everything(
+    number: NDArray[np.int64], elapsed_s: NDArray[np.float64], group: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """The part that has all there is."""
+    return np.ones(len(number), bool)
+
+
+def only(group: int) -> Part:
+    """The part that is one group."""
+    return lambda number, elapsed_s, groups: groups == group
+
+
+def without(group: int) -> Part:
+    """The part that is every group but one."""
+    return lambda number, elapsed_s, groups: (groups != group) & (groups >= 0)
+
+
 def chosen(run: Run, part: Part) -> NDArray[np.bool_]:
     """Which counted readings of a run belong to a part, shape (fresh,)."""
     row = run.readings.rows
@@ -91,11 +108,20 @@ class Samples:
         return out
 
 
-def in_stretches(data: ServoData, part: Part) -> ServoData:
-    """The same data with the runs' parts cut into stretches to hold out, where there is one group.
+def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
+    """Data whose part has groups to hold out, and a note if they had to be made.
 
-    The first rows after a boundary belong to no stretch: a servo would remember the one before.
+    Where the part has one group only, it is cut into stretches. The first rows after a boundary
+    belong to no stretch: a servo would remember the one before.
     """
+    present = {
+        int(g)
+        for found in data.runs.values()
+        for run in found
+        for g in run.group[run.readings.rows][chosen(run, part)]
+    }
+    if len(present) > 1:
+        return data, None
 
     def cut(run: Run) -> Run:
         inside = np.flatnonzero(chosen_rows(run, part))
@@ -106,7 +132,12 @@ def in_stretches(data: ServoData, part: Part) -> ServoData:
         return replace(run, group=group)
 
     runs = {j: tuple(cut(run) for run in found) for j, found in data.runs.items()}
-    return replace(data, runs=runs, groups=tuple(f"stretch {n + 1}" for n in range(_STRETCHES)))
+    names = tuple(f"stretch {n + 1}" for n in range(_STRETCHES))
+    group = data.groups[next(iter(present))] if present else "nothing"
+    return replace(data, runs=runs, groups=names), (
+        f"There is one group to learn from ({group}), so models are chosen by holding out "
+        "stretches of it. Record more loops or tones to know how they generalise."
+    )
 
 
 def merged_groups(data: ServoData, most: int = 5) -> ServoData:

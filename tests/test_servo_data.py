@@ -15,7 +15,7 @@ from sysid.servo_data import ServoData, look_up, servo_data
 from sysid.servo_samples import (
     WINDOW,
     chosen,
-    in_stretches,
+    grouped,
     merged_groups,
     samples,
     training_sets,
@@ -299,7 +299,7 @@ def test_padding_and_other_parts_never_count():
 
 def test_stretches_leave_half_a_second_after_each_boundary_out():
     data = servo_data([recording(trial(0, 0.0, sine(300), sine(300)))], [JOINT], "all")
-    cut = in_stretches(data, everything)
+    cut, _ = grouped(data, everything)
     guard = np.full(25, -1)  # 0.5 s in ticks of 20 ms
     expected = [np.zeros(100), guard, np.ones(75), guard, np.full(75, 2)]
     np.testing.assert_array_equal(cut.runs[JOINT][0].group, np.concatenate(expected))
@@ -326,7 +326,7 @@ def test_merged_groups_are_few_and_keep_neighbouring_tones_apart():
 
 def test_rows_without_a_group_stay_without_one_when_groups_are_merged():
     data = servo_data([recording(trial(0, 0.0, sine(300), sine(300)))], [JOINT], "all")
-    cut = in_stretches(data, everything)
+    cut, _ = grouped(data, everything)
     merged = merged_groups(cut, most=2)
     np.testing.assert_array_equal(merged.runs[JOINT][0].group == -1, cut.runs[JOINT][0].group == -1)
 
