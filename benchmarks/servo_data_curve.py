@@ -28,13 +28,15 @@ from servo_models.interface import ServoModel
 from sysid import servo_scores as scores
 from sysid.command_playback import playback
 from sysid.excitation import LEAD_IN_S
-from sysid.figure_style import BLUE, GREEN, INK, RED, axes_column, save, styled
+from sysid.figure_style import save
 from sysid.network_fit import fit_network, past_ticks
 from sysid.physics_fit import delayed_pd_fits, delayed_pd_model
 from sysid.published_networks import fit_published
 from sysid.recorder import record
 from sysid.recording import Recording, load
 from sysid.servo_data import ServoData, servo_data
+from sysid.servo_data_curve import FILE, data_curve_figure, measured
+from sysid.servo_data_curve import MODELS as CURVES
 from sysid.servo_samples import Part, grouped, merged_groups, samples
 
 JOINTS = ("LF_hip", "LF_calf")
@@ -90,13 +92,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("data_curve.png"))
+    parser.add_argument("--csv", type=Path, default=Path(f"sysid/data/{FILE}"))
     parser.add_argument("--sizes", type=int, nargs="*", default=SIZES)
     options = parser.parse_args()
     last = -(-max(options.sizes) // LOOP_ROWS)  # first loop of the test
     with tempfile.TemporaryDirectory() as name:
         recording = recorded(options.seed, last + TEST_LOOPS, Path(name))
-    found: dict[tuple[str, str], list[float]] = {m: [] for m in MODELS}
-    print("| samples per joint | " + " | ".join(_title(m) for m in MODELS) + " |")
+    rows = []
+    print("| samples per joint | " + " | ".join(CURVES[_key(m)][0] for m in MODELS) + " |")
     print("|---|" + "---|" * len(MODELS))
     for size in options.sizes:
         loops, rest = divmod(size, LOOP_ROWS)
@@ -114,41 +117,26 @@ def main() -> None:
         cells = []
         for model in MODELS:
             if model[1] == "paper" and size > PUBLISHED_MOST:
-                found[model].append(float("nan"))
-                cells.append("-")
+                cells.append("–")
                 continue
             started = time.perf_counter()
             fit = fitted(*model, data, first, options.seed)
             seconds = time.perf_counter() - started
             errors = scores.errors(fit, scores.tracks(fit, data), data, unseen)
-            found[model].append(float(np.mean([scores.rms(e.free_run) for e in errors.values()])))
-            cells.append(f"{1e3 * found[model][-1]:.1f} ({seconds:.0f} s)")
+            error = float(np.mean([scores.rms(e.free_run) for e in errors.values()]))
+            rows.append(
+                {"model": _key(model), "samples_per_joint": size, "rmse_free_run_rad": error,
+                 "fit_s": round(seconds, 1)}
+            )  # fmt: skip
+            cells.append(f"{1e3 * error:.1f} ({seconds:.0f} s)")
         print(f"| {size} | " + " | ".join(cells) + " |", flush=True)
-    save(curve_figure(list(options.sizes), found), options.out, force=True)
+    table = pd.DataFrame(rows)
+    table.to_csv(options.csv, index=False)
+    save(data_curve_figure(measured()), options.out, force=True)
 
 
-def _title(model: tuple[str, str]) -> str:
-    name = {"fir": "linear", "delayed-pd": "DelayedPD"}.get(model[0], model[0].upper())
-    return name + (", as published" if model[1] == "paper" else "")
-
-
-@styled
-def curve_figure(sizes: list[int], found: dict[tuple[str, str], list[float]]):
-    """Error against samples, one line per model."""
-    figure, (axes,) = axes_column(1, 3.6)
-    looks = zip(
-        "os^Dv>", (INK, GREEN, BLUE, RED, BLUE, RED), ("-", "-", "-", "-", ":", ":"), strict=True
-    )
-    for (model, errors), (mark, colour, line) in zip(found.items(), looks, strict=True):
-        axes.loglog(
-            sizes, 1e3 * np.array(errors), marker=mark, color=colour, ls=line, label=_title(model)
-        )
-    axes.set_xlabel("samples per joint")
-    axes.set_ylabel("error in free run [mrad]")
-    axes.set_xticks(sizes, [str(s) for s in sizes])
-    axes.minorticks_off()
-    axes.legend()
-    return figure
+def _key(model: tuple[str, str]) -> str:
+    return model[0] if model[1] == "default" else f"{model[0]} paper"
 
 
 if __name__ == "__main__":

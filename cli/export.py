@@ -1,4 +1,4 @@
-"""`export`: a calibration, a recording or a servo model in a form that other programs read."""
+"""`export`: a calibration, recording, servo model or policy in a form that other programs read."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from cli import terminal
+from cli.policy_choice import is_policy, policy_at
 from common.errors import InputError
 from servo_models.calibration import PRESETS, load_calibration
 from sysid.export import to_csv
@@ -17,18 +18,20 @@ from sysid.recording import load
 
 @dataclass(frozen=True)
 class Export:
-    """Write a calibration, a preset, a recording or a servo model for other programs.
+    """Write a calibration, a preset, a recording, a servo model or a policy for other programs.
 
     Example: pupper-sysid export calibrated.yaml --to csv --out calibrated.csv
 
     Example: pupper-sysid export servo/ --to onnx --out servo.onnx
+
+    Example: pupper-sysid export runs/mlp --to onnx --out policy.onnx
     """
 
     source: tyro.conf.Positional[str]
-    """calibrated.yaml, the name of a preset (paper, release), a recording, or a servo model's
-    folder."""
+    """calibrated.yaml, the name of a preset (paper, release), a recording, or the folder of a servo
+    model, a policy or a training run."""
     to: Literal["csv", "onnx", "torchscript"] = "csv"
-    """Format: csv, a tidy table, of all; onnx and torchscript of learned servo models."""
+    """Format: csv, a tidy table; onnx and torchscript of learned servo models and policies."""
     out: Path | None = None
     """File to write; by default the source's name with the format's ending, in this folder."""
     force: bool = False
@@ -40,13 +43,26 @@ class Export:
         """Convert and write."""
         path = Path(self.source)
         if self.source not in PRESETS and path.is_dir():
-            target = self._servo_model(path)
+            target = self._policy(path) if is_policy(path) else self._servo_model(path)
         else:
             target = self._table(path)
         if self.json:
             terminal.print_json({"written": str(target)})
         else:
             terminal.err.print(f"Wrote {target}.")
+
+    def _policy(self, folder: Path) -> Path:
+        if self.to == "csv":
+            raise InputError(
+                f"{folder} is a policy: export it with `--to onnx` or `--to torchscript`."
+            )
+        from policies.policy_export import ENDINGS, export_policy
+
+        policy, _ = policy_at(folder)
+        target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
+        worst = export_policy(policy, self.to, target, self.force)
+        terminal.err.print(f"Its actions equal the policy's to {worst:.1e}.")
+        return target
 
     def _servo_model(self, folder: Path) -> Path:
         from servo_models.servo_file import load_servo_model

@@ -27,8 +27,7 @@ from cli.report import Report
 from cli.scan import Scan
 from cli.sindy import Sindy
 from cli.sweep import Sweep
-from cli.terminal import err
-from common.errors import PupperError
+from cli.user_errors import user_errors
 
 Command = (
     Annotated[Scan, tyro.conf.subcommand("scan")]
@@ -56,38 +55,16 @@ Start with `pupper-sysid sweep --freqs 1-10` (no robot needed), then `delay`, `c
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; ends the process with 0, 2 (bad input, one sentence) or 1."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in given
-    given = [a for a in given if a != "--debug"] or ["--help"]
-    try:
+    with user_errors(given, "pupper-sysid") as rest:
         command = tyro.cli(
             Command,
             prog="pupper-sysid",
             description=DESCRIPTION,
-            args=given,
+            args=rest or ["--help"],
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
         _end_politely()
         command.run()
-    except PupperError as error:
-        if debug:
-            raise
-        err.print(f"[red]error:[/] {error}", soft_wrap=True)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        err.print("Stopped.")
-        sys.exit(1)
-    except BrokenPipeError:  # `| head` closed its end: not our user's mistake
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
-    except Exception as error:
-        if debug:
-            raise
-        err.print(
-            f"[red]error:[/] {type(error).__name__}: {error}. This is a defect of pupper-sysid; "
-            "run again with --debug and report what it prints.",
-            soft_wrap=True,
-        )
-        sys.exit(1)
 
 
 def _end_politely() -> None:

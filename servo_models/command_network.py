@@ -143,6 +143,11 @@ class CommandNetwork(JointArrays):
         return out
 
     @property
+    def memory(self) -> dict[str, NDArray[np.float32]]:
+        """See `JointArrays`: newest commands and last position, normalised."""
+        return {"history": self._history, "last": self._last}
+
+    @property
     def _history(self) -> NDArray[np.float32]:
         """Normalised commands (joints, taps, environments), newest first."""
         return self._room[:, self._newest : self._newest + self.taps]

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from common.errors import InputError
+from servo_models.delay_line import DelayLine
 
 TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""
@@ -125,7 +126,7 @@ class DelayedPD:
         self.time_step_s = float(time_step_s)
         self._values = values
         self._own = np.broadcast_shapes(*(v.shape for v in values.values()))
-        self._nsample = int(np.floor(np.max(values["delay_s"]) / time_step_s)) + 2
+        self._delay_line = DelayLine(values["delay_s"], self.time_step_s)
         self.reset(np.zeros(self._own))
 
     def reset(self, position: ArrayLike) -> None:
@@ -139,7 +140,7 @@ class DelayedPD:
         self._position = position.copy()
         self._velocity = np.zeros(self.batch)
         self._setpoint = position.copy()
-        self._past = np.broadcast_to(position, (self._nsample, *self.batch)).copy()
+        self._delay_line.reset(position)
 
     def step(self, command: ArrayLike) -> NDArray[np.float64]:
         """Advance one time step under `command` [rad]; returns the position after it."""
@@ -150,45 +151,12 @@ class DelayedPD:
         """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
         commands = np.asarray(commands, float)
         commands = np.broadcast_to(commands, (len(commands), *self.batch))
-        history = np.concatenate([self._past, commands])
-        self._past = history[len(history) - self._nsample :].copy()
-        delay = np.broadcast_to(self._values["delay_s"] / self.time_step_s, self.batch).reshape(-1)
-        delayed = fractional_shift(history.reshape(len(history), -1), len(commands), delay)
-        delayed = delayed.reshape(commands.shape)
         state = (self._position, self._velocity, self._setpoint)
-        positions, state = integrate(delayed, state, self._values, self.time_step_s)
+        positions, state = integrate(
+            self._delay_line.shift(commands), state, self._values, self.time_step_s
+        )
         self._position, self._velocity, self._setpoint = state
         return positions
-
-
-def fractional_shift(
-    history: NDArray, steps: int, delay_steps: NDArray, column: NDArray | None = None
-) -> NDArray[np.float64]:
-    """Last `steps` rows of `history` as they arrive after fractional delays.
-
-    Parameters
-    ----------
-    history : ndarray, shape (rows, series)
-        Rows before the last `steps` are the past; there must be at least `max(delay_steps) + 1`.
-    steps : int
-    delay_steps : ndarray, shape (n,)
-    column : ndarray of int, shape (n,), optional
-        Which series each delay applies to; by default one each, in order.
-
-    Returns
-    -------
-    ndarray, shape (steps, n)
-    """
-    series = history.shape[1]
-    column = np.arange(series) if column is None else column
-    whole = np.floor(delay_steps).astype(int)
-    # one row more than asked for: each row's successor is the other end of its interpolation
-    row = np.arange(len(history) - steps - 1, len(history))[:, None]
-    taken = np.take(history.reshape(-1), row * series + (column - whole * series))
-    out = np.subtract(taken[:-1], taken[1:])
-    out *= delay_steps - whole
-    out += taken[1:]
-    return out
 
 
 def integrate(

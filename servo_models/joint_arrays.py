@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,6 +65,26 @@ class JointArrays(ABC):
     @abstractmethod
     def step(self, command: ArrayLike) -> NDArray[np.float32]:
         """Advance one time step under `command` [rad]; returns the position after it [rad]."""
+
+    @abstractmethod
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""
+
+    @property
+    @abstractmethod
+    def memory(self) -> dict[str, NDArray[np.float32]]:
+        """What is remembered from step to step, writable, environments on axis 2 (1 of `last`)."""
+
+    def reset_some(self, rows: NDArray[np.intp], position: ArrayLike) -> None:
+        """Rest at `position` [rad], shape (len(rows), joints), in environments `rows` only."""
+        fresh = copy(self)
+        fresh.reset(position)
+        new = fresh.memory
+        for name, value in self.memory.items():
+            if name == "last":
+                value[:, rows] = new[name]
+            else:
+                value[:, :, rows] = new[name]
 
     def one_step(
         self, commands: NDArray[np.floating], position: NDArray[np.floating]

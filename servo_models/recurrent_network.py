@@ -89,6 +89,14 @@ class RecurrentNetwork(JointArrays):
         """Positions [rad] after each command, shape (steps, *environments, joints)."""
         return np.stack([self.step(command) for command in np.asarray(commands, np.float32)])
 
+    @property
+    def memory(self) -> dict[str, NDArray[np.float32]]:
+        """See `JointArrays`: states of the cells, newest commands and last position."""
+        return {
+            "hidden": self._hidden, "cell": self._cell,
+            "history": np.moveaxis(self._history, -1, 1), "last": self._last,
+        }  # fmt: skip
+
     def _advance(self, newest: NDArray) -> None:
         """One step of all memories; leaves the normalised position in `_last`."""
         p = self.parameters

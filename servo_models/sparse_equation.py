@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from common.errors import InputError
-from servo_models.delayed_pd import TIME_STEP_S, fractional_shift
+from servo_models.delay_line import DelayLine
+from servo_models.delayed_pd import TIME_STEP_S
 
 
 class Coefficient(NamedTuple):
@@ -123,7 +124,7 @@ class SparseEquation:
         self._own = np.broadcast_shapes(
             *(v.shape for v in values.values()), self.delay_s.shape, self.offset_rad.shape
         )
-        self._nsample = int(np.floor(np.max(self.delay_s) / h)) + 2
+        self._delay_line = DelayLine(self.delay_s, h)
         self.reset(np.zeros(self._own))
 
     def reset(self, position: ArrayLike) -> None:
@@ -135,7 +136,7 @@ class SparseEquation:
         self.batch = np.broadcast_shapes(position.shape, self._own)
         self._position = np.broadcast_to(position, self.batch).copy()
         self._velocity = np.zeros(self.batch)
-        self._past = np.broadcast_to(position, (self._nsample, *self.batch)).copy()
+        self._delay_line.reset(np.broadcast_to(position, self.batch))
 
     def step(self, command: ArrayLike) -> NDArray[np.float64]:
         """Advance one time step under `command` [rad]; returns the position after it."""
@@ -147,12 +148,8 @@ class SparseEquation:
         if commands.ndim == 1:  # one series for the whole batch
             commands = commands.reshape(-1, *[1] * len(self.batch))
         commands = np.broadcast_to(commands, (len(commands), *self.batch))
-        history = np.concatenate([self._past, commands])
-        self._past = history[len(history) - self._nsample :].copy()
-        delay = np.broadcast_to(self.delay_s / self.time_step_s, self.batch).reshape(-1)
-        delayed = fractional_shift(history.reshape(len(history), -1), len(commands), delay)
         positions, state = integrate(
-            delayed.reshape(commands.shape),
+            self._delay_line.shift(commands),
             (self._position, self._velocity),
             self.coefficients,
             self.time_step_s,

@@ -85,8 +85,8 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
     """MJCF of free-air hinges, one per servo, named `joint0`, `joint1`, …, without gravity."""
     bodies, actuators = [], []
     for i, servo in enumerate(servos):
-        joint = _attributes({"name": f"joint{i}"} | joint_attributes(servo, time_step_s))
-        pid = _attributes({"joint": f"joint{i}"} | actuator_attributes(servo, time_step_s))
+        joint = attributes({"name": f"joint{i}"} | joint_attributes(servo, time_step_s))
+        pid = attributes({"joint": f"joint{i}"} | actuator_attributes(servo, time_step_s))
         bodies.append(
             f'<body><joint type="hinge" axis="0 1 0" {joint}/>'
             '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/></body>'
@@ -124,5 +124,6 @@ def _number(value) -> str:
     return repr(float(np.asarray(value)))
 
 
-def _attributes(values: dict[str, str]) -> str:
+def attributes(values: dict[str, str]) -> str:
+    """As they stand in an MJCF element."""
     return " ".join(f'{name}="{value}"' for name, value in values.items())

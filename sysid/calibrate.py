@@ -17,28 +17,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from common.joints import JOINT_NAMES
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from sysid.delay import LEVEL, Interval, LagBudget, lag_budget
 from sysid.ladder import LADDER, Rung, rung
-from sysid.output_error import (
-    Fit,
-    Problem,
-    TrialData,
-    fit,
-    global_starts,
-    look_up,
-    positions,
-    prepare,
+from sysid.ladder_fit import (
+    PREFERRED,
+    dead_time_profile,
+    fit_with_folds,
+    fresh_residuals,
+    integrated_autocorrelation_time,
+    leave_one_out_folds,
 )
+from sysid.output_error import Fit, TrialData, look_up, positions, prepare
 from sysid.poll_lattice import find_poll_lattice, quantum, readings
 from sysid.recording import Recording, Trial
 
-PREFERRED = "delayed_pd"
 _PREFERENCE = 1.05
-_MOST_FOLDS = 6
 
 
 @dataclass(frozen=True)
@@ -298,7 +295,7 @@ def _prepare(task: _Task) -> PreparedJoint:
 def _dead_time(task: _Task) -> DeadTime:
     ready, model = _prepare(task), rung(PREFERRED)
     (best,) = fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.rng, {})
-    dead_time, best = _profile(model, ready.data, ready.noise_rad, best)
+    dead_time, best = dead_time_profile(model, ready.data, ready.noise_rad, best)
     return DeadTime(ready.budget, dead_time, ready.quantum_rad, float(best.values[-1]))
 
 
@@ -311,7 +308,9 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
     for model in LADDER:
         best[model.name] = fit_with_folds(model, data, folds, noise, ready.rng, best)
         if model.name == PREFERRED:
-            dead_time, best[PREFERRED][0] = _profile(model, data, noise, best[PREFERRED][0])
+            dead_time, best[PREFERRED][0] = dead_time_profile(
+                model, data, noise, best[PREFERRED][0]
+            )
         rungs[model.name] = _result(model, best[model.name], data, folds, noise)
     chosen = _choose(rungs)
     pd = rungs[PREFERRED]
@@ -325,138 +324,7 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
     )  # fmt: skip
 
 
-# ------------------------------------------------------------------------------- fitting
-
-
-def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
-    """Which trials remain when each frequency is left out; by trial where there are no tones."""
-    labels = [
-        round(d.frequency_hz, 2) if d.frequency_hz > 0 else float(n) for n, d in enumerate(data)
-    ]
-    names = sorted(set(labels))
-    if len(names) < 2:
-        return {}
-    picked = names
-    if len(names) > _MOST_FOLDS:  # a fine sweep: every n-th frequency says as much
-        index = np.unique(np.round(np.linspace(0, len(names) - 1, _MOST_FOLDS)).astype(int))
-        picked = [names[i] for i in index]
-    return {name: tuple(label != name for label in labels) for name in picked}
-
-
-def fit_with_folds(
-    model: Rung,
-    data: tuple[TrialData, ...],
-    folds: dict[float, tuple[bool, ...]],
-    noise: float,
-    rng: np.random.Generator,
-    lower: dict[str, list[Fit]],
-    more_starts: NDArray | None = None,
-) -> list[Fit]:
-    """Best fit to all trials, then to each fold, each from starts of its own.
-
-    A fold never starts from the fit to all trials: that would leave the optimum of the held-out
-    frequency within reach. `more_starts` (problems, starts, parameters) join the global ones.
-    """
-    everything = Problem(data, (True,) * len(data), noise, {})
-    problems = [everything, *(replace(everything, use=use) for use in folds.values())]
-    if model.name == f"{PREFERRED}_backlash":  # nested in DelayedPD: start from its solutions
-        starts = [
-            [np.insert(f.values, -1, gap) for gap in (0.002, 0.008, 0.025)]
-            for f in lower[PREFERRED]
-        ]
-        return best_of(model, problems, np.array(starts), 15)
-    # few tones leave many local optima: start from more places
-    keep, final = (12, 3) if len(problems) <= 5 else (4, 2)
-    starts = global_starts(model, problems, rng, 256, keep)
-    if more_starts is not None:
-        starts, keep = np.concatenate([starts, more_starts], axis=1), keep + more_starts.shape[1]
-    flat = [p for p in problems for _ in range(keep)]
-    early = fit(model, flat, starts.reshape(-1, starts.shape[-1]), 8)
-    top = []
-    for i in range(len(problems)):
-        own = sorted(early[i * keep : (i + 1) * keep], key=lambda f: f.cost)[:final]
-        top.append([f.values for f in own])
-    return best_of(model, problems, np.array(top), 20)
-
-
-def best_of(
-    model: Rung, problems: Sequence[Problem], starts: NDArray, iterations: int
-) -> list[Fit]:
-    """Fit every problem from each of its starts, shape (problems, starts, parameters)."""
-    count = starts.shape[1]
-    flat = [p for p in problems for _ in range(count)]
-    fits = fit(model, flat, starts.reshape(-1, starts.shape[-1]), iterations)
-    return [min(fits[i : i + count], key=lambda f: f.cost) for i in range(0, len(fits), count)]
-
-
-def _profile(
-    model: Rung, data: tuple[TrialData, ...], noise: float, best: Fit
-) -> tuple[Interval, Fit]:
-    """Dead time with its profile-likelihood interval, and the best fit met on the way."""
-    everything = Problem(data, (True,) * len(data), noise, {})
-    residual = fresh_residuals(model, best.values, data)
-    threshold = 0.5 * float(chi2.ppf(LEVEL, 1)) * _effective(residual)
-    fits, lowest, delays = [best], best, np.array([best.values[0]])
-    for _ in range(3):
-        centre = best.values[0]
-        spread = np.array([0.001, 0.002, 0.0035, 0.005, 0.0075, 0.010, 0.014])
-        delays = np.concatenate([centre - spread[::-1], [centre], centre + spread])
-        delays = delays[(delays >= model.parameters[0].low) & (delays <= model.parameters[0].high)]
-        problems = [replace(everything, frozen={"delay_s": float(d)}) for d in delays]
-        fits = fit(model, problems, np.tile(best.values, (len(delays), 1)), 10)
-        # neighbours know better ways: pass each point's solution on, outward and back
-        for shift in (1, -1):
-            moved = fit(model, problems, np.roll([f.values for f in fits], shift, axis=0), 4)
-            fits = [min(pair, key=lambda f: f.cost) for pair in zip(fits, moved, strict=True)]
-        lowest = min(fits, key=lambda f: f.cost)
-        if lowest.cost > best.cost - 0.5:
-            break
-        best = min(*fit(model, [everything], lowest.values[None], 25), best, key=lambda f: f.cost)
-    cost = np.array([f.cost for f in fits]) - min(best.cost, lowest.cost)
-    low, high = _crossings(delays, cost, best.values[0], threshold)
-    centre, grain = float(best.values[0]), 0.5 * TIME_STEP_S  # no finer than the physics step
-    ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
-    return Interval(centre, float(ends[0]), float(ends[1])), best
-
-
-def _crossings(
-    delays: NDArray, cost: NDArray, centre: float, threshold: float
-) -> tuple[float, float]:
-    """Where the profile rises through the threshold on either side of `centre`."""
-    below = cost <= threshold
-    inside = np.flatnonzero(below)
-    if not len(inside):
-        return float(centre), float(centre)
-    ends = []
-    for edge, step in ((inside[0], -1), (inside[-1], 1)):
-        beyond = edge + step
-        if 0 <= beyond < len(delays):
-            part = (threshold - cost[edge]) / max(cost[beyond] - cost[edge], 1e-9)
-            ends.append(float(delays[edge] + part * (delays[beyond] - delays[edge])))
-        else:
-            ends.append(float(delays[edge]))
-    return min(ends[0], float(centre)), max(ends[1], float(centre))
-
-
-def _effective(residuals: Sequence[NDArray]) -> float:
-    """How many nominal samples carry the information of one, given their autocorrelation."""
-    total, correlation = 0.0, np.zeros(8)
-    for r in residuals:
-        r = r - r.mean()
-        total += float(r @ r)
-        for lag in range(1, 9):
-            correlation[lag - 1] += float(r[lag:] @ r[:-lag])
-    correlation /= max(total, 1e-18)
-    positive = np.cumprod(correlation > 0.1)  # up to where it fades into its own noise
-    return float(max(1.0, 1.0 + 2.0 * np.sum(correlation * positive)))
-
-
 # ------------------------------------------------------------------------------- scoring
-
-
-def fresh_residuals(model: Rung, values: NDArray, data: Sequence[TrialData]) -> list[NDArray]:
-    track = positions(model, [(values[None], data)])[0][:, 0]
-    return [look_up(track[:, n], t.sample_step) - t.sample_rad for n, t in enumerate(data)]
 
 
 def score(
@@ -518,7 +386,7 @@ def _result(
         held_out[name] = np.concatenate(fresh_residuals(model, fold.values, left))
     residual = fresh_residuals(model, best.values, data)
     # soft-L1 works in units of the noise; its covariance is for residuals of that size
-    inflation = _effective(residual) * max(1.0, _rms(residual) ** 2 / noise**2)
+    inflation = integrated_autocorrelation_time(residual) * max(1.0, _rms(residual) ** 2 / noise**2)
     sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
     z = norm.ppf((1 + LEVEL) / 2)
     speed = max(_command_speed(d) for d in data)

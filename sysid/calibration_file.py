@@ -32,8 +32,9 @@ from servo_models.calibration_parts import (
     Selection,
 )
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from sysid.calibrate import PREFERRED, JointCalibrationResult, RungResult
+from sysid.calibrate import JointCalibrationResult, RungResult
 from sysid.delay import Interval
+from sysid.ladder_fit import PREFERRED
 from sysid.poll_lattice import PollLattice
 from sysid.recording import Recording
 

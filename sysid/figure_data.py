@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from servo_models.delayed_pd import TIME_STEP_S
-from sysid.calibrate import PREFERRED, JointCalibrationResult
+from sysid.calibrate import JointCalibrationResult
 from sysid.delay import LEVEL, Interval
 from sysid.ladder import rung
+from sysid.ladder_fit import PREFERRED
 from sysid.output_error import TrialData, look_up, positions
 from sysid.poll_lattice import PollLattice
 

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from servo_models.delayed_pd import TIME_STEP_S, fractional_shift
+from servo_models.delay_line import fractional_shift
+from servo_models.delayed_pd import TIME_STEP_S
 from sysid.ladder import Rung
 from sysid.poll_lattice import Readings
 from sysid.recording import Trial

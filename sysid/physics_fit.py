@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from servo_models.control_rate import AtControlRate, substeps
 from servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from servo_models.sparse_equation import COEFFICIENTS, SparseEquation
-from sysid.calibrate import PREFERRED, best_of
 from sysid.ladder import rung
-from sysid.output_error import Problem, TrialData, fit, global_starts
+from sysid.ladder_fit import PREFERRED, fit_problems
+from sysid.output_error import Problem, TrialData
 from sysid.poll_lattice import quantum
 from sysid.servo_data import ServoData
 from sysid.servo_samples import Part, chosen
 
-_CANDIDATES = 256
 _MANY = 10  # problems; fewer are started from more places, since few tones have many local optima
 
 
@@ -44,15 +43,8 @@ def delayed_pd_fits(
             problems.append(Problem(trials, (True,) * len(trials), noise, {}))
             shifts.append(_truncation_shift(data, joint))
     rng = np.random.default_rng(seed)
-    kept, final = (12, 3) if len(problems) <= _MANY else (6, 2)
-    starts = global_starts(model, problems, rng, _CANDIDATES, kept)
-    flat = [p for p in problems for _ in range(kept)]
-    early = fit(model, flat, starts.reshape(-1, starts.shape[-1]), 8)
-    top = [
-        [f.values for f in sorted(early[i : i + kept], key=lambda f: f.cost)[:final]]
-        for i in range(0, len(early), kept)
-    ]
-    best = best_of(model, problems, np.array(top), 20)
+    keep, final = (12, 3) if len(problems) <= _MANY else (6, 2)
+    best = fit_problems(model, problems, rng, keep, final)
     found = []
     for n in range(len(parts)):
         own = slice(n * len(data.joints), (n + 1) * len(data.joints))

@@ -7,11 +7,8 @@ intervals pin the lattice down to a fraction of a millisecond, and every changed
 then be given the time at which it was measured, which is what makes the lag of the servo visible
 behind the age of the feedback.
 
-Method (after facts of the recordings this project was built on): for one stretch of a few seconds
-and a trial period T, count for every phase how many changed rows' intervals contain an instant;
-the log-likelihood of the count, against intervals placed at random, is the score. Real polls drift
-by some 0.4 % from stretch to stretch, so stretches share T only through a Gaussian of that width.
-The score is compared with the same score after the gaps between changes were shuffled.
+`find_poll_lattice` cuts trials into stretches, has `sysid.poll_search` look for a common period and
+each stretch's phase, and counts the polls that failed; `readings` dates the fresh rows by them.
 """
 
 from __future__ import annotations
@@ -23,17 +20,21 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.poll_search import (
+    BLUR_S,
+    BLURS_S,
+    Phase,
+    Stretch,
+    best_blur,
+    best_period,
+    contains,
+    refine,
+    shuffled,
+)
 from sysid.recording import Trial
 
-OUTLIERS = 0.03
-"""Share of changed rows that may contradict the lattice (a late reply, a missed row)."""
-
 _STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e-4
-_DRIFT = 0.0045  # relative sd of the period between stretches, measured on a Mini Pupper 2
-_BLURS_S = (0.0012, 0.0025, 0.005)  # full width of the uncertainty of one poll instant
-_BINS = 64
 _LONGEST_S = 0.12
-_PEAKS = 12
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 _ALL_FRESH = 0.97
 
@@ -57,7 +58,7 @@ class PollLattice:
         Share of changed rows with a lattice instant between the previous read and this one.
     fresh_fraction : float
         Share of rows with a new value, among all rows.
-    phases : tuple of _Phase
+    phases : tuple of Phase
         Lattice of each stretch.
     """
 
@@ -69,24 +70,12 @@ class PollLattice:
     z_score: float
     hit_rate: float
     fresh_fraction: float
-    phases: tuple[_Phase, ...] = ()
+    phases: tuple[Phase, ...] = ()
 
     @property
     def mean_age_s(self) -> float:
         """Mean age of a reading implied by period and loss [s]; NaN without a lattice."""
         return self.period_s * (0.5 + self.loss / (1 - self.loss))
-
-
-@dataclass(frozen=True)
-class _Phase:
-    """The lattice in one stretch of one trial."""
-
-    trial: int
-    start_s: float
-    stop_s: float
-    period_s: float
-    phase_s: float
-    phase_sd_s: float
 
 
 @dataclass(frozen=True)
@@ -188,35 +177,29 @@ def find_poll_lattice(
         return nothing
 
     # ln T, spaced so that the last poll of a stretch moves by half of the blur
-    grid = np.exp(
-        np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * _BLURS_S[1] / _STRETCH_S)
-    )
+    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * BLUR_S / _STRETCH_S))
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
-    period, score = _best_period(informative, grid)
+    period, score = best_period(informative, grid)
     z_score = float("nan")
     if rng is not None:
         null = [
-            _best_period([_shuffle(s, rng) for s in informative], grid)[1] for _ in range(shuffles)
+            best_period([shuffled(s, rng) for s in informative], grid)[1] for _ in range(shuffles)
         ]
         z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
 
-    phases = tuple(_refine(s, period, _BLURS_S[1], None) for s in stretches)
+    phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
     loss, _ = _loss(trials, phases)
     if np.isfinite(loss):
         # second pass: rows that did not change speak too, and the blur is what fits best
         loss = float(np.clip(loss, 0.02, 0.98))
-        evidence = [
-            sum(_posterior(s, period, blur, loss, 25, 64)[3] for s in informative)
-            for blur in _BLURS_S
-        ]
-        blur = _BLURS_S[int(np.argmax(evidence))]
-        phases = tuple(_refine(s, period, blur, loss) for s in stretches)
+        blur = best_blur(informative, period, loss)
+        phases = tuple(refine(s, period, blur, loss) for s in stretches)
     weights = np.array([len(s.begin) for s in stretches], float)
     periods = np.array([p.period_s for p in phases])
     period = float(np.average(periods, weights=weights))
     spread = float(np.sqrt(np.average((periods - period) ** 2, weights=weights)))
     effective = weights.sum() ** 2 / np.sum(weights**2)
-    hits = [_contains(s.begin, s.end, p) for s, p in zip(stretches, phases, strict=True)]
+    hits = [contains(s, p) for s, p in zip(stretches, phases, strict=True)]
     hit_rate = float(np.mean(np.concatenate(hits)))
     loss, loss_sd = _loss(trials, phases)
     found = hit_rate >= 0.9 and not z_score < 4.0
@@ -252,7 +235,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
         inside = (read[rows] >= phase.start_s) & (read[rows] <= phase.stop_s)
         count = np.round((time - phase.phase_s) / phase.period_s)
         instant = phase.phase_s + count * phase.period_s
-        slack = 0.5 * _BLURS_S[-1]
+        slack = 0.5 * BLURS_S[-1]
         hit = inside & (instant >= before - slack) & (instant <= read[rows] + slack)
         time = np.where(hit, np.minimum(instant, read[rows]), time)
     if own:
@@ -264,25 +247,10 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
     return Readings(rows, time, trial.position_rad[rows], held, sd)
 
 
-# ---------------------------------------------------------------- one stretch of one trial
+# ---------------------------------------------------------------- stretches of a trial
 
 
-@dataclass(frozen=True)
-class _Stretch:
-    trial: int
-    start_s: float
-    stop_s: float
-    begin: NDArray[np.float64]
-    """Previous read of each changed row."""
-    end: NDArray[np.float64]
-    """Read of each changed row."""
-    same_begin: NDArray[np.float64]
-    """Previous read of each row whose value did not change although the servo must have moved."""
-    same_end: NDArray[np.float64]
-    """Read of each such row."""
-
-
-def _stretches(trial: Trial, step: float) -> list[_Stretch]:
+def _stretches(trial: Trial, step: float) -> list[Stretch]:
     """Cut a trial into stretches short enough for one strict lattice each."""
     read, rows, before = trial.read_time_s, fresh_rows(trial), _read_before(trial)
     moving = np.flatnonzero(moving_rows(trial, step))
@@ -295,9 +263,7 @@ def _stretches(trial: Trial, step: float) -> list[_Stretch]:
         own, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
         if len(own) >= 8:
             found.append(
-                _Stretch(
-                    trial.number, start, stop, before[own], read[own], before[held], read[held]
-                )
+                Stretch(trial.number, start, stop, before[own], read[own], before[held], read[held])
             )
     return found
 
@@ -305,122 +271,6 @@ def _stretches(trial: Trial, step: float) -> list[_Stretch]:
 def _loop_period(trials: Sequence[Trial]) -> float:
     gaps = [np.diff(t.read_time_s) for t in trials if len(t.read_time_s) > 1]
     return float(np.median(np.concatenate(gaps))) if gaps else float("nan")
-
-
-def _best_period(stretches: Sequence[_Stretch], grid: NDArray) -> tuple[float, float]:
-    """The common period [s] and its score: a quick search, its best peaks scored with care."""
-    pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
-    best = (float("nan"), -np.inf)
-    for _ in range(_PEAKS):
-        peak = int(np.argmax(pooled))
-        if not np.isfinite(pooled[peak]):
-            break
-        score = sum(_posterior(s, grid[peak], _BLURS_S[1], None, 25, 64)[3] for s in stretches)
-        best = max(best, (float(grid[peak]), float(score)), key=lambda pair: pair[1])
-        pooled[np.abs(np.log(grid / grid[peak])) < 2 * _DRIFT] = -np.inf
-    return best
-
-
-def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64]:
-    """Best log-likelihood over phases for each period, against intervals placed at random."""
-    # No blur here: intervals meet end to end, so with one a poll on a common edge would explain
-    # every row at periods of two loops. Polls that jitter over an edge count as outliers.
-    chance = np.minimum(np.median(end - begin) / periods, 1.0)  # for an interval at random
-    low = begin[None, :] / periods[:, None]
-    length = np.minimum((end - begin)[None, :] / periods[:, None], 1.0)
-    first = np.floor((low % 1.0) * _BINS).astype(np.int64)
-    span = np.round(length * _BINS).astype(np.int64)
-    row = np.arange(len(periods))[:, None] * (2 * _BINS + 1)
-    size = len(periods) * (2 * _BINS + 1)
-    up = np.bincount((row + first).ravel(), minlength=size)
-    down = np.bincount((row + first + span).ravel(), minlength=size)
-    inside = np.cumsum((up - down).reshape(len(periods), -1), axis=1)[:, : 2 * _BINS]
-    hits = (inside[:, :_BINS] + inside[:, _BINS:]).max(axis=1)
-    hit = np.log((1 - OUTLIERS) + OUTLIERS * chance) - np.log(chance)
-    return hits * hit + (len(begin) - hits) * np.log(OUTLIERS)
-
-
-def _pool(profiles: list[NDArray], grid: NDArray) -> NDArray[np.float64]:
-    """Sum of the profiles, each free to sit a little beside the common period."""
-    log_period = np.log(grid)
-    reach = int(np.ceil(3 * _DRIFT / (log_period[1] - log_period[0])))
-    offsets = np.arange(-reach, reach + 1)
-    penalty = -0.5 * (offsets * (log_period[1] - log_period[0]) / _DRIFT) ** 2
-    total = np.zeros(len(grid))
-    for profile in profiles:
-        padded = np.pad(profile, reach, constant_values=-np.inf)
-        windows = np.lib.stride_tricks.sliding_window_view(padded, len(offsets))
-        total += np.max(windows + penalty, axis=1)
-    return total
-
-
-def _shuffle(stretch: _Stretch, rng: np.random.Generator) -> _Stretch:
-    """The same changes with the gaps between them in another order."""
-    order = rng.permutation(len(stretch.end) - 1)
-    end = stretch.end[0] + np.concatenate([[0.0], np.cumsum(np.diff(stretch.end)[order])])
-    return replace(stretch, begin=end - (stretch.end - stretch.begin), end=end)
-
-
-def _posterior(
-    stretch: _Stretch,
-    period: float,
-    blur: float,
-    loss: float | None,
-    period_count: int,
-    phase_count: int,
-) -> tuple[NDArray, NDArray, NDArray, float]:
-    """Log-posterior over (period, phase) near `period`, the two axes, and the peak's score.
-
-    Without a `loss`, only rows that changed count. With one, a row that did not change although
-    the servo moved says that no poll, or a failed one, lies in its interval.
-    """
-    reference = 0.5 * (stretch.start_s + stretch.stop_s)
-    periods = period * np.exp(np.linspace(-2.5 * _DRIFT, 2.5 * _DRIFT, period_count))
-    steps = np.linspace(-0.5, 0.5, phase_count, endpoint=False)
-
-    def inside(begin: NDArray, end: NDArray) -> NDArray[np.float64]:
-        turns = (0.5 * (begin + end) - reference)[None, :] / periods[:, None]
-        away = (turns[:, None, :] - steps[None, :, None] + 0.5) % 1.0 - 0.5
-        distance = np.abs(away) * periods[:, None, None]
-        return np.clip((0.5 * (end - begin) - distance) / blur + 0.5, 0.0, 1.0)
-
-    chance = np.minimum((stretch.end - stretch.begin) / period, 1.0)
-    changed = (1 - OUTLIERS) * inside(stretch.begin, stretch.end) + OUTLIERS * chance
-    log_likelihood = np.log(changed).sum(axis=2)
-    if loss is not None and len(stretch.same_end):
-        seen = (1 - OUTLIERS) * (1 - loss) * inside(stretch.same_begin, stretch.same_end)
-        log_likelihood += np.log(1 - seen).sum(axis=2)
-    log_likelihood -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
-    return log_likelihood, periods, steps, float(log_likelihood.max() - np.log(chance).sum())
-
-
-def _refine(stretch: _Stretch, period: float, blur: float, loss: float | None) -> _Phase:
-    """Posterior mean of a stretch's period and phase near the common period."""
-    log_likelihood, periods, steps, _ = _posterior(stretch, period, blur, loss, 61, 128)
-    reference = 0.5 * (stretch.start_s + stretch.stop_s)
-    weight = np.exp(log_likelihood - log_likelihood.max())
-    weight /= weight.sum()
-    best_period = float(np.sum(weight.sum(axis=1) * periods))
-    # the phase is an angle: average around the peak, not across the seam
-    peak = steps[int(np.argmax(weight.sum(axis=0)))]
-    near = (steps - peak + 0.5) % 1.0 - 0.5
-    marginal = weight.sum(axis=0)
-    mean = float(np.sum(marginal * near))
-    sd = float(np.sqrt(np.sum(marginal * (near - mean) ** 2)))
-    return _Phase(
-        stretch.trial,
-        stretch.start_s,
-        stretch.stop_s,
-        best_period,
-        reference + (peak + mean) * best_period,
-        sd * best_period,
-    )
-
-
-def _contains(begin: NDArray, end: NDArray, phase: _Phase) -> NDArray[np.bool_]:
-    middle = 0.5 * (begin + end)
-    instant = phase.phase_s + phase.period_s * np.round((middle - phase.phase_s) / phase.period_s)
-    return np.abs(instant - middle) <= 0.5 * (end - begin) + 0.5 * _BLURS_S[1]
 
 
 # ------------------------------------------------------------------ where the servo must move
@@ -455,7 +305,7 @@ def _moving_fresh(trials: Sequence[Trial]) -> tuple[int, int]:
     return moving, fresh
 
 
-def _loss(trials: Sequence[Trial], phases: Sequence[_Phase]) -> tuple[float, float]:
+def _loss(trials: Sequence[Trial], phases: Sequence[Phase]) -> tuple[float, float]:
     """Share of polls that left the value as it was while the servo must have been moving."""
     step = max(quantum(trials), 1e-6)
     polls = successes = 0

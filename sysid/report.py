@@ -20,8 +20,9 @@ from common.files import refuse_overwrite, versions, write_bytes, write_text
 from servo_models.calibration import Calibration
 from sysid import figures
 from sysid import report_tables as tables
-from sysid.calibrate import PREFERRED, JointCalibrationResult
+from sysid.calibrate import JointCalibrationResult
 from sysid.figure_data import Track, hold_runs, lag_parts, tracks
+from sysid.ladder_fit import PREFERRED
 from sysid.recording import Recording
 from sysid.report_advice import advice
 from sysid.report_tables import MODEL_NAMES, Column, Table

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from common.joints import JOINT_NAMES
-from sysid.calibrate import PREFERRED, JointCalibrationResult
+from sysid.calibrate import JointCalibrationResult
+from sysid.ladder_fit import PREFERRED
 
 _FEW_FREQUENCIES = 4
 _FAST_HZ = 5.0  # below it a servo of 20 ms dynamics looks like 20 ms more of dead time

@@ -6,8 +6,9 @@ from dataclasses import asdict
 from typing import Any
 
 from servo_models.calibration import Calibration
-from sysid.calibrate import PREFERRED, DeadTime, JointCalibrationResult, RungResult
+from sysid.calibrate import DeadTime, JointCalibrationResult, RungResult
 from sysid.delay import Interval
+from sysid.ladder_fit import PREFERRED
 from sysid.poll_lattice import PollLattice
 
 

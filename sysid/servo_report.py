@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sysid import servo_scores as scores
 from sysid.figure_style import png
 from sysid.report import Picture, Section
 from sysid.report_tables import Column, Table
 from sysid.servo_compare import LINEAR, Comparison
+from sysid.servo_data_curve import MODELS, DataCurve, data_curve_figure, measured
 from sysid.servo_figures import compare_figure
 
 
@@ -53,6 +56,18 @@ def servo_section(found: Comparison) -> Section:
         )
         for joint in found.data.joints
     ]
+    curve = measured()
+    own = int(np.median([sum(len(r.readings.rows) for r in found.data.runs[j])
+                         for j in found.data.joints]))  # fmt: skip
+    pictures.append(
+        Picture(
+            "servo_data_curve",
+            "How much data a servo model needs, measured on the emulated robot under random "
+            "commands of 0.5 to 4 Hz (the emulated servo is a DelayedPD, which therefore needs "
+            "least). The line marks the readings per joint of this recording.",
+            png(data_curve_figure(curve, own)),
+        )
+    )
     return Section(
         "servo",
         "Servo models",
@@ -62,9 +77,27 @@ def servo_section(found: Comparison) -> Section:
             "the reading before, which makes no prediction at all."
         ],
         figures=pictures,
-        tables=[Table("servo_models", "Error of the servo models", columns, tuple(rows))],
+        tables=[
+            Table("servo_models", "Error of the servo models", columns, tuple(rows)),
+            _curve_table(curve),
+        ],
         notes=found.notes,
     )
+
+
+def _curve_table(curve: DataCurve) -> Table:
+    rows = [
+        {"samples_per_joint": n, **{f"{m}_rad": errors[i] for m, errors in curve.error_rad.items()}}
+        for i, n in enumerate(curve.samples)
+    ]
+    columns = (
+        Column("samples per joint", lambda row: f"{row['samples_per_joint']:,}", "key"),
+        *(
+            Column(f"{MODELS[m][0]}, mrad", lambda row, m=m: _mrad(row[f"{m}_rad"]))
+            for m in curve.error_rad
+        ),
+    )
+    return Table("servo_data_curve", "Error against samples, emulated robot", columns, tuple(rows))
 
 
 def _mrad(value: float) -> str:

@@ -36,18 +36,15 @@ from servo_models.sparse_equation import (
     explain,
     integrate,
 )
-from sysid.calibrate import (
+from sysid.calibrate import Scores, joint_rng, prepare_joints, score
+from sysid.ladder import Parameter, Rung, rung
+from sysid.ladder_fit import (
     PREFERRED,
-    Scores,
     best_of,
     fit_with_folds,
     fresh_residuals,
-    joint_rng,
     leave_one_out_folds,
-    prepare_joints,
-    score,
 )
-from sysid.ladder import Parameter, Rung, rung
 from sysid.output_error import Fit, Problem, TrialData, positions
 from sysid.recording import Recording
 from sysid.sindy_structure import PULLS, Support, ordered, propose

@@ -1,0 +1,142 @@
+"""How fast the walking environment and PPO are, both sides of every ratio measured in one run.
+
+    .venv/bin/python benchmarks/training_speed.py --threads 2
+
+Prints three tables: the environment against a bare `Batch.step` on the same model, threads and
+substeps, for 64 to 8,192 environments; what delay, feedback model and terrain cost; PPO end to end
+for each architecture, and the Transformer's update on sequences against one window per sample.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import time
+from dataclasses import replace
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+import torch
+
+from policies.run_file import preset
+from policies.speed import environment_rates, measure
+from policies.transformer import CONTEXT, CausalAttention
+from sim.servo_ranges import servo_ranges
+from sim.walking_config import Walking
+from sim.walking_env import PupperEnv
+
+ACTUATOR = "data/samples/calibrated.yaml"
+SIZES = (64, 256, 1024, 4096, 8192)
+PAPER = {"mlp": "30,000", "lstm": "15,000–20,000", "transformer": "5,500"}
+
+
+def environments(threads: int) -> None:
+    """Cost against number of environments, and memory."""
+    print("| environments | bare Batch.step, steps/s | PupperEnv, steps/s | ratio | kB per robot |")
+    print("|---|---|---|---|---|")
+    servos = servo_ranges(ACTUATOR)
+    for size in SIZES:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        env = PupperEnv(Walking(), servos, size, 0, threads)
+        bare, own = environment_rates(env)
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        memory = f"{(after - before) / size:.0f}" if size >= 1024 else "–"
+        print(f"| {size:,} | {bare:,.0f} | {own:,.0f} | {own / bare:.2f} | {memory} |", flush=True)
+        del env
+
+
+def parts(threads: int) -> None:
+    """What delay, feedback and terrain cost."""
+    print("\n| 512 environments | PupperEnv, steps/s | bare Batch.step, steps/s |")
+    print("|---|---|---|")
+    late = servo_ranges(ACTUATOR)
+    at_once = replace(
+        late,
+        **{k: {**getattr(late, k), "delay_s": np.zeros(12)} for k in ("low", "value", "high")},
+    )
+    cases = {
+        "delay, held feedback, flat": (Walking(), late),
+        "no delay": (Walking(), at_once),
+        "ideal feedback": (Walking(), servo_ranges(ACTUATOR, "ideal")),
+        "rough ground": (Walking(terrain="rough"), late),
+        "slopes": (Walking(terrain="slopes"), late),
+        "serial knee": (Walking(knee="serial"), late),
+    }
+    for name, (task, servos) in cases.items():
+        bare, own = environment_rates(PupperEnv(task, servos, 512, 0, threads))
+        print(f"| {name} | {own:,.0f} | {bare:,.0f} |", flush=True)
+
+
+def end_to_end(threads: int) -> None:
+    """PPO with each architecture, in this project's sizes and in the paper's."""
+    print(
+        "\n| policy | sizes | environment, steps/s | update, samples/s | end to end, samples/s | "
+        "of the ideal | paper, RTX 4090 |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for sizes in ("fast", "paper"):
+        for kind in ("mlp", "mlp-actions", "lstm", "gru", "transformer"):
+            run = preset(sizes, kind)
+            run = replace(
+                run, actuator=ACTUATOR, threads=threads, environments=512,
+                task=Walking(), learner=preset("fast", kind).learner,
+            )  # fmt: skip
+            found = measure(run)
+            print(
+                f"| {kind} | {sizes} | {found['env_steps_per_s']:,.0f} | "
+                f"{found['update_samples_per_s']:,.0f} | "
+                f"{found['end_to_end_samples_per_s']:,.0f} | {found['end_to_end_ratio']:.2f} | "
+                f"{PAPER.get(kind, '–') if sizes == 'paper' else ''} |",
+                flush=True,
+            )
+
+
+def attention() -> None:
+    """One pass over sequences against one window per sample: forward and backward."""
+    steps, robots, size = 24, 128, 60
+    torch.manual_seed(0)
+    layer = CausalAttention(size)
+    tokens = torch.randn(robots, CONTEXT - 1 + steps, size)
+    present = torch.ones(robots, CONTEXT - 1 + steps, dtype=torch.bool)
+    windows = tokens.unfold(1, CONTEXT, 1).transpose(2, 3).reshape(-1, CONTEXT, size)
+    there = torch.ones(len(windows), CONTEXT, dtype=torch.bool)
+
+    def sequence() -> torch.Tensor:
+        return layer(tokens, present, steps).reshape(-1, layer.width)
+
+    def window() -> torch.Tensor:
+        # what a window per sample computes: every position, of which only the last is used
+        return layer(windows, there, CONTEXT)[:, -1]
+
+    assert torch.allclose(sequence(), window(), atol=1e-5)
+    rates = []
+    for run in (sequence, window):
+        best = np.inf
+        for _ in range(5):
+            begun = time.perf_counter()
+            run().square().sum().backward()
+            best = min(best, time.perf_counter() - begun)
+        rates.append(robots * steps / best)
+    print(
+        f"\nTransformer, forward and backward: {rates[0]:,.0f} samples/s in sequence form, "
+        f"{rates[1]:,.0f} with one window per sample: {rates[0] / rates[1]:.1f} times."
+    )
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    attention()
+    environments(options.threads)
+    parts(options.threads)
+    end_to_end(options.threads)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Networks, training, evaluation and (later) deployment of walking policies."""

@@ -1,0 +1,158 @@
+"""Settings of a training run, and the file in its folder that holds them.
+
+`Run` is all settings (every field a flag of `pupper-train`); `preset` gives complete ones for a
+kind of policy. `save_run` writes `run.yaml` into a run's folder, with hashes and versions;
+`load_run` reads it back and refuses, in a sentence, what it does not understand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from common.errors import InputError
+from common.files import sha256, versions, write_text
+from policies.hyperparameters import Architecture, Hyperparameters, Imitation, Kind
+from sim.walking_config import PRESETS, Walking
+
+RUN_SCHEMA = "pupper-run"
+RUN_VERSION = 1
+RUN_FILE = "run.yaml"
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything that a training run is made of."""
+
+    actuator: str = "calibrated.yaml"
+    """A calibration (`pupper-sysid calibrate` writes one), `paper`, `release` or `ideal`; or a
+    servo model's folder (`pupper-sysid fit-servo`)."""
+    feedback: str = "held"
+    """`held`: readings as the calibration measured them; `ideal`: fresh and exact; or another
+    calibration whose feedback to take."""
+    architecture: Architecture = field(default_factory=Architecture)
+    task: Walking = field(default_factory=Walking)
+    learner: Hyperparameters = field(default_factory=Hyperparameters)
+    imitation: Imitation = field(default_factory=Imitation)
+    environments: int = 512
+    """How many robots learn together (per process)."""
+    iterations: int = 400
+    """Updates of PPO, after imitation; training ends when they are done."""
+    minutes: float = 120.0
+    """Training ends after this time, too."""
+    threads: int = 0
+    """Of physics and of torch, each; 0 for all cores (one per process with torchrun)."""
+    seed: int = 0
+    """Of everything that is drawn."""
+
+
+def preset(name: Literal["fast", "paper", "release"], kind: Kind) -> Run:
+    """Complete settings for one kind of policy.
+
+    `fast` suits a few cores; `paper` and `release` follow the published sizes.
+    """
+    task = PRESETS[name]
+    privileged = task.observation.privileged_critic
+    if name == "fast":
+        hidden = (256, 128, 64) if kind in ("mlp", "mlp-actions") else (128, 64)
+        memory = 64
+        return Run(
+            architecture=Architecture(kind, hidden, memory, (256, 128, 64), privileged), task=task
+        )
+    wide = (512, 256, 128)
+    return Run(
+        architecture=Architecture(kind, wide, 128, wide, privileged), task=task,
+        learner=Hyperparameters(
+            epochs=5, learning_rate=1e-3, value_weight=1.0, initial_std=1.0, normalise=False,
+            entropy=0.0025 if kind == "mlp" else 0.005,
+        ),
+        imitation=Imitation(iterations=0), environments=4096, iterations=20_000, minutes=1e6,
+    )  # fmt: skip
+
+
+def load_run(folder: Path) -> Run:
+    """Settings of the run in `folder`.
+
+    Raises
+    ------
+    InputError
+        If there is none, or they cannot be understood.
+    """
+    path = folder / RUN_FILE
+    if not path.exists():
+        raise InputError(f"{folder} holds no run: there is no {RUN_FILE} in it.")
+    try:
+        found = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not readable YAML.") from error
+    if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
+        raise InputError(f"{path} is not the settings of a training run.")
+    if found.get("schema_version") != RUN_VERSION:
+        raise InputError(
+            f"{path} has schema version {found.get('schema_version')}; this version reads "
+            f"{RUN_VERSION}."
+        )
+    return _from_dict(Run, found.get("settings"), str(path))
+
+
+def _from_dict(kind: type, given: Any, where: str) -> Any:
+    """A frozen dataclass from plain data, its types checked by its own defaults."""
+    if not isinstance(given, dict):
+        raise InputError(f"{where}: expected settings by name.")
+    default = kind()
+    known = asdict(default)
+    unknown = set(given) - set(known)
+    if unknown:
+        raise InputError(f"{where}: unknown setting {sorted(unknown)[0]}.")
+    values = {}
+    for name, value in given.items():
+        now = getattr(default, name)
+        if hasattr(now, "__dataclass_fields__"):
+            value = _from_dict(type(now), value, f"{where}, {name}")
+        elif isinstance(now, tuple) and isinstance(value, list):
+            value = tuple(value)
+        elif isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        elif type(value) is not type(now):
+            raise InputError(f"{where}: {name} is {value!r}; a {type(now).__name__} was expected.")
+        values[name] = value
+    return replace(default, **values)
+
+
+def save_run(folder: Path, run: Run) -> None:
+    """Write the settings of a run that begins.
+
+    Raises
+    ------
+    InputError
+        If the folder holds a run already.
+    """
+    if (folder / RUN_FILE).exists():
+        raise InputError(
+            f"{folder} holds a run already. Resume it with --resume {folder}, or give another "
+            "--name."
+        )
+    source = Path(run.actuator)
+    found = {
+        "schema": RUN_SCHEMA,
+        "schema_version": RUN_VERSION,
+        "settings": plain(run),
+        "actuator_sha256": sha256(source) if source.is_file() else None,
+        "versions": versions("torch", "rsl-rl-lib"),
+    }
+    text = "# Settings of a training run, written by pupper-train.\n"
+    write_text(folder / RUN_FILE, text + yaml.safe_dump(found, sort_keys=False))
+
+
+def plain(value: Any) -> Any:
+    """Settings as dictionaries and lists."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {k: plain(v) for k, v in asdict(value).items()}
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(v) for v in value]
+    return value
