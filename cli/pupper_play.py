@@ -77,38 +77,41 @@ def _run(options: Play) -> None:
     import torch
 
     from policies.evaluation import evaluation_task
+    from sim.servo_ranges import servo_model_of
     from sim.walking_env import PupperEnv
 
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
     task, servos = simulator(policy, run, options.actuator, options.feedback)
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
-    env = PupperEnv(task, servos, 1, options.seed, 1)
+    model = servo_model_of(servos.source, task.control_step_s)
+    env = PupperEnv(task, servos, 1, options.seed, 1, model)
     env.set_command(np.array(options.command))
     screen = _Screen(env, options)
     observation, _ = env.observe()
     policy.reset(env.action)
     start = env.batch.bind("qpos")[0, :2].copy()
-    velocities, fell_at = [], None
+    velocities, ended, away = [], "", np.zeros(2)
     for step in range(round(options.seconds / task.control_step_s)):
         found = env.step(policy.act(observation))
         observation = found.observation
         if found.done[0]:
-            fell_at = step * task.control_step_s
+            what = "Left the ground's edge" if found.timed_out[0] else "Fell"
+            ended = f"{what} after {(step + 1) * task.control_step_s:.1f} s."
             break
+        away = env.batch.bind("qpos")[0, :2] - start
         facts = found.facts
         velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
         if not screen.show(task.control_step_s):
             break
     screen.close()
     moved = np.mean(velocities, axis=0) if velocities else np.zeros(3)
-    away = env.batch.bind("qpos")[0, :2] - start
-    if fell_at is not None:
-        out.print(f"Fell after {fell_at:.1f} s.")
+    if ended:
+        out.print(ended)
     out.print(
         "asked {:.2f} m/s forward, {:.2f} m/s left, {:.2f} rad/s; mean ".format(*options.command)
         + "{:.2f}, {:.2f}, {:.2f}".format(*moved)
-        + (f"; {np.hypot(*away):.2f} m from the start" if fell_at is None else "")
+        + f"; {np.linalg.norm(away):.2f} m from the start"
     )
 
 
@@ -156,7 +159,7 @@ class _Screen:
             self._writer = imageio.get_writer(
                 self._path, fps=_FRAMES_PER_S, codec="libx264", macro_block_size=None
             )
-        except ImportError as error:
+        except (ImportError, ValueError, RuntimeError) as error:  # no imageio, or no ffmpeg
             raise InputError(
                 "Writing video needs the package imageio: pip install 'pupper-sysid[video]'."
             ) from error

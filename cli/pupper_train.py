@@ -76,7 +76,7 @@ def _parse(given: list[str]) -> Options:
 def _choice(given: list[str], flag: str, kind: Any) -> Any:
     """Value of a flag, or its default: what is wrong with it, tyro will say."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument(flag)
+    parser.add_argument(flag, nargs="?")
     value = vars(parser.parse_known_args(given)[0]).popitem()[1]
     return value if value in get_args(kind) else get_args(kind)[0]
 
@@ -84,7 +84,7 @@ def _choice(given: list[str], flag: str, kind: Any) -> Any:
 def _run(options: Options) -> None:
     run = options.run
     if options.print_config:
-        out.print(yaml.safe_dump(plain(run), sort_keys=False), end="")
+        print(yaml.safe_dump(plain(run), sort_keys=False), end="")
         return
     if options.resume is None:
         check_actuator(run.actuator)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.policy_file import Policy
-from sim.servo_ranges import ServoRanges
+from sim.servo_ranges import ServoRanges, servo_model_of
 from sim.walking_config import Commands, Curriculum, Walking
 from sim.walking_env import PupperEnv
 
@@ -99,7 +99,8 @@ def walk(
     command : (float, float, float), optional
         Instead of random ones.
     """
-    env = PupperEnv(task, servos, episodes, seed, threads)
+    model = servo_model_of(servos.source, task.control_step_s)
+    env = PupperEnv(task, servos, episodes, seed, threads, model)
     if command is not None:
         env.set_command(np.array(command))
     observation, _ = env.observe()

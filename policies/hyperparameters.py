@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from common.errors import InputError
+
 Kind = Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
 KINDS: tuple[Kind, ...] = ("mlp", "lstm", "gru", "transformer", "mlp-actions")
 
@@ -28,6 +30,10 @@ class Architecture:
     """Units of the layers of the critic."""
     privileged_critic: bool = True
     """Whether the critic sees the truth beside the observation."""
+
+    def __post_init__(self):
+        if min(*self.hidden, *self.critic_hidden, self.memory, 1) < 1:
+            raise InputError("A layer of the architecture has no units; each needs at least 1.")
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,11 @@ class Hyperparameters:
     mixed_precision: bool = False
     """bfloat16 in the update; worth it where the processor has it (avx512_bf16, amx, GPUs)."""
 
+    def __post_init__(self):
+        for name in ("steps_per_environment", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise InputError(f"learner.{name} is {getattr(self, name)}; it must be at least 1.")
+
 
 @dataclass(frozen=True)
 class Imitation:
@@ -70,12 +81,6 @@ class Imitation:
 
     iterations: int = 40
     """How many rounds; 0 to start PPO from nothing."""
-    frequency_hz: float = 3.0
-    """Of the trot."""
-    lift_m: float = 0.012
-    """How high it lifts its feet."""
-    gain: float = 1.0
-    """Speed of its feet over the commanded speed, to make up for slip."""
     epochs: int = 6
     """Passes over the data of a round."""
     learning_rate: float = 1e-3

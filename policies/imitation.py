@@ -14,13 +14,12 @@ import torch
 
 from policies.hyperparameters import Imitation
 from policies.learner import Learner
-from sim.trot import Trot
 from sim.walking_env import PupperEnv
 
 
-def teacher_actions(env: PupperEnv, trot: Trot) -> np.ndarray:
+def teacher_actions(env: PupperEnv) -> np.ndarray:
     """What the trot would do next in every environment, shape (n, 12), in units of actions."""
-    scale = env.config.action_scale
+    trot, scale = env.trot, env.config.action_scale
     last = env.default + scale * env.action
     phase = trot.phase_of(last, env.command)
     phase = phase + 2 * np.pi * trot.frequency_hz * env.config.control_step_s
@@ -33,13 +32,12 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
     Early rounds let the teacher act in some environments, so that the policy sees a walk.
     """
     env, ppo = learner.env.env, learner.ppo
-    trot = Trot(how.frequency_hz, how.lift_m, how.gain)
     share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
     led = torch.from_numpy(env.rng.random(env.environments) < share)
     asked: list[torch.Tensor] = []
     with torch.inference_mode():
         for _ in range(learner.hyper.steps_per_environment):
-            teacher = torch.from_numpy(teacher_actions(env, trot).astype(np.float32))
+            teacher = torch.from_numpy(teacher_actions(env).astype(np.float32))
             asked.append(teacher)
             actions = ppo.act(learner.observations)
             noise = actions - ppo.actor.output_mean

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import os
 from dataclasses import dataclass
@@ -30,6 +31,10 @@ from policies.vec_env import WalkingVecEnv
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
 CHECKPOINT_VERSION = 1
+_PARTS = (
+    "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
+    "learning_rate", "iteration", "torch_rng", "hidden", "observations", "environment", "more",
+)  # fmt: skip
 
 
 class TerminalPPO(PPO):
@@ -76,6 +81,21 @@ class Ranks:
         """Where this process computes."""
         return f"cuda:{self.local_rank}" if torch.cuda.is_available() else "cpu"
 
+    def any(self, here: bool) -> bool:
+        """Whether it is so in any process: what all must decide alike, or they wait for ever."""
+        return bool(self._reduced(float(here), "MAX"))
+
+    def mean(self, here: float) -> float:
+        """Mean over the processes, the same in all."""
+        return self._reduced(here, "SUM") / self.size
+
+    def _reduced(self, here: float, operation: str) -> float:
+        if self.size == 1:
+            return here
+        found = torch.tensor(here, dtype=torch.float64, device=self.device)
+        torch.distributed.all_reduce(found, getattr(torch.distributed.ReduceOp, operation))
+        return float(found)
+
 
 class Learner:
     """An environment, a policy, a critic and PPO.
@@ -87,6 +107,11 @@ class Learner:
     hyper : Hyperparameters
     seed : int
     ranks : Ranks
+
+    Raises
+    ------
+    InputError
+        If a recurrent policy has fewer environments than minibatches.
     """
 
     def __init__(
@@ -104,6 +129,12 @@ class Learner:
         torch.manual_seed(seed)
         self.observations = env.get_observations()
         actor, critic = build(architecture, self.observations, hyper)
+        # a recurrent policy's minibatches are whole environments
+        if actor.is_recurrent and env.num_envs < hyper.minibatches:
+            raise InputError(
+                f"{env.num_envs} environments cannot be split into {hyper.minibatches} "
+                "minibatches. Give more --environments or fewer --learner.minibatches."
+            )
         storage = RolloutStorage(
             "rl", env.num_envs, hyper.steps_per_environment, self.observations,
             [env.num_actions], device,
@@ -151,6 +182,29 @@ class Learner:
 
     # ------------------------------------------------------------------------- checkpoints
 
+    def networks(self) -> dict[str, Any]:
+        """A copy of networks, optimiser and learning rate; `take_back` returns to it."""
+        return copy.deepcopy(self.ppo.save()) | {
+            "learning_rate": self.ppo.learning_rate, "iteration": self.iteration,
+        }  # fmt: skip
+
+    def take_back(self, networks: dict[str, Any]) -> None:
+        """Undo what was learned since `networks`; the environments stay where they are."""
+        self.ppo.load(networks, None, True)
+        self.ppo.learning_rate = networks["learning_rate"]
+        self.iteration = networks["iteration"]
+
+    @property
+    def finite(self) -> bool:
+        """Whether networks, observations and recurrent state are all numbers."""
+        hidden = self.actor.get_hidden_state()
+        states = hidden if isinstance(hidden, tuple) else (hidden,)
+        whole: list[Any] = [
+            *self.ppo.actor.state_dict().values(), *self.ppo.critic.state_dict().values(),
+            *self.observations.values(), *(s for s in states if s is not None),
+        ]  # fmt: skip
+        return all(bool(torch.isfinite(t).all()) for t in whole)
+
     def save(self, path: Path, more: dict[str, Any]) -> None:
         """Write a checkpoint in one atomic step; the one before survives if that fails.
 
@@ -195,20 +249,23 @@ class Learner:
                 f"{self.architecture.kind}. Resume without --policy, or start a new run."
             )
         try:
-            self.ppo.load(content, None, True)
+            self.take_back(content)
         except (RuntimeError, KeyError, ValueError) as error:
             raise InputError(
                 f"{path} does not fit this run's networks ({str(error).splitlines()[0]}). "
                 "Resume with the settings of the run."
             ) from error
-        self.ppo.learning_rate = content["learning_rate"]
-        self.iteration = content["iteration"]
-        self.env.restore(
-            {
-                k: v.numpy() if isinstance(v, torch.Tensor) else v
-                for k, v in content["environment"].items()
-            }
-        )
+        state = {
+            k: v.numpy() if isinstance(v, torch.Tensor) else v
+            for k, v in content["environment"].items()
+        }
+        differ = sorted(state.keys() ^ self.env.state.keys())
+        if differ:
+            raise InputError(
+                f"{path} does not fit this run's environments ({differ[0]}). Resume with the "
+                "settings of the run."
+            )
+        self.env.restore(state)
         hidden = content["hidden"]
         self.actor.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
         self.observations = TensorDict(content["observations"], batch_size=[self.env.num_envs]).to(
@@ -241,4 +298,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"{path} has schema version {content.get('schema_version')}; this version reads "
             f"{CHECKPOINT_VERSION}."
         )
+    missing = [part for part in _PARTS if part not in content]
+    if missing:
+        raise InputError(f"{path} has no {missing[0]}. Resume from another checkpoint of the run.")
     return content

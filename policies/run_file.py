@@ -7,9 +7,10 @@ kind of policy. `save_run` writes `run.yaml` into a run's folder, with hashes an
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -86,7 +87,7 @@ def load_run(folder: Path) -> Run:
         raise InputError(f"{folder} holds no run: there is no {RUN_FILE} in it.")
     try:
         found = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is not readable YAML.") from error
     if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
@@ -99,27 +100,40 @@ def load_run(folder: Path) -> Run:
 
 
 def _from_dict(kind: type, given: Any, where: str) -> Any:
-    """A frozen dataclass from plain data, its types checked by its own defaults."""
+    """A frozen dataclass from plain data, checked against its own types."""
     if not isinstance(given, dict):
         raise InputError(f"{where}: expected settings by name.")
-    default = kind()
-    known = asdict(default)
-    unknown = set(given) - set(known)
+    default, types = kind(), get_type_hints(kind)
+    unknown = [name for name in given if name not in types]
     if unknown:
-        raise InputError(f"{where}: unknown setting {sorted(unknown)[0]}.")
+        raise InputError(f"{where}: unknown setting {unknown[0]}.")
     values = {}
     for name, value in given.items():
-        now = getattr(default, name)
-        if hasattr(now, "__dataclass_fields__"):
-            value = _from_dict(type(now), value, f"{where}, {name}")
-        elif isinstance(now, tuple) and isinstance(value, list):
-            value = tuple(value)
-        elif isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        elif type(value) is not type(now):
-            raise InputError(f"{where}: {name} is {value!r}; a {type(now).__name__} was expected.")
-        values[name] = value
+        if is_dataclass(types[name]):
+            values[name] = _from_dict(type(getattr(default, name)), value, f"{where}, {name}")
+        else:
+            values[name] = _value(types[name], value, f"{where}: {name}")
     return replace(default, **values)
+
+
+def _value(kind: Any, given: Any, where: str) -> Any:
+    """A setting that is no dataclass: a number, a word, a list of them."""
+    if get_origin(kind) is tuple and isinstance(given, list):
+        kinds = get_args(kind)
+        if kinds[-1] is Ellipsis:
+            kinds = kinds[:1] * len(given)
+        if len(kinds) == len(given):
+            return tuple(_value(k, g, where) for k, g in zip(kinds, given, strict=True))
+    elif get_origin(kind) is Literal:
+        if given in get_args(kind):
+            return given
+        raise InputError(f"{where} is {given!r}; expected one of {', '.join(get_args(kind))}.")
+    elif kind is float and type(given) in (int, float) and math.isfinite(given):
+        return float(given)
+    elif type(given) is kind and kind is not float:
+        return given
+    wanted = {float: "a number", int: "a whole number", str: "a word", bool: "true or false"}
+    raise InputError(f"{where} is {given!r}; expected {wanted.get(kind, 'a list of numbers')}.")
 
 
 def save_run(folder: Path, run: Run) -> None:

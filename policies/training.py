@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from common.errors import PupperError
+from common.errors import InputError, PupperError
+from common.files import write_text
+from common.memory import keep_freed_memory
 from policies.imitation import imitate
 from policies.learner import Learner, Ranks
 from policies.policy_export import write_policy
@@ -64,6 +66,7 @@ def threads_of(run: Run, ranks: Ranks) -> int:
 def make_learner(run: Run, ranks: Ranks) -> Learner:
     """Environment, policy, critic and PPO of a run."""
     torch.set_num_threads(threads_of(run, ranks))
+    keep_freed_memory()
     env = make_env(run, ranks)
     return Learner(
         WalkingVecEnv(env, action_history(run, env.servos), ranks.device), run.architecture,
@@ -99,7 +102,7 @@ def train(
     InputError
         If the folder is in use, or holds no run to resume.
     PupperError
-        If the numbers stop being numbers; the state before is saved.
+        If the numbers stop being numbers; the networks before are saved.
     """
     ranks = Ranks.join()
     resumed = run is None
@@ -111,7 +114,8 @@ def train(
         counters = learner.load(folder / _rank_file(LAST, ranks))
     elif ranks.rank == 0:
         save_run(folder, run)
-    writer = _Writer(folder) if ranks.rank == 0 else None
+    done_before = {"imitation": counters["imitated"], "ppo": learner.iteration}
+    writer = _Writer(folder, done_before) if ranks.rank == 0 else None
     started = time.monotonic() - counters["elapsed_s"]
     episodes = _Episodes(learner.env.num_envs)
 
@@ -133,12 +137,10 @@ def train(
             )  # fmt: skip
 
     samples_per_update = learner.hyper.steps_per_environment * learner.env.num_envs * ranks.size
-    begun_here = (learner.iteration, counters["imitated"])
 
-    def left(phase: str, done: int, total: int) -> float:
-        first = begun_here[0] if phase == "ppo" else begun_here[1]
-        steps = max(done - first, 1)
-        at_this_pace = (total - done) * (time.monotonic() - phase_began[phase]) / steps
+    def left(phase: str, now: int, total: int) -> float:
+        steps = max(now - done_before[phase], 1)
+        at_this_pace = (total - now) * (time.monotonic() - phase_began[phase]) / steps
         until_time_is_up = 60 * run.minutes - counters["elapsed_s"]
         return max(min(at_this_pace, until_time_is_up) if phase == "ppo" else at_this_pace, 0.0)
 
@@ -153,29 +155,54 @@ def train(
             remaining = left(phase, done, total)
             watch(Progress(phase, done, total, counters["elapsed_s"], row, remaining))
 
-    with _interruptible() as asked_to_stop:
+    def refuse_nan(before: dict[str, Any], numbers: Iterable[float]) -> None:
+        fine = all(np.isfinite(x) for x in numbers) and learner.finite
+        if not ranks.any(not fine):
+            return
+        learner.take_back(before)
+        if ranks.any(not learner.finite):
+            raise PupperError(
+                f"The simulation gave observations that are not numbers after update "
+                f"{learner.iteration}. Nothing was saved; {folder / LAST} is what it was before."
+            )
+        # a resumed run then collects other data with the networks from before
+        save(LAST)
+        raise PupperError(
+            f"The policy's numbers stopped being numbers after update {learner.iteration}. The "
+            f"networks before that are in {folder / LAST}: pupper-train --resume {folder} goes on "
+            "from them; if it happens again, start a run with a lower --learner.learning-rate."
+        )
+
+    with _interruptible() as asked:
+
+        def asked_to_stop() -> bool:
+            return ranks.any(asked())
+
         phase_began["imitation"] = time.monotonic()
         while counters["imitated"] < run.imitation.iterations and not asked_to_stop():
+            before = learner.networks()
             error = imitate(learner, run.imitation, counters["imitated"])
+            refuse_nan(before, [error])
             counters["imitated"] += 1
             if counters["imitated"] == run.imitation.iterations:
                 _fresh_optimiser(learner)
             report(
                 "imitation", counters["imitated"], run.imitation.iterations, {"difference": error}
             )
+            if counters["imitated"] % 10 == 0:
+                save(LAST)
         phase_began["ppo"] = time.monotonic()
         if counters["imitated"] >= run.imitation.iterations:
-            while (
-                learner.iteration < run.iterations
-                and time.monotonic() - started < 60 * run.minutes
-                and not asked_to_stop()
+            while learner.iteration < run.iterations and not ranks.any(
+                asked() or time.monotonic() - started >= 60 * run.minutes
             ):
                 begun = time.perf_counter()
                 learner.rollout(episodes)
                 collected = time.perf_counter()
+                before = learner.networks()
                 losses = learner.update()
                 ended = time.perf_counter()
-                _refuse_nan(learner, losses, folder, ranks)
+                refuse_nan(before, losses.values())
                 row = episodes.row() | {
                     "value_loss": losses["value"],
                     "entropy": losses["entropy"],
@@ -186,19 +213,18 @@ def train(
                     "collect_s": collected - begun,
                     "update_s": ended - collected,
                 }  # fmt: skip
-                before = counters["smooth"]
-                reward = row["reward"]
+                smooth, reward = counters["smooth"], ranks.mean(row["reward"])
                 counters["smooth"] = (
-                    reward if before is None else before + _SMOOTHED * (reward - before)
+                    reward if smooth is None else smooth + _SMOOTHED * (reward - smooth)
                 )
                 report("ppo", learner.iteration, run.iterations, row)
                 if learner.iteration % 10 == 0:
-                    save(LAST)
-                best = counters["best"]
-                if learner.iteration % 10 == 0 and (best is None or counters["smooth"] > best):
-                    counters["best"] = counters["smooth"]
-                    save(BEST)
-                    write("policy_best")
+                    best = counters["best"]
+                    if best is None or counters["smooth"] > best:
+                        counters["best"] = counters["smooth"]
+                        save(BEST)
+                        write("policy_best")
+                    save(LAST)  # after that, or a resumed run would not know its best
         save(LAST)
     write("policy_last")
     if writer:
@@ -218,17 +244,6 @@ def _fresh_optimiser(learner: Learner) -> None:
         [*ppo.actor.parameters(), *ppo.critic.parameters()], lr=learner.hyper.learning_rate
     )
     ppo.learning_rate = learner.hyper.learning_rate
-
-
-def _refuse_nan(learner: Learner, losses: dict, folder: Path, ranks: Ranks) -> None:
-    finite = all(np.isfinite(v) for v in losses.values())
-    if finite and all(torch.isfinite(p).all() for p in learner.actor.parameters()):
-        return
-    raise PupperError(
-        f"The policy's numbers stopped being numbers in update {learner.iteration}. The last good "
-        f"checkpoint is {folder / _rank_file(LAST, ranks)}: resume it with another --seed or a "
-        "lower --learner.learning-rate."
-    )
 
 
 @contextmanager
@@ -284,26 +299,54 @@ class _Episodes:
 
 
 class _Writer:
-    """`progress.csv` and TensorBoard, appended to."""
+    """`progress.csv`, `imitation.csv` and TensorBoard, appended to.
 
-    def __init__(self, folder: Path):
+    Rows beyond `done` (by phase) are from after the checkpoint that is resumed, and are dropped.
+    """
+
+    def __init__(self, folder: Path, done: dict[str, int]):
         from torch.utils.tensorboard import SummaryWriter
 
-        self._path = folder / PROGRESS
-        self._board = SummaryWriter(str(folder / "tensorboard"))
+        self._paths = {"ppo": folder / PROGRESS, "imitation": folder / "imitation.csv"}
+        for phase, path in self._paths.items():
+            with _writing(path):
+                _drop_rows(path, done[phase])
+        with _writing(folder / "tensorboard"):
+            self._board = SummaryWriter(str(folder / "tensorboard"))
 
     def write(self, phase: str, step: int, row: dict[str, float]) -> None:
         """One row."""
-        path = self._path if phase == "ppo" else self._path.with_name("imitation.csv")
-        new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.writer(file)
-            if new:
-                writer.writerow(["update", *row])
-            writer.writerow([step, *(f"{v:.6g}" for v in row.values())])
-        for name, value in row.items():
-            self._board.add_scalar(f"{phase}/{name}", value, step)
+        path = self._paths[phase]
+        with _writing(path):
+            new = not path.exists()
+            with path.open("a", newline="") as file:
+                writer = csv.writer(file)
+                if new:
+                    writer.writerow(["update", *row])
+                writer.writerow([step, *(f"{v:.6g}" for v in row.values())])
+            for name, value in row.items():
+                self._board.add_scalar(f"{phase}/{name}", value, step)
 
     def close(self) -> None:
         """Finish writing."""
         self._board.close()
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """A full disk, or a folder that may not be written, is said in a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def _drop_rows(path: Path, last: int) -> None:
+    """Keep a table's header and its rows up to update `last`."""
+    if not path.exists():
+        return
+    with path.open(newline="") as file:
+        header, *rows = file.readlines() or [""]
+    kept = [r for r in rows if r.split(",")[0].isdigit() and int(r.split(",")[0]) <= last]
+    if kept != rows:
+        write_text(path, "".join([header, *kept]), force=True)

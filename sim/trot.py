@@ -24,20 +24,14 @@ _PAIR = np.array([1.0, -1.0, -1.0, 1.0])  # LF, RF, LB, RB: +1 moves with LF
 
 @dataclass(frozen=True)
 class Trot:
-    """A trot.
+    """A trot. Feet leave the ground for half of each cycle."""
 
-    Attributes
-    ----------
-    frequency_hz : float
-    lift_m : float
-        Height of a swinging foot.
-    gain : float
-        Commanded speed over the speed of the feet; above 1 makes up for slip.
-    """
-
-    frequency_hz: float = 2.5
-    lift_m: float = 0.020
+    frequency_hz: float = 3.5
+    """Strides per second."""
+    lift_m: float = 0.010
+    """Height of a swinging foot."""
     gain: float = 1.0
+    """Speed of the feet over the commanded speed; above 1 makes up for slip."""
 
     def joints(
         self, phase: NDArray[np.float64], command: NDArray[np.float64]

@@ -12,6 +12,7 @@ from typing import Literal
 from common.errors import InputError
 from sim.mini_pupper import Knee
 from sim.terrain import Terrain
+from sim.trot import Trot
 from sim.walking_rewards import DEFAULT, PAPER, RELEASE, Rewards
 
 
@@ -114,6 +115,8 @@ class Walking:
     randomisation: Randomisation = field(default_factory=Randomisation)
     curriculum: Curriculum = field(default_factory=Curriculum)
     rewards: Rewards = DEFAULT
+    trot: Trot = field(default_factory=Trot)
+    """The reference: episodes may start in its poses, and imitation learns to continue it."""
 
     def __post_init__(self):
         ratio = self.control_step_s / max(self.physics_step_s, 1e-9)

@@ -36,7 +36,6 @@ from sim.mini_pupper import (
 from sim.servo_mjcf import mujoco
 from sim.servo_ranges import ServoRanges
 from sim.terrain import make_ground
-from sim.trot import Trot
 from sim.walking_config import Walking
 
 Array = NDArray[np.float64]
@@ -163,7 +162,7 @@ class PupperEnv:
 
         self.batch = Batch(self.model, environments, threads)
         self.default, (self._low, self._high) = default_pose(), limits()
-        self.trot = Trot()
+        self.trot = config.trot
         n = environments
         self._fields = {
             name: self.batch.expand(name)
@@ -371,8 +370,10 @@ class PupperEnv:
             self.command.copy(), velocity, qvel[:, 3:6].copy(), self._gravity(),
             qpos[:, 7:] - self.default, qvel[:, 6:].copy(),
             (qvel[:, 6:] - velocity_before) / self.config.control_step_s, torque,
-            self.action.copy(), self.last_action.copy(), self.earlier_action.copy(), contact, self._air.copy(),
-            self._contact.copy(), self._last_air.copy(), self._last_contact.copy(), height, speed, self._average.copy(),
+            self.action.copy(), self.last_action.copy(), self.earlier_action.copy(), contact,
+            self._air.copy(), self._contact.copy(), self._last_air.copy(),
+            self._last_contact.copy(), height, speed,
+            self._average.copy(),
         )  # fmt: skip
 
     def _broken(self) -> NDArray[np.bool_]:
@@ -407,6 +408,7 @@ class PupperEnv:
     def _restart(self, ids: NDArray[np.intp]) -> None:
         self._draw_robots(ids)
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._warnings[ids] = self.batch.warning[ids]  # a reset clears them
         self._draw_commands(ids)
         start = self._draw_pose(ids)
         told = self._to_servo(start)

@@ -81,7 +81,7 @@ class Rewards:
 
     base_linear_velocity: float = 2.0
     """Follow the commanded speed at every instant."""
-    base_angular_velocity: float = 2.0
+    base_angular_velocity: float = 3.0
     """Follow the commanded turn rate at every instant."""
     stride_linear_velocity: float = 2.0
     """Follow the commanded speed on average over about a stride."""
@@ -95,7 +95,7 @@ class Rewards:
     """`gaussian`: exp(-error²/σ²); `exponential`: exp(-error/σ), as published."""
     linear_sigma: float = 0.1
     """σ of the speed error [m/s]."""
-    angular_sigma: float = 0.4
+    angular_sigma: float = 0.3
     """σ of the turn rate's error [rad/s]."""
     fast_bonus: float = 0.0
     """Published: the speed term grows by this per m/s above `fast_above`."""
@@ -109,6 +109,8 @@ class Rewards:
     """Longest swing that `air_time` pays for [s]."""
     gait: float = 0.5
     """Diagonal feet together, the two pairs in turn (a trot)."""
+    gait_threshold: float = 0.1
+    """Like `moving_threshold`, for the gait [m/s]."""
     gait_sigma: float = 0.05
     """Its width [s²]."""
     gait_most: float = 0.15
@@ -168,7 +170,7 @@ RELEASE = Rewards(
 )  # fmt: skip
 """Weights of the authors' released training configuration."""
 
-PAPER = replace(RELEASE, action_smoothness=-1.0, joint_position=-0.7, hip_abduction=0.0)
+PAPER = replace(RELEASE, action_smoothness=-1.0, joint_position=-0.7)
 """Weights that the paper's text names; the rest as released."""
 
 
@@ -223,7 +225,7 @@ def gait(s: Step, p: Rewards) -> Array:
         gap = np.minimum((s.air_s[:, a] - s.contact_s[:, b]) ** 2, most)
         gap = gap + np.minimum((s.contact_s[:, a] - s.air_s[:, b]) ** 2, most)
         product = product * np.exp(-gap / p.gait_sigma)
-    return np.where(s.moving(p.moving_threshold), product, 0.0)
+    return np.where(s.moving(p.gait_threshold), product, 0.0)
 
 
 def foot_clearance(s: Step, p: Rewards) -> Array:
@@ -257,7 +259,7 @@ def action_jerk(s: Step, p: Rewards) -> Array:
 def air_time_variance(s: Step, p: Rewards) -> Array:
     """Variance over feet of their last swings and stances, up to half a second [s²]."""
     swings, stances = np.minimum(s.last_air_s, 0.5), np.minimum(s.last_contact_s, 0.5)
-    return swings.var(axis=1) + stances.var(axis=1)
+    return swings.var(axis=1, ddof=1) + stances.var(axis=1, ddof=1)
 
 
 def base_motion(s: Step, p: Rewards) -> Array:

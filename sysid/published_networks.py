@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from common.errors import InputError
 from common.joints import DEFAULT_POSE
+from common.memory import keep_freed_memory
 from servo_models.command_network import CommandNetwork
 from servo_models.recurrent_network import RecurrentNetwork
 from sysid.servo_data import ServoData
@@ -46,6 +47,7 @@ def fit_published(
         If the joints were not recorded together for the LSTM, or trials are too short.
     """
     torch.set_num_threads(1)
+    keep_freed_memory()
     generator = torch.Generator().manual_seed(seed)
     trials = [_trials(data, joint, part) for joint in data.joints]
     joints = len(trials)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from common.memory import keep_freed_memory
 from sysid.linear_fir import LinearFits, fading, learns_from
 from sysid.servo_samples import WINDOW, Samples
 
@@ -109,6 +110,7 @@ def train(
         Whether it was interrupted.
     """
     torch.set_num_threads(1)
+    keep_freed_memory()
     generator = torch.Generator().manual_seed(seed)
     batches = np.random.default_rng(seed)
     shape = (len(data.command), len(sets), len(recipe.decays), recipe.members)

@@ -1,0 +1,69 @@
+"""The robot without gravity, ground and weight: where each of its servos should move as fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from common.joints import JOINT_NAMES
+from servo_models import DelayedPD, DelayedPDParameters
+from sim.mini_pupper import default_pose
+from sim.servo_mjcf import mujoco
+
+
+def standing(model: Any) -> Any:
+    """The default pose, at rest, commanded there for long."""
+    data = mujoco.MjData(model)
+    data.qpos[7:] = default_pose()
+    told = default_pose()
+    if model.ntendon:
+        told[2::3] += told[1::3]
+    data.ctrl[:] = data.act[:] = told
+    for i in range(model.nu):
+        samples = model.actuator_history[i][0]
+        mujoco.mj_initCtrlHistory(model, data, i, None, np.full((samples, 1), told[i]))
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def in_free_space(model: Any, data: Any) -> None:
+    """No gravity, no ground, and a trunk that nothing moves."""
+    model.opt.gravity[:] = 0
+    trunk = model.body("trunk").id
+    model.body_mass[trunk] = model.body_inertia[trunk] = 1e6
+    data.qpos[2] = 1.0
+
+
+def error_in_air(
+    model: Any, servos: Sequence[DelayedPDParameters], exactly_solved: bool = True
+) -> np.ndarray:
+    """Largest difference [rad] of each servo from `DelayedPD` while all swing weightless links."""
+    step = model.opt.timestep
+    for name in JOINT_NAMES:
+        body = model.body(name).id
+        model.body_mass[body], model.body_inertia[body] = 1e-9, 1e-15
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    if exactly_solved:
+        model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 100, 1e-15
+    data = standing(model)
+    in_free_space(model, data)
+    start = data.ctrl.copy()
+    swing = np.sin(2 * np.pi * 2.5 * np.arange(300) * step)[:, None]
+    commands = start + 0.2 * swing * np.linspace(0.6, 1, 12)
+    found = []
+    for command in commands:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        found.append(data.qpos[7:].copy())
+    angles = np.array(found)
+    if model.ntendon:
+        angles[:, 2::3] += angles[:, 1::3]
+    expected = np.empty_like(angles)
+    for i, servo in enumerate(servos):
+        alone = DelayedPD(servo, step)
+        alone.reset(start[i])
+        expected[:, i] = alone.rollout(commands[:, i])
+    assert np.ptp(expected, axis=0).min() > 0.1, "servos must move for this to be a comparison"
+    return np.abs(angles - expected).max(axis=0)

@@ -1,0 +1,308 @@
+"""pupper-train, pupper-play and pupper-eval as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from tiny_training import CALIBRATION
+
+import cli.pupper_eval
+import cli.pupper_play
+import cli.pupper_train
+from policies.learner import read_checkpoint
+from policies.run_file import load_run, plain, preset
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = (
+    "--actuator", CALIBRATION, "--environments", "4", "--threads", "1", "--iterations", "2",
+    "--imitation.iterations", "2", "--imitation.epochs", "1", "--task.episode-s", "0.5",
+    "--learner.steps-per-environment", "6", "--learner.minibatches", "2", "--learner.epochs", "1",
+    "--architecture.hidden", "16", "--architecture.critic-hidden", "16",
+)  # fmt: skip
+
+
+def run(capsys, module, *arguments) -> tuple[int, str, str]:
+    """Exit code, stdout, and stderr on one line."""
+    try:
+        module.main([str(a) for a in arguments])
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    said = capsys.readouterr()
+    return code, said.out, " ".join(said.err.split())
+
+
+def refused(capsys, module, *arguments) -> str:
+    """What is said to input that cannot be used: no traceback, no blame on the program."""
+    code, out, err = run(capsys, module, *arguments)
+    assert code == 2, err
+    assert out == "" and "Traceback" not in err and "defect" not in err
+    return err
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder in which `pupper-train --name tiny` ran to its end."""
+    folder = tmp_path_factory.mktemp("work")
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        cli.pupper_train.main([*TINY, "--name", "tiny"])
+    finally:
+        os.chdir(before)
+    return folder / "runs" / "tiny"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# ------------------------------------------------------------------------------ pupper-train
+
+
+def test_training_leaves_a_run_with_settings_curves_checkpoint_and_policy(trained):
+    assert {p.name for p in trained.iterdir()} >= {
+        "run.yaml", "progress.csv", "imitation.csv", "tensorboard", "last.pt", "policy_last",
+    }  # fmt: skip
+    settings = load_run(trained)
+    assert settings.environments == 4 and settings.architecture.hidden == (16,)
+    assert settings.actuator == CALIBRATION
+    found = read_checkpoint(trained / "last.pt")
+    assert found["iteration"] == 2 and found["more"]["imitated"] == 2
+
+
+@pytest.mark.parametrize("name", ["fast", "paper", "release"])
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_all_settings_can_be_printed_and_are_those_of_the_preset(capsys, name, kind):
+    arguments = ("--print-config", "--preset", name, f"--policy={kind}", "--seed", "7")
+    code, out, err = run(capsys, cli.pupper_train, *arguments)
+    assert (code, err) == (0, "")
+    assert yaml.safe_load(out) == plain(preset(name, kind)) | {"seed": 7}
+
+
+def test_printed_settings_are_not_wrapped_or_coloured(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    name = "a/very/long/path/[red]with/brackets/" * 4 + "calibrated.yaml"
+    _, out, _ = run(capsys, cli.pupper_train, "--print-config", "--actuator", name)
+    assert yaml.safe_load(out)["actuator"] == name
+
+
+def test_a_calibration_that_is_not_there_is_refused_before_anything_is_made(capsys, here):
+    said = refused(capsys, cli.pupper_train, "--actuator", "missing.yaml")
+    assert "missing.yaml: there is no such file" in said and "pupper-sysid calibrate" in said
+    assert not list(here.iterdir())
+
+
+def test_a_calibration_with_an_unknown_joint_is_refused_by_name(capsys, here):
+    text = Path(CALIBRATION).read_text().replace("LF_hip:", "LF_wing:")
+    (here / "wing.yaml").write_text(text)
+    said = refused(capsys, cli.pupper_train, "--actuator", "wing.yaml", "--environments", "2")
+    assert "wing.yaml" in said and "LF_wing" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--policy", "perceptron"), "perceptron"), (("--policy=perceptron",), "perceptron"),
+        (("--policy",), "policy"), (("--preset", "quick"), "quick"),
+        (("--environment-count", "3"), "--environment-count"), (("--environments", "x"), "x"),
+    ],
+)  # fmt: skip
+def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here, arguments, word):
+    assert word in refused(capsys, cli.pupper_train, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--environments", "0"), "at least 1 is needed"),
+        (("--learner.minibatches", "0"), "minibatches is 0"),
+        (("--architecture.hidden", "0"), "at least 1"),
+        (("--task.control-step-s", "0.003"), "whole multiple"),
+        (("--policy", "lstm", "--environments", "1"), "1 environments cannot be split"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(capsys, here, arguments, words):
+    assert words in refused(capsys, cli.pupper_train, *TINY, *arguments)
+
+
+def test_a_run_is_not_begun_in_the_folder_of_another(capsys, trained, monkeypatch):
+    monkeypatch.chdir(trained.parents[1])
+    before = (trained / "last.pt").read_bytes()
+    said = refused(capsys, cli.pupper_train, *TINY, "--name", "tiny")
+    assert "holds a run already" in said and "--resume" in said
+    assert (trained / "last.pt").read_bytes() == before
+
+
+def test_an_empty_folder_or_none_cannot_be_resumed(capsys, here):
+    (here / "empty").mkdir()
+    said = refused(capsys, cli.pupper_train, "--resume", "empty")
+    assert "empty holds no run: there is no run.yaml in it" in said
+    assert "does not exist" in refused(capsys, cli.pupper_train, "--resume", "nowhere")
+
+
+def test_a_finished_run_can_be_resumed_and_stays_as_it_is(capsys, trained):
+    code, _, err = run(capsys, cli.pupper_train, "--resume", trained)
+    assert code == 0 and f"Going on with {trained}".replace(" ", "") in err.replace(" ", "")
+    assert read_checkpoint(trained / "last.pt")["iteration"] == 2
+
+
+def test_ctrl_c_saves_and_ends_well(tmp_path):
+    """A real process, a real signal: exit 0, a checkpoint, and the way to go on."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cli.pupper_train", *TINY, "--iterations", "100000",
+         "--name", "stopped"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        said = []
+        for line in process.stderr:
+            said.append(line)
+            if "PPO 1/" in line:
+                break
+        process.send_signal(signal.SIGINT)
+        _, rest = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    whole = "".join(said) + rest
+    assert process.returncode == 0 and "Traceback" not in whole, whole
+    assert "pupper-train --resume" in " ".join(whole.split())
+    folder = tmp_path / "runs" / "stopped"
+    assert 1 <= read_checkpoint(folder / "last.pt")["iteration"] < 100000
+    assert (folder / "policy_last" / "contract.json").is_file()
+
+
+# ------------------------------------------------------------------------------ pupper-eval
+
+
+def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
+    code, out, _ = run(
+        capsys, cli.pupper_eval, trained, "--json", "--episodes", "5", "--threads", "1",
+        "--terrain", "flat", "--extra-delay-ms", "0", "20",
+    )  # fmt: skip
+    assert code == 0
+    found = json.loads(out)
+    errors = {"fall_rate", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s"}
+    assert found.keys() >= errors | {"episodes", "actuator", "feedback", "by_command"}
+    assert found["episodes"] == 5
+    assert found["actuator"] == CALIBRATION and found["feedback"] == "held"
+    for row in found["by_command"]:
+        assert row.keys() >= errors | {"command"} and len(row["command"]) == 3
+    for row in (found, *found["by_command"]):
+        assert 0 <= row["fall_rate"] <= 1 and row["mae_vx_m_s"] > 0
+    assert [r["extra_delay_ms"] for r in found["by_extra_delay"]] == [0, 20]
+    assert [r["terrain"] for r in found["by_terrain"]] == ["flat"]
+    # the row without extra delay on flat ground is the same walk as that ground's
+    late, ground = found["by_extra_delay"][0], found["by_terrain"][0]
+    assert late["mae_vx_m_s"] == ground["mae_vx_m_s"] != found["by_extra_delay"][1]["mae_vx_m_s"]
+
+
+def test_an_evaluation_elsewhere_says_where(capsys, trained):
+    code, out, _ = run(
+        capsys, cli.pupper_eval, trained / "policy_last", "--json", "--episodes", "1",
+        "--actuator", "ideal", "--feedback", "ideal", "--terrain", "flat", "--extra-delay-ms", "0",
+        "--threads", "1",
+    )  # fmt: skip
+    found = json.loads(out)
+    assert code == 0 and (found["actuator"], found["feedback"]) == ("ideal", "ideal")
+
+
+def test_an_evaluation_is_a_table_with_every_direction(capsys, trained, monkeypatch):
+    code, out, _ = run(
+        capsys, cli.pupper_eval, trained, "--episodes", "1", "--terrain", "flat",
+        "--extra-delay-ms", "0", "--threads", "1",
+    )  # fmt: skip
+    assert code == 0
+    for name in ("random commands", "a robot that stands", "forward", "turn right", "ground: flat"):
+        assert name in out
+
+
+def test_no_episodes_are_refused(capsys, trained):
+    said = refused(capsys, cli.pupper_eval, trained, "--episodes", "0")
+    assert "--episodes is 0; it must be at least 1" in said
+
+
+@pytest.mark.parametrize("module", [cli.pupper_eval, cli.pupper_play])
+def test_a_folder_without_a_policy_is_refused(capsys, here, module):
+    assert "neither a run nor a policy" in refused(capsys, module, here)
+    (here / "run.yaml").write_text("")
+    assert "has no policy yet" in refused(capsys, module, here)
+
+
+@pytest.mark.parametrize("module", [cli.pupper_eval, cli.pupper_play])
+def test_an_actuator_that_is_not_there_is_refused(capsys, trained, module):
+    assert "no such file" in refused(capsys, module, trained, "--actuator", "missing.yaml")
+
+
+# ------------------------------------------------------------------------------ pupper-play
+
+
+def test_a_walk_is_told_in_numbers(capsys, trained):
+    arguments = ("--seconds", "0.2", "--command", "0.1", "0", "0.3")
+    code, out, _ = run(capsys, cli.pupper_play, trained, *arguments)
+    assert code == 0
+    assert "asked 0.10 m/s forward, 0.00 m/s left, 0.30 rad/s" in " ".join(out.split())
+
+
+def test_a_fall_is_told_with_its_time(capsys, trained, monkeypatch):
+    """Folding all legs, the trunk falls 9 cm: within 0.5 s, not at once."""
+    import numpy as np
+
+    from policies.policy_file import Policy
+
+    monkeypatch.setattr(Policy, "act", lambda *_: np.array([[0.0, 4.0, -4.0] * 4]))
+    code, out, _ = run(capsys, cli.pupper_play, trained, "--seconds", "2")
+    assert code == 0
+    time = float(out.split("Fell after ")[1].split(" s.")[0])
+    assert 0.02 < time < 0.6
+
+
+def test_where_nothing_can_be_drawn_the_walk_goes_on_without_a_video(
+    capsys, trained, here, monkeypatch
+):
+    import mujoco
+
+    def no_gl(*_, **__):
+        raise RuntimeError("no EGL display")
+
+    monkeypatch.setattr(mujoco, "Renderer", no_gl)
+    arguments = ("--seconds", "0.2", "--video", here / "walk.mp4")
+    code, out, err = run(capsys, cli.pupper_play, trained, *arguments)
+    assert code == 0 and "asked 0.15 m/s" in out
+    assert "No frames can be drawn here (RuntimeError: no EGL display)" in err
+    assert not (here / "walk.mp4").exists()
+
+
+def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):
+    import mujoco.viewer
+
+    def no_display(*_, **__):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", no_display)
+    said = refused(capsys, cli.pupper_play, trained, "--viewer")
+    assert "No window could be opened (no display)" in said and "--video" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--seconds", "0"), "--seconds is 0.0; it must be a positive number"),
+        (("--seconds", "nan"), "must be a positive number"),
+        (("--video", "walk.gif"), "ends in .mp4"),
+        (("--video", "there.mp4"), "exists already"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(capsys, trained, here, arguments, words):
+    (here / "there.mp4").write_text("kept")
+    assert words in refused(capsys, cli.pupper_play, trained, *arguments)
+    assert (here / "there.mp4").read_text() == "kept"
