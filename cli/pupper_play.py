@@ -90,7 +90,7 @@ def _run(options: Play) -> None:
     screen = _Screen(env, options)
     observation, _ = env.observe()
     policy.reset(env.action)
-    start = env.batch.bind("qpos")[0, :2].copy()
+    start = env.robots.qpos[0, :2].copy()
     velocities, ended, away = [], "", np.zeros(2)
     for step in range(round(options.seconds / task.control_step_s)):
         found = env.step(policy.act(observation))
@@ -99,7 +99,7 @@ def _run(options: Play) -> None:
             what = "Left the ground's edge" if found.timed_out[0] else "Fell"
             ended = f"{what} after {(step + 1) * task.control_step_s:.1f} s."
             break
-        away = env.batch.bind("qpos")[0, :2] - start
+        away = env.robots.qpos[0, :2] - start
         facts = found.facts
         velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
         if not screen.show(task.control_step_s):
@@ -124,7 +124,7 @@ class _Screen:
         self._renderer: Any = None
         self._writer: Any = None
         self._viewer: Any = None
-        self._model = env.batch.get_model(0)
+        self._model = env.robots.batch.get_model(0)
         self._data: Any = None
         if options.viewer:
             self._open_viewer()
@@ -134,7 +134,7 @@ class _Screen:
     def _open_viewer(self) -> None:
         try:
             viewer = importlib.import_module("mujoco.viewer")
-            self._data = self._env.batch.get_data(0)
+            self._data = self._env.robots.batch.get_data(0)
             self._viewer = viewer.launch_passive(self._model, self._data)
         except Exception as error:  # whatever the window system raises
             raise InputError(
@@ -168,7 +168,7 @@ class _Screen:
         """One more picture; False when the window was closed."""
         if self._viewer is None and self._writer is None:
             return True
-        self._data = self._env.batch.get_data(0, self._data)
+        self._data = self._env.robots.batch.get_data(0, self._data)
         mujoco: Any = importlib.import_module("mujoco")
         mujoco.mj_forward(self._model, self._data)
         if self._writer is not None:

@@ -45,12 +45,12 @@ def environment_rates(env: PupperEnv) -> tuple[float, float]:
         begun = time.perf_counter()
         for action in actions:
             env.step(action)
-            controls.append(env.batch.bind("ctrl").copy())
+            controls.append(env.robots.batch.bind("ctrl").copy())
         own.append(n * _STEPS / (time.perf_counter() - begun))
         begun = time.perf_counter()
         for control in controls:
-            env.batch.bind("ctrl")[:] = control
-            env.batch.step(nstep=substeps)
+            env.robots.batch.bind("ctrl")[:] = control
+            env.robots.batch.step(nstep=substeps)
         bare.append(n * _STEPS / (time.perf_counter() - begun))
     return max(bare), max(own)
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from robot_in_air import error_in_air
 
-import sim.walking_env
+import sim.robot_batch
 from common.errors import InputError
 from common.joints import JOINT_NAMES
 from servo_models import DelayedPDParameters
 from sim.mini_pupper import STANDING_HEIGHT_M, default_pose, limits, robot_xml
 from sim.servo_mjcf import mujoco
 from sim.servo_ranges import ServoRanges, servo_ranges
+from sim.trot import Trot
 from sim.walking_config import Commands, Curriculum, Observation, Randomisation, Walking
 from sim.walking_env import OBSERVATION, OBSERVATION_SIZE, PupperEnv, StepResult
 from sim.walking_rewards import Rewards, weights
@@ -62,7 +63,7 @@ def walk_about(env: PupperEnv, steps: int, seed: int = 5) -> list[StepResult]:
 
 def drawn_field(env: PupperEnv, name: str) -> np.ndarray:
     """A field of the model as it is in each simulation."""
-    values = env.batch.expanded(name)
+    values = env.robots.batch.expanded(name)
     assert values is not None
     return values
 
@@ -75,7 +76,7 @@ def only(**given: Any) -> Rewards:
 
 def lift(env: PupperEnv) -> None:
     """Into free fall, where joints feel no weight."""
-    env.batch.bind("qpos")[:, 2] = 1.0
+    env.robots.batch.bind("qpos")[:, 2] = 1.0
 
 
 def with_delay(low: float, high: float) -> ServoRanges:
@@ -94,7 +95,7 @@ def with_delay(low: float, high: float) -> ServoRanges:
 
 def throw(env: PupperEnv, ids) -> None:
     """On their backs."""
-    env.batch.bind("qpos")[ids, 3:7] = 0.0, 1.0, 0.0, 0.0
+    env.robots.batch.bind("qpos")[ids, 3:7] = 0.0, 1.0, 0.0, 0.0
 
 
 def time_out(env: PupperEnv, ids) -> None:
@@ -102,7 +103,7 @@ def time_out(env: PupperEnv, ids) -> None:
 
 
 def spoil(env: PupperEnv, ids) -> None:
-    env.batch.bind("qvel")[ids, 7] = np.nan
+    env.robots.batch.bind("qvel")[ids, 7] = np.nan
 
 
 ENDS = {"fall": throw, "time-out": time_out, "NaN": spoil}
@@ -117,9 +118,9 @@ def test_the_open_loop_trot_walks_after_every_kind_of_reset(actuator):
     if actuator == "ideal":
         # without a limit on its torque, a robot that snaps into the trot from far away is thrown
         start = replace(start, joint_rad=0.1, on_the_move=0.0, friction=(0.8, 0.8))
-    config = Walking(randomisation=start)
+    config = Walking(randomisation=start, trot=Trot(2.5, 0.020))
     env = make(actuator, config, 8)
-    command = np.array([0.2, 0.0, 0.0])
+    command = np.array([0.2, 0.0, 0.0])  # strokes of 20 mm to either side
     walk_about(env, 2)
     # robots 0 and 1 walk on from their initial reset
     for i, end in enumerate(ENDS.values()):
@@ -136,11 +137,13 @@ def test_the_open_loop_trot_walks_after_every_kind_of_reset(actuator):
         assert not result.done.any(), f"fell at step {i}"
         if i >= 40:
             speed.append(result.facts.linear_velocity[:, 0])
-            height.append(env.batch.bind("qpos")[:, 2].copy())
+            height.append(env.robots.batch.bind("qpos")[:, 2].copy())
         assert result.facts.gravity[:, 2].max() < -0.8  # within 37 degrees of upright
     speed, height = np.mean(speed, axis=0), np.array(height)
     assert 0.1 < speed.mean() < 0.25, speed
-    assert (speed > 0.05).all() and (speed < 0.25).all(), speed
+    assert (speed > 0.05).all() and (speed < 0.30).all(), (
+        speed
+    )  # each slips, and bounces, its own way
     assert (height.mean(axis=0) > 0.070).all() and (height.mean(axis=0) < 0.090).all()
 
 
@@ -187,8 +190,8 @@ def test_speed_and_gravity_are_seen_in_the_trunks_frame():
     turn = rng.standard_normal((4, 4))
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     speed, rate = rng.standard_normal((2, 4, 3))
-    env.batch.bind("qpos")[:, 3:7] = turn
-    env.batch.bind("qvel")[:, :3], env.batch.bind("qvel")[:, 3:6] = speed, rate
+    env.robots.batch.bind("qpos")[:, 3:7] = turn
+    env.robots.batch.bind("qvel")[:, :3], env.robots.batch.bind("qvel")[:, 3:6] = speed, rate
     observation, _ = env.observe()
     for i in range(4):
         back, expected = np.zeros(4), np.zeros(3)
@@ -205,7 +208,7 @@ def test_speed_and_gravity_are_seen_in_the_trunks_frame():
 
 def test_a_robot_that_cannot_measure_its_speed_sees_zeros_without_noise():
     env = make(config=replace(QUIET, observation=Observation(noise=True, base_velocity="zero")))
-    env.batch.bind("qvel")[:, :3] = 1.0
+    env.robots.batch.bind("qvel")[:, :3] = 1.0
     assert not env.observe()[0][:, PARTS["base_linear_velocity"]].any()
 
 
@@ -227,7 +230,7 @@ def test_with_ideal_feedback_joints_are_seen_as_they_are(knee):
     seen, rng = [], np.random.default_rng(0)
     for _ in range(6):
         result = env.step(rng.uniform(-0.3, 0.3, (4, 12)))
-        seen.append(env.batch.bind("qpos")[:, 7:] - default_pose())
+        seen.append(env.robots.batch.bind("qpos")[:, 7:] - default_pose())
         part = result.observation[:, PARTS["joint_position_relative"]]
         np.testing.assert_allclose(part, seen[-1], atol=1e-6)
         effort = result.observation[:, PARTS["joint_effort"]]
@@ -240,7 +243,7 @@ def test_with_ideal_feedback_joints_are_seen_as_they_are(knee):
 def test_with_the_measured_feedback_joints_are_seen_late_coarse_and_off():
     env = make(MEASURED)
     result = walk_about(env, 10)[-1]
-    truth = env.batch.bind("qpos")[:, 7:] - default_pose()
+    truth = env.robots.batch.bind("qpos")[:, 7:] - default_pose()
     error = result.observation[:, PARTS["joint_position_relative"]] - truth
     assert np.abs(error).max() > 0.01
     quantum = servo_ranges(MEASURED).feedback[0].quantum_rad
@@ -315,28 +318,28 @@ def test_each_simulated_robot_has_the_servos_that_were_drawn_for_it(knee):
     throw(env, [1])
     env.step(still(env))
     for i in (0, 1):
-        drawn = {field: values[i] for field, values in env._drawn.items()}
+        drawn = {field: values[i] for field, values in env.robots.drawn.items()}
         servos = [
             DelayedPDParameters(**{field: values[j] for field, values in drawn.items()})
             for j in range(12)
         ]
-        error = error_in_air(env.batch.get_model(i), servos)
+        error = error_in_air(env.robots.batch.get_model(i), servos)
         np.testing.assert_allclose(error, 0.0, atol=1e-6)
-    assert (env._drawn["stiffness"][0] != env._drawn["stiffness"][1]).all()
+    assert (env.robots.drawn["stiffness"][0] != env.robots.drawn["stiffness"][1]).all()
 
 
 def test_a_command_acts_after_the_delay_that_was_drawn_and_in_part_between_steps():
     env = make(with_delay(0.004, 0.017), count=12)
     lift(env)
-    start, saved = env.batch.bind("ctrl").copy(), env.state
+    start, saved = env.robots.batch.bind("ctrl").copy(), env.state
     moved = []
     for change in (0.0, 0.01):  # small: neither rate nor torque is limited
         env.restore(saved)
-        env.batch.bind("ctrl")[:] = start
-        env.batch.bind("ctrl")[:, 0] += change
-        moved.append(env.batch.rollout(10, record=("qpos",))["qpos"][:, :, 7])
+        env.robots.batch.bind("ctrl")[:] = start
+        env.robots.batch.bind("ctrl")[:, 0] += change
+        moved.append(env.robots.batch.rollout(10, record=("qpos",))["qpos"][:, :, 7])
     effect = moved[1] - moved[0]
-    steps = env._drawn["delay_s"][:, 0] / H
+    steps = env.robots.drawn["delay_s"][:, 0] / H
     assert np.ptp(steps) > 3
     first = (np.abs(effect) > 1e-9).argmax(axis=1)
     np.testing.assert_array_equal(first, np.floor(steps))
@@ -355,19 +358,19 @@ def test_after_a_reset_nothing_moves_until_the_delay_is_over(end):
         walk_about(env, 3)
         end(env, slice(None))
         assert env.step(still(env) + 1.0).done.all()
-    start = env.batch.bind("qpos")[:, 7:].copy()
-    told = env._to_servo(start)
-    np.testing.assert_array_equal(env.batch.bind("ctrl"), told)
-    lines = env.batch.bind("history").reshape(4, 12, -1)
+    start = env.robots.batch.bind("qpos")[:, 7:].copy()
+    told = env.robots.to_servo(start)
+    np.testing.assert_array_equal(env.robots.batch.bind("ctrl"), told)
+    lines = env.robots.batch.bind("history").reshape(4, 12, -1)
     values = (lines.shape[2] - 2) // 2
     np.testing.assert_array_equal(lines[:, :, -values:], np.repeat(told[..., None], values, 2))
     lift(env)
     for _ in range(3):
         env.step(still(env) + 0.5)
-        np.testing.assert_allclose(env.batch.bind("qpos")[:, 7:], start, atol=1e-6)
+        np.testing.assert_allclose(env.robots.batch.bind("qpos")[:, 7:], start, atol=1e-6)
     for _ in range(3):
         env.step(still(env) + 0.5)
-    assert (np.abs(env.batch.bind("qpos")[:, 7:] - start).max(axis=1) > 0.05).all()
+    assert (np.abs(env.robots.batch.bind("qpos")[:, 7:] - start).max(axis=1) > 0.05).all()
 
 
 @pytest.mark.parametrize("more", [0.0, 0.0005, 0.02, 0.1])
@@ -375,14 +378,14 @@ def test_the_delay_buffers_hold_the_longest_delay_that_can_be_drawn(more):
     for actuator in ACTUATORS:
         servos = servo_ranges(actuator).later(more)
         env = make(servos, count=1)
-        assert env.model.actuator_history[:, 0].min() * H > servos.longest_delay_s
+        assert env.robots.model.actuator_history[:, 0].min() * H > servos.longest_delay_s
 
 
 def test_a_delay_that_does_not_fit_its_buffer_is_refused(monkeypatch):
     def short(servos, *rest):
         return robot_xml({k: replace(v, delay_s=0.01) for k, v in servos.items()}, *rest)
 
-    monkeypatch.setattr(sim.walking_env, "robot_xml", short)
+    monkeypatch.setattr(sim.robot_batch, "robot_xml", short)
     with pytest.raises(InputError, match=r"does not fit the buffer of 0\.014 s"):
         make("paper")
 
@@ -394,7 +397,9 @@ def test_an_action_moves_the_target_by_its_scale_within_the_joint_limits():
         env.step(still(env) + action)
         target = np.clip(default_pose() + 0.5 * action, low, high)
         target[2::3] += target[1::3]  # servo 3 holds thigh + calf
-        np.testing.assert_allclose(env.batch.bind("ctrl"), np.tile(target, (4, 1)), atol=1e-12)
+        np.testing.assert_allclose(
+            env.robots.batch.bind("ctrl"), np.tile(target, (4, 1)), atol=1e-12
+        )
 
 
 # ------------------------------------------------------------------------------------- episodes
@@ -411,7 +416,7 @@ def test_a_simulation_that_becomes_nan_ends_without_reward_and_starts_anew():
     assert env.nan_resets == 2
     np.testing.assert_array_equal(env.episode_step, [4, 0, 4, 0])
     for _ in range(3):
-        assert np.isfinite(env.batch.state).all()
+        assert np.isfinite(env.robots.batch.state).all()
         assert np.isfinite(result.observation).all() and np.isfinite(result.privileged).all()
         result = env.step(still(env))
         assert not result.done.any() and np.isfinite(result.reward).all()
@@ -423,14 +428,14 @@ def test_a_robot_has_fallen_when_it_tilts_beyond_53_degrees(degrees, falls):
     env = make()
     lift(env)
     half = np.radians(degrees) / 2
-    env.batch.bind("qpos")[:, 3:7] = np.cos(half), np.sin(half), 0.0, 0.0
+    env.robots.batch.bind("qpos")[:, 3:7] = np.cos(half), np.sin(half), 0.0, 0.0
     result = env.step(still(env))
     assert (result.done == falls).all() and not result.timed_out.any()
 
 
 def test_a_robot_has_fallen_when_its_trunk_touches_the_ground():
     env = make()
-    qpos, folded = env.batch.bind("qpos"), np.tile([0.0, 2.4, -2.18], 4)
+    qpos, folded = env.robots.batch.bind("qpos"), np.tile([0.0, 2.4, -2.18], 4)
     # folded feet reach 26.3 mm down, the trunk 26.75 mm: a little above the ground, it lands on it
     qpos[0, 2], qpos[0, 7:] = 0.028, folded
     qpos[1, 2], qpos[1, 7:] = 1.0, folded
@@ -484,7 +489,7 @@ def test_facts_are_of_the_old_episode_also_where_it_ended():
 def test_the_stride_average_forgets_with_its_time_constant_and_at_the_end_of_an_episode():
     env = make()
     lift(env)
-    env.batch.bind("qvel")[:, :2] = np.random.default_rng(0).uniform(-1, 1, (4, 2))
+    env.robots.batch.bind("qvel")[:, :2] = np.random.default_rng(0).uniform(-1, 1, (4, 2))
     velocity = env.observe()[0][:, :2]
     for k in range(1, 4):
         average = env.step(still(env)).facts.stride_velocity[:, :2]
@@ -502,7 +507,7 @@ def test_a_standing_robot_has_its_feet_on_the_ground_and_does_not_slip():
     assert np.abs(facts.foot_height_m).max() < 0.001
     assert facts.foot_speed_m_s.max() < 0.01
     assert (facts.contact_s > 0.3).all() and not facts.air_s.any()
-    np.testing.assert_allclose(env.batch.bind("qpos")[:, 2], STANDING_HEIGHT_M, atol=0.003)
+    np.testing.assert_allclose(env.robots.batch.bind("qpos")[:, 2], STANDING_HEIGHT_M, atol=0.003)
 
 
 def test_the_reward_is_the_sum_of_its_terms_times_the_control_period():
@@ -516,20 +521,20 @@ def test_the_reward_is_the_sum_of_its_terms_times_the_control_period():
 
 def test_leaving_the_field_is_a_time_out():
     env = make(config=replace(QUIET, terrain="rough"))
-    qpos = env.batch.bind("qpos")
+    qpos = env.robots.batch.bind("qpos")
     qpos[:, 0] = 7.4, 7.6, -7.6, 0.0
     qpos[:, 1:3] = 0.0, 1.0
     result = env.step(still(env))
     np.testing.assert_array_equal(result.timed_out, [False, True, True, False])
-    assert np.abs(env.batch.bind("qpos")[1:3, :2]).max() <= 7.0
+    assert np.abs(env.robots.batch.bind("qpos")[1:3, :2]).max() <= 7.0
 
 
 def test_robots_start_on_the_ground_of_every_terrain_and_stand():
     for terrain in ("rough", "mixed"):
         env = make(config=replace(QUIET, terrain=terrain), count=8)
-        x, y = env.batch.bind("qpos")[:, :2].T
+        x, y = env.robots.batch.bind("qpos")[:, :2].T
         under = env.ground.height(x, y)
-        assert (env.batch.bind("qpos")[:, 2] >= under + STANDING_HEIGHT_M).all()
+        assert (env.robots.batch.bind("qpos")[:, 2] >= under + STANDING_HEIGHT_M).all()
         for _ in range(15):
             assert not env.step(still(env)).done.any(), terrain
 
@@ -578,14 +583,14 @@ def test_a_set_command_holds_until_the_episode_ends():
 
 def test_friction_payload_and_start_are_drawn_within_their_ranges():
     env = make(config=Walking(randomisation=Randomisation(on_the_move=0.0)), count=64)
-    feet = [env.model.geom(f"{leg}_foot").id for leg in ("LF", "RF", "LB", "RB")]
+    feet = [env.robots.model.geom(f"{leg}_foot").id for leg in ("LF", "RF", "LB", "RB")]
     friction = drawn_field(env, "geom_friction")[:, feet, 0]
     np.testing.assert_array_equal(friction, np.repeat(friction[:, :1], 4, axis=1))
     assert 0.3 <= friction.min() < 0.4 and 0.9 < friction.max() <= 1.0
-    trunk = env.model.body("trunk").id
-    payload = drawn_field(env, "body_mass")[:, trunk] - env.model.body_mass[trunk]
+    trunk = env.robots.model.body("trunk").id
+    payload = drawn_field(env, "body_mass")[:, trunk] - env.robots.model.body_mass[trunk]
     assert -0.05 <= payload.min() < -0.03 and 0.03 < payload.max() <= 0.05
-    away = env.batch.bind("qpos")[:, 7:] - default_pose()
+    away = env.robots.batch.bind("qpos")[:, 7:] - default_pose()
     low, _ = limits()
     assert 0.18 < np.abs(away).max() <= 0.2
     assert (away >= low - default_pose() - 1e-12).all()
@@ -603,9 +608,9 @@ def test_pushes_set_the_horizontal_speed_within_their_range_at_their_times():
     lift(env)
     pushed = []
     for _ in range(10):
-        before = env.batch.bind("qvel")[:, :2].copy()
+        before = env.robots.batch.bind("qvel")[:, :2].copy()
         env.step(still(env))
-        now = env.batch.bind("qvel")[:, :2]
+        now = env.robots.batch.bind("qvel")[:, :2]
         pushed.append((np.abs(now - before) > 1e-3).any(axis=1).mean())
         assert np.abs(now).max() <= 0.5 + 1e-6
     np.testing.assert_array_equal(pushed, [0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
@@ -634,7 +639,7 @@ def test_the_curriculum_eases_delay_commands_penalties_and_action_scale():
         env.reset()
         delay, forward = drawn_field(env, "actuator_delay")[0, 0], env.command[0, 0]
         terms = env.step(still(env) + 0.1).terms
-        hip = env.batch.bind("ctrl")[0, 0]
+        hip = env.robots.batch.bind("ctrl")[0, 0]
         return delay, forward, terms["action_rate"][0], hip
 
     full = -1.0 * 12 * 0.1**2 * SPAN
@@ -671,4 +676,4 @@ def test_no_robots_are_refused():
 
 def test_the_joints_of_the_model_are_in_the_projects_order():
     env = make(count=1)
-    assert [env.model.joint(i + 1).name for i in range(12)] == list(JOINT_NAMES)
+    assert [env.robots.model.joint(i + 1).name for i in range(12)] == list(JOINT_NAMES)
