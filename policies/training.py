@@ -7,7 +7,6 @@ see `policies.learner`), and `policy_last/`, `policy_best/` (see `policies.polic
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import threading
@@ -21,9 +20,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from common.errors import InputError, PupperError
-from common.files import write_text
+from common.errors import PupperError
 from common.memory import keep_freed_memory
+from policies.curves import CurveWriter, EpisodeMeans
 from policies.imitation import imitate
 from policies.learner import Learner, Ranks
 from policies.policy_export import write_policy
@@ -32,7 +31,8 @@ from policies.vec_env import WalkingVecEnv
 from sim.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from sim.walking_env import PupperEnv
 
-LAST, BEST, PROGRESS = "last.pt", "best.pt", "progress.csv"
+LAST, BEST = "last.pt", "best.pt"
+_SAVE_EVERY = 10
 _SMOOTHED = 0.1  # weight of the newest update in the mean reward that decides what is best
 
 
@@ -104,132 +104,158 @@ def train(
     PupperError
         If the numbers stop being numbers; the networks before are saved.
     """
-    ranks = Ranks.join()
-    resumed = run is None
-    if run is None:
-        run = load_run(folder)
-    learner = make_learner(run, ranks)
-    counters: dict[str, Any] = {"elapsed_s": 0.0, "imitated": 0, "smooth": None, "best": None}
-    if resumed:
-        counters = learner.load(folder / _rank_file(LAST, ranks))
-    elif ranks.rank == 0:
-        save_run(folder, run)
-    done_before = {"imitation": counters["imitated"], "ppo": learner.iteration}
-    writer = _Writer(folder, done_before) if ranks.rank == 0 else None
-    started = time.monotonic() - counters["elapsed_s"]
-    episodes = _Episodes(learner.env.num_envs)
+    session = _Session(folder, run, watch)
+    with _interruptible() as asked:
+        session.learn_first_gait(asked)
+        session.improve(asked)
+        session.save(LAST)
+    session.finish()
+    return session.learner
 
-    def save(name: str) -> None:
-        learner.save(folder / _rank_file(name, ranks), counters)
 
-    def write(name: str) -> None:
-        if ranks.rank == 0:
-            history = action_history(run, learner.env.env.servos)
-            about = {
-                "iteration": learner.iteration, "imitation_rounds": counters["imitated"],
-                "reward": counters["smooth"], "seed": run.seed,
-                "samples": learner.iteration * samples_per_update,
-                "elapsed_s": counters["elapsed_s"],
-            }  # fmt: skip
-            write_policy(
-                folder / name, learner.actor.state_dict(), run, learner.env.env.servos, history,
-                about,
-            )  # fmt: skip
+class _Session:
+    """One sitting of a run: from its beginning, or from a checkpoint, until someone stops it."""
 
-    samples_per_update = learner.hyper.steps_per_environment * learner.env.num_envs * ranks.size
+    def __init__(self, folder: Path, run: Run | None, watch: Callable[[Progress], None] | None):
+        self.ranks = Ranks.join()
+        self.folder, self.watch = folder, watch
+        self.run = load_run(folder) if run is None else run
+        self.learner = make_learner(self.run, self.ranks)
+        self.counters: dict[str, Any] = {
+            "elapsed_s": 0.0, "imitated": 0, "smooth": None, "best": None,
+        }  # fmt: skip
+        if run is None:
+            self.counters = self.learner.load(folder / _rank_file(LAST, self.ranks))
+        elif self.ranks.rank == 0:
+            save_run(folder, run)
+        self.done_before = {
+            "imitation": self.counters["imitated"], "ppo": self.learner.iteration,
+        }  # fmt: skip
+        self.writer = CurveWriter(folder, self.done_before) if self.ranks.rank == 0 else None
+        self.started = time.monotonic() - self.counters["elapsed_s"]
+        self.phase_began = self.started
 
-    def left(phase: str, now: int, total: int) -> float:
-        steps = max(now - done_before[phase], 1)
-        at_this_pace = (total - now) * (time.monotonic() - phase_began[phase]) / steps
-        until_time_is_up = 60 * run.minutes - counters["elapsed_s"]
-        return max(min(at_this_pace, until_time_is_up) if phase == "ppo" else at_this_pace, 0.0)
+    def learn_first_gait(self, asked: Callable[[], bool]) -> None:
+        """Rounds of imitation that are still to do."""
+        learner, rounds = self.learner, self.run.imitation.iterations
+        self.phase_began = time.monotonic()
+        while self.counters["imitated"] < rounds and not self.ranks.any(asked()):
+            before = learner.networks()
+            error = imitate(learner, self.run.imitation, self.counters["imitated"])
+            self.refuse_nan(before, [error])
+            self.counters["imitated"] += 1
+            if self.counters["imitated"] == rounds:
+                _fresh_optimiser(learner)
+            self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
+            if self.counters["imitated"] % _SAVE_EVERY == 0:
+                self.save(LAST)
 
-    phase_began: dict[str, float] = {}
+    def improve(self, asked: Callable[[], bool]) -> None:
+        """Updates of PPO, until they are done, time is up or someone asks to stop."""
+        if self.counters["imitated"] < self.run.imitation.iterations:
+            return
+        learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
+        self.phase_began = time.monotonic()
+        while learner.iteration < self.run.iterations and not self.ranks.any(
+            asked() or time.monotonic() - self.started >= 60 * self.run.minutes
+        ):
+            begun = time.perf_counter()
+            learner.rollout(episodes)
+            collected = time.perf_counter()
+            before = learner.networks()
+            losses = learner.update()
+            ended = time.perf_counter()
+            self.refuse_nan(before, losses.values())
+            row = episodes.row() | {
+                "value_loss": losses["value"],
+                "entropy": losses["entropy"],
+                "std": float(learner.actor.output_std.detach().mean()),
+                "learning_rate": learner.ppo.learning_rate,
+                "nan_resets": learner.env.env.nan_resets,
+                "samples": self.samples,
+                "collect_s": collected - begun,
+                "update_s": ended - collected,
+            }
+            smooth, reward = self.counters["smooth"], self.ranks.mean(row["reward"])
+            self.counters["smooth"] = (
+                reward if smooth is None else smooth + _SMOOTHED * (reward - smooth)
+            )
+            self.report("ppo", learner.iteration, self.run.iterations, row)
+            if learner.iteration % _SAVE_EVERY == 0:
+                best = self.counters["best"]
+                if best is None or self.counters["smooth"] > best:
+                    self.counters["best"] = self.counters["smooth"]
+                    self.save(BEST)
+                    self.write_policy("policy_best")
+                self.save(LAST)  # after that, or a resumed run would not know its best
 
-    def report(phase: Literal["imitation", "ppo"], done: int, total: int, row: dict) -> None:
-        counters["elapsed_s"] = time.monotonic() - started
-        row = {"elapsed_s": counters["elapsed_s"], **row}
-        if writer:
-            writer.write(phase, done, row)
-        if watch and ranks.rank == 0:
-            remaining = left(phase, done, total)
-            watch(Progress(phase, done, total, counters["elapsed_s"], row, remaining))
+    def finish(self) -> None:
+        """Write the last policy, and end the curves."""
+        self.write_policy("policy_last")
+        if self.writer:
+            self.writer.close()
 
-    def refuse_nan(before: dict[str, Any], numbers: Iterable[float]) -> None:
+    @property
+    def samples(self) -> int:
+        """Control steps of all robots of all processes that PPO has learned from."""
+        env = self.learner.env
+        per_update = self.learner.hyper.steps_per_environment * env.num_envs * self.ranks.size
+        return self.learner.iteration * per_update
+
+    def save(self, name: str) -> None:
+        """Write a checkpoint."""
+        self.learner.save(self.folder / _rank_file(name, self.ranks), self.counters)
+
+    def write_policy(self, name: str) -> None:
+        """Write a policy folder."""
+        if self.ranks.rank != 0:
+            return
+        servos = self.learner.env.env.servos
+        about = {
+            "iteration": self.learner.iteration, "imitation_rounds": self.counters["imitated"],
+            "reward": self.counters["smooth"], "seed": self.run.seed, "samples": self.samples,
+            "elapsed_s": self.counters["elapsed_s"],
+        }  # fmt: skip
+        write_policy(
+            self.folder / name, self.learner.actor.state_dict(), self.run, servos,
+            action_history(self.run, servos), about,
+        )  # fmt: skip
+
+    def report(
+        self, phase: Literal["imitation", "ppo"], done: int, total: int, row: dict[str, float]
+    ) -> None:
+        """One row of the curves, and word to whoever watches."""
+        now = time.monotonic()
+        elapsed = self.counters["elapsed_s"] = now - self.started
+        row = {"elapsed_s": elapsed, **row}
+        if self.writer:
+            self.writer.write(phase, done, row)
+        if self.watch and self.ranks.rank == 0:
+            steps = max(done - self.done_before[phase], 1)
+            left = (total - done) * (now - self.phase_began) / steps
+            if phase == "ppo":
+                left = min(left, 60 * self.run.minutes - elapsed)
+            self.watch(Progress(phase, done, total, elapsed, row, max(left, 0.0)))
+
+    def refuse_nan(self, before: dict[str, Any], numbers: Iterable[float]) -> None:
+        """Raise if anything stopped being a number; the networks of before are then saved."""
+        learner, last = self.learner, self.folder / LAST
         fine = all(np.isfinite(x) for x in numbers) and learner.finite
-        if not ranks.any(not fine):
+        if not self.ranks.any(not fine):
             return
         learner.take_back(before)
-        if ranks.any(not learner.finite):
+        if self.ranks.any(not learner.finite):
             raise PupperError(
                 f"The simulation gave observations that are not numbers after update "
-                f"{learner.iteration}. Nothing was saved; {folder / LAST} is what it was before."
+                f"{learner.iteration}. Nothing was saved; {last} is what it was before."
             )
         # a resumed run then collects other data with the networks from before
-        save(LAST)
+        self.save(LAST)
         raise PupperError(
             f"The policy's numbers stopped being numbers after update {learner.iteration}. The "
-            f"networks before that are in {folder / LAST}: pupper-train --resume {folder} goes on "
+            f"networks before that are in {last}: pupper-train --resume {self.folder} goes on "
             "from them; if it happens again, start a run with a lower --learner.learning-rate."
         )
-
-    with _interruptible() as asked:
-
-        def asked_to_stop() -> bool:
-            return ranks.any(asked())
-
-        phase_began["imitation"] = time.monotonic()
-        while counters["imitated"] < run.imitation.iterations and not asked_to_stop():
-            before = learner.networks()
-            error = imitate(learner, run.imitation, counters["imitated"])
-            refuse_nan(before, [error])
-            counters["imitated"] += 1
-            if counters["imitated"] == run.imitation.iterations:
-                _fresh_optimiser(learner)
-            report(
-                "imitation", counters["imitated"], run.imitation.iterations, {"difference": error}
-            )
-            if counters["imitated"] % 10 == 0:
-                save(LAST)
-        phase_began["ppo"] = time.monotonic()
-        if counters["imitated"] >= run.imitation.iterations:
-            while learner.iteration < run.iterations and not ranks.any(
-                asked() or time.monotonic() - started >= 60 * run.minutes
-            ):
-                begun = time.perf_counter()
-                learner.rollout(episodes)
-                collected = time.perf_counter()
-                before = learner.networks()
-                losses = learner.update()
-                ended = time.perf_counter()
-                refuse_nan(before, losses.values())
-                row = episodes.row() | {
-                    "value_loss": losses["value"],
-                    "entropy": losses["entropy"],
-                    "std": float(learner.actor.output_std.detach().mean()),
-                    "learning_rate": learner.ppo.learning_rate,
-                    "nan_resets": learner.env.env.nan_resets,
-                    "samples": learner.iteration * samples_per_update,
-                    "collect_s": collected - begun,
-                    "update_s": ended - collected,
-                }  # fmt: skip
-                smooth, reward = counters["smooth"], ranks.mean(row["reward"])
-                counters["smooth"] = (
-                    reward if smooth is None else smooth + _SMOOTHED * (reward - smooth)
-                )
-                report("ppo", learner.iteration, run.iterations, row)
-                if learner.iteration % 10 == 0:
-                    best = counters["best"]
-                    if best is None or counters["smooth"] > best:
-                        counters["best"] = counters["smooth"]
-                        save(BEST)
-                        write("policy_best")
-                    save(LAST)  # after that, or a resumed run would not know its best
-        save(LAST)
-    write("policy_last")
-    if writer:
-        writer.close()
-    return learner
 
 
 def _rank_file(name: str, ranks: Ranks) -> str:
@@ -264,89 +290,3 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-class _Episodes:
-    """Means over the steps of an update: reward and its terms, falls, lengths of episodes."""
-
-    def __init__(self, environments: int):
-        self._length = np.zeros(environments)
-        self._terms: list[dict[str, float]] = []
-        self._ended: list[float] = []
-        self._falls = self._steps = 0
-
-    def __call__(self, rewards: torch.Tensor, dones: torch.Tensor, extras: dict) -> None:
-        done = dones.cpu().numpy().astype(bool)
-        self._length += 1
-        self._ended += self._length[done].tolist()
-        self._length[done] = 0
-        self._falls += int(done.sum()) - len(extras["terminal_ids"])
-        self._steps += len(done)
-        self._terms.append({k: float(v.mean()) for k, v in extras["terms"].items()})
-
-    def row(self) -> dict[str, float]:
-        """Means since the last call."""
-        names = self._terms[0]
-        terms = {k: float(np.mean([t[k] for t in self._terms])) for k in names}
-        row = {
-            "reward": sum(terms.values()),
-            "falls_per_1000_steps": 1000 * self._falls / self._steps,
-            "episode_steps": float(np.mean(self._ended)) if self._ended else float("nan"),
-            **{f"reward.{k}": v for k, v in terms.items()},
-        }
-        self._terms, self._ended, self._falls, self._steps = [], [], 0, 0
-        return row
-
-
-class _Writer:
-    """`progress.csv`, `imitation.csv` and TensorBoard, appended to.
-
-    Rows beyond `done` (by phase) are from after the checkpoint that is resumed, and are dropped.
-    """
-
-    def __init__(self, folder: Path, done: dict[str, int]):
-        from torch.utils.tensorboard import SummaryWriter
-
-        self._paths = {"ppo": folder / PROGRESS, "imitation": folder / "imitation.csv"}
-        for phase, path in self._paths.items():
-            with _writing(path):
-                _drop_rows(path, done[phase])
-        with _writing(folder / "tensorboard"):
-            self._board = SummaryWriter(str(folder / "tensorboard"))
-
-    def write(self, phase: str, step: int, row: dict[str, float]) -> None:
-        """One row."""
-        path = self._paths[phase]
-        with _writing(path):
-            new = not path.exists()
-            with path.open("a", newline="") as file:
-                writer = csv.writer(file)
-                if new:
-                    writer.writerow(["update", *row])
-                writer.writerow([step, *(f"{v:.6g}" for v in row.values())])
-            for name, value in row.items():
-                self._board.add_scalar(f"{phase}/{name}", value, step)
-
-    def close(self) -> None:
-        """Finish writing."""
-        self._board.close()
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """A full disk, or a folder that may not be written, is said in a sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
-
-
-def _drop_rows(path: Path, last: int) -> None:
-    """Keep a table's header and its rows up to update `last`."""
-    if not path.exists():
-        return
-    with path.open(newline="") as file:
-        header, *rows = file.readlines() or [""]
-    kept = [r for r in rows if r.split(",")[0].isdigit() and int(r.split(",")[0]) <= last]
-    if kept != rows:
-        write_text(path, "".join([header, *kept]), force=True)

@@ -22,12 +22,13 @@ from tiny_training import ALL_KINDS, CALIBRATION, tiny_run
 
 from common.errors import InputError, PupperError
 from policies import training
+from policies.curves import PROGRESS
 from policies.hyperparameters import Architecture, Hyperparameters, Imitation
 from policies.imitation import imitate, teacher_actions
 from policies.learner import Learner, Ranks, read_checkpoint
 from policies.policy_file import load_policy
 from policies.run_file import RUN_FILE, load_run, plain, preset, save_run
-from policies.training import LAST, PROGRESS, make_env, make_learner, train
+from policies.training import LAST, make_env, make_learner, train
 from policies.vec_env import WalkingVecEnv
 from sim.walking_config import Walking
 
