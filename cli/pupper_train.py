@@ -48,7 +48,7 @@ class Options:
     name: str | None = None
     """Name of the run's folder in runs/; by default policy, date and time."""
     resume: Path | None = None
-    """Folder of a run to go on with; its own settings are used."""
+    """Folder of a run to go on with; only --iterations and --minutes can be new."""
     print_config: bool = False
     """Show all settings as YAML and stop."""
     benchmark: bool = False
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, "pupper-train") as rest:
-        _run(_parse(rest))
+        _run(_parse(rest), rest)
 
 
 def _parse(given: list[str]) -> Options:
@@ -81,7 +81,7 @@ def _choice(given: list[str], flag: str, kind: Any) -> Any:
     return value if value in get_args(kind) else get_args(kind)[0]
 
 
-def _run(options: Options) -> None:
+def _run(options: Options, given: list[str]) -> None:
     run = options.run
     if options.print_config:
         print(yaml.safe_dump(plain(run), sort_keys=False), end="")
@@ -90,6 +90,7 @@ def _run(options: Options) -> None:
         check_actuator(run.actuator)
     # torch and rsl_rl take seconds to import: not before the settings are known to be good
     warnings.filterwarnings("ignore", category=UserWarning, module="torch")
+    from policies.learner import Ranks
     from policies.training import train
 
     if options.benchmark:
@@ -103,15 +104,37 @@ def _run(options: Options) -> None:
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
                 out.print(f"{name:28} {text}")
         return
-    folder = options.resume or Path("runs") / (options.name or _name(options))
+    ranks = Ranks.join()
+    folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
     if options.resume is not None and not options.resume.is_dir():
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
-    err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
+    if ranks.rank == 0:
+        err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
     with _bar() as watch:
-        train(folder, None if options.resume else run, watch)
+        if options.resume:
+            train(folder, None, watch, *_extension(options, given))
+        else:
+            train(folder, run, watch)
+    if ranks.rank > 0:
+        return
     err.print(
         f"Saved. Look at it: pupper-play {folder} --video walk.mp4; measure it: "
         f"pupper-eval {folder}; go on: pupper-train --resume {folder}"
+    )
+
+
+def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:
+    """New --iterations and --minutes of a run that goes on; anything else would be ignored."""
+    flags = {a.split("=")[0] for a in given if a.startswith("--")}
+    other = flags - {"--resume", "--iterations", "--minutes"}
+    if other:
+        raise InputError(
+            f"A resumed run keeps its own settings, so {sorted(other)[0]} would change nothing. "
+            "Leave it out, or start a new run."
+        )
+    return (
+        options.run.iterations if "--iterations" in flags else None,
+        options.run.minutes if "--minutes" in flags else None,
     )
 
 

@@ -81,6 +81,13 @@ class Ranks:
         """Where this process computes."""
         return f"cuda:{self.local_rank}" if torch.cuda.is_available() else "cpu"
 
+    def same(self, text: str) -> str:
+        """The first process's `text`, in all."""
+        found = [text]
+        if self.size > 1:
+            torch.distributed.broadcast_object_list(found, src=0)
+        return found[0]
+
     def any(self, here: bool) -> bool:
         """Whether it is so in any process: what all must decide alike, or they wait for ever."""
         return bool(self._reduced(float(here), "MAX"))

@@ -83,8 +83,38 @@ def load_run(folder: Path) -> Run:
         If there is none, or they cannot be understood.
     """
     path = folder / RUN_FILE
+    return _from_dict(Run, _read(path).get("settings"), str(path))
+
+
+def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
+    """Settings of a run that goes on, perhaps for longer than it was meant to; kept in its file.
+
+    Raises
+    ------
+    InputError
+        If they cannot be understood, or the actuator's file is not what it was.
+    """
+    path, run = folder / RUN_FILE, load_run(folder)
+    before, source = _read(path).get("actuator_sha256"), Path(run.actuator)
+    if before and not source.is_file():
+        raise InputError(
+            f"{run.actuator}, with which {folder} was trained, is not there. Put it back, or go to "
+            "the folder where the run was begun."
+        )
+    if before and sha256(source) != before:
+        raise InputError(
+            f"{run.actuator} is no longer the file with which {folder} was begun. Put that back, "
+            "or start a new run with this one."
+        )
+    longer = replace(run, iterations=iterations or run.iterations, minutes=minutes or run.minutes)
+    if longer != run:
+        _write(path, longer)
+    return longer
+
+
+def _read(path: Path) -> dict[str, Any]:
     if not path.exists():
-        raise InputError(f"{folder} holds no run: there is no {RUN_FILE} in it.")
+        raise InputError(f"{path.parent} holds no run: there is no {RUN_FILE} in it.")
     try:
         found = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -96,7 +126,7 @@ def load_run(folder: Path) -> Run:
             f"{path} has schema version {found.get('schema_version')}; this version reads "
             f"{RUN_VERSION}."
         )
-    return _from_dict(Run, found.get("settings"), str(path))
+    return found
 
 
 def _from_dict(kind: type, given: Any, where: str) -> Any:
@@ -149,6 +179,10 @@ def save_run(folder: Path, run: Run) -> None:
             f"{folder} holds a run already. Resume it with --resume {folder}, or give another "
             "--name."
         )
+    _write(folder / RUN_FILE, run)
+
+
+def _write(path: Path, run: Run) -> None:
     source = Path(run.actuator)
     found = {
         "schema": RUN_SCHEMA,
@@ -158,7 +192,7 @@ def save_run(folder: Path, run: Run) -> None:
         "versions": versions("torch", "rsl-rl-lib"),
     }
     text = "# Settings of a training run, written by pupper-train.\n"
-    write_text(folder / RUN_FILE, text + yaml.safe_dump(found, sort_keys=False))
+    write_text(path, text + yaml.safe_dump(found, sort_keys=False), force=True)
 
 
 def plain(value: Any) -> Any:

@@ -26,7 +26,7 @@ from policies.curves import CurveWriter, EpisodeMeans
 from policies.imitation import imitate
 from policies.learner import Learner, Ranks
 from policies.policy_export import write_policy
-from policies.run_file import Run, load_run, save_run
+from policies.run_file import Run, resume_run, save_run
 from policies.vec_env import WalkingVecEnv
 from sim.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from sim.walking_env import PupperEnv
@@ -85,6 +85,8 @@ def train(
     folder: Path,
     run: Run | None,
     watch: Callable[[Progress], None] | None = None,
+    iterations: int | None = None,
+    minutes: float | None = None,
 ) -> Learner:
     """Begin a run in an empty folder, or (with `run` None) resume the one in it.
 
@@ -96,6 +98,8 @@ def train(
     run : Run or None
     watch : callable, optional
         Called after each update.
+    iterations, minutes : optional
+        Until when a resumed run goes on, instead of what it was begun with.
 
     Raises
     ------
@@ -104,7 +108,9 @@ def train(
     PupperError
         If the numbers stop being numbers; the networks before are saved.
     """
-    session = _Session(folder, run, watch)
+    resumed = run is None
+    settings = resume_run(folder, iterations, minutes) if run is None else run
+    session = _Session(folder, settings, resumed, watch)
     with _interruptible() as asked:
         session.learn_first_gait(asked)
         session.improve(asked)
@@ -116,15 +122,21 @@ def train(
 class _Session:
     """One sitting of a run: from its beginning, or from a checkpoint, until someone stops it."""
 
-    def __init__(self, folder: Path, run: Run | None, watch: Callable[[Progress], None] | None):
+    def __init__(
+        self,
+        folder: Path,
+        run: Run,
+        resumed: bool,
+        watch: Callable[[Progress], None] | None,
+    ):
         self.ranks = Ranks.join()
         self.folder, self.watch = folder, watch
-        self.run = load_run(folder) if run is None else run
+        self.run = run
         self.learner = make_learner(self.run, self.ranks)
         self.counters: dict[str, Any] = {
             "elapsed_s": 0.0, "imitated": 0, "smooth": None, "best": None,
         }  # fmt: skip
-        if run is None:
+        if resumed:
             self.counters = self.learner.load(folder / _rank_file(LAST, self.ranks))
         elif self.ranks.rank == 0:
             save_run(folder, run)

@@ -99,6 +99,25 @@ def test_a_run_that_was_stopped_and_resumed_is_bit_for_bit_the_run_that_was_not(
         assert different(straight[part], stopped[part])
 
 
+def test_a_resumed_run_can_be_extended_and_remembers_it(tmp_path, uninterrupted):
+    train(tmp_path, tiny_run(iterations=2))
+    train(tmp_path, None, iterations=3)
+    assert load_run(tmp_path).iterations == 3
+    assert different(uninterrupted("mlp"), read_checkpoint(tmp_path / LAST)) == []
+
+
+def test_a_run_is_not_resumed_with_another_actuator_file(tmp_path):
+    actuator = tmp_path / "calibrated.yaml"
+    actuator.write_text(Path(CALIBRATION).read_text())
+    train(tmp_path / "run", tiny_run(actuator=str(actuator), iterations=1))
+    actuator.write_text(Path(CALIBRATION).read_text() + "# another\n")
+    with pytest.raises(InputError, match="no longer the file"):
+        train(tmp_path / "run", None, iterations=2)
+    actuator.unlink()
+    with pytest.raises(InputError, match="is not there"):
+        train(tmp_path / "run", None, iterations=2)
+
+
 def test_another_seed_is_another_run(tmp_path, uninterrupted):
     train(tmp_path, tiny_run(seed=1))
     other = different(uninterrupted("mlp"), read_checkpoint(tmp_path / LAST))
