@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import tyro
 from cli import terminal
 from cli.policy_choice import policy_at, simulator
 from cli.terminal import err, number, out, print_json
-from cli.user_errors import user_errors
+from cli.user_errors import run_program
 from common.errors import InputError
 from sim.terrain import Terrain
 
@@ -52,14 +51,7 @@ class Eval:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    with user_errors(given, "pupper-eval") as rest:
-        _run(
-            tyro.cli(
-                Eval, args=rest, description=DESCRIPTION, prog="pupper-eval",
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
-        )  # fmt: skip
+    run_program(Eval, _run, "pupper-eval", DESCRIPTION, arguments)
 
 
 def _run(options: Eval) -> None:

@@ -20,7 +20,7 @@ import tyro
 
 from cli.policy_choice import policy_at, simulator
 from cli.terminal import err, need_positive, out, warn
-from cli.user_errors import user_errors
+from cli.user_errors import run_program
 from common.errors import InputError
 from common.files import refuse_overwrite
 from sim.terrain import Terrain
@@ -58,14 +58,7 @@ class Play:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    with user_errors(given, "pupper-play") as rest:
-        _run(
-            tyro.cli(
-                Play, args=rest, description=DESCRIPTION, prog="pupper-play",
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
-        )  # fmt: skip
+    run_program(Play, _run, "pupper-play", DESCRIPTION, arguments)
 
 
 def _run(options: Play) -> None:

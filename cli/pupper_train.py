@@ -119,7 +119,8 @@ def _run(options: Options, given: list[str]) -> None:
         return
     err.print(
         f"Saved. Look at it: pupper-play {folder} --video walk.mp4; measure it: "
-        f"pupper-eval {folder}; go on: pupper-train --resume {folder}"
+        f"pupper-eval {folder}; go on: pupper-train --resume {folder} (longer than it was begun "
+        "for: with --iterations or --minutes)"
     )
 
 

@@ -7,11 +7,34 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
+
+import tyro
 
 from cli.terminal import err
 from common.errors import PupperError
+
+Options = TypeVar("Options")
+
+
+def run_program(
+    options: type[Options],
+    work: Callable[[Options], None],
+    program: str,
+    description: str,
+    arguments: Sequence[str] | None,
+) -> None:
+    """Parse a program's arguments into `options` and do its `work`; ends the process on errors."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(given, program) as rest:
+        work(
+            tyro.cli(
+                options, args=rest, description=description, prog=program,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+        )  # fmt: skip
 
 
 @contextmanager

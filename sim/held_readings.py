@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servo_models.held_feedback import HeldFeedback
+from sim.emulated_robot import RobotSpec
 
-_JITTER_S = 0.0008
-_DRIFT = 0.002
+# as of the emulated bus
+_JITTER_S, _DRIFT = RobotSpec.poll_jitter_s, RobotSpec.poll_drift
 
 
 class HeldReadings:

@@ -132,7 +132,10 @@ class PupperEnv:
         self.nan_resets = 0
         self.steps = 0
         self.level = config.curriculum.level(0)
-        zeros = lambda *shape: np.zeros((n, *shape))  # noqa: E731
+
+        def zeros(*shape: int) -> Array:
+            return np.zeros((n, *shape))
+
         self.command = zeros(3)
         self.episode_step = np.zeros(n, int)
         self.action, self.last_action, self.earlier_action = zeros(12), zeros(12), zeros(12)

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from common.joints import JOINT_NAMES
@@ -31,39 +30,12 @@ from sysid.ladder_fit import (
     integrated_autocorrelation_time,
     leave_one_out_folds,
 )
-from sysid.output_error import Fit, TrialData, look_up, positions, prepare
+from sysid.model_scores import Scores, rms, score
+from sysid.output_error import Fit, TrialData, positions, prepare
 from sysid.poll_lattice import find_poll_lattice, quantum, readings
 from sysid.recording import Recording, Trial
 
 _PREFERENCE = 1.05
-
-
-@dataclass(frozen=True)
-class Scores:
-    """How far a model is from the readings, RMS [rad], and in percent of their spread.
-
-    Attributes
-    ----------
-    fresh, held, naive : float
-        Free run against fresh rows when they were measured; all rows when their value was
-        measured; all rows at their own send time.
-    one_step : float
-        Model's move from one fresh row to the next, against the readings' move.
-    leave_one_out : float
-        Free run on fresh rows of frequencies the fit has not seen; NaN with one frequency.
-    leave_one_out_by_frequency : dict of float to float
-        The same per frequency (per trial number where there are no tones).
-    fit_percent : float
-        100 (1 - RMS / standard deviation of the fresh readings).
-    """
-
-    fresh: float
-    held: float
-    naive: float
-    one_step: float
-    leave_one_out: float
-    leave_one_out_by_frequency: dict[float, float]
-    fit_percent: float
 
 
 @dataclass(frozen=True)
@@ -327,41 +299,6 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
 # ------------------------------------------------------------------------------- scoring
 
 
-def score(
-    track: NDArray[np.float64], data: Sequence[TrialData], held_out: dict[float, NDArray]
-) -> Scores:
-    """Scores of simulated positions.
-
-    Parameters
-    ----------
-    track : ndarray, shape (steps + 1, trials)
-        Position at step edges, relative to rest [rad].
-    data : sequence of TrialData
-    held_out : dict of float to ndarray
-        Residuals on each left-out frequency, from fits that have not seen it.
-    """
-    fresh, held, naive, one_step, spread = [], [], [], [], []
-    for n, t in enumerate(data):
-        model = look_up(track[:, n], t.sample_step)
-        fresh.append(model - t.sample_rad)
-        one_step.append(np.diff(model) - np.diff(t.sample_rad))
-        seen = np.isfinite(t.row_rad)
-        held.append((look_up(track[:, n], t.held_step) - t.row_rad)[seen])
-        naive.append((look_up(track[:, n], t.row_step) - t.row_rad)[seen])
-        spread.append(t.sample_rad - t.sample_rad.mean())
-    left = {name: _rms([r]) for name, r in held_out.items()}
-    return Scores(
-        _rms(fresh), _rms(held), _rms(naive), _rms(one_step),
-        _rms(list(held_out.values())) if held_out else float("nan"), left,
-        100.0 * (1.0 - _rms(fresh) / max(_rms(spread), 1e-9)),
-    )  # fmt: skip
-
-
-def _rms(parts: Sequence[NDArray]) -> float:
-    everything = np.concatenate(parts)
-    return float(np.sqrt(np.mean(everything**2))) if len(everything) else float("nan")
-
-
 def _score_preset(
     parameters: DelayedPDParameters, data: tuple[TrialData, ...], offset_rad: float
 ) -> Scores:
@@ -386,7 +323,7 @@ def _result(
         held_out[name] = np.concatenate(fresh_residuals(model, fold.values, left))
     residual = fresh_residuals(model, best.values, data)
     # soft-L1 works in units of the noise; its covariance is for residuals of that size
-    inflation = integrated_autocorrelation_time(residual) * max(1.0, _rms(residual) ** 2 / noise**2)
+    inflation = integrated_autocorrelation_time(residual) * max(1.0, rms(residual) ** 2 / noise**2)
     sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
     z = norm.ppf((1 + LEVEL) / 2)
     speed = max(_command_speed(d) for d in data)

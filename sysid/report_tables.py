@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Quantity, unit_of
-from sysid.calibrate import JointCalibrationResult, Scores
+from sysid.calibrate import JointCalibrationResult
 from sysid.delay import Interval
 from sysid.figure_data import lag_parts
+from sysid.model_scores import Scores
 
 if TYPE_CHECKING:  # it brings python-control, which a table does not need
     from sysid.frequency_response import FrequencyResponse

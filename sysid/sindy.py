@@ -36,7 +36,7 @@ from servo_models.sparse_equation import (
     explain,
     integrate,
 )
-from sysid.calibrate import Scores, joint_rng, prepare_joints, score
+from sysid.calibrate import joint_rng, prepare_joints
 from sysid.ladder import Parameter, Rung, rung
 from sysid.ladder_fit import (
     PREFERRED,
@@ -45,6 +45,7 @@ from sysid.ladder_fit import (
     fresh_residuals,
     leave_one_out_folds,
 )
+from sysid.model_scores import Scores, score
 from sysid.output_error import Fit, Problem, TrialData, positions
 from sysid.recording import Recording
 from sysid.sindy_structure import PULLS, Support, ordered, propose

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import onnx
 import pytest
 import torch
 from tiny_training import (
@@ -218,7 +219,6 @@ INPUTS = {
 
 
 def test_an_onnx_file_acts_like_the_policy_and_carries_its_contract(policy, tmp_path):
-    onnx = pytest.importorskip("onnx")
     path = tmp_path / "policy.onnx"
     assert export_policy(policy, "onnx", path) <= 1e-5
     model = onnx.load(path)

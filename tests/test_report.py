@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from common.errors import InputError
 from servo_models.delayed_pd import TIME_STEP_S
 from sysid import figures
-from sysid.calibrate import JointCalibrationResult, RungResult, Scores
+from sysid.calibrate import JointCalibrationResult, RungResult
 from sysid.calibration_file import to_calibration
 from sysid.delay import FrequencyLag, Interval, LagBudget
 from sysid.doctor import Examination, JointExamination
@@ -30,6 +30,7 @@ from sysid.figure_data import (
 )
 from sysid.frequency_response import FrequencyResponse, TransferFunction
 from sysid.ladder import LADDER, rung
+from sysid.model_scores import Scores
 from sysid.output_error import TrialData, look_up, positions
 from sysid.poll_lattice import PollLattice
 from sysid.recording import Recording
