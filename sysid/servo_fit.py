@@ -134,7 +134,10 @@ class ServoFit:
     @property
     def verdict(self) -> str:
         """Whether it was worth it, in words."""
-        name, (gain, low, high) = self.arch.upper(), self.difference
+        name = {"delayed-pd": "DelayedPD", "sindy": "sparse equation"}.get(
+            self.arch, self.arch.upper()
+        )
+        gain, low, high = self.difference
         linear = self.scored["linear"].mean
         span = f"({100 * gain / linear:+.0f} %, 90 % interval {100 * low / linear:+.0f} to "
         span += f"{100 * high / linear:+.0f} %)"
