@@ -46,8 +46,9 @@ class Hyperparameters:
     """Passes over the data of an update."""
     minibatches: int = 4
     """Parts of the data per pass."""
-    learning_rate: float = 5e-4
-    """At the start; adapted to the KL divergence afterwards."""
+    learning_rate: float = 3e-5
+    """At the start, small enough not to spoil an imitated gait; adapted to the KL divergence
+    afterwards."""
     desired_kl: float = 0.01
     """KL divergence per update that the learning rate aims at."""
     discount: float = 0.99
@@ -62,7 +63,7 @@ class Hyperparameters:
     """Weight of the value's error."""
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
-    initial_std: float = 0.12
+    initial_std: float = 0.04
     """Standard deviation of the actions at the start."""
     normalise: bool = True
     """Whether observations are normalised by their running mean and deviation."""
@@ -79,9 +80,11 @@ class Hyperparameters:
 class Imitation:
     """How the first gait is learned."""
 
-    iterations: int = 40
+    iterations: int = 60
     """How many rounds; 0 to start PPO from nothing."""
     epochs: int = 6
     """Passes over the data of a round."""
+    minibatches: int = 16
+    """Parts of the data per pass."""
     learning_rate: float = 1e-3
     """Of Adam, at the start; it falls to a tenth."""

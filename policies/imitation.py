@@ -1,9 +1,9 @@
 """A first gait: the policy learns to continue an open-loop trot before PPO begins.
 
 Rewards alone seldom find a walk within the samples that two cores can give. So the policy is first
-shown one (DAgger: it acts, the teacher says what it would have done). The teacher sees only what
-the policy sees: it reads the phase of the trot off the last action and returns the next point, so
-the rhythm that is learned needs no clock. PPO then owns the policy; nothing of the trot is left in
+shown one (DAgger: it acts, the teacher says what it would have done). The teacher has no clock
+either: it reads the phase of the trot off the last two actions and returns the next point, so
+the rhythm that is learned needs none. PPO then owns the policy; nothing of the trot is left in
 its rewards.
 """
 
@@ -16,13 +16,15 @@ from policies.hyperparameters import Imitation
 from policies.learner import Learner
 from sim.walking_env import PupperEnv
 
+_NOISE = 0.5  # share of PPO's: the last action is the policy's clock, and must not be blurred much
+
 
 def teacher_actions(env: PupperEnv) -> np.ndarray:
     """What the trot would do next in every environment, shape (n, 12), in units of actions."""
     trot, scale = env.trot, env.config.action_scale
-    last = env.default + scale * env.action
-    phase = trot.phase_of(last, env.command)
-    phase = phase + 2 * np.pi * trot.frequency_hz * env.config.control_step_s
+    span = env.config.control_step_s
+    now, before = (env.default + scale * a for a in (env.action, env.last_action))
+    phase = trot.phase_of(now, before, span, env.command) + 2 * np.pi * trot.frequency_hz * span
     return (trot.joints(phase, env.command) - env.default) / scale
 
 
@@ -39,9 +41,8 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
         for _ in range(learner.hyper.steps_per_environment):
             teacher = torch.from_numpy(teacher_actions(env).astype(np.float32))
             asked.append(teacher)
-            actions = ppo.act(learner.observations)
-            noise = actions - ppo.actor.output_mean
-            actions = torch.where(led[:, None], teacher + noise, actions)
+            noisy, mean = ppo.act(learner.observations), ppo.actor.output_mean
+            actions = torch.where(led[:, None], teacher, mean) + _NOISE * (noisy - mean)
             learner.observations, rewards, dones, extras = learner.env.step(actions)
             ppo.process_env_step(learner.observations, rewards, dones, extras)
         ppo.compute_returns(learner.observations)
@@ -55,9 +56,9 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
     for group in ppo.optimizer.param_groups:
         group["lr"] = how.learning_rate * (1.0 - 0.9 * round_ / how.iterations)
     if ppo.actor.is_recurrent:
-        batches = storage.recurrent_mini_batch_generator(learner.hyper.minibatches, how.epochs)
+        batches = storage.recurrent_mini_batch_generator(how.minibatches, how.epochs)
     else:
-        batches = storage.mini_batch_generator(learner.hyper.minibatches, how.epochs)
+        batches = storage.mini_batch_generator(how.minibatches, how.epochs)
     errors = []
     for batch in batches:
         mean = ppo.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0])
@@ -76,4 +77,4 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
         ppo.actor.update_normalization(seen)
         ppo.critic.update_normalization(seen)
     storage.clear()
-    return float(np.sqrt(np.mean(errors[-learner.hyper.minibatches :])))
+    return float(np.sqrt(np.mean(errors[-how.minibatches :])))

@@ -49,7 +49,8 @@ VELOCITY_STEPS = 4
 """Joint velocity is the difference of readings this many control steps apart: polls are too rare
 for less."""
 
-_TOUCH_N = 1.0
+_TOUCH_N = 1.0  # published; of what must not touch the ground
+_FOOT_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
 _STRIDE_S = 0.2  # time constant of the average over a stride
 _FALLEN_TILT = 0.6  # cosine: 53 degrees
 _EDGE_M = 0.5
@@ -246,8 +247,8 @@ class PupperEnv:
 
     def _contacts(self, touch: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which feet are on the ground, and which robots have fallen."""
-        pressed = touch.max(axis=1) > _TOUCH_N
-        contact, touched = pressed[:, :FEET], pressed[:, FEET:].any(axis=1)
+        force = touch.max(axis=1)
+        contact, touched = force[:, :FEET] > _FOOT_N, (force[:, FEET:] > _TOUCH_N).any(axis=1)
         span = self.config.control_step_s
         landed, lifted = contact & (self._air > 0), ~contact & (self._contact > 0)
         self._last_air = np.where(landed, self._air, self._last_air)

@@ -107,7 +107,7 @@ class Rewards:
     """Published: long swings and stances while moving, all feet down while standing."""
     air_time_most: float = 0.25
     """Longest swing that `air_time` pays for [s]."""
-    gait: float = 0.5
+    gait: float = 0.3
     """Diagonal feet together, the two pairs in turn (a trot)."""
     gait_threshold: float = 0.1
     """Like `moving_threshold`, for the gait [m/s]."""
@@ -137,7 +137,7 @@ class Rewards:
     """0.8 v_z² + 0.2 (|ω_x| + |ω_y|)."""
     base_orientation: float = -1.0
     """Tilt."""
-    foot_slip: float = -0.5
+    foot_slip: float = -1.0
     """Speed of feet on the ground."""
     joint_position: float = -0.1
     """Distance from the default pose."""
