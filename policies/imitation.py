@@ -55,10 +55,12 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
         ppo.critic.update_normalization(seen)
     for group in ppo.optimizer.param_groups:
         group["lr"] = how.learning_rate * (1.0 - 0.9 * round_ / how.iterations)
+    parts = how.minibatches
     if ppo.actor.is_recurrent:
-        batches = storage.recurrent_mini_batch_generator(how.minibatches, how.epochs)
+        parts = min(parts, env.environments)  # it divides robots, not steps
+        batches = storage.recurrent_mini_batch_generator(parts, how.epochs)
     else:
-        batches = storage.mini_batch_generator(how.minibatches, how.epochs)
+        batches = storage.mini_batch_generator(parts, how.epochs)
     errors = []
     for batch in batches:
         mean = ppo.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0])
@@ -77,4 +79,4 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
         ppo.actor.update_normalization(seen)
         ppo.critic.update_normalization(seen)
     storage.clear()
-    return float(np.sqrt(np.mean(errors[-how.minibatches :])))
+    return float(np.sqrt(np.mean(errors[-parts:])))
