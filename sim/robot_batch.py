@@ -21,6 +21,7 @@ from sim.mini_pupper import (
     CONTACT_BODIES,
     FOOT_RADIUS_M,
     STANDING_HEIGHT_M,
+    default_pose,
     limits,
     robot_xml,
 )
@@ -113,6 +114,10 @@ class RobotBatch:
         self._feet_sites = np.array([self.model.site(f"{leg}_foot").id for leg in LEGS])
         self._trunk = self.model.body("trunk").id
         self._low, self._high = limits()
+        # a servo model was fitted to angles told as if the thighs stood at their neutral
+        # (hardware.joint_map, servo coordinates)
+        default = default_pose()
+        self._bend = self.to_servo(default) - default
         self._warnings = self.batch.warning.copy()
         self.drawn = {f: np.zeros((environments, len(JOINT_NAMES))) for f in servos.value}
         self.friction = np.zeros(environments)
@@ -195,8 +200,9 @@ class RobotBatch:
             self._control[:] = self.to_servo(target)
         else:
             before = self._control.copy()
-            predicted = np.asarray(self.servo_model.step(target), float)
-            after = self.to_servo(np.clip(predicted, self._low, self._high))
+            predicted = np.asarray(self.servo_model.step(self.to_servo(target) - self._bend), float)
+            joints = self.from_servo(predicted + self._bend)
+            after = self.to_servo(np.clip(joints, self._low, self._high))
             share = np.arange(1, config.substeps + 1)[:, None] / config.substeps
             control = before[:, None] + share * (after - before)[:, None]
         found = self.batch.rollout(
@@ -290,7 +296,7 @@ class RobotBatch:
         lines[:, :, -values:] = told[:, :, None]
         self._history[ids] = lines.reshape(n, -1)
         if self.servo_model is not None:
-            self.servo_model.reset_some(ids, joints)
+            self.servo_model.reset_some(ids, told - self._bend)
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
     def push(self, ids: NDArray[np.intp], velocity: Array) -> None:

@@ -13,6 +13,7 @@ import sim.robot_batch
 from common.errors import InputError
 from common.joints import JOINT_NAMES, LEGS
 from servo_models import DelayedPDParameters
+from servo_models.command_network import CommandNetwork
 from sim.mini_pupper import (
     STANDING_HEIGHT_M,
     default_pose,
@@ -161,6 +162,41 @@ def test_the_open_loop_trot_walks_after_every_kind_of_reset(actuator):
         speed
     )  # each slips, and bounces, its own way
     assert (height.mean(axis=0) > 0.070).all() and (height.mean(axis=0) < 0.090).all()
+
+
+# --------------------------------------------------------------------------------- learned servos
+
+
+def proportional(gain: float | np.ndarray) -> CommandNetwork:
+    """A servo model that goes to `gain` times the command's distance from the default pose."""
+    ones, pose = np.ones(12), default_pose()
+    return CommandNetwork(
+        JOINT_NAMES, SPAN,
+        {
+            "command_center": pose, "command_scale": ones, "position_center": pose,
+            "position_scale": ones, "bound": np.full(12, np.inf), "fir_bias": 0 * ones,
+            "fir": (gain * ones)[:, None],
+        },
+    )  # fmt: skip
+
+
+def test_a_servo_model_decides_where_the_joints_go():
+    env = make("ideal", QUIET, 2, servo_model=proportional(0.5))
+    action = np.tile([0.0, 0.2, -0.2], (2, 4))
+    for _ in range(40):
+        env.step(action)
+    moved = env.robots.joints - default_pose()
+    np.testing.assert_allclose(moved, 0.5 * 0.5 * action, atol=0.01)
+
+
+def test_a_servo_model_speaks_of_servos_not_of_joints():
+    """The third servo of a leg sets thigh + calf; it was fitted while the thigh stood still."""
+    env = make("ideal", QUIET, 1, servo_model=proportional(np.tile([1.0, 0.0, 1.0], 4)))
+    for _ in range(40):
+        env.step(np.tile([0.0, 0.2, 0.0], (1, 4)))
+    moved = (env.robots.joints - default_pose())[0].reshape(4, 3)
+    # the thighs' servos do not move; the calves' were told to hold the calf against them
+    np.testing.assert_allclose(moved, np.tile([0.0, 0.0, 0.1], (4, 1)), atol=0.01)
 
 
 # ----------------------------------------------------------------------------- what the policy sees
