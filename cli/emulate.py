@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,15 +19,16 @@ from common.errors import InputError
 from common.files import write_text
 from hardware.esp32_bus import SOCKET
 from hardware.feetech_registers import BAUD_RATES, SCS0009, STS3215
-from hardware.joint_map import load_joint_map
+from hardware.joint_map import JointMap, load_joint_map
 from hardware.loop import real_time_priority
 from sim.bus_faults import BusFaults
-from sim.emulated_robot import RobotSpec, draw_robot
-from sim.esp32_emulator import ProxyEmulator
+from sim.emulated_robot import EmulatedRobot, RobotSpec, draw_robot
+from sim.esp32_emulator import ImuProxy, ProxyEmulator
 from sim.esp32_socket import ProxySocket
 from sim.feetech_emulator import FeetechEmulator
 from sim.feetech_pty import FeetechPty
 from sim.servo_bench import ServoBench
+from sim.walking_robot import WalkingRobot
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,9 @@ class Common:
     """What goes wrong, as kind=probability per answer: lost=0.02,late=0.01,corrupted=0.01. Kinds:
     lost, late, truncated, corrupted, duplicated, foreign, wrong-length, error-bits, frozen,
     brown-out, unplugged, second-writer."""
+    walking: bool = False
+    """The robot stands on the ground and walks where its servos carry it; otherwise its legs hang
+    in free air."""
     by_hand: bool = False
     """Someone swings the joints while they are limp, for trying calibrate-joints."""
     truth: Path | None = None
@@ -58,15 +65,13 @@ class Esp32(Common):
     def run(self) -> None:
         """Serve until Ctrl-C."""
         rng = np.random.default_rng(self.seed)
-        bench = ServoBench(
-            draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0], self.by_hand,
-            keep_log=False,
-        )  # fmt: skip
+        bench = _bench(self, draw_robot(rng), load_joint_map("mini_pupper_2"), rng)
         emulator = ProxyEmulator(bench, rng, BusFaults.parse(self.faults, rng))
         server = ProxySocket(emulator, self.socket)
         _write_truth(self, bench)
         name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
-        _serve(server, f"Emulated Mini Pupper 2 at {self.socket}.", name)
+        what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
+        _serve(server, f"{what} at {self.socket}.", name, self.walking)
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,8 @@ class Feetech(Common):
     """A stable name for the device; survives being unplugged."""
     echo: bool = False
     """The adapter sends the host's own bytes back."""
+    imu_socket: Path | None = None
+    """Serve the robot's IMU here, as the Mini Pupper 2's proxy does: a serial line has none."""
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
@@ -97,21 +104,17 @@ class Feetech(Common):
             raise InputError(f"--baud {baud}: servos know {', '.join(map(str, BAUD_RATES))}.")
         # read directly, a servo answers for the very moment: no polls in between, none lost
         spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
-        bench = ServoBench(
-            draw_robot(rng, spec), layout, rng.spawn(1)[0], self.by_hand, keep_log=False
-        )
+        bench = _bench(self, draw_robot(rng, spec), layout, rng)
         emulator = FeetechEmulator(
             bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
             BusFaults.parse(self.faults, rng), self.echo,
         )  # fmt: skip
-        server = FeetechPty(emulator, self.link or Path(tempfile.mkdtemp()) / "servos")
-        _write_truth(self, bench)
-        count = len(emulator.servos)
-        _serve(
-            server,
-            f"{count} emulated {series.name} at {server.device}, {baud} baud.",
-            f"feetech:{server.device}",
-        )
+        with _imu_beside(bench, self.imu_socket, rng):
+            server = FeetechPty(emulator, self.link or Path(tempfile.mkdtemp()) / "servos")
+            _write_truth(self, bench)
+            what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
+            what += f"; IMU at {self.imu_socket}." if self.imu_socket else "."
+            _serve(server, what, f"feetech:{server.device}", self.walking)
 
 
 Emulate = (
@@ -120,17 +123,51 @@ Emulate = (
 )
 
 
+def _bench(
+    options: Common, robot: EmulatedRobot, layout: JointMap, rng: np.random.Generator
+) -> ServoBench:
+    """The servos of a robot in free air or on the ground."""
+    if options.walking and options.by_hand:
+        raise InputError("--by-hand swings legs in free air: leave out --walking.")
+    own, imu = rng.spawn(2)
+    plant = WalkingRobot(robot, imu) if options.walking else None
+    return ServoBench(robot, layout, own, options.by_hand, keep_log=False, plant=plant)
+
+
+@contextmanager
+def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) -> Iterator[None]:
+    """The IMU of the same robot on a socket of its own, if there is a path, during the block."""
+    if path is None:
+        yield
+        return
+    # a proxy polls its servos, although nobody can ask this one for them
+    polled = replace(bench.robot, spec=RobotSpec())
+    shown = ServoBench(
+        polled, load_joint_map("mini_pupper_2"), rng.spawn(1)[0], keep_log=False, plant=bench.plant
+    )
+    server = ProxySocket(ImuProxy(shown, rng.spawn(1)[0]), path)
+    thread = threading.Thread(target=server.serve, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.stop()
+        thread.join()
+        server.close()
+
+
 def _write_truth(options: Common, bench: ServoBench) -> None:
     if options.truth:
         text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
         write_text(options.truth, text, options.force)
 
 
-def _serve(server: ProxySocket | FeetechPty, what: str, name: str) -> None:
+def _serve(server: ProxySocket | FeetechPty, what: str, name: str, walking: bool) -> None:
     terminal.out.print(what, soft_wrap=True)
+    # a sweep is for legs in free air
+    sweep = "" if walking else f"  pupper-sysid sweep --freqs 1-10 --joints LF --bus {name}\n"
     terminal.out.print(
-        f"In another terminal:\n  pupper-sysid sweep --freqs 1-10 --joints LF --bus {name}\n"
-        f"  pupper-sysid monitor --bus {name}\nCtrl-C ends it.",
+        f"In another terminal:\n{sweep}  pupper-sysid monitor --bus {name}\nCtrl-C ends it.",
         soft_wrap=True,
     )
     try:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from common.errors import FileExistsRefusal, InputError
 
 PACKAGE = "pupper-sysid"
+
+_SYNC_S = 1.0  # at most this much is lost with the power
 
 
 def refuse_overwrite(path: Path, force: bool = False) -> None:
@@ -42,6 +47,91 @@ def write_bytes(path: Path, data: bytes, force: bool = False) -> None:
             raise
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+class SyncedText:
+    """A text file that grows line by line; what was written is on the disk within a second.
+
+    Syncing is done in a thread, because a memory card can take seconds.
+
+    Parameters
+    ----------
+    path : Path
+    force : bool
+        Replace an existing file.
+    append_at : int, optional
+        Go on writing an existing file from this byte on instead; what follows it is cut off.
+    advice : str
+        What to do when it can no longer be written, for the error's sentence.
+
+    Raises
+    ------
+    InputError
+        If the file exists, or cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, force: bool = False, append_at: int | None = None, advice: str = ""
+    ):
+        self.path, self._advice = path, advice
+        if append_at is None:
+            refuse_overwrite(path, force)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            mode = "w" if append_at is None else "r+"
+            self._file = path.open(mode, encoding="utf-8", newline="\n")
+            if append_at is not None:
+                self._file.seek(append_at)
+                self._file.truncate()
+        except OSError as error:
+            raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+        self._closing = threading.Event()
+        self._syncer = threading.Thread(target=self._sync, daemon=True)
+        self._syncer.start()
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has been closed."""
+        return self._file.closed
+
+    def write(self, lines: Sequence[str]) -> None:
+        """Write whole lines.
+
+        Raises
+        ------
+        InputError
+            If the disk does not take them; what is there stays.
+        """
+        try:
+            self._file.writelines(f"{line}\n" for line in lines)
+            self._file.flush()
+        except OSError as error:
+            self._end()
+            raise InputError(
+                f"{self.path} cannot be written: {error.strerror}. Make room{self._advice}."
+            ) from error
+
+    def close(self, lines: Sequence[str] = ()) -> None:
+        """Write the last lines and close. May be called twice."""
+        if self.closed:
+            return
+        try:
+            self.write(lines)
+        finally:
+            self._end()
+
+    def _end(self) -> None:
+        self._closing.set()
+        self._syncer.join()
+        with suppress(OSError):
+            os.fsync(self._file.fileno())
+        with suppress(OSError):
+            self._file.close()
+
+    def _sync(self) -> None:
+        while not self._closing.wait(_SYNC_S):
+            with suppress(OSError):  # the next write will say so
+                os.fsync(self._file.fileno())
 
 
 def sha256(path: Path) -> str:

@@ -27,6 +27,7 @@ from common.errors import BusError, InputError
 from hardware import esp32_datagrams as datagrams
 from hardware.bus import BusSample, Sent
 from hardware.clock import HostClock
+from hardware.imu import ImuSample, from_chip
 from hardware.joint_map import JointMap, load_joint_map
 
 SOCKET = Path("/tmp/esp32-proxy.socket")
@@ -140,6 +141,22 @@ class Esp32Bus:
             voltage_v=missing if self._power is None else np.full(joints, self._power.voltage_v),
             load=missing if load is None else load[self._by_id],
         )
+
+    def imu(self) -> ImuSample | None:
+        """The IMU, of at most some milliseconds ago; None if it or the proxy did not answer.
+
+        As with positions, an answer counts when another one agrees.
+        """
+        before = self.now()
+        seen: list[list[float]] = []
+        for _ in range(_SAME_READINGS):
+            raw = self._ask(datagrams.GET_IMU, datagrams.parse_imu)
+            if raw is None:
+                return None
+            if raw.tolist() in seen:
+                return from_chip(round((before + self.now()) / 2, 6), raw)
+            seen.append(raw.tolist())
+        return None
 
     def torque(self, on: bool) -> bool:
         """Hold the present pose, or let all servos go limp."""

@@ -26,7 +26,9 @@ HIGHEST_COUNT = 1023
 _SET = struct.Struct("<BB12B12H")
 _COUNTS = struct.Struct("<BB12H")
 _LOADS = struct.Struct("<BB12h")
+_IMU = struct.Struct("<BB6f")
 _POWER = struct.Struct("<BB2f")
+_IMU_FULL_SCALE = np.repeat([2.0, 2048.0], 3)  # g, °/s
 ACKNOWLEDGED = bytes([2, SET_POSITION])
 REPLY_SIZES = {SET_POSITION: 2, GET_POSITION: 26, GET_LOAD: 26, GET_IMU: 26, GET_POWER: 10}
 
@@ -84,6 +86,17 @@ def parse_load(reply: bytes) -> NDArray[np.float64] | None:
         return None
     load = np.array(_LOADS.unpack(reply)[2:], float) / 1000.0
     return np.where(np.abs(load) <= 1.03, load, np.nan)
+
+
+def parse_imu(reply: bytes) -> NDArray[np.float64] | None:
+    """Acceleration [g] and rate [°/s] along the chip's axes, shape (6,); None if it is no such
+    reply or the numbers are beyond what the chip can say. Six zeros are a read that failed.
+    """
+    if not _is(reply, GET_IMU):
+        return None
+    raw = np.array(_IMU.unpack(reply)[2:], float)
+    # NaN is beyond everything
+    return raw if np.all(np.abs(raw) <= _IMU_FULL_SCALE) else None
 
 
 def parse_power(reply: bytes) -> Power | None:

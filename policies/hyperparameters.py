@@ -46,7 +46,7 @@ class Hyperparameters:
     """Passes over the data of an update."""
     minibatches: int = 4
     """Parts of the data per pass."""
-    learning_rate: float = 3e-5
+    learning_rate: float = 1e-5
     """At the start, small enough not to spoil an imitated gait; adapted to the KL divergence
     afterwards."""
     desired_kl: float = 0.01
@@ -63,8 +63,9 @@ class Hyperparameters:
     """Weight of the value's error."""
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
-    initial_std: float = 0.04
-    """Standard deviation of the actions at the start."""
+    initial_std: float = 0.015
+    """Standard deviation of the actions at the start. More, and dry friction in the servos is
+    shaken loose: the policy learns to walk on other servos than those it will have."""
     normalise: bool = True
     """Whether observations are normalised by their running mean and deviation."""
     mixed_precision: bool = False

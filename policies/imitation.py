@@ -16,8 +16,6 @@ from policies.hyperparameters import Imitation
 from policies.learner import Learner
 from sim.walking_env import PupperEnv
 
-_NOISE = 0.5  # share of PPO's: the last action is the policy's clock, and must not be blurred much
-
 
 def teacher_actions(env: PupperEnv) -> np.ndarray:
     """What the trot would do next in every environment, shape (n, 12), in units of actions."""
@@ -41,8 +39,9 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
         for _ in range(learner.hyper.steps_per_environment):
             teacher = torch.from_numpy(teacher_actions(env).astype(np.float32))
             asked.append(teacher)
-            noisy, mean = ppo.act(learner.observations), ppo.actor.output_mean
-            actions = torch.where(led[:, None], teacher, mean) + _NOISE * (noisy - mean)
+            actions = ppo.act(learner.observations)
+            noise = actions - ppo.actor.output_mean
+            actions = torch.where(led[:, None], teacher + noise, actions)
             learner.observations, rewards, dones, extras = learner.env.step(actions)
             ppo.process_env_step(learner.observations, rewards, dones, extras)
         ppo.compute_returns(learner.observations)

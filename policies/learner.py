@@ -134,6 +134,8 @@ class Learner:
         device = self.ranks.device
         # the networks of all ranks start alike; what they sample later must differ
         torch.manual_seed(seed)
+        # as if begun at different times: not all episodes shall end in the same update
+        env.episode_length_buf = torch.randint(0, env.max_episode_length, (env.num_envs,))
         self.observations = env.get_observations()
         actor, critic = build(architecture, self.observations, hyper)
         # a recurrent policy's minibatches are whole environments

@@ -27,8 +27,8 @@ from hardware.bus import BusSample, Sent
 from hardware.joint_map import load_joint_map
 from sim.clocks import Clock, RealClock, VirtualClock
 from sim.emulated_robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
-from sim.free_air_servo import FreeAirServo
 from sim.poll_schedule import PollSchedule
+from sim.servo_plant import FreeAirServos, ServoPlant
 
 NOMINAL_SPEED_LIMIT_RAD_S = 7.5
 """What a user would know of the servo before measuring it [rad/s]."""
@@ -49,21 +49,27 @@ class EmulatedBus:
         Decides lost polls, noise and timing.
     real_time : bool
         Live by the host's clock instead of virtual time.
+    plant : ServoPlant, optional
+        What moves; by default the robot's servos in free air.
     """
 
     name = "emulated"
     joint_names: tuple[str, ...] = JOINT_NAMES
 
-    def __init__(self, robot: EmulatedRobot, rng: np.random.Generator, real_time: bool = False):
+    def __init__(
+        self,
+        robot: EmulatedRobot,
+        rng: np.random.Generator,
+        real_time: bool = False,
+        plant: ServoPlant | None = None,
+    ):
         self.robot = robot
         spec = robot.spec
         polls, self._noise, clock = rng.spawn(3)
         self._clock: Clock = (
             RealClock() if real_time else VirtualClock(spec.sleep_overshoot_s, clock)
         )
-        self._servos = [
-            FreeAirServo(servo.actuator, DEFAULT_POSE[servo.joint]) for servo in robot.servos
-        ]
+        self._plant = plant or FreeAirServos(robot)
         self._schedule = None
         if spec.poll_period_s > 0:
             phase = np.array([servo.poll_phase_s for servo in robot.servos])
@@ -122,8 +128,8 @@ class EmulatedBus:
             )
         sent, asked = self._clock.now(), goal
         goal = self._truncated(goal)
-        for i in np.flatnonzero(goal != self._goal):
-            self._servos[i].command(sent, goal[i])
+        for i in np.flatnonzero(goal != self._goal).tolist():
+            self._plant.command(i, sent, goal[i])
             self._changes[i].append(sent)
         self._goal = goal
         self._clock.spend(self.robot.spec.write_duration_s)
@@ -144,10 +150,10 @@ class EmulatedBus:
         measured = self._last_polls(time_s)
         fresh = np.flatnonzero(measured > self._measured_s)
         noise = self.robot.spec.reading_noise_rad * self._noise.standard_normal(len(fresh))
-        position = np.array([self._servos[i].position_at(measured[i]) for i in fresh])
+        position = np.array([self._plant.angle(i, measured[i]) for i in fresh.tolist()])
         self._reading[fresh], self._count[fresh] = self._quantised(position + noise, fresh)
         self._measured_s = measured
-        true = np.array([servo.position_at(time_s) for servo in self._servos])
+        true = np.array([self._plant.angle(i, time_s) for i in range(len(JOINT_NAMES))])
         self._log.append((time_s, true, measured))
         at = np.full(len(JOINT_NAMES), time_s)
         return BusSample(at, self._reading.copy(), self._count.copy())
@@ -156,8 +162,8 @@ class EmulatedBus:
         """Hold the present pose, or let every joint go limp."""
         self._refuse_closed()
         now = self._clock.now()
-        for servo in self._servos:
-            servo.torque(now, on)
+        for i in range(len(JOINT_NAMES)):
+            self._plant.torque(i, now, on)
         # the next write must reach the servos even if it repeats the last one
         self._goal = np.full(len(JOINT_NAMES), np.nan)
         return True

@@ -17,6 +17,7 @@ import numpy as np
 
 from common.errors import InputError
 from hardware import esp32_datagrams as datagrams
+from hardware.imu import to_chip
 from sim.bus_faults import BusFaults
 from sim.poll_schedule import PollSchedule
 from sim.servo_bench import ServoBench
@@ -29,7 +30,6 @@ LOW_VOLTAGE_V = 4.0
 
 _SET = struct.Struct("<BB12B12H")
 _CENTRE = 512
-_AT_REST_IMU = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
 
 
 class ProxyEmulator:
@@ -82,14 +82,14 @@ class ProxyEmulator:
             values = _SET.unpack(request)[2:]
             self._obey(values[:12], values[12:], now)
             return datagrams.ACKNOWLEDGED
+        if request == datagrams.request(datagrams.GET_IMU):
+            return self._imu(now)
         self._refresh(now)
         if len(request) == 2:
             if opcode == datagrams.GET_POSITION:
                 return struct.pack("<BB12H", 26, opcode, *self._counts)
             if opcode == datagrams.GET_LOAD:
                 return struct.pack("<BB12h", 26, opcode, *self._loads)
-            if opcode == datagrams.GET_IMU:
-                return struct.pack("<BB6f", 26, opcode, *_AT_REST_IMU)
             if opcode == datagrams.GET_POWER:
                 return struct.pack("<BB2f", 10, opcode, self.bench.supply_v, 0.4)
         return previous or self.rng.bytes(2)
@@ -121,6 +121,11 @@ class ProxyEmulator:
             return [(0.0, reply + b"\0" if self.rng.random() < 0.5 else reply[:-1] or b"\0")]
         other = struct.pack("<BB2f", 10, datagrams.GET_POWER, self.bench.supply_v, 0.4)
         return self.faults.spoil(kind, reply, other)
+
+    def _imu(self, now: float) -> bytes:
+        sample = self.bench.imu(now)
+        raw = np.zeros(6) if sample is None else to_chip(sample)
+        return struct.pack("<BB6f", 26, datagrams.GET_IMU, *raw)
 
     def _obey(self, torque: tuple[int, ...], counts: tuple[int, ...], now: float) -> None:
         """A setpoint reaches the servos with the firmware's next tick."""
@@ -157,3 +162,13 @@ class ProxyEmulator:
         block = tuple(int(c) for c in self._counts)
         if self.bench.keep_log and (not self.history or self.history[-1][1] != block):
             self.history.append((self._time, block))
+
+
+class ImuProxy(ProxyEmulator):
+    """A proxy that answers for the IMU alone: the robot's servos hang on another line."""
+
+    def answer(self, request: bytes, previous: bytes, now: float) -> bytes:
+        """The reply to one datagram at `now`; all but GET_IMU are unknown."""
+        if request == datagrams.request(datagrams.GET_IMU):
+            return self._imu(now)
+        return previous or self.rng.bytes(2)

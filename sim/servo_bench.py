@@ -1,9 +1,10 @@
 """Emulated servos as a protocol server sees them: goals and positions in counts, in real time.
 
 Behind the emulators of both buses stand the same servos as behind `EmulatedBus`, with the same
-truth. Here they have what a register or a datagram can ask of them: counts of an encoder, share of
-duty, temperature, a supply that can sag, an encoder that can freeze, and a hand that moves a limp
-joint (`by_hand`), so that a calibration of the joints can be tried without a robot.
+truth, in free air or in a robot that walks (`sim.servo_plant`). Here they have what a register or a
+datagram can ask of them: counts of an encoder, share of duty, temperature, a supply that can sag,
+an encoder that can freeze, and a hand that moves a limp joint (`by_hand`), so that a calibration of
+the joints can be tried without a robot.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from common.joints import DEFAULT_POSE, JOINT_NAMES
+from common.joints import JOINT_NAMES
+from hardware.imu import ImuSample
 from hardware.joint_map import JointMap
 from sim.emulated_robot import EmulatedRobot
-from sim.free_air_servo import FreeAirServo
+from sim.servo_plant import FreeAirServos, ServoPlant
 
 AMBIENT_C, SUPPLY_V = 27.0, 7.4
 _HAND_RAD, _HAND_PERIOD_S = 0.6, 6.0
@@ -35,6 +37,8 @@ class ServoBench:
         Whether someone swings the joints while they are limp.
     keep_log : bool
         Whether goals and readings are remembered: for proofs, not for a robot that runs for days.
+    plant : ServoPlant, optional
+        What moves; by default the robot's servos in free air.
     """
 
     def __init__(
@@ -44,10 +48,12 @@ class ServoBench:
         rng: np.random.Generator,
         by_hand: bool = False,
         keep_log: bool = True,
+        plant: ServoPlant | None = None,
     ):
         self.robot, self.map = robot, joint_map.select(JOINT_NAMES).per_servo()
         self._rng, self._by_hand = rng, by_hand
-        self._servos = [FreeAirServo(s.actuator, DEFAULT_POSE[s.joint]) for s in robot.servos]
+        self.plant = plant or FreeAirServos(robot)
+        """What moves."""
         self._offset = np.array([s.feedback.offset_rad for s in robot.servos])
         self._noise = robot.spec.reading_noise_rad
         self._limp_since = np.full(len(JOINT_NAMES), np.inf)
@@ -61,7 +67,7 @@ class ServoBench:
 
     def command(self, index: int, time_s: float, count: int) -> None:
         """Goal of one servo from `time_s` on, which must not go backwards."""
-        self._servos[index].command(time_s, (count - self._zero[index]) / self._scale[index])
+        self.plant.command(index, time_s, (count - self._zero[index]) / self._scale[index])
         if self.keep_log:
             self.commands.append((time_s, index, count))
 
@@ -71,7 +77,7 @@ class ServoBench:
         if on == (not limp):
             return
         self._limp_since[index] = np.inf if on else time_s
-        self._servos[index].torque(time_s, on)
+        self.plant.torque(index, time_s, on)
 
     def is_on(self, index: int) -> bool:
         """Whether the servo holds."""
@@ -79,7 +85,7 @@ class ServoBench:
 
     def angle(self, index: int, time_s: float) -> float:
         """Where the servo truly is [rad], servo coordinates."""
-        angle = self._servos[index].position_at(time_s)
+        angle = self.plant.angle(index, time_s)
         if self._by_hand and np.isfinite(self._limp_since[index]):
             phase = 2 * np.pi * (time_s - self._limp_since[index]) / _HAND_PERIOD_S
             angle += _HAND_RAD * np.sin(phase)
@@ -95,7 +101,11 @@ class ServoBench:
     def load(self, index: int) -> int:
         """Signed duty in thousandths, in the direction of the counts."""
         direction = 1 if self._scale[index] > 0 else -1
-        return round(1000 * direction * self._servos[index].load)
+        return round(1000 * direction * self.plant.load(index))
+
+    def imu(self, time_s: float) -> ImuSample | None:
+        """What the robot's IMU says."""
+        return self.plant.imu(time_s)
 
     def truth(self, **transport: Any) -> dict[str, Any]:
         """What an identification should find, with how the protocol delays commands."""

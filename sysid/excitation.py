@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from common.errors import InputError
 from common.joints import DEFAULT_POSE
+from hardware.moves import raised_cosine
 
 KINDS = ("sine", "chirp", "multisine", "steps", "square")
 
@@ -270,11 +271,6 @@ def off_harmonics(frequency_hz: float, rates_hz: Sequence[float], duration_s: fl
             if f > 0 and clear(f):
                 return round(f, 6)
     return frequency_hz
-
-
-def raised_cosine(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A smooth way from 0 to 1 while `share` goes from 0 to 1; constant outside."""
-    return 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
 
 
 Offset = Callable[[NDArray[np.float64]], NDArray[np.float64]]

@@ -20,7 +20,8 @@ from common.errors import BusError, InputError
 from hardware.bus import BusSample, ServoBus
 from hardware.guard import GuardedBus, guarded
 from hardware.loop import FixedRateLoop
-from sysid.excitation import Plan, TrialPlan, raised_cosine
+from hardware.moves import glide
+from sysid.excitation import Plan, TrialPlan
 from sysid.recording import RecordingWriter
 from sysid.resume import Resume
 
@@ -32,9 +33,6 @@ REST_S = 0.5
 
 RETURN_S = 0.4
 """Shortest way back to the start pose after a trial [s]."""
-
-GENTLE_RAD_S = 1.0
-"""Highest speed of the moves between trials."""
 
 _FIRST_READING_S = 2.0
 
@@ -208,15 +206,7 @@ class _Session:
 
     def _move_to_start(self) -> None:
         """From the last command to the start pose on a raised cosine, gently."""
-        origin, way = self._sent.copy(), self._start - self._sent
-        farthest = float(np.max(np.abs(way)))
-        if farthest == 0:
-            return
-        # the fastest point of a raised cosine is pi/2 times its mean speed
-        duration = max(RETURN_S, 0.5 * np.pi * farthest / GENTLE_RAD_S)
-        for elapsed in self._between.ticks(duration):
-            self._command(origin + raised_cosine(np.array(elapsed / duration)) * way)
-        self._command(self._start)
+        glide(self._between, self._command, self._sent.copy(), self._start, RETURN_S)
 
     def _hold(self, duration_s: float) -> None:
         """Rest at the start pose."""

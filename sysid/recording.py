@@ -13,11 +13,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +25,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import InputError
-from common.files import refuse_overwrite, versions
+from common.files import SyncedText, versions
 from common.joints import JOINT_NAMES
 
 SCHEMA_VERSION = 1
@@ -39,7 +36,7 @@ REQUIRED_COLUMNS = (
 OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
 FOLDER = Path("recordings")
 
-_SYNC_S = 1.0  # at most this much is lost with the power
+_ADVICE = "; what is there can be continued with `pupper-sysid sweep --resume`"
 
 
 @dataclass(frozen=True)
@@ -226,20 +223,14 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, metadata: dict[str, Any], force: bool = False):
-        refuse_overwrite(path, force)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("w", encoding="utf-8", newline="\n")
-        except OSError as error:
-            raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+        self._file = SyncedText(path, force, advice=_ADVICE)
         self._columns: tuple[str, ...] = ()
         created = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
         header = {"schema_version": SCHEMA_VERSION, "created": created, "versions": versions()}
-        self._keep_synced()
         lines = [
             f"# {k}: {json.dumps(v, ensure_ascii=False)}" for k, v in (header | metadata).items()
         ]
-        self._write([TITLE, *lines])
+        self._file.write([TITLE, *lines])
 
     @classmethod
     def resumed(cls, path: Path, trial: int) -> RecordingWriter:
@@ -258,16 +249,9 @@ class RecordingWriter:
         lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
         made = cls.__new__(cls)
         made._columns = tuple(lines[0].split(",")) if lines else ()
-        try:
-            made._file = path.open("r+", encoding="utf-8", newline="\n")
-            made._file.seek(0, os.SEEK_END)
-            made._file.truncate(len(whole.encode()))
-            made._file.seek(0, os.SEEK_END)
-        except OSError as error:
-            raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+        made._file = SyncedText(path, append_at=len(whole.encode()), advice=_ADVICE)
         at = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
-        made._keep_synced()
-        made._write([f"# resumed: {json.dumps({'trial': trial, 'at': at})}"])
+        made._file.write([f"# resumed: {json.dumps({'trial': trial, 'at': at})}"])
         return made
 
     def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
@@ -278,54 +262,20 @@ class RecordingWriter:
             optional = [c for c in OPTIONAL_COLUMNS if c in rows[0]]
             self._columns = (*REQUIRED_COLUMNS, *optional)
             lines.append(",".join(self._columns))
-        self._write([*lines, *(",".join(_cell(c, row[c]) for c in self._columns) for row in rows)])
+        self._file.write(
+            [*lines, *(",".join(_cell(c, row[c]) for c in self._columns) for row in rows)]
+        )
 
     def close(self, completed: dict[str, Any] | None = None) -> None:
         """Close the file; `completed` becomes its footer. May be called twice."""
-        if self._file.closed:
-            return
-        try:
-            if completed is not None:
-                self._write([f"# completed: {json.dumps(completed, ensure_ascii=False)}"])
-        finally:
-            self._end()
+        footer = f"# completed: {json.dumps(completed, ensure_ascii=False)}"
+        self._file.close([] if completed is None else [footer])
 
     def __enter__(self) -> RecordingWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _write(self, lines: Sequence[str]) -> None:
-        try:
-            self._file.writelines(f"{line}\n" for line in lines)
-            self._file.flush()
-        except OSError as error:
-            self._end()
-            raise InputError(
-                f"{self._file.name} cannot be written: {error.strerror}. Make room; what is there "
-                "can be continued with `pupper-sysid sweep --resume`."
-            ) from error
-
-    def _end(self) -> None:
-        self._closing.set()
-        self._syncer.join()
-        with suppress(OSError):
-            os.fsync(self._file.fileno())
-        with suppress(OSError):
-            self._file.close()
-
-    def _keep_synced(self) -> None:
-        """Bring rows to the disk once a second, in a thread: a memory card can take seconds."""
-        self._closing = threading.Event()
-
-        def sync() -> None:
-            while not self._closing.wait(_SYNC_S):
-                with suppress(OSError):  # the next write will say so
-                    os.fsync(self._file.fileno())
-
-        self._syncer = threading.Thread(target=sync, daemon=True)
-        self._syncer.start()
 
 
 _DECIMALS = {"send_time_s": 6, "read_time_s": 6, "command_rad": 7, "position_rad": 7}

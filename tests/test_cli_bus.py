@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import yaml
 from command_line import run
-from servo_servers import moving_servos, on_a_port, still_servos
+from servo_servers import moving_servos, on_a_port, still_servos, wait_until
 
+from hardware.esp32_bus import Esp32Bus
 from hardware.feetech_registers import SCS0009
 from sysid.recording import load
 
@@ -96,6 +97,7 @@ def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
         (("sweep", "--resume", "nothing.csv"), "does not exist"),
         (("emulate", "feetech", "--ids", "1-20"), "has the ids 1 to 12"),
         (("emulate", "feetech", "--baud", "7"), "servos know 1000000"),
+        (("emulate", "esp32", "--walking", "--by-hand"), "leave out --walking"),
         (("emulate", "esp32", "--faults", "gremlins=1"), "'gremlins' is not known"),
         (("emulate", "esp32", "--faults", "lost=2"), "is no probability"),
         (("emulate", "esp32", "--faults", "lost"), "is not kind=probability"),
@@ -148,3 +150,26 @@ def test_an_emulator_says_what_to_type_and_ends_on_request(tmp_path, kind):
     assert not (tmp_path / "s").exists(), "it leaves nothing behind"
     truth = yaml.safe_load((tmp_path / "t.yaml").read_text())
     assert truth["joints"]["LF_hip"]["actuator"]["delay_s"] > 0
+
+
+def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cli.pupper_sysid", "emulate", "feetech", "--walking",
+         "--link", "s", "--imu-socket", "i"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    said = "".join(process.stdout.readline() for _ in range(4))
+    try:
+        imu = Esp32Bus(tmp_path / "i")
+        samples: list = []
+        assert wait_until(lambda: bool(samples.append(imu.imu()) or samples[-1]))
+        imu.close()
+        np.testing.assert_allclose(samples[-1].acceleration_m_s2, [0, 0, 9.81], atol=0.15)
+    finally:
+        process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=10)
+    assert "IMU at i." in said and "monitor --bus feetech:s" in said and "Ctrl-C" in said
+    assert "sweep" not in said, "a sweep is for legs in free air"
+    assert "Traceback" not in err and not list(tmp_path.glob("[is]"))

@@ -16,10 +16,11 @@ from common.errors import BusError, FileExistsRefusal, InputError
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.bus import BusSample, Sent
 from hardware.limits import PositionLimits
+from hardware.moves import GENTLE_RAD_S
 from sim import EmulatedBus, RobotSpec, draw_robot
 from sysid.command_playback import playback
 from sysid.excitation import LEAD_IN_S, Plan, plan
-from sysid.recorder import GENTLE_RAD_S, REST_S, record
+from sysid.recorder import REST_S, record
 from sysid.recording import load
 
 PERIOD = 0.019

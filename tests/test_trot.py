@@ -10,7 +10,7 @@ from common.joints import LEGS
 from sim.mini_pupper import default_pose, foot_position, limits
 from sim.trot import Trot
 
-TROT = Trot(frequency_hz=2.5, lift_m=0.020, duty=0.6, gain=1.0)
+TROT = Trot(frequency_hz=2.5, lift_m=0.020, duty=0.6, gain=1.0, turn_gain=1.0)
 STEP_S = 0.02
 COMMANDS = {
     "forward": (0.2, 0.0, 0.0),

@@ -1,0 +1,101 @@
+"""The IMU of the robot: what its chip says, in the trunk's axes and in SI units.
+
+The trunk's axes are x forward, y left, z up. The Mini Pupper 2's chip, a QMI8658C, is mounted
+upside down and with x and y exchanged (vendor's ROS driver, `imu_interface.py`): its z points down,
+its x to the left and its y forward, so
+
+    x = y_chip,  y = x_chip,  z = -z_chip
+
+for both of its sensors, which is a rotation and its own inverse. The accelerometer measures the
+*specific force*, acceleration minus gravity: standing still it points up with 9.81 m/s², which the
+chip reports as about -1 g on its z. It ends at ±2 g, and walking gets there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+GRAVITY_M_S2 = 9.80665
+"""One g, the chip's unit."""
+ACCELERATION_QUANTUM_G = 1 / 16384
+RATE_QUANTUM_DEG_S = 1 / 16
+SAMPLE_RATE_HZ = 235.0
+"""New values of the chip per second."""
+
+_LOWEST, _HIGHEST = -(2**15), 2**15 - 1  # 16-bit words: ±2 g, ±2048 °/s
+_QUANTA = np.repeat([ACCELERATION_QUANTUM_G, RATE_QUANTUM_DEG_S], 3)
+_TRUNK_FROM_CHIP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """One reading of the IMU in the trunk's axes (x forward, y left, z up).
+
+    Attributes
+    ----------
+    time_s : float
+        When it was read, on the clock of the bus that read it [s].
+    rate_rad_s : ndarray, shape (3,)
+        Angular velocity: rolling to the right, nose going down, turning to the left [rad/s].
+    acceleration_m_s2 : ndarray, shape (3,)
+        Specific force; (0, 0, 9.81) while standing level.
+    clipped : bool
+        Whether a number is at the end of its range, so that the truth may lie beyond it.
+    """
+
+    time_s: float
+    rate_rad_s: NDArray[np.float64]
+    acceleration_m_s2: NDArray[np.float64]
+    clipped: bool
+
+
+class Imu(Protocol):
+    """Whatever has an IMU: a bus, real or emulated."""
+
+    def imu(self) -> ImuSample | None:
+        """The latest reading; None if there is none."""
+        ...
+
+
+def from_chip(time_s: float, raw: NDArray[np.float64]) -> ImuSample | None:
+    """The sample behind the chip's six numbers.
+
+    Parameters
+    ----------
+    time_s : float
+    raw : ndarray, shape (6,)
+        Acceleration [g], then rate [°/s], along the chip's axes.
+
+    Returns
+    -------
+    ImuSample or None
+        None if all six are 0: so the firmware reports a read that failed.
+
+    Examples
+    --------
+    >>> sample = from_chip(0.0, np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
+    >>> sample.acceleration_m_s2.tolist()
+    [0.0, 0.0, 9.80665]
+    """
+    if not np.any(raw):
+        return None
+    word = np.asarray(raw, float) / _QUANTA
+    clipped = bool(np.any((word <= _LOWEST) | (word >= _HIGHEST)))
+    acceleration = GRAVITY_M_S2 * (_TRUNK_FROM_CHIP @ raw[:3])
+    return ImuSample(time_s, np.radians(_TRUNK_FROM_CHIP @ raw[3:]), acceleration, clipped)
+
+
+def to_chip(sample: ImuSample) -> NDArray[np.float64]:
+    """The chip's six numbers behind a sample, shape (6,): the inverse of `from_chip`."""
+    acceleration = _TRUNK_FROM_CHIP.T @ sample.acceleration_m_s2 / GRAVITY_M_S2
+    rate = np.degrees(_TRUNK_FROM_CHIP.T @ sample.rate_rad_s)
+    return np.concatenate([acceleration, rate])
+
+
+def as_words(raw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the chip's 16-bit words leave of six true numbers [g, °/s], shape (6,)."""
+    return np.clip(np.rint(raw / _QUANTA), _LOWEST, _HIGHEST) * _QUANTA
