@@ -172,6 +172,16 @@ class GuardedBus:
         self._watch.forget(self.bus.now())
         return done
 
+    @property
+    def sent(self) -> Angles:
+        """The last goal that went out [rad], or where the robot is if none did."""
+        return (self._present if self._sent is None else self._sent).copy()
+
+    def limp(self) -> None:
+        """After a fault that the guard did not see itself: torque off, no way back."""
+        self._stopped_for_safety = True
+        self.park()
+
     def park(self, pose_rad: Angles | None = None) -> None:
         """Stop, go back to `pose_rad` (by default where the robot was found), torque off.
 
@@ -216,7 +226,7 @@ class GuardedBus:
             self._watchdog.beat()
 
     def _return(self, pose: Angles) -> None:
-        origin = (self._present if self._sent is None else self._sent).copy()
+        origin = self.sent
         self.write(origin)
         way = self.limits.clip(pose) - origin
         farthest = float(np.max(np.abs(way)))
@@ -233,19 +243,23 @@ class GuardedBus:
             self.read()
 
     def _bounded(self, goal: Angles, since_s: float) -> Angles:
-        """`goal`, or as much of the way there as speed and acceleration allow."""
+        """`goal`, or as much of the way there as the servos' speed and acceleration allow."""
         assert self._sent is not None
+        wanted, here = self.limits.servo_angles(goal), self.limits.servo_angles(self._sent)
         dt = float(np.clip(since_s, 1e-4, _LONGEST_TICK_S))
         if since_s > _REST_S:
             self._velocity[:] = 0.0
-        asked = (goal - self._sent) / dt
+        asked = (wanted - here) / dt
         gain = self.guard.acceleration_rad_s2 * dt
         low = np.maximum(np.minimum(self._velocity, 0.0) - gain, -self.guard.speed_rad_s)
         high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self.guard.speed_rad_s)
         self._velocity = np.clip(asked, low, high)
         held = self._velocity != asked
-        self.report.slowed += int(held.any())
-        return np.where(held, self._sent + self._velocity * dt, goal)
+        if not held.any():
+            return goal
+        self.report.slowed += 1
+        slower = np.where(held, here + self._velocity * dt, wanted)
+        return self.limits.clip(self.limits.from_servo_angles(slower))
 
     def _refuse_far(self, goal: Angles) -> None:
         away = np.abs(goal - self._present)

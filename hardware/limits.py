@@ -58,6 +58,21 @@ class PositionLimits:
             allowed[c.calf] = np.clip(wanted, self.low_rad[c.calf], self.high_rad[c.calf])
         return allowed
 
+    def servo_angles(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the servos turn by, up to a constant: a linked calf's servo moves with its thigh."""
+        return self._sheared(position_rad, +1)
+
+    def from_servo_angles(self, servo_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `servo_angles`."""
+        return self._sheared(servo_rad, -1)
+
+    def _sheared(self, angles: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
+        sheared, c = np.array(angles, float), self.coupling
+        # with the other sign the bus itself counts in servo angles, and the joint is the sum
+        if c is not None and c.sign > 0:
+            sheared[c.calf] += direction * sheared[c.thigh]
+        return sheared
+
     def room(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far each joint alone may swing to both sides of a pose [rad]; 0 if it is outside."""
         pose = np.asarray(position_rad, float)

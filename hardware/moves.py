@@ -1,4 +1,4 @@
-"""Gentle ways from pose to pose, at the rate of a control loop."""
+"""Where a robot is at the start, and gentle ways from pose to pose."""
 
 from __future__ import annotations
 
@@ -7,15 +7,43 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from common.errors import BusError
+from hardware.bus import ServoBus
 from hardware.loop import FixedRateLoop
 
 GENTLE_RAD_S = 1.0
 """Highest speed of a joint on the way."""
 
+_FIRST_READING_S = 2.0
+
 
 def raised_cosine(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
     """From 0 to 1, starting and ending at rest, for a share of the way's time."""
     return 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
+
+
+def first_pose(bus: ServoBus, period_s: float) -> NDArray[np.float64]:
+    """Where the robot is, shape (joints,) [rad]; waits a little for the first polls.
+
+    Raises
+    ------
+    BusError
+        If a joint does not say.
+    """
+    until = bus.now() + _FIRST_READING_S
+    pose = np.full(len(bus.joint_names), np.nan)
+    while True:
+        reading = bus.read().position_rad
+        pose = np.where(np.isfinite(reading), reading, pose)
+        if np.isfinite(pose).all():
+            return pose
+        if bus.now() >= until:
+            silent = [n for n, x in zip(bus.joint_names, pose, strict=True) if np.isnan(x)]
+            raise BusError(
+                f"the bus {bus.name} gives no position of {', '.join(silent)}. Check that the "
+                "robot is on and its servos connected, then try again."
+            )
+        bus.sleep_until(bus.now() + period_s)
 
 
 def glide(

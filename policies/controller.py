@@ -91,6 +91,8 @@ class Controller:
         In servo coordinates, at the loop's period.
     joint_map : JointMap
         Of the bus, in joint coordinates: limits, and how the knees are linked.
+    stall_torque_nm : float
+        Torque at a reported load of 1 [N·m].
 
     Raises
     ------
@@ -98,7 +100,14 @@ class Controller:
         If the policy expects another observation than this gives.
     """
 
-    def __init__(self, policy: Policy, stack: Stack, observer: Observer, joint_map: JointMap):
+    def __init__(
+        self,
+        policy: Policy,
+        stack: Stack,
+        observer: Observer,
+        joint_map: JointMap,
+        stall_torque_nm: float = 0.35,
+    ):
         contract = policy.contract
         if tuple(part.name for part in contract.observation) != _NAMES:
             raise InputError(
@@ -108,6 +117,7 @@ class Controller:
         if joint_map.joint_names != JOINT_NAMES or joint_map.coordinates != "joint":
             raise InputError("A policy needs a bus of all twelve joints, in joint coordinates.")
         self.policy, self.stack, self.observer = policy, stack, observer
+        self.stall_torque_nm = stall_torque_nm
         self.period_s = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
         self._map, self._per_servo = joint_map, joint_map.per_servo()
         self._limits = joint_map.position_limits()
@@ -134,7 +144,7 @@ class Controller:
         rest : Rest
             Bias of the gyroscope and direction of gravity, measured at rest.
         """
-        self.observer.reset(self._to_servo(position))
+        self.observer.reset(self.to_servo(position))
         self._attitude.reset(rest)
         self._told = np.asarray(position, float).copy()
         self._action = np.zeros(len(JOINT_NAMES), np.float32)
@@ -187,7 +197,7 @@ class Controller:
 
     def _estimate(self, senses: Senses) -> JointEstimate:
         """Where the joints are, as the policy is told, in joint coordinates."""
-        found = self.observer.step(self._to_servo(self._told), self._to_servo(senses.position))
+        found = self.observer.step(self.to_servo(self._told), self.to_servo(senses.position))
         position = self._to_joint(found.position)
         # velocities go through the linkage as differences of angles do
         velocity = self._to_joint(found.position + found.velocity) - position
@@ -200,7 +210,8 @@ class Controller:
             return np.zeros(3)
         return np.array([*(_PUBLISHED_SPEED_SHARE * command[:2]), 0.0])
 
-    def _to_servo(self, joints: Array) -> Array:
+    def to_servo(self, joints: Array) -> Array:
+        """Joint angles as the servos' own (`hardware.joint_map`, servo coordinates)."""
         return self._per_servo.to_angles(self._map.to_counts(joints))
 
     def _to_joint(self, servo: Array) -> Array:

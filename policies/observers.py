@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.errors import InputError
 from common.joints import JOINT_NAMES
+from policies.stacks import ObserverKind
 from servo_models.control_rate import substeps as physics_substeps
 from servo_models.delayed_pd import DelayedPD, DelayedPDParameters, integrate
 from servo_models.joint_arrays import JointArrays
@@ -393,3 +394,49 @@ def _spread(value: ArrayLike, batch: tuple[int, ...], name: str) -> Array:
         raise InputError(
             f"{name} has shape {value.shape}; the observer was reset with {batch}."
         ) from None
+
+
+def make_observer(
+    kind: ObserverKind,
+    period_s: float,
+    velocity_steps: int,
+    actuator: DelayedPDParameters,
+    limits_rad: tuple[ArrayLike, ArrayLike],
+    servo_model: JointArrays | None,
+) -> Observer:
+    """The observer that a stack names.
+
+    Parameters
+    ----------
+    kind : str
+        See `policies.stacks.Stack`.
+    period_s : float
+        Control period [s].
+    velocity_steps : int
+        Of the policy's contract, for `readings`.
+    actuator : DelayedPDParameters
+        Each (12,), for `synthetic-pd`.
+    limits_rad : tuple of ndarray, shape (12,)
+        Of the servos' angles, where a simulated one stops.
+    servo_model : JointArrays or None
+        For `servo-model`.
+
+    Raises
+    ------
+    InputError
+        If a servo model is asked for and none is given, or it does not fit.
+    """
+    if kind == "readings":
+        return HeldEncoder(period_s, velocity_steps)
+    if kind == "synthetic-pd":
+        return SyntheticPD(actuator, period_s, limits_rad=limits_rad)
+    if kind == "published-pd":
+        return SyntheticPD.paper(period_s, limits_rad)
+    if kind == "rest":
+        return Zero(period_s)
+    if servo_model is None:
+        raise InputError(
+            "This stack shows the policy a servo model's prediction: name one with --servo FOLDER "
+            "(`pupper-sysid fit-servo` makes one)."
+        )
+    return ServoModelObserver(servo_model, period_s)

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import BusError, InputError
+from common.errors import InputError
 from hardware.bus import BusSample, ServoBus
 from hardware.guard import GuardedBus, guarded
 from hardware.loop import FixedRateLoop
-from hardware.moves import glide
+from hardware.moves import first_pose, glide
 from sysid.excitation import Plan, TrialPlan
 from sysid.recording import RecordingWriter
 from sysid.resume import Resume
@@ -33,8 +33,6 @@ REST_S = 0.5
 
 RETURN_S = 0.4
 """Shortest way back to the start pose after a trial [s]."""
-
-_FIRST_READING_S = 2.0
 
 Progress = Callable[[float, float, str], None]
 """Called with seconds done, seconds in all, and what is going on."""
@@ -125,7 +123,7 @@ class _Session:
     def run(self, path: Path, metadata: dict[str, Any], force: bool) -> Path:
         """Everything between opening the file and parking the robot."""
         bus, resume = self._bus, self._resume
-        present = self._first_pose()
+        present = first_pose(bus, self._loop.period_s)
         self._start = np.where(np.isfinite(self._start), self._start, present)
         self._sent = present
         first, rows = 0, 0
@@ -164,23 +162,6 @@ class _Session:
             ),
             "loop": {"period_s": self._loop.period_s},
         } | metadata
-
-    def _first_pose(self) -> NDArray[np.float64]:
-        """Where the robot is; waits a little for the first polls."""
-        bus, until = self._bus, self._bus.now() + _FIRST_READING_S
-        pose = np.full(len(bus.joint_names), np.nan)
-        while True:
-            reading = bus.read().position_rad
-            pose = np.where(np.isfinite(reading), reading, pose)
-            if np.isfinite(pose).all():
-                return pose
-            if bus.now() >= until:
-                silent = [n for n, x in zip(bus.joint_names, pose, strict=True) if np.isnan(x)]
-                raise BusError(
-                    f"the bus {bus.name} gives no position of {', '.join(silent)}. Check that the "
-                    "robot is on and its servos connected, then record again."
-                )
-            bus.sleep_until(bus.now() + self._loop.period_s)
 
     def _trial(self, number: int, trial: TrialPlan, writer: RecordingWriter, done: float) -> int:
         """One trial, recorded; returns its number of rows."""

@@ -241,3 +241,28 @@ def test_an_unsent_command_is_counted_and_the_next_one_starts_from_the_last_sent
 def test_a_guard_is_not_guarded_twice():
     guard = GuardedBus(PlainBus())
     assert guarded(guard) is guard
+
+
+def test_speed_is_bounded_where_the_servo_turns_not_where_the_joint_bends():
+    """The calf's servo turns by thigh + calf: a calf that folds as its thigh rises stands still."""
+
+    def moved(goal: np.ndarray) -> np.ndarray:
+        bus = PlainBus()
+        one = np.array([0])
+        bus.limits = PositionLimits(
+            np.full(2, -2.0), np.full(2, 2.0),
+            Coupling(one + 1, one, 1, np.array([-3.0]), np.array([3.0])),
+        )  # fmt: skip
+        guard = GuardedBus(bus, GuardLimits(speed_rad_s=8.0, acceleration_rad_s2=1e6))
+        guard.read()
+        guard.torque(True)
+        guard.write(np.zeros(2))
+        bus.time += PERIOD
+        guard.write(goal)
+        return bus.written[-1]
+
+    # thigh at its limit of 0.16 rad per tick, calf's servo at rest
+    np.testing.assert_allclose(moved(np.array([0.15, -0.15])), [0.15, -0.15])
+    # both forward: the calf's servo would turn by twice as much
+    thigh, calf = moved(np.array([0.15, 0.15]))
+    assert thigh == pytest.approx(0.15) and thigh + calf == pytest.approx(0.16)

@@ -1,0 +1,255 @@
+"""`pupper-deploy`: run a policy on a robot, or on an emulated one, behind the same bus."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import tyro
+
+from cli import terminal
+from cli.policy_choice import policy_at
+from cli.terminal import err, need_positive, out, print_json, warn
+from cli.user_errors import run_program
+from common.errors import InputError
+from hardware.connect import open_guarded, parse_address
+from hardware.guard import GuardedBus
+from hardware.imu import Imu
+from hardware.joint_map import JointMap, load_joint_map
+from hardware.loop import real_time_priority
+from policies.stacks import STACKS, ObserverKind, Stack, StackName, suited
+from sim.servo_ranges import check_actuator
+from sysid.recording import RecordingWriter
+
+DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
+
+The robot stands up, is measured at rest for a second, walks, and sits down. Ctrl-C ends it there,
+a fault leaves it limp. Every input and output is in walks/<name>/walk.csv, which --replay repeats
+bit for bit; walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
+"""
+
+_DEMO_S = 60.0
+
+
+@dataclass(frozen=True)
+class Deploy:
+    """What to run, and on what."""
+
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run (`runs/<name>`) or a policy folder."""
+    bus: str = "sim"
+    """`sim` (an emulated robot, as fast as it goes), `esp32`, `esp32:SOCKET`, `feetech:DEVICE`."""
+    imu: Path | None = None
+    """Socket of the proxy whose IMU to read, for a Feetech line, which has none."""
+    joint_map: str | None = None
+    """Joint map of the bus: a file of `calibrate-joints` or a preset."""
+    stack: Literal["auto", "closed-loop", "lstm-servo", "mlp-observer"] = "auto"
+    """`closed-loop`: the policy sees the servos' readings; `lstm-servo`: a servo model's
+    prediction; `mlp-observer`: that of a simulated PD; `auto`: what it was trained with."""
+    servo: Path | None = None
+    """Servo model's folder, for `lstm-servo`."""
+    actuator: str | None = None
+    """Calibration for `mlp-observer`, and of the comparison before the start; by default the one
+    the policy was trained with."""
+    observer: ObserverKind | None = None
+    """Instead of the stack's."""
+    lowpass_hz: float | None = None
+    """Instead of the stack's; 0 for none."""
+    fade_in_s: float | None = None
+    """Instead of the stack's."""
+    scale_rad: float | None = None
+    """Radians per unit of action, instead of the trained scale."""
+    rate: float | None = None
+    """Hz of the loop, instead of the policy's own; its time then runs faster or slower."""
+    command: tuple[float, float, float] = (0.15, 0.0, 0.0)
+    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    script: Path | None = None
+    """CSV of commands with the columns seconds,forward_m_s,left_m_s,turn_rad_s, one after the
+    other, instead of --command."""
+    keyboard: bool = False
+    """Drive: w/s forward, a/d sideways, q/e turn, space stands, x ends."""
+    seconds: float = _DEMO_S
+    """How long to walk."""
+    replay: Path | None = None
+    """Instead of walking: repeat the log `walk.csv` through the policy and compare."""
+    name: str | None = None
+    """Of the folder in walks/; by default the policy's and the time."""
+    seed: int = 0
+    """Of the emulated robot."""
+    json: bool = False
+    """Print one JSON object."""
+    force: bool = False
+    """Replace an existing log."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
+    run_program(Deploy, _run, "pupper-deploy", DESCRIPTION, arguments)
+
+
+def _run(options: Deploy) -> None:
+    need_positive("--seconds", options.seconds)
+    if options.policy is None:
+        raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
+    import torch
+
+    torch.set_num_threads(1)
+    from policies.assembly import assemble
+
+    policy, run = policy_at(options.policy)
+    name, stack = _stack(options, policy.contract)
+    if options.replay:
+        _replay(options.replay, policy)
+        return
+    folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
+    bus, imu, joint_map, truth = _open(options)
+    try:
+        actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
+        check_actuator(actuator)
+        parts = assemble(policy, stack, joint_map, actuator, options.servo)
+        _say_match(parts.match)
+        header = parts.header | {
+            "policy": str(options.policy), "stack_name": name, "seed": options.seed,
+            "bus": {"name": bus.name} | bus.metadata,
+        }  # fmt: skip
+        _walk(options, bus, imu, parts.controller, header, folder, truth)
+    finally:
+        bus.close()
+
+
+def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
+    """The stack, with what the user changed of it."""
+    name = suited(contract) if options.stack == "auto" else options.stack
+    stack = STACKS[name]
+    if options.observer:
+        stack = replace(stack, observer=options.observer)
+    if options.lowpass_hz is not None:
+        stack = replace(stack, lowpass_hz=options.lowpass_hz or None)
+    if options.fade_in_s is not None:
+        stack = replace(stack, fade_in_s=options.fade_in_s)
+    stack = replace(stack, scale_rad=options.scale_rad, rate_hz=options.rate)
+    own = 1 / contract.control_step_s
+    if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
+        warn(
+            [
+                f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its time "
+                f"runs {stack.rate_hz / own:.2f} times as fast, its gait too."
+            ]
+        )
+    return name, stack
+
+
+def _open(options: Deploy) -> tuple[GuardedBus, Imu, JointMap, Any]:
+    """Bus, IMU, joint map, and the emulated robot if it is one."""
+    if options.bus == "sim":
+        from sim.emulated_robot import draw_robot
+        from sim.walking_bus import WalkingBus
+
+        rng = np.random.default_rng(options.seed)
+        inner = WalkingBus(draw_robot(rng), rng, real_time=options.keyboard)
+        return GuardedBus(inner), inner, load_joint_map("mini_pupper_2"), inner.robot
+    address = parse_address(options.bus)
+    preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
+    joint_map = load_joint_map(
+        Path(options.joint_map) if options.joint_map and Path(options.joint_map).exists()
+        else options.joint_map or preset
+    )  # fmt: skip
+    if address.kind == "feetech" and options.imu is None:
+        raise InputError(
+            "A Feetech line has no IMU, and a policy needs one. Give the proxy's socket with --imu."
+        )
+    bus = open_guarded(address, joint_map)
+    if options.imu is None:
+        return bus, bus.bus, joint_map, None  # type: ignore[return-value]
+    from hardware.esp32_bus import Esp32Bus
+
+    return bus, Esp32Bus(options.imu), joint_map, None
+
+
+def _replay(path: Path, policy: Any) -> None:
+    """Repeat a log and compare."""
+    from policies.assembly import reassemble
+    from policies.walk_log import read_walk, replay
+
+    walk = read_walk(path)
+    differs = replay(walk, reassemble(policy, walk.header, path))
+    ended = walk.ended or "it was cut short"
+    if differs is not None:
+        raise InputError(
+            f"{path}: tick {differs} of {len(walk.senses)} gives another action than it gave then. "
+            "The policy and all settings are the same; the libraries or the processor are not."
+        )
+    out.print(f"{len(walk.senses)} ticks repeated, every action equal bit for bit ({ended}).")
+
+
+def _say_match(match: Any) -> None:
+    if match.fits:
+        err.print(match.sentence())
+        return
+    warn([match.sentence()])
+    table = terminal.table(
+        "Swing over command, and phase in degrees", "", "Hz", "observer", "actuator"
+    )
+    for row in match.table():
+        table.add_row(*(str(v) for v in row.values()))
+    err.print(table)
+
+
+def _walk(
+    options: Deploy, bus: GuardedBus, imu: Imu, controller: Any, header: dict[str, Any],
+    folder: Path, truth: Any,
+) -> None:  # fmt: skip
+    """Walk, log, and say how it went."""
+    from policies.commands import constant, script
+    from policies.deployment import deploy
+    from policies.walk_score import WalkScore
+
+    commands = script(options.script) if options.script else constant(options.command)
+    score = WalkScore(bus, truth) if truth else None
+    log, table = folder / "walk.csv", folder / "recording.csv"
+    about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
+    with RecordingWriter(table, about, options.force) as rows, real_time_priority() as priority:
+        if options.bus != "sim":
+            err.print(f"Running with {priority}.")
+        outcome = deploy(
+            bus, imu, controller, commands, options.seconds, log, header, rows, score,
+            options.force,
+        )  # fmt: skip
+        rows.close({"stop_reason": outcome.stop_reason})
+    step = 1e3 * np.array(outcome.step_s or [np.nan])
+    found = {
+        "rate_hz": outcome.loop.get("ticks", 0) / max(outcome.seconds, 1e-9),
+        "seconds": outcome.seconds,
+        "deadline_misses": outcome.deadline_misses,
+        "step_ms": {
+            "p50": float(np.percentile(step, 50)), "p99": float(np.percentile(step, 99)),
+            "max": float(step.max()),
+        },
+        "fell": outcome.fell,
+        **(score.summary() if score else dict.fromkeys(WalkScore.NAMES)),
+        "stop_reason": outcome.stop_reason,
+        "guard": outcome.guard,
+        "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},
+        "log": str(log),
+    }  # fmt: skip
+    if options.json:
+        print_json(found)
+        return
+    shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
+    for key, value in found.items():
+        shown.add_row(
+            key, str(value) if not isinstance(value, float) else terminal.number(value, 3)
+        )
+    out.print(shown)
+    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}")
+
+
+if __name__ == "__main__":
+    main()

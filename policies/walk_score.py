@@ -1,0 +1,44 @@
+"""How well an emulated robot did what it was told: its true motion against the commands."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hardware.bus import ServoBus
+from policies.deployment import Tick
+from sim.walking_robot import WalkingRobot
+
+
+class WalkScore:
+    """Watches the ticks of a walk; see `policies.deployment.deploy`.
+
+    Parameters
+    ----------
+    bus : ServoBus
+        Whose clock counts.
+    robot : WalkingRobot
+    """
+
+    NAMES = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
+
+    def __init__(self, bus: ServoBus, robot: WalkingRobot):
+        self._bus, self._robot = bus, robot
+        self._errors: list[np.ndarray] = []
+        self._moved: list[np.ndarray] = []
+
+    def __call__(self, tick: Tick) -> None:
+        """Look at the robot."""
+        trunk = self._robot.trunk(self._bus.now())
+        moved = np.array([*trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s])
+        self._moved.append(moved)
+        self._errors.append(np.abs(moved - tick.senses.command))
+
+    def summary(self) -> dict[str, Any]:
+        """Mean absolute errors and the mean motion."""
+        if not self._errors:
+            return dict.fromkeys((*self.NAMES, "mean_motion"))
+        errors = np.mean(self._errors, axis=0)
+        found: dict[str, Any] = dict(zip(self.NAMES, errors.tolist(), strict=True))
+        return found | {"mean_motion": np.mean(self._moved, axis=0).tolist()}
