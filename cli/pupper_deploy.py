@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +17,7 @@ import tyro
 
 from cli import terminal
 from cli.policy_choice import policy_at
+from cli.sweep import EMULATED, Sweep
 from cli.terminal import err, need_positive, out, print_json, warn
 from cli.user_errors import run_program
 from common.errors import InputError
@@ -35,7 +37,7 @@ a fault leaves it limp. Every input and output is in walks/<name>/walk.csv, whic
 bit for bit; walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
 """
 
-_DEMO_S = 60.0
+PLAYBACK_LOOPS, PLAYBACK_HZ = 3, 50.0
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,11 @@ class Deploy:
     other, instead of --command."""
     keyboard: bool = False
     """Drive: w/s forward, a/d sideways, q/e turn, space stands, x ends."""
-    seconds: float = _DEMO_S
+    seconds: float = 20.0
     """How long to walk."""
+    playback: Path | None = None
+    """Instead of a policy: play the commands of this CSV three times and record the servos, for
+    `pupper-sysid fit-servo`."""
     replay: Path | None = None
     """Instead of walking: repeat the log `walk.csv` through the policy and compare."""
     name: str | None = None
@@ -96,6 +101,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: Deploy) -> None:
     need_positive("--seconds", options.seconds)
+    if options.playback:
+        Sweep(
+            playback=options.playback, loops=PLAYBACK_LOOPS, joint_map=options.joint_map,
+            bus=EMULATED if options.bus == "sim" else options.bus, seed=options.seed,
+            rate=options.rate or PLAYBACK_HZ, json=options.json, force=options.force,
+        ).run()  # fmt: skip
+        return
     if options.policy is None:
         raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
     import torch
@@ -207,25 +219,31 @@ def _walk(
     folder: Path, truth: Any,
 ) -> None:  # fmt: skip
     """Walk, log, and say how it went."""
+    from cli.drive import Driver
     from policies.commands import constant, script
     from policies.deployment import deploy
     from policies.walk_score import WalkScore
 
-    commands = script(options.script) if options.script else constant(options.command)
+    told = script(options.script) if options.script else constant(options.command)
     score = WalkScore(bus, truth) if truth else None
     log, table = folder / "walk.csv", folder / "recording.csv"
     about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
-    with RecordingWriter(table, about, options.force) as rows, real_time_priority() as priority:
+    with ExitStack() as open_things:
+        priority = open_things.enter_context(real_time_priority())
         if options.bus != "sim":
             err.print(f"Running with {priority}.")
+        watchers: list[Any] = [score] if score else []
+        if options.keyboard:
+            driver = open_things.enter_context(Driver().driving())
+            told, watchers = driver, [*watchers, driver.watch]
+        rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
-            bus, imu, controller, commands, options.seconds, log, header, rows, score,
-            options.force,
-        )  # fmt: skip
+            bus, imu, controller, told, options.seconds, log, header, rows, watchers, options.force
+        )
         rows.close({"stop_reason": outcome.stop_reason})
     step = 1e3 * np.array(outcome.step_s or [np.nan])
     found = {
-        "rate_hz": outcome.loop.get("ticks", 0) / max(outcome.seconds, 1e-9),
+        "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),
         "seconds": outcome.seconds,
         "deadline_misses": outcome.deadline_misses,
         "step_ms": {

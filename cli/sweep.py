@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -50,6 +50,8 @@ class Sweep:
     """Shape of the motion."""
     playback: Path | None = None
     """Play the commands of this recording or command file instead."""
+    loops: int = 1
+    """How often to play them."""
     amplitude: float = 0.3
     """Largest excursion from the start pose [rad]; less where the speed limit asks for it."""
     duration: float | None = None
@@ -130,6 +132,8 @@ class Sweep:
         """All that decides what will be done; the recording keeps it, so that it can go on."""
         terminal.need_positive("--rate", self.rate)
         bus = self.bus
+        if self.loops < 1:
+            raise InputError(f"--loops is {self.loops}; it must be at least 1.")
         if self.real_time and bus != EMULATED:
             raise InputError("--real-time: a real bus knows no other time; leave it out.")
         return {
@@ -144,6 +148,7 @@ class Sweep:
             "amplitude_rad": self.amplitude,
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
+            "loops": self.loops,
         }
 
     def _say(
@@ -195,7 +200,9 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
     """The plan that a request describes, within the limits of the bus."""
     joints = request["joints"]
     if request["playback"]:
-        return playback(Path(request["playback"]), joints)
+        chosen = playback(Path(request["playback"]), joints)
+        # recordings of before loops could be asked for say nothing of them
+        return replace(chosen, trials=chosen.trials * request.get("loops", 1))
     room = bus.limits.room(start_pose(bus.joint_names))
     return plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],

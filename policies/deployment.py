@@ -8,7 +8,7 @@ itself (`policies.controller`) is pure, the guard (`hardware.guard`) stands befo
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -104,7 +104,7 @@ def deploy(
     log: Path,
     header: dict[str, Any],
     rows: Rows | None = None,
-    watch: Callable[[Tick], None] | None = None,
+    watchers: Sequence[Callable[[Tick], None]] = (),
     force: bool = False,
 ) -> Outcome:
     """Walk for `seconds`, or until `commands` says to stop, or something goes wrong.
@@ -125,8 +125,8 @@ def deploy(
         More keys for its header.
     rows : Rows, optional
         Is given the servos' rows of each tick, as of a recording.
-    watch : callable, optional
-        Called with each tick.
+    watchers : sequence of callable
+        Each called with each tick.
     force : bool
         Replace an existing log.
 
@@ -153,7 +153,7 @@ def deploy(
         writer = WalkLog(log, header | start_header(start, rest), force)
         try:
             controller.reset(start, rest)
-            _walk(bus, imu, controller, commands, seconds, writer, rows, watch, outcome)
+            _walk(bus, imu, controller, commands, seconds, writer, rows, watchers, outcome)
             glide(standing, lambda pose: _send(bus, pose), bus.sent, controller.default, SETTLE_S)
         except (SafetyStop, BusError) as fault:
             bus.limp()
@@ -180,7 +180,7 @@ def _walk(
     seconds: float,
     writer: WalkLog,
     rows: Rows | None,
-    watch: Callable[[Tick], None] | None,
+    watchers: Sequence[Callable[[Tick], None]],
     outcome: Outcome,
 ) -> None:
     """The control loop."""
@@ -215,7 +215,7 @@ def _walk(
             writer.append(senses, decision, sent.position_rad)
             if rows:
                 rows.append(_rows(controller, sent, reading))
-            if watch:
+            for watch in watchers:
                 watch(Tick(elapsed, senses, decision, sent.position_rad, reading))
             outcome.seconds = elapsed
             if decision.observation[8] > _FALLEN:

@@ -1,0 +1,116 @@
+"""Driving a robot by keys, with a live table of what it is told and how it is."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from rich.live import Live
+from rich.table import Table
+
+from cli import terminal
+from common.errors import InputError
+from common.joints import JOINT_NAMES
+from hardware.bus import BusSample
+from policies.deployment import Tick
+
+STEP = np.array([0.05, 0.04, 0.1])
+"""What one key press adds [m/s, m/s, rad/s]."""
+LARGEST = np.array([0.2, 0.1, 0.5])
+KEYS = {
+    "w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "e": (2, -1),
+}  # fmt: skip
+_HELP = "w/s forward  a/d sideways  q/e turn  space stands  x ends"
+_SHOWN_EVERY_S = 0.2
+
+
+class Driver:
+    """Commands from the keyboard; also watches the ticks to show them.
+
+    Use it as a context; it is a `policies.commands.Commands`.
+    """
+
+    def __init__(self) -> None:
+        self._command = np.zeros(3)
+        self._ended = False
+        self._live = Live(console=terminal.err, auto_refresh=False)
+        self._shown_s = -np.inf
+        self._age = np.zeros(len(JOINT_NAMES))
+        self._seen: BusSample | None = None
+        self._seen_s = 0.0
+
+    def __call__(self, elapsed_s: float) -> np.ndarray | None:
+        """What to do now; None once x was pressed."""
+        while select.select([sys.stdin], [], [], 0)[0]:
+            typed = os.read(sys.stdin.fileno(), 64).decode(errors="ignore").lower()
+            if not typed:
+                self._ended = True  # the terminal is gone: nobody drives
+                break
+            for key in typed:
+                self._press(key)
+        return None if self._ended else self._command.copy()
+
+    def _press(self, key: str) -> None:
+        if key == "x":
+            self._ended = True
+        elif key == " ":
+            self._command[:] = 0.0
+        elif key in KEYS:
+            axis, sign = KEYS[key]
+            told = self._command[axis] + sign * STEP[axis]
+            # steps back to standing end there, not a rounding error beside it
+            self._command[axis] = np.clip(np.round(told, 6), -LARGEST[axis], LARGEST[axis])
+
+    def watch(self, tick: Tick) -> None:
+        """Show a tick, a few times a second."""
+        if self._seen is not None:
+            changed = tick.reading.position_rad != self._seen.position_rad
+            self._age = np.where(changed, 0.0, self._age + tick.elapsed_s - self._seen_s)
+        self._seen, self._seen_s = tick.reading, tick.elapsed_s
+        if tick.elapsed_s - self._shown_s < _SHOWN_EVERY_S:
+            return
+        self._shown_s = tick.elapsed_s
+        self._live.update(_table(tick, self._age), refresh=True)
+
+    @contextmanager
+    def driving(self) -> Iterator[Driver]:
+        """Keys come one by one, unseen, for as long as the block.
+
+        Raises
+        ------
+        InputError
+            If there is no terminal to type in.
+        """
+        if not sys.stdin.isatty():
+            raise InputError("--keyboard needs a terminal to type in; use --command or --script.")
+        before = termios.tcgetattr(sys.stdin)
+        single = [*before[:3], before[3] & ~(termios.ICANON | termios.ECHO), *before[4:]]
+        termios.tcsetattr(sys.stdin, termios.TCSANOW, single)
+        try:
+            with self._live:
+                yield self
+        finally:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _table(tick: Tick, age_s: np.ndarray) -> Table:
+    forward, left, turn = tick.senses.command
+    shown = terminal.table(
+        f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
+        f"{turn:+.2f} rad/s   {_HELP}",
+        "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "room rad",
+    )  # fmt: skip
+    for i, joint in enumerate(JOINT_NAMES):
+        room = tick.decision.room[i]
+        shown.add_row(
+            joint, terminal.number(tick.sent[i], 3),
+            terminal.number(float(tick.reading.position_rad[i]), 3), terminal.ms(age_s[i], 0),
+            terminal.number(tick.senses.load[i], 2),
+            f"[red]{room:.2f}[/]" if room < 0.02 else terminal.number(room, 2),
+        )  # fmt: skip
+    return shown
