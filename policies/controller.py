@@ -119,7 +119,8 @@ class Controller:
         self.policy, self.stack, self.observer = policy, stack, observer
         self.stall_torque_nm = stall_torque_nm
         self.period_s = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
-        self._map, self._per_servo = joint_map, joint_map.per_servo()
+        self._to_servo = _affine(joint_map, joint_map.per_servo())
+        self._to_joint = _affine(joint_map.per_servo(), joint_map)
         self._limits = joint_map.position_limits()
         self.default = np.array([contract.default_pose_rad[name] for name in JOINT_NAMES])
         self._scale = stack.scale_rad or contract.action_scale_rad
@@ -198,9 +199,8 @@ class Controller:
     def _estimate(self, senses: Senses) -> JointEstimate:
         """Where the joints are, as the policy is told, in joint coordinates."""
         found = self.observer.step(self.to_servo(self._told), self.to_servo(senses.position))
-        position = self._to_joint(found.position)
-        # velocities go through the linkage as differences of angles do
-        velocity = self._to_joint(found.position + found.velocity) - position
+        position = _apply(self._to_joint, found.position)
+        velocity = found.velocity @ self._to_joint[0]
         measured = self.stack.observer == "readings"
         return JointEstimate(position, velocity, senses.load if measured else found.effort)
 
@@ -212,7 +212,18 @@ class Controller:
 
     def to_servo(self, joints: Array) -> Array:
         """Joint angles as the servos' own (`hardware.joint_map`, servo coordinates)."""
-        return self._per_servo.to_angles(self._map.to_counts(joints))
+        return _apply(self._to_servo, joints)
 
-    def _to_joint(self, servo: Array) -> Array:
-        return self._map.to_angles(self._per_servo.to_counts(servo))
+
+def _affine(source: JointMap, target: JointMap) -> tuple[Array, Array]:
+    """Matrix and constant that turn angles of one map into those of another of the same counts."""
+    constant = target.to_angles(source.to_counts(np.zeros(len(JOINT_NAMES))))
+    return target.to_angles(source.to_counts(np.eye(len(JOINT_NAMES)))) - constant, constant
+
+
+def _apply(affine: tuple[Array, Array], angles: Array) -> Array:
+    """Each row of the matrix is what one source angle moves; a missing angle stays its own."""
+    matrix, constant = affine
+    known = np.nan_to_num(angles)
+    lost = np.isnan(angles) @ (matrix != 0) > 0
+    return np.where(lost, np.nan, known @ matrix + constant)
