@@ -23,12 +23,12 @@ import numpy as np
 import pandas as pd
 from emulators import in_process
 
+from common.figure_style import save
 from common.joints import DEFAULT_POSE
 from servo_models.interface import ServoModel
 from sysid import servo_scores as scores
 from sysid.command_playback import playback
 from sysid.excitation import LEAD_IN_S
-from sysid.figure_style import save
 from sysid.network_fit import fit_network, past_ticks
 from sysid.physics_fit import delayed_pd_fits, delayed_pd_model
 from sysid.published_networks import fit_published

@@ -40,7 +40,7 @@ class Compare:
 
     def run(self) -> None:
         """Compare, print, draw."""
-        from sysid.figure_style import save
+        from common.figure_style import save
         from sysid.servo_compare import compare, to_json
         from sysid.servo_figures import compare_figure
 

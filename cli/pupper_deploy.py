@@ -242,6 +242,8 @@ def _walk(
         )
         rows.close({"stop_reason": outcome.stop_reason})
     step = 1e3 * np.array(outcome.step_s or [np.nan])
+    # only an emulated robot says where it really went
+    motion: dict[str, Any] = score.summary() if score else dict.fromkeys(WalkScore.NAMES)
     found = {
         "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),
         "seconds": outcome.seconds,
@@ -251,7 +253,7 @@ def _walk(
             "max": float(step.max()),
         },
         "fell": outcome.fell,
-        **(score.summary() if score else dict.fromkeys(WalkScore.NAMES)),
+        **motion,
         "stop_reason": outcome.stop_reason,
         "guard": outcome.guard,
         "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},

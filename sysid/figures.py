@@ -1,6 +1,6 @@
 """The report's figures: each function takes results and returns a matplotlib `Figure`.
 
-They only draw: curves come from `sysid.figure_data`, looks from `sysid.figure_style`. Every curve
+They only draw: curves come from `sysid.figure_data`, looks from `common.figure_style`. Every curve
 differs from the others in more than its colour. `save` writes a figure as PNG.
 """
 
@@ -17,19 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from sysid.calibrate import JointCalibrationResult
-from sysid.figure_data import (
-    LONGEST_RUN,
-    HoldRuns,
-    LagParts,
-    Track,
-    lag_parts,
-    response_errors,
-    some_tracks,
-    tracks,
-    window,
-)
-from sysid.figure_style import (
+from common.figure_style import (
     BLUE,
     FAINT,
     GREEN,
@@ -43,6 +31,18 @@ from sysid.figure_style import (
     png,
     save,
     styled,
+)
+from sysid.calibrate import JointCalibrationResult
+from sysid.figure_data import (
+    LONGEST_RUN,
+    HoldRuns,
+    LagParts,
+    Track,
+    lag_parts,
+    response_errors,
+    some_tracks,
+    tracks,
+    window,
 )
 
 if TYPE_CHECKING:  # it brings python-control, which is not needed to draw

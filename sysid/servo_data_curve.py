@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from sysid.figure_style import BLUE, FAINT, GREEN, INK, RED, axes_column, styled
+from common.figure_style import BLUE, FAINT, GREEN, INK, RED, axes_column, styled
 
 FILE = "servo_data_curve.csv"
 MODELS = {

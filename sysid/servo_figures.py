@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from sysid.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PINK, RED, axes_column, styled
+from common.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PINK, RED, axes_column, styled
 from sysid.servo_compare import LINEAR, Comparison, band_half_width
 
 _LONGEST_S = 3.0

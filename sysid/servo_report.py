@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from common.figure_style import png
 from sysid import servo_scores as scores
-from sysid.figure_style import png
 from sysid.report import Picture, Section
 from sysid.report_tables import Column, Table
 from sysid.servo_compare import LINEAR, Comparison

@@ -1,0 +1,209 @@
+"""`pupper-analyze`: what a gait is like, where its rhythm comes from, what it withstands."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from cli import terminal
+from cli.policy_choice import policy_at, simulator
+from cli.terminal import err, need_positive, out, print_json
+from cli.user_errors import run_program
+from common.errors import InputError
+from common.files import refuse_overwrite
+
+DESCRIPTION = """What a policy's gait is like, where its rhythm comes from, and what it withstands.
+
+gait: frequency, sine fit, phases, duty, jitter. attractor: orbits of actions and hidden states.
+delay, ablation: late, noisy, missing and stale observations, in replay and closed loop.
+autonomy: does the rhythm go on when its inputs are frozen?
+"""
+
+Tries = list[tuple[str, Any, Any]]
+"""Name, policy and trial of each."""
+Found = tuple[dict[str, Any], Any, Table]
+"""For --json, picture, and what is printed."""
+
+DELAYS_MS = (0.0, 160.0, 320.0)
+"""Of the published orbits."""
+
+
+@dataclass(frozen=True)
+class Analyze:
+    """What to look at, and how long."""
+
+    what: Annotated[
+        Literal["gait", "attractor", "delay", "ablation", "autonomy"], tyro.conf.Positional
+    ]
+    policies: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Runs (`runs/<name>`) or policy folders."""
+    command: tuple[float, float, float] = (0.15, 0.0, 0.0)
+    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    robots: int = 16
+    """How many robots walk, each with its own servos."""
+    seconds: float = 10.0
+    """How long; a gait needs 7 s."""
+    actuator: str | None = None
+    """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
+    feedback: str | None = None
+    """`held`, `ideal` or a calibration instead of what it was trained with."""
+    out: Path = Path("analysis")
+    """Folder for the pictures."""
+    seed: int = 0
+    """Of servos, friction, start and noise."""
+    json: bool = False
+    """Print one JSON object."""
+    force: bool = False
+    """Replace existing pictures."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
+    run_program(Analyze, _run, "pupper-analyze", DESCRIPTION, arguments)
+
+
+def _run(options: Analyze) -> None:
+    need_positive("--seconds", options.seconds)
+    if not options.policies:
+        raise InputError(f"No policy was named: pupper-analyze {options.what} runs/<name>.")
+    if options.robots < 1:
+        raise InputError(f"--robots is {options.robots}; it must be at least 1.")
+    import torch
+
+    from common.figure_style import save
+    from policies.robustness import Trial
+
+    torch.set_num_threads(1)
+    picture = options.out / f"{options.what}.png"
+    refuse_overwrite(picture, options.force)
+    tries: Tries = []
+    for path in options.policies:
+        policy, run = policy_at(path)
+        task, servos = simulator(policy, run, options.actuator, options.feedback)
+        trial = Trial(
+            task, servos, options.command, options.robots, options.seconds, options.seed
+        )  # fmt: skip
+        tries.append((_name(path), policy, trial))
+    found, figure, table = _ANALYSES[options.what](tries, np.random.default_rng(options.seed))
+    save(figure, picture, options.force)
+    if options.json:
+        print_json(found | {"picture": str(picture)})
+    else:
+        out.print(table)
+        err.print(f"Picture: {picture}")
+
+
+def _name(path: Path) -> str:
+    """Short and distinct: the run's name, without `policy_best`."""
+    return path.parent.name if path.name.startswith("policy_") else path.name
+
+
+def _gait(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import gait_figure
+    from policies.gait import describe
+
+    table = terminal.table(
+        "Gait (90 % intervals over robots)", "policy", "Hz", "sine R² actions", "of noise",
+        "diagonal", "duty", "jitter rad", "robots",
+    )  # fmt: skip
+    found, figure = {}, None
+    for name, policy, trial in tries:
+        walked = trial.walk(policy)
+        figure = figure or gait_figure(walked)
+        gait = describe(walked, rng)
+        found[name] = asdict(gait)
+        table.add_row(
+            name, _interval(gait.frequency_hz, 2), _interval(gait.action_r2, 2),
+            terminal.number(gait.null_r2, 2), _interval(gait.diagonal, 2),
+            terminal.number(float(np.mean([d.value for d in gait.duty])), 2),
+            terminal.number(gait.jitter_rad.value, 3), f"{gait.robots} of {trial.robots}",
+        )  # fmt: skip
+    return {"gaits": found}, figure, table
+
+
+def _attractor(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import orbit_figure
+    from policies.robustness import orbits
+
+    table = terminal.table(
+        "Orbits at more delay of the joints (replay, as published)", "states", "variance in 3 PCs",
+        "dimensions", *(f"closure +{d:g} ms" for d in DELAYS_MS),
+        *(f"area +{d:g} ms" for d in DELAYS_MS[1:]),
+    )  # fmt: skip
+    found, drawn = {}, {}
+    for name, policy, trial in tries:
+        for states, seen in orbits(policy, trial, DELAYS_MS).items():
+            drawn[f"{name} {states}"] = seen.pop("orbits")
+            found.setdefault(name, {})[states] = seen
+            table.add_row(
+                f"{name} {states}", terminal.number(seen["explained_3"], 3),
+                terminal.number(seen["participation_ratio"], 1),
+                *(terminal.number(c, 2) for c in seen["closure"]),
+                *(terminal.number(a, 2) for a in seen["area_ratio"][1:]),
+            )  # fmt: skip
+    return {"delays_ms": DELAYS_MS, "orbits": found}, orbit_figure(drawn, DELAYS_MS), table
+
+
+def _delay(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import delay_figure
+    from policies.robustness import delay_curve
+
+    curves = {name: delay_curve(policy, trial) for name, policy, trial in tries}
+    columns = ("extra_delay_ms", "mode", "survival", "frequency_hz", "amplitude_rad", "mae_vx_m_s")
+    return {"curves": curves}, delay_figure(curves), _table("Against more delay", curves, columns)
+
+
+def _ablation(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import ablation_figure
+    from policies.robustness import ablation
+
+    tables = {name: ablation(policy, trial) for name, policy, trial in tries}
+    columns = ("channel", "kind", "level", "sigma", "correlation", "survival", "mae_vx_m_s")
+    shown = _table("Altered observations", tables, columns)
+    return {"ablations": tables}, ablation_figure(tables), shown
+
+
+def _autonomy(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import autonomy_figure
+    from policies.robustness import autonomy
+
+    tables = {name: autonomy(policy, trial) for name, policy, trial in tries}
+    columns = ("test", "frequency_hz", "amplitude_rad", "share")
+    shown = _table("Does the rhythm go on? (replay)", tables, columns)
+    return {"autonomy": tables}, autonomy_figure(tables), shown
+
+
+def _table(title: str, tables: dict[str, list[dict[str, Any]]], columns: Sequence[str]) -> Table:
+    made = terminal.table(title, "policy", *columns)
+    for name, rows in tables.items():
+        for row in rows:
+            made.add_row(name, *(_cell(row.get(c)) for c in columns))
+    return made
+
+
+def _cell(value: Any) -> str:
+    return terminal.number(float(value), 3) if isinstance(value, float | int) else str(value)
+
+
+def _interval(value: Any, digits: int) -> str:
+    low, high = (terminal.number(x, digits) for x in (value.low, value.high))
+    return f"{terminal.number(value.value, digits)} ({low}–{high})"
+
+
+_ANALYSES: dict[str, Callable[[Tries, np.random.Generator], Found]] = {
+    "gait": _gait, "attractor": _attractor, "delay": _delay, "ablation": _ablation,
+    "autonomy": _autonomy,
+}  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,273 @@
+"""How a policy's walk stands up to late, noisy, missing and frozen observations.
+
+Every test is done twice where the published one was done in replay only: in *replay* the policy is
+shown altered recordings and nothing follows from what it does; in *closed loop* the robot in the
+simulator has to live with it. Replay says how a network reacts, closed loop whether it walks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import InputError
+from policies import perturbations
+from policies.attractor import closure, collapse, principal_components
+from policies.gait import amplitude, correlation, describe, frequency, jitter
+from policies.perturbations import JOINTS, PARTS
+from policies.policy_file import Policy
+from policies.rollouts import Change, Rollout, collect, replay
+from sim.servo_ranges import ServoRanges
+from sim.walking_config import Walking
+
+EXTRA_DELAYS_MS = (0, 40, 80, 160, 240, 320, 400)
+NOISE_SHARES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+HOLD_MS = (40, 80, 160, 320)
+_SETTLE_S = 2.0
+_MOST_LAG = 5
+_STILL_RAD = 1e-3  # less moves no servo by a count
+_LAST_ACTION = PARTS["last_action"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Where, for how long and with how many robots a policy is tried."""
+
+    task: Walking
+    servos: ServoRanges
+    command: tuple[float, float, float] = (0.15, 0.0, 0.0)
+    robots: int = 16
+    seconds: float = 10.0
+    seed: int = 0
+    threads: int = 0
+
+    def walk(
+        self, policy: Policy, change: Change | None = None, servos: ServoRanges | None = None
+    ) -> Rollout:
+        """One rollout, with an altered observation or other servos."""
+        return collect(
+            policy, self.task, servos or self.servos, self.command, self.robots, self.seconds,
+            self.seed, self.threads, change,
+        )  # fmt: skip
+
+
+def outcome(rollout: Rollout, rng: np.random.Generator) -> dict[str, float]:
+    """Survival, tracking and gait of a rollout; NaN where no robot walked long enough."""
+    alive = rollout.alive
+    error = np.abs(rollout.velocity - np.array(rollout.command))[alive].mean(axis=0)
+    found = {
+        "survival": float(alive[-1].mean()),
+        "mae_vx_m_s": float(error[0]),
+        "mae_vy_m_s": float(error[1]),
+        "mae_yaw_rad_s": float(error[2]),
+    }
+    try:
+        gait = describe(rollout, rng)
+    except InputError:
+        return found | dict.fromkeys(("frequency_hz", "amplitude_rad", "jitter_rad"), float("nan"))
+    return found | {
+        "frequency_hz": gait.frequency_hz.value,
+        "amplitude_rad": float(np.mean([e.value for e in gait.half_range_rad])),
+        "jitter_rad": gait.jitter_rad.value,
+    }
+
+
+def delay_curve(
+    policy: Policy, trial: Trial, extra_ms: Sequence[float] = EXTRA_DELAYS_MS
+) -> list[dict[str, float | str]]:
+    """Against more delay: in replay as published, and closed loop, fixed and jittered.
+
+    Fixed delay is the servos' own, on top of what the calibration says; jittered delay is of what
+    the policy is told of its joints, since a servo cannot answer out of order.
+
+    Returns
+    -------
+    list of dict
+        `extra_delay_ms`, `mode` (`replay`, `fixed`, `jittered`), `survival` (NaN in replay),
+        `frequency_hz`, `amplitude_rad`, `jitter_rad` and tracking errors.
+    """
+    step_ms = 1e3 * trial.task.control_step_s
+    rng = np.random.default_rng(trial.seed)
+    plain = trial.walk(policy)
+    found: list[dict[str, float | str]] = []
+    for extra in extra_ms:
+        steps = round(extra / step_ms)
+        seen = perturbations.applied(perturbations.delayed(JOINTS, steps), plain.observation)
+        actions, _ = replay(policy, seen)
+        found.append(
+            {"extra_delay_ms": extra, "mode": "replay", "survival": float("nan")}
+            | _gait_of_actions(plain, actions)
+        )
+        fixed = plain if extra == 0 else trial.walk(policy, None, trial.servos.later(extra / 1e3))
+        found.append({"extra_delay_ms": extra, "mode": "fixed"} | outcome(fixed, rng))
+        change = perturbations.jittered(JOINTS, steps, rng)
+        moving = plain if extra == 0 else trial.walk(policy, change)
+        found.append({"extra_delay_ms": extra, "mode": "jittered"} | outcome(moving, rng))
+    return found
+
+
+def ablation(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+    """Noise, zeros and staleness on what comes from the servos, by channel and jointly.
+
+    Noise is in shares of a channel's own standard deviation while walking; `sigma` is that in the
+    channel's unit (NaN where several units are mixed).
+
+    Returns
+    -------
+    list of dict
+        `channel`, `kind` (`noise`, `zero`, `hold`), `level` (share, 0, ms), `sigma`,
+        `correlation` (replay, with the actions of the whole observation), `survival` and the rest
+        of `outcome` (closed loop).
+    """
+    rng = np.random.default_rng(trial.seed)
+    plain = trial.walk(policy)
+    settled = round(_SETTLE_S / plain.step_s)
+    channels = {
+        name: PARTS[name] for name in ("joint_position_relative", "joint_velocity", "joint_effort")
+    } | {"all joints": JOINTS, "last_action": PARTS["last_action"]}
+    found: list[dict[str, float | str]] = []
+    for name, part in channels.items():
+        spread = plain.observation[settled:, :, part].std(axis=(0, 1))
+        sigma = float(spread.mean()) if name != "all joints" else float("nan")
+        cases: list[tuple[str, float, float, Callable[[], Change]]] = [
+            ("noise", share, share * sigma, partial(perturbations.noisy, part, share * spread, rng))
+            for share in NOISE_SHARES
+        ]
+        cases.append(("zero", 0.0, float("nan"), partial(perturbations.zeroed, part)))
+        cases += [
+            ("hold", ms, float("nan"), partial(perturbations.held, part, _steps(ms, plain.step_s)))
+            for ms in HOLD_MS
+        ]
+        for kind, level, size, change in cases:
+            walked = outcome(trial.walk(policy, change()), rng)
+            actions, _ = replay(policy, perturbations.applied(change(), plain.observation))
+            agreement = _agreement(plain.action[settled:], actions[settled:])
+            found.append(
+                {"channel": name, "kind": kind, "level": level, "sigma": size,
+                 "correlation": agreement} | walked
+            )  # fmt: skip
+    return found
+
+
+def autonomy(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+    """Whether the rhythm is the network's own: tests that the paper lacks.
+
+    In replay, from two seconds on: everything frozen but the policy's own last action; everything
+    frozen; only the last action frozen. A rhythm that goes on with all inputs frozen is made
+    inside; one that needs its last action is made by the loop through the action; one that stops
+    needs the joints.
+
+    Returns
+    -------
+    list of dict
+        `test`, `frequency_hz`, `amplitude_rad`, `share` (of the amplitude before) and `rhythmic`.
+    """
+    plain = trial.walk(policy)
+    start = round(_SETTLE_S / plain.step_s)
+    own = _LAST_ACTION
+    before = float(np.mean(amplitude(plain.action_rad[start:, 0])[0]))
+    found: list[dict[str, float | str]] = []
+    tests = {
+        "nothing frozen": (None, False),
+        "senses frozen, its own last action": (slice(0, own.start), True),
+        "senses and last action frozen": (slice(0, own.stop), False),
+        "last action frozen, senses recorded": (own, False),
+    }
+    for name, (part, feeds_back) in tests.items():
+        actions = _driven(policy, plain, part, feeds_back, start)
+        gait = _gait_of_actions(plain, actions)
+        found.append({"test": name, "share": gait["amplitude_rad"] / max(before, 1e-9)} | gait)
+    return found
+
+
+def orbits(policy: Policy, trial: Trial, delays_ms: Sequence[float]) -> dict[str, dict[str, Any]]:
+    """Orbits of actions and hidden states in replay with late joints, on axes common to all delays.
+
+    Returns
+    -------
+    dict of str to dict
+        For `actions` and `hidden`: `orbits` (of one robot, per delay), `explained` and
+        `explained_3` (shares of variance), `participation_ratio`, `closure` and `area_ratio`
+        (to no delay) per delay.
+    """
+    plain = trial.walk(policy)
+    start = round(_SETTLE_S / plain.step_s)
+    acted, minds = [], []
+    for delay in delays_ms:
+        change = perturbations.delayed(JOINTS, round(delay / 1e3 / plain.step_s))
+        actions, hidden = replay(policy, perturbations.applied(change, plain.observation))
+        acted.append(plain.action_scale * actions[start:, 0].astype(float))
+        minds.append(hidden[start:, 0].astype(float))
+    rate = _rate(acted[0], plain.step_s)
+    found = {}
+    for name, conditions, count in (("actions", acted, 3), ("hidden", minds, 3)):
+        axes = principal_components(conditions, count)
+        paths = [axes.orbit(c) for c in conditions]
+        found[name] = {
+            "orbits": paths,
+            "explained": axes.explained.tolist(),
+            "explained_3": float(axes.explained[:3].sum()),
+            "participation_ratio": float(axes.participation_ratio),
+            "closure": [closure(path, plain.step_s, rate) for path in paths],
+            "area_ratio": [collapse(path[:, :2], paths[0][:, :2]).area for path in paths],
+        }
+    return found
+
+
+def _driven(
+    policy: Policy, plain: Rollout, frozen: slice | None, own_action: bool, start: int
+) -> Array:
+    """Actions of a policy that is shown a recording with a part frozen from `start` on.
+
+    With `own_action` its last action is what it really did last, else what the recording (or the
+    frozen part) says.
+    """
+    player = copy(policy)
+    seen = plain.observation
+    player.reset(seen[0, :, _LAST_ACTION])
+    last, actions = seen[0, :, _LAST_ACTION], []
+    for step, observation in enumerate(seen):
+        shown = observation.copy()
+        if frozen is not None and step >= start:
+            shown[:, frozen] = seen[start, :, frozen]
+        if own_action:
+            shown[:, _LAST_ACTION] = last
+        last = player.act(shown)
+        actions.append(last)
+    return np.stack(actions)
+
+
+def _gait_of_actions(plain: Rollout, actions: NDArray[np.floating]) -> dict[str, float]:
+    """Frequency, amplitude and jitter of replayed actions, means over robots, once settled."""
+    radians = plain.action_scale * actions[round(_SETTLE_S / plain.step_s) :].astype(float)
+    robots = range(radians.shape[1])
+    return {
+        "frequency_hz": float(np.mean([_rate(radians[:, i], plain.step_s) for i in robots])),
+        "amplitude_rad": float(np.mean([amplitude(radians[:, i])[0] for i in robots])),
+        "jitter_rad": float(np.mean([jitter(radians[:, i]) for i in robots])),
+    }
+
+
+def _steps(ms: float, step_s: float) -> int:
+    return max(round(ms / 1e3 / step_s), 1)
+
+
+def _rate(signal: Array, step_s: float) -> float:
+    """Frequency of a signal; NaN if it stands still."""
+    if signal.std() < _STILL_RAD:
+        return float("nan")
+    return frequency(signal, step_s).value
+
+
+def _agreement(whole: NDArray[np.floating], altered: NDArray[np.floating]) -> float:
+    """Gait correlation: mean over robots of Pearson's r, which is the mean over joints."""
+    robots = range(whole.shape[1])
+    return float(np.mean([correlation(whole[:, i], altered[:, i], _MOST_LAG).r for i in robots]))
