@@ -41,8 +41,9 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
     from policies.policy_file import CONTRACT, load_policy  # torch takes seconds to import
 
     if (path / CONTRACT).is_file():
-        parent = path.parent
-        return load_policy(path), load_run(parent) if (parent / RUN_FILE).is_file() else None
+        # a shipped policy has its run's settings beside it, one in a run above it
+        of_run = next((f for f in (path, path.parent) if (f / RUN_FILE).is_file()), None)
+        return load_policy(path), load_run(of_run) if of_run else None
     if not (path / RUN_FILE).is_file():
         raise InputError(
             f"{path} is neither a run nor a policy. Give a folder that pupper-train wrote, "

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import refused
+from command_line import run_program as run
 from tiny_training import CALIBRATION
 
 import cli.pupper_eval
@@ -26,25 +28,6 @@ TINY = (
     "--learner.steps-per-environment", "6", "--learner.minibatches", "2", "--learner.epochs", "1",
     "--architecture.hidden", "16", "--architecture.critic-hidden", "16",
 )  # fmt: skip
-
-
-def run(capsys, module, *arguments) -> tuple[int, str, str]:
-    """Exit code, stdout, and stderr on one line."""
-    try:
-        module.main([str(a) for a in arguments])
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, " ".join(said.err.split())
-
-
-def refused(capsys, module, *arguments) -> str:
-    """What is said to input that cannot be used: no traceback, no blame on the program."""
-    code, out, err = run(capsys, module, *arguments)
-    assert code == 2, err
-    assert out == "" and "Traceback" not in err and "defect" not in err
-    return err
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,134 @@
+"""pupper-deploy and pupper-analyze as a user meets them, with the shipped policy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import refused, run_program
+
+import cli.pupper_analyze
+import cli.pupper_deploy
+from policies.walk_log import read_walk
+from sysid.recording import load
+
+ROOT = Path(__file__).resolve().parents[1]
+POLICY = ROOT / "data/samples/policies/lstm"
+CALIBRATION = ROOT / "data/samples/calibrated.yaml"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def deploy(capsys, *arguments) -> dict:
+    code, out, err = run_program(
+        capsys, cli.pupper_deploy, POLICY, "--actuator", CALIBRATION, "--json", *arguments
+    )
+    assert code == 0, err
+    return json.loads(out)
+
+
+def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(capsys, here):
+    found = deploy(capsys, "--seconds", 6, "--name", "walk", "--command", 0.15, 0, 0)
+    assert found["stop_reason"] == "time is up" and found["fell"] is False
+    assert found["rate_hz"] == pytest.approx(50, rel=0.01) and found["deadline_misses"] == 0
+    assert found["mae_vx_m_s"] < 0.06 and found["mae_vy_m_s"] < 0.035
+    assert found["mae_yaw_rad_s"] < 0.15 and set(found["step_ms"]) == {"p50", "p99", "max"}
+    log = Path(found["log"])
+    code, out, _ = run_program(
+        capsys, cli.pupper_deploy, POLICY, "--replay", log, "--actuator", CALIBRATION
+    )
+    assert code == 0 and "300 ticks repeated" in out
+    assert len(read_walk(log).senses) == 300
+    # the servos' side of it is a recording like any other
+    recording = load(log.with_name("recording.csv"))
+    assert len(recording.joints) == 12 and recording.loop_period_s == pytest.approx(0.02, abs=1e-3)
+
+
+def test_a_script_is_followed(capsys, here):
+    Path("s.csv").write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0.1,0,0\n0.5,0,0,0\n")
+    found = deploy(capsys, "--script", "s.csv", "--name", "walk")
+    assert found["stop_reason"] == "told to stop"
+    assert found["seconds"] == pytest.approx(1.5, abs=0.05)
+
+
+def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
+    code, _, err = run_program(
+        capsys, cli.pupper_deploy, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 1,
+        "--name", "slow",
+    )  # fmt: skip
+    assert code == 0 and "0.50 times as fast" in err
+
+
+def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(capsys, here):
+    code, _, err = run_program(
+        capsys, cli.pupper_deploy, POLICY, "--actuator", CALIBRATION, "--observer",
+        "published-pd", "--seconds", 1, "--name", "paper",
+    )  # fmt: skip
+    assert code == 0 and "warning" in err and "Hz" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((), "No policy was named"),
+        (("nowhere",), "neither a run nor a policy"),
+        ((POLICY, "--actuator", "nowhere.yaml"), "no such file"),
+        ((POLICY, "--actuator", CALIBRATION, "--bus", "feetech:/dev/none"), "no IMU"),
+        ((POLICY, "--actuator", CALIBRATION, "--bus", "serial"), "--bus serial"),
+        ((POLICY, "--actuator", CALIBRATION, "--stack", "lstm-servo"), "--servo"),
+        ((POLICY, "--actuator", CALIBRATION, "--command", "9", "0", "0"), "--command"),
+        ((POLICY, "--actuator", CALIBRATION, "--lowpass-hz", "40"), "half the rate"),
+        ((POLICY, "--actuator", CALIBRATION, "--keyboard"), "terminal"),
+        ((POLICY, "--replay", "nowhere.csv"), "cannot be read"),
+        ((POLICY, "--seconds", "-1"), "--seconds"),
+    ],
+)
+def test_bad_input_is_answered_in_a_sentence(capsys, here, arguments, says):
+    assert says in refused(capsys, cli.pupper_deploy, *arguments)
+
+
+# ------------------------------------------------------------------------------ pupper-analyze
+
+
+def analyze(capsys, what, *arguments) -> dict:
+    code, out, err = run_program(
+        capsys, cli.pupper_analyze, what, POLICY, "--actuator", CALIBRATION, "--json",
+        "--robots", 2, "--seconds", 8, *arguments,
+    )  # fmt: skip
+    assert code == 0, err
+    found = json.loads(out)
+    assert Path(found["picture"]).stat().st_size > 5_000
+    return found
+
+
+def test_the_gait_of_the_shipped_policy_is_a_trot(capsys, here):
+    gait = analyze(capsys, "gait")["gaits"]["lstm"]
+    assert gait["frequency_hz"][0] == pytest.approx(3.25, abs=0.15)
+    assert gait["diagonal"][0] > 0.6 and gait["rhythmic"] == 1.0
+
+
+def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(capsys, here):
+    rows = {r["test"]: r for r in analyze(capsys, "autonomy")["autonomy"]["lstm"]}
+    assert rows["nothing frozen"]["share"] == pytest.approx(1.0, abs=0.1)
+    assert rows["senses frozen, its own last action"]["share"] > 0.5
+    assert rows["senses and last action frozen"]["share"] < 0.2
+
+
+def test_orbits_close(capsys, here):
+    orbits = analyze(capsys, "attractor")["orbits"]["lstm"]
+    assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
+
+
+def test_pictures_are_not_written_over(capsys, here):
+    analyze(capsys, "gait")
+    again = refused(capsys, cli.pupper_analyze, "gait", POLICY, "--actuator", CALIBRATION)
+    assert "exists already" in again
+
+
+def test_an_analysis_of_nothing_is_refused(capsys, here):
+    assert "nowhere" in refused(capsys, cli.pupper_analyze, "gait", "nowhere")
