@@ -29,6 +29,11 @@ from sim.walking_config import Walking
 EXTRA_DELAYS_MS = (0, 40, 80, 160, 240, 320, 400)
 NOISE_SHARES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 HOLD_MS = (40, 80, 160, 320)
+CHANNELS = {
+    name: PARTS[name]
+    for name in ("joint_position_relative", "joint_velocity", "joint_effort", "last_action")
+} | {"all joints": JOINTS}
+"""Parts of the observation that are ablated."""
 _SETTLE_S = 2.0
 _MOST_LAG = 5
 _STILL_RAD = 1e-3  # less moves no servo by a count
@@ -114,7 +119,9 @@ def delay_curve(
     return found
 
 
-def ablation(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+def ablation(
+    policy: Policy, trial: Trial, channels: Sequence[str] = tuple(CHANNELS)
+) -> list[dict[str, float | str]]:
     """Noise, zeros and staleness on what comes from the servos, by channel and jointly.
 
     Noise is in shares of a channel's own standard deviation while walking; `sigma` is that in the
@@ -130,11 +137,9 @@ def ablation(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
     rng = np.random.default_rng(trial.seed)
     plain = trial.walk(policy)
     settled = round(_SETTLE_S / plain.step_s)
-    channels = {
-        name: PARTS[name] for name in ("joint_position_relative", "joint_velocity", "joint_effort")
-    } | {"all joints": JOINTS, "last_action": PARTS["last_action"]}
     found: list[dict[str, float | str]] = []
-    for name, part in channels.items():
+    for name in channels:
+        part = CHANNELS[name]
         spread = plain.observation[settled:, :, part].std(axis=(0, 1))
         sigma = float(spread.mean()) if name != "all joints" else float("nan")
         cases: list[tuple[str, float, float, Callable[[], Change]]] = [
