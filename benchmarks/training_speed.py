@@ -21,6 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 
+from policies.hyperparameters import KINDS
 from policies.run_file import preset
 from policies.speed import environment_rates, measure
 from policies.transformer import CONTEXT, CausalAttention
@@ -78,7 +79,7 @@ def end_to_end(threads: int) -> None:
     )
     print("|---|---|---|---|---|---|---|")
     for sizes in ("fast", "paper"):
-        for kind in ("mlp", "mlp-actions", "lstm", "gru", "transformer"):
+        for kind in KINDS if sizes == "fast" else PAPER:
             run = preset(sizes, kind)
             run = replace(
                 run, actuator=ACTUATOR, threads=threads, environments=512,

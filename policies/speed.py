@@ -20,7 +20,8 @@ from policies.training import make_env, make_learner
 from sim.walking_env import PupperEnv
 
 _ROUNDS = 3
-_STEPS = 20
+_STEPS = range(5, 21)  # few of many robots, many of few
+_ROBOT_STEPS = 20_000
 
 
 def environment_rates(env: PupperEnv) -> tuple[float, float]:
@@ -29,9 +30,10 @@ def environment_rates(env: PupperEnv) -> tuple[float, float]:
     The bare steps repeat the controls, from where the environment's steps left the robots.
     """
     n, substeps = env.environments, env.config.substeps
+    steps = int(np.clip(_ROBOT_STEPS // n, _STEPS[0], _STEPS[-1]))
     rng = np.random.default_rng(0)
     # a trot with noise: robots at rest would have other contacts
-    phase = 2 * np.pi * env.trot.frequency_hz * env.config.control_step_s * np.arange(_STEPS)
+    phase = 2 * np.pi * env.trot.frequency_hz * env.config.control_step_s * np.arange(steps)
     actions = [
         (env.trot.joints(np.full(n, p), env.command) - env.default) / env.config.action_scale
         + 0.05 * rng.standard_normal((n, 12))
@@ -46,12 +48,12 @@ def environment_rates(env: PupperEnv) -> tuple[float, float]:
         for action in actions:
             env.step(action)
             controls.append(env.robots.batch.bind("ctrl").copy())
-        own.append(n * _STEPS / (time.perf_counter() - begun))
+        own.append(n * steps / (time.perf_counter() - begun))
         begun = time.perf_counter()
         for control in controls:
             env.robots.batch.bind("ctrl")[:] = control
             env.robots.batch.step(nstep=substeps)
-        bare.append(n * _STEPS / (time.perf_counter() - begun))
+        bare.append(n * steps / (time.perf_counter() - begun))
     return max(bare), max(own)
 
 
