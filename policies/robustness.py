@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from common.errors import InputError
 from policies import perturbations
 from policies.attractor import closure, collapse, principal_components
-from policies.gait import amplitude, correlation, describe, frequency, jitter
+from policies.gait import amplitude, correlation, describe, jitter
 from policies.perturbations import JOINTS, PARTS
 from policies.policy_file import Policy
+from policies.rhythm import frequency
 from policies.rollouts import Change, Rollout, collect, replay
 from sim.servo_ranges import ServoRanges
 from sim.walking_config import Walking

@@ -18,14 +18,11 @@ from policies.gait import (
     diagonal_coordination,
     duty,
     fast_share,
-    frequency,
     intervals,
     jitter,
-    null_r2,
     phases,
-    sine_fit_r2,
-    sine_frequency,
 )
+from policies.rhythm import frequency, null_r2, sine_fit_r2, sine_frequency
 from policies.rollouts import Rollout
 from sim.mini_pupper import default_pose, foot_position
 from sim.trot import Trot
