@@ -81,9 +81,9 @@ class Hyperparameters:
 class Imitation:
     """How the first gait is learned."""
 
-    iterations: int = 60
+    iterations: int = 80
     """How many rounds; 0 to start PPO from nothing."""
-    epochs: int = 6
+    epochs: int = 12
     """Passes over the data of a round."""
     minibatches: int = 16
     """Parts of the data per pass."""

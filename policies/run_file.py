@@ -58,7 +58,8 @@ def preset(name: Literal["fast", "paper", "release"], kind: Kind) -> Run:
     task = PRESETS[name]
     privileged = task.observation.privileged_critic
     if name == "fast":
-        hidden = (256, 128, 64) if kind in ("mlp", "mlp-actions") else (128, 64)
+        # without a memory, reading the gait's phase off one action takes a wide network
+        hidden = (512, 256, 128) if kind in ("mlp", "mlp-actions") else (128, 64)
         memory = 64
         return Run(
             architecture=Architecture(kind, hidden, memory, (256, 128, 64), privileged), task=task
