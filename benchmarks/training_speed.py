@@ -14,6 +14,7 @@ import os
 import resource
 import time
 from dataclasses import replace
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -34,17 +35,21 @@ SIZES = (64, 256, 1024, 4096, 8192)
 PAPER = {"mlp": "30,000", "lstm": "15,000–20,000", "transformer": "5,500"}
 
 
+def resident_kb() -> float:
+    """Memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1024
+
+
 def environments(threads: int) -> None:
     """Cost against number of environments, and memory."""
     print("| environments | bare Batch.step, steps/s | PupperEnv, steps/s | ratio | kB per robot |")
     print("|---|---|---|---|---|")
     servos = servo_ranges(ACTUATOR)
     for size in SIZES:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        before = resident_kb()
         env = PupperEnv(Walking(), servos, size, 0, threads)
         bare, own = environment_rates(env)
-        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        memory = f"{(after - before) / size:.0f}" if size >= 1024 else "–"
+        memory = f"{(resident_kb() - before) / size:.0f}" if size >= 1024 else "–"
         print(f"| {size:,} | {bare:,.0f} | {own:,.0f} | {own / bare:.2f} | {memory} |", flush=True)
         del env
 

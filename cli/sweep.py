@@ -201,7 +201,6 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
     joints = request["joints"]
     if request["playback"]:
         chosen = playback(Path(request["playback"]), joints)
-        # recordings of before loops could be asked for say nothing of them
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
     room = bus.limits.room(start_pose(bus.joint_names))
     return plan(

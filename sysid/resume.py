@@ -40,6 +40,8 @@ class Request(BaseModel):
     amplitude_rad: float
     duration_s: float | None
     playback: str | None
+    loops: int = Field(1, ge=1, le=1000)
+    """Of a playback; recordings of before this could be asked for do not say it."""
 
 
 @dataclass(frozen=True)
