@@ -15,7 +15,7 @@ from sim.servo_ranges import ServoRanges, check_actuator, servo_ranges
 from sim.walking_config import Walking
 
 if TYPE_CHECKING:
-    from policies.policy_file import Contract, Policy
+    from policies.policy_file import Policy
 
 _CONTRACT = "contract.json"
 
@@ -63,8 +63,10 @@ def simulator(
     policy: Policy, run: Run | None, actuator: str | None, feedback: str | None
 ) -> tuple[Walking, ServoRanges]:
     """Task and servos to run a policy in: its own, unless told otherwise."""
+    from policies.policy_file import refuse_other_observation
+
     contract = policy.contract
-    _refuse_other_observation(contract)
+    refuse_other_observation(contract)
     task = run.task if run else Walking(
         physics_step_s=contract.physics_step_s, control_step_s=contract.control_step_s,
         action_scale=contract.action_scale_rad, knee=contract.knee,
@@ -84,17 +86,3 @@ def simulator(
             ]
         )
     return task, servos
-
-
-def _refuse_other_observation(contract: Contract) -> None:
-    """A policy that expects other numbers than the simulator gives would only look confused."""
-    from sim.walking_env import OBSERVATION, VELOCITY_STEPS
-
-    expected = [(p.name, p.size) for p in contract.observation]
-    given = [(name, size) for name, size, _ in OBSERVATION]
-    if expected != given or contract.velocity_steps != VELOCITY_STEPS:
-        raise InputError(
-            "The policy's observation is not the one this version gives "
-            f"({', '.join(name for name, _ in given)}; velocity over {VELOCITY_STEPS} steps). "
-            "Use the version that trained it, or train it again."
-        )

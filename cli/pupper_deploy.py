@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,12 +16,14 @@ import numpy as np
 import tyro
 
 from cli import terminal
+from cli.buses import chosen_map
 from cli.policy_choice import policy_at
 from cli.sweep import EMULATED, Sweep
 from cli.terminal import err, need_positive, out, print_json, warn
 from cli.user_errors import run_program
 from common.errors import InputError
 from hardware.connect import open_guarded, parse_address
+from hardware.esp32_bus import SOCKET, Esp32Bus
 from hardware.guard import GuardedBus
 from hardware.imu import Imu
 from hardware.joint_map import JointMap, load_joint_map
@@ -121,8 +123,8 @@ def _run(options: Deploy) -> None:
         _replay(options.replay, policy)
         return
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
-    bus, imu, joint_map, truth = _open(options)
-    try:
+    with ExitStack() as open_things:
+        bus, imu, joint_map, truth = _open(options, open_things)
         actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
         check_actuator(actuator)
         parts = assemble(policy, stack, joint_map, actuator, options.servo)
@@ -132,8 +134,6 @@ def _run(options: Deploy) -> None:
             "bus": {"name": bus.name} | bus.metadata,
         }  # fmt: skip
         _walk(options, bus, imu, parts.controller, header, folder, truth)
-    finally:
-        bus.close()
 
 
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
@@ -158,7 +158,7 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     return name, stack
 
 
-def _open(options: Deploy) -> tuple[GuardedBus, Imu, JointMap, Any]:
+def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:
     """Bus, IMU, joint map, and the emulated robot if it is one."""
     if options.bus == "sim":
         from sim.emulated_robot import draw_robot
@@ -166,23 +166,20 @@ def _open(options: Deploy) -> tuple[GuardedBus, Imu, JointMap, Any]:
 
         rng = np.random.default_rng(options.seed)
         inner = WalkingBus(draw_robot(rng), rng, real_time=options.keyboard)
-        return GuardedBus(inner), inner, load_joint_map("mini_pupper_2"), inner.robot
+        bus = open_things.enter_context(closing(GuardedBus(inner)))
+        return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
     address = parse_address(options.bus)
     preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
-    joint_map = load_joint_map(
-        Path(options.joint_map) if options.joint_map and Path(options.joint_map).exists()
-        else options.joint_map or preset
-    )  # fmt: skip
+    joint_map = chosen_map(options.joint_map) or load_joint_map(preset)
     if address.kind == "feetech" and options.imu is None:
         raise InputError(
             "A Feetech line has no IMU, and a policy needs one. Give the proxy's socket with --imu."
         )
-    bus = open_guarded(address, joint_map)
-    if options.imu is None:
-        return bus, bus.bus, joint_map, None  # type: ignore[return-value]
-    from hardware.esp32_bus import Esp32Bus
-
-    return bus, Esp32Bus(options.imu), joint_map, None
+    bus = open_things.enter_context(closing(open_guarded(address, joint_map)))
+    if isinstance(bus.bus, Imu):
+        return bus, bus.bus, joint_map, None
+    other = open_things.enter_context(closing(Esp32Bus(options.imu or SOCKET)))
+    return bus, other, joint_map, None
 
 
 def _replay(path: Path, policy: Any) -> None:
@@ -206,10 +203,9 @@ def _say_match(match: Any) -> None:
         err.print(match.sentence())
         return
     warn([match.sentence()])
-    table = terminal.table(
-        "Swing over command, and phase in degrees", "", "Hz", "observer", "actuator"
-    )
-    for row in match.table():
+    rows = match.table()
+    table = terminal.table("Swing over command, and phase", *rows[0])
+    for row in rows:
         table.add_row(*(str(v) for v in row.values()))
     err.print(table)
 

@@ -82,7 +82,7 @@ def open_guarded(
     """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
     bus = open_bus(address, joint_map, joints)
     try:
-        watchdog = Watchdog(address, joint_map, joints)
+        watchdog = Watchdog(address, joint_map)
     except BaseException:
         bus.close()
         raise

@@ -21,6 +21,7 @@ import numpy as np
 from common.errors import BusError, SafetyStop
 from hardware.bus import BusSample, Sent, ServoBus
 from hardware.guard_watch import Angles, GuardLimits, Watch
+from hardware.moves import raised_cosine
 from hardware.watchdog import Watchdog
 
 _HEARTBEAT_S = 0.1
@@ -28,6 +29,7 @@ _PARK_PERIOD_S = 0.02
 _LONGEST_TICK_S = 0.06  # a pause does not save up for a jump
 _REST_S = 0.1  # longer since the last goal than any tick: the goal has been at rest
 _TORQUE_OFF_TRIES = 10
+_FIND_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
 
 
 @dataclass
@@ -147,15 +149,7 @@ class GuardedBus:
             If it has not, or if a servo did not confirm that it is on.
         """
         if on:
-            if not np.isfinite(self._present).all():
-                self.read()
-            if not np.isfinite(self._present).all():
-                raise BusError(
-                    f"{self.name}: the torque stays off, for {self._silent()} does not say where "
-                    "it is."
-                )
-            if self._found is None:
-                self._found = self._present.copy()
+            self._find()
         self._on = on
         done = self.bus.torque(on)
         if on and not done:
@@ -166,11 +160,26 @@ class GuardedBus:
             self._sent = None
         if self._watchdog and self._found is not None:
             if on:
-                self._watchdog.arm(self._found)
+                self._watchdog.arm(self.joint_names, self._found)
             else:
                 self._watchdog.disarm()
         self._watch.forget(self.bus.now())
         return done
+
+    def take_over(self) -> None:
+        """The torque is on, and whoever switched it on is gone: from here on it is ours.
+
+        As `torque`, but a servo that does not confirm does not cost the others their way back.
+
+        Raises
+        ------
+        BusError
+            If a servo does not say where it is.
+        """
+        self._on = True
+        self._find()
+        self.bus.torque(True)
+        self._watch.forget(self.bus.now())
 
     @property
     def sent(self) -> Angles:
@@ -225,6 +234,21 @@ class GuardedBus:
         if self._watchdog:
             self._watchdog.beat()
 
+    def _find(self) -> None:
+        """Where the robot is, before anything is sent to it."""
+        for _ in range(_FIND_TRIES):
+            if np.isfinite(self._present).all():
+                break
+            self.read()
+            self.bus.sleep_until(self.bus.now() + _PARK_PERIOD_S)
+        if not np.isfinite(self._present).all():
+            raise BusError(
+                f"{self.name}: {self._silent()} does not say where it is, and so nothing is sent "
+                "to it."
+            )
+        if self._found is None:
+            self._found = self._present.copy()
+
     def _return(self, pose: Angles) -> None:
         origin = self.sent
         self.write(origin)
@@ -239,7 +263,7 @@ class GuardedBus:
         while share < 1.0:
             self.bus.sleep_until(self.bus.now() + _PARK_PERIOD_S)
             share = min((self.bus.now() - start) / duration, 1.0)
-            self.write(origin + (0.5 - 0.5 * np.cos(np.pi * share)) * way)
+            self.write(origin + raised_cosine(share) * way)
             self.read()
 
     def _bounded(self, goal: Angles, since_s: float) -> Angles:

@@ -14,7 +14,7 @@ chip reports as about -1 g on its z. It ends at ±2 g, and walking gets there.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ class ImuSample:
     clipped: bool
 
 
+@runtime_checkable
 class Imu(Protocol):
     """Whatever has an IMU: a bus, real or emulated."""
 

@@ -31,6 +31,7 @@ from common.errors import BusError, PupperError
 from hardware.joint_map import JointMap, joint_map_from
 
 if TYPE_CHECKING:
+    from hardware.bus import ServoBus
     from hardware.connect import BusAddress
 
 HANG_S = 1.0
@@ -40,6 +41,7 @@ PARK_WITHIN_S = 0.5
 
 _BEAT_S = 0.05
 _OPEN_WITHIN_S = 0.4
+_GIVE_UP_S = 3.0
 _START_WITHIN_S = 20.0
 
 
@@ -50,7 +52,6 @@ class Watchdog:
     ----------
     address : BusAddress
     joint_map : JointMap or None
-    joints : sequence of str or None
         As given to `open_bus`.
 
     Raises
@@ -59,16 +60,13 @@ class Watchdog:
         If the process does not start.
     """
 
-    def __init__(
-        self, address: BusAddress, joint_map: JointMap | None, joints: Sequence[str] | None
-    ):
+    def __init__(self, address: BusAddress, joint_map: JointMap | None):
         orders = {
             "kind": address.kind,
             "where": address.where,
             "baud": address.baud,
             "map": joint_map.file.model_dump(mode="json", by_alias=True) if joint_map else None,
             "coordinates": joint_map.coordinates if joint_map else None,
-            "joints": list(joints) if joints else None,
             "driver": os.getpid(),
         }
         root = str(Path(__file__).resolve().parents[1])
@@ -89,9 +87,9 @@ class Watchdog:
                 "if this one died. Check the machine's load and memory, then try again."
             )
 
-    def arm(self, pose_rad: NDArray[np.float64]) -> None:
-        """The torque is on: from now on beats are expected; `pose_rad` is where to park."""
-        self._say({"arm": [float(x) for x in pose_rad]})
+    def arm(self, joints: Sequence[str], pose_rad: NDArray[np.float64]) -> None:
+        """The torque of `joints` is on: from now on beats are expected, and this is home."""
+        self._say({"arm": dict(zip(joints, map(float, pose_rad), strict=True))})
 
     def disarm(self) -> None:
         """The torque is off: there is nothing to watch over."""
@@ -156,36 +154,54 @@ def main() -> None:
                 os.kill(orders["driver"], signal.SIGKILL)
             break
     if pose is not None:
-        park(orders, np.array(pose))
+        park(orders, pose)
 
 
-def park(orders: dict[str, Any], pose_rad: NDArray[np.float64]) -> None:
-    """Open the bus that the driver has left, and park the robot."""
-    from hardware.connect import BusAddress, open_bus
+def park(orders: dict[str, Any], pose_rad: dict[str, float]) -> None:
+    """Open the bus that the driver has left, and park the robot.
+
+    All joints are taken home together if they answer soon, and those that do not are left behind:
+    they get further chances of their own.
+    """
     from hardware.guard import GuardedBus, GuardLimits
 
     joint_map = joint_map_from(orders["map"], "the joint map") if orders["map"] else None
     if joint_map is not None and orders["coordinates"] == "servo":
         joint_map = joint_map.per_servo()
-    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
-    limits = GuardLimits(park_within_s=PARK_WITHIN_S)
-    until = time.monotonic() + _OPEN_WITHIN_S
-    while True:
+    left, start = list(pose_rad), time.monotonic()
+    while left and time.monotonic() - start < _GIVE_UP_S:
+        patient = time.monotonic() - start < _OPEN_WITHIN_S
         try:
-            bus = GuardedBus(open_bus(address, joint_map, orders["joints"]), limits)
-            break
+            bus = _opened(orders, joint_map, left, patient)
         except PupperError:
             # the driver's lock goes with its last thread, which can take a moment
-            if time.monotonic() > until:
-                return
             time.sleep(0.02)
-    try:
-        bus.torque(True)
-        bus.park(pose_rad)
-    except PupperError:
-        bus.bus.torque(False)
-    finally:
-        bus.close()
+            continue
+        guard = GuardedBus(bus, GuardLimits(park_within_s=PARK_WITHIN_S))
+        try:
+            guard.take_over()
+            guard.park(np.array([pose_rad[name] for name in guard.joint_names]))
+        except PupperError:
+            guard.limp()
+        finally:
+            guard.close()
+        left = [name for name in left if name not in guard.joint_names]
+
+
+def _opened(
+    orders: dict[str, Any], joint_map: JointMap | None, joints: list[str], all_of_them: bool
+) -> ServoBus:
+    """The bus of `joints`, or of those that answer."""
+    from hardware.connect import BusAddress, open_bus
+
+    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
+    if not all_of_them:
+        there = open_bus(address, joint_map)
+        there.close()
+        joints = [name for name in joints if name in there.joint_names]
+        if not joints:
+            raise BusError("None of the joints answers.")
+    return open_bus(address, joint_map, joints)
 
 
 if __name__ == "__main__":

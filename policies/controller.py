@@ -21,15 +21,11 @@ from common.joints import JOINT_NAMES
 from hardware.joint_map import JointMap
 from policies.filters import ComplementaryFilter, LowPass, Rest
 from policies.observers import JointEstimate, Observer
-from policies.policy_file import Policy
+from policies.policy_file import Policy, refuse_other_observation
 from policies.stacks import Stack
 
 Array = NDArray[np.float64]
 
-_NAMES = (
-    "base_linear_velocity", "base_angular_velocity", "projected_gravity", "command",
-    "joint_position_relative", "joint_velocity", "joint_effort", "last_action",
-)  # fmt: skip
 _PUBLISHED_SPEED_SHARE = 0.7
 
 
@@ -109,11 +105,7 @@ class Controller:
         stall_torque_nm: float = 0.35,
     ):
         contract = policy.contract
-        if tuple(part.name for part in contract.observation) != _NAMES:
-            raise InputError(
-                "The policy expects another observation than this version gives: "
-                f"{', '.join(part.name for part in contract.observation)}."
-            )
+        refuse_other_observation(contract)
         if joint_map.joint_names != JOINT_NAMES or joint_map.coordinates != "joint":
             raise InputError("A policy needs a bus of all twelve joints, in joint coordinates.")
         self.policy, self.stack, self.observer = policy, stack, observer

@@ -27,6 +27,7 @@ from policies.commands import Commands
 from policies.controller import Controller, Decision, Senses
 from policies.filters import Rest, at_rest
 from policies.walk_log import WalkLog, start_header
+from sim.walking_env import FALLEN_TILT, OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 STAND_S = 3.0
@@ -34,7 +35,7 @@ SETTLE_S = 0.5
 REST_SAMPLES = 50
 IMU_SILENT_S = 0.2
 _REST_PERIOD_S = 0.02
-_FALLEN = -0.6  # of gravity along the trunk's z: tilted by more than 53 degrees, as in training
+_GRAVITY = OBSERVATION_PARTS["projected_gravity"]
 
 
 class Rows(Protocol):
@@ -218,7 +219,7 @@ def _walk(
             for watch in watchers:
                 watch(Tick(elapsed, senses, decision, sent.position_rad, reading))
             outcome.seconds = elapsed
-            if decision.observation[8] > _FALLEN:
+            if decision.observation[_GRAVITY][2] > -FALLEN_TILT:
                 outcome.fell = True
                 raise SafetyStop(f"the robot fell after {elapsed:.2f} s.")
     finally:

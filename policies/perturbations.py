@@ -10,16 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.rollouts import Change
-from sim.walking_env import OBSERVATION
+from sim.walking_env import OBSERVATION_PARTS as PARTS
 
 Observations = NDArray[np.float32]
-
-_ENDS = np.cumsum([size for _, size, _ in OBSERVATION])
-PARTS = {
-    name: slice(int(end) - size, int(end))
-    for (name, size, _), end in zip(OBSERVATION, _ENDS, strict=True)
-}
-"""Where each part of the observation is."""
 
 JOINTS = slice(PARTS["joint_position_relative"].start, PARTS["joint_effort"].stop)
 """All that comes from the servos: positions, velocities, efforts (12:48)."""

@@ -23,6 +23,7 @@ from common.errors import InputError
 from common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from policies.policy_network import ACTIONS, PolicyNetwork
+from sim.walking_env import OBSERVATION, VELOCITY_STEPS
 
 SCHEMA, VERSION = "pupper-policy", 1
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
@@ -177,6 +178,23 @@ def load_policy(folder: Path) -> Policy:
         ) from error
     refuse_bad(network, str(folder))
     return Policy(network, contract)
+
+
+def refuse_other_observation(contract: Contract) -> None:
+    """A policy that expects other numbers than it would be given only looks confused.
+
+    Raises
+    ------
+    InputError
+    """
+    expected = [(p.name, p.size) for p in contract.observation]
+    given = [(name, size) for name, size, _ in OBSERVATION]
+    if expected != given or contract.velocity_steps != VELOCITY_STEPS:
+        raise InputError(
+            "The policy's observation is not the one this version gives "
+            f"({', '.join(name for name, _ in given)}; velocity over {VELOCITY_STEPS} steps). "
+            "Use the version that trained it, or train it again."
+        )
 
 
 def refuse_bad(network: PolicyNetwork, name: str) -> None:

@@ -8,12 +8,12 @@ slow (`null_r2`).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
-from scipy.optimize import OptimizeResult, minimize_scalar
+from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import t as student_t
 
@@ -117,7 +117,7 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
     if not y.any():
         raise InputError("Nothing moves in this signal: it has no frequency.")
     coarse, within = _peak(y, step_s), 0.5 / (len(y) * step_s)
-    found: OptimizeResult = minimize_scalar(
+    found: Any = minimize_scalar(
         lambda f: -sine_fit_r2(y, step_s, f).sum(),
         bounds=(coarse - within, coarse + within), method="bounded", options={"xatol": 1e-7},
     )  # fmt: skip

@@ -20,12 +20,13 @@ from common.errors import InputError
 from policies import perturbations
 from policies.attractor import closure, collapse, principal_components
 from policies.gait import amplitude, correlation, describe, jitter
-from policies.perturbations import JOINTS, PARTS
+from policies.perturbations import JOINTS
 from policies.policy_file import Policy
 from policies.rhythm import frequency
 from policies.rollouts import Change, Rollout, collect, replay
 from sim.servo_ranges import ServoRanges
 from sim.walking_config import Walking
+from sim.walking_env import OBSERVATION_PARTS as PARTS
 
 EXTRA_DELAYS_MS = (0, 40, 80, 160, 240, 320, 400)
 NOISE_SHARES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)

@@ -22,6 +22,7 @@ from common.files import SyncedText, versions
 from common.joints import JOINT_NAMES
 from policies.controller import Controller, Decision, Senses
 from policies.filters import Rest
+from sim.walking_env import OBSERVATION_SIZE
 
 TITLE = "# pupper-sysid walk"
 SCHEMA_VERSION = 1
@@ -35,7 +36,7 @@ _SENSES = (
     ("rate", tuple(f"rate_{a}_rad_s" for a in _AXES)),
     ("acceleration", tuple(f"acceleration_{a}_m_s2" for a in _AXES)),
 )
-_OBSERVATION = tuple(f"observation_{i}" for i in range(60))
+_OBSERVATION = tuple(f"observation_{i}" for i in range(OBSERVATION_SIZE))
 _ACTION = tuple(f"{j}_action" for j in JOINT_NAMES)
 _TARGET = tuple(f"{j}_target_rad" for j in JOINT_NAMES)
 _SENT = tuple(f"{j}_sent_rad" for j in JOINT_NAMES)

@@ -44,6 +44,15 @@ OBSERVATION = (
 )
 """Name, size and half width of the published uniform noise of each part of an observation."""
 OBSERVATION_SIZE = sum(size for _, size, _ in OBSERVATION)
+_ENDS = np.cumsum([size for _, size, _ in OBSERVATION])
+OBSERVATION_PARTS = {
+    name: slice(int(end) - size, int(end))
+    for (name, size, _), end in zip(OBSERVATION, _ENDS, strict=True)
+}
+"""Where each part of an observation is."""
+
+FALLEN_TILT = 0.6
+"""Cosine of the tilt from which a robot has fallen: 53 degrees."""
 
 VELOCITY_STEPS = 4
 """Joint velocity is the difference of readings this many control steps apart: polls are too rare
@@ -52,7 +61,6 @@ for less."""
 _TOUCH_N = 1.0  # published; of what must not touch the ground
 _FOOT_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
 _STRIDE_S = 0.2  # time constant of the average over a stride
-_FALLEN_TILT = 0.6  # cosine: 53 degrees
 _EDGE_M = 0.5
 
 
@@ -255,7 +263,7 @@ class PupperEnv:
         self._last_contact = np.where(lifted, self._contact, self._last_contact)
         self._air = np.where(contact, 0.0, self._air + span)
         self._contact = np.where(contact, self._contact + span, 0.0)
-        return contact, touched | (self.robots.gravity[:, 2] > -_FALLEN_TILT)
+        return contact, touched | (self.robots.gravity[:, 2] > -FALLEN_TILT)
 
     def _step_facts(
         self, velocity_before: Array, torque: Array, contact: NDArray[np.bool_]

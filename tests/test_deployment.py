@@ -16,8 +16,11 @@ from hardware.guard import GuardedBus
 from hardware.joint_map import load_joint_map
 from policies.assembly import assemble, reassemble
 from policies.commands import constant, script
+from policies.controller import Controller, Senses
 from policies.deployment import IMU_SILENT_S, Outcome, deploy
+from policies.filters import Rest
 from policies.hyperparameters import Architecture
+from policies.observers import ServoModelObserver
 from policies.policy_export import write_policy
 from policies.policy_file import Policy, load_policy
 from policies.stacks import STACKS, Stack, suited
@@ -28,6 +31,7 @@ from sim.emulated_robot import draw_robot
 from sim.servo_ranges import servo_ranges
 from sim.trot import Trot
 from sim.walking_bus import WalkingBus
+from sim.walking_env import OBSERVATION_PARTS
 
 JOINTS = load_joint_map("mini_pupper_2")
 FORWARD = constant((0.15, 0.0, 0.0))
@@ -249,15 +253,33 @@ def test_what_is_sent_grows_over_the_fade_in(policy, tmp_path):
 
 def test_the_policy_is_shown_a_servo_model_in_place_of_readings(policy):
     pose, ones = np.array(list(policy.contract.default_pose_rad.values())), np.ones(12)
+    bent = JOINTS.per_servo().to_angles(JOINTS.to_counts(pose))
     model = CommandNetwork(
         JOINTS.joint_names, 0.02,
         {
-            "command_center": pose, "command_scale": ones, "position_center": pose,
+            "command_center": bent, "command_scale": ones, "position_center": bent,
             "position_scale": ones, "bound": np.full(12, np.inf), "fir_bias": 0 * ones,
             "fir": 0.5 * ones[:, None],
         },
     )  # fmt: skip
-    assert model.joints == JOINTS.joint_names
+    trotting = Trotting(policy.network, policy.contract)
+    stack = Stack("servo-model", fade_in_s=0.0)
+    controller = Controller(trotting, stack, ServoModelObserver(model, 0.02), JOINTS)
+    rest = Rest(np.array([0.0, 0.0, -1.0]), np.zeros(3))
+    controller.reset(pose, rest)
+    nowhere, level = np.full(12, np.nan), np.array([0.0, 0.0, 9.81])
+    command, told = np.array([0.15, 0.0, 0.0]), pose
+    for tick in range(20):
+        senses = Senses(0.02 * tick, command, nowhere, np.zeros(12), np.zeros(3), level)
+        decision = controller.step(senses)
+        # half of what the servos were told, whatever the encoders say; the calf's through the rod
+        seen = decision.observation[OBSERVATION_PARTS["joint_position_relative"]]
+        np.testing.assert_allclose(seen, 0.5 * (told - pose), atol=1e-5)
+        told = decision.target
+    assert np.abs(told - pose).max() > 0.1
+
+
+def test_a_stack_that_lacks_its_servo_model_is_refused(policy):
     with pytest.raises(InputError, match="--servo"):
         assemble(policy, STACKS["lstm-servo"], JOINTS, CALIBRATION, None)
     with pytest.raises(InputError, match="no such folder"):

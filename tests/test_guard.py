@@ -148,6 +148,39 @@ def test_the_torque_stays_off_while_a_joint_does_not_say_where_it_is():
     assert bus.log == []
 
 
+def test_a_lost_reading_does_not_keep_the_torque_off():
+    bus = PlainBus()
+    bus.silent[1] = True
+    reads = bus.read
+
+    def once_silent():
+        sample = reads()
+        bus.silent[1] = False
+        return sample
+
+    bus.read = once_silent
+    assert GuardedBus(bus).torque(True)
+
+
+def test_who_takes_over_goes_home_although_a_servo_does_not_confirm():
+    bus = PlainBus()
+    bus.goal = np.array([0.3, -0.2])
+    told = bus.torque
+
+    def unsure(on):
+        told(on)
+        return not on
+
+    bus.torque = unsure
+    guard = GuardedBus(bus, GuardLimits(park_within_s=0.5))
+    with pytest.raises(BusError, match="confirm"):
+        guard.torque(True)
+    guard.take_over()
+    guard.park(np.zeros(2))
+    np.testing.assert_allclose(bus.goal, 0.0, atol=1e-6)
+    assert bus.log[-1] == "torque False"
+
+
 def test_a_healthy_robot_is_left_alone_for_a_minute():
     guard = ready(PlainBus())
     drive(guard, 60.0, swing)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from policies import perturbations
-from policies.perturbations import JOINTS, PARTS
+from policies.perturbations import JOINTS
 from policies.policy_file import load_policy
 from policies.robustness import Trial, ablation, delay_curve
 from sim.servo_ranges import servo_ranges
 from sim.walking_config import Walking
+from sim.walking_env import OBSERVATION_PARTS as PARTS
 
 ROOT = Path(__file__).resolve().parents[1]
 STEPS, ROBOTS = 60, 3

@@ -26,6 +26,7 @@ from sim.servo_mjcf import mujoco
 from sim.servo_ranges import ServoRanges, servo_ranges
 from sim.walking_config import Commands, Curriculum, Observation, Randomisation, Walking
 from sim.walking_env import OBSERVATION, OBSERVATION_SIZE, PupperEnv, StepResult
+from sim.walking_env import OBSERVATION_PARTS as PARTS
 from sim.walking_rewards import Rewards, weights
 
 MEASURED = "data/samples/calibrated.yaml"
@@ -44,11 +45,6 @@ STILL = Randomisation(
 )
 SEEN = Observation(noise=False, base_velocity="true")
 QUIET = Walking(randomisation=STILL, observation=SEEN)
-
-PARTS = {}
-for _name, _size, _ in OBSERVATION:
-    _start = sum(p.stop - p.start for p in PARTS.values())
-    PARTS[_name] = slice(_start, _start + _size)
 
 
 def make(

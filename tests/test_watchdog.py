@@ -27,12 +27,18 @@ ROOT = Path(__file__).resolve().parents[1]
 DRIVER = """
 import sys, time
 import numpy as np
+from common.errors import BusError
 from hardware.connect import open_guarded, parse_address
 bus = open_guarded(parse_address(sys.argv[1]))
 pose = bus.read().position_rad
 while not np.isfinite(pose).all():
     pose = bus.read().position_rad
-bus.torque(True)
+for _ in range(20):  # servos that share a busy machine with their driver answer too late
+    try:
+        bus.torque(True)
+        break
+    except BusError:
+        pass
 start = bus.now()
 print("driving", flush=True)
 while True:
