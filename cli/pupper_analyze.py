@@ -25,7 +25,10 @@ DESCRIPTION = """What a policy's gait is like, where its rhythm comes from, and 
 
 gait: frequency, sine fit, phases, duty, jitter. attractor: orbits of actions and hidden states.
 delay, ablation: late, noisy, missing and stale observations, in replay and closed loop.
-autonomy: does the rhythm go on when its inputs are frozen?
+autonomy: does the rhythm go on with inputs frozen, after a push, at another control rate?
+terrain, compliance: where it stays up, and whether it goes where it is told.
+servo: published PD, fitted PD, LSTM and MLP on a recording (or on a walk of an emulated robot).
+claims: all published claims beside what is found here, as a page with pictures.
 """
 
 Tries = list[tuple[str, Any, Any]]
@@ -33,19 +36,27 @@ Tries = list[tuple[str, Any, Any]]
 Found = tuple[dict[str, Any], Any, Table]
 """For --json, picture, and what is printed."""
 
-DELAYS_MS = (0.0, 160.0, 320.0)
-"""Of the published orbits."""
-
 
 @dataclass(frozen=True)
 class Analyze:
     """What to look at, and how long."""
 
     what: Annotated[
-        Literal["gait", "attractor", "delay", "ablation", "autonomy"], tyro.conf.Positional
+        Literal[
+            "gait",
+            "attractor",
+            "delay",
+            "ablation",
+            "autonomy",
+            "terrain",
+            "compliance",
+            "servo",
+            "claims",
+        ],
+        tyro.conf.Positional,
     ]
     policies: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Runs (`runs/<name>`) or policy folders."""
+    """Runs (`runs/<name>`) or policy folders; for `servo` also recordings."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
     """Forward and sideways speed [m/s], turn rate [rad/s]."""
     robots: int = 16
@@ -56,6 +67,10 @@ class Analyze:
     """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
     feedback: str | None = None
     """`held`, `ideal` or a calibration instead of what it was trained with."""
+    recordings: tuple[Path, ...] = ()
+    """For `claims`: sweeps and a playback of a robot."""
+    servo: Path | None = None
+    """For `claims`: servo model's folder, to compare its stack with the closed loop."""
     out: Path = Path("analysis")
     """Folder for the pictures."""
     seed: int = 0
@@ -80,26 +95,42 @@ def _run(options: Analyze) -> None:
     import torch
 
     from common.figure_style import save
-    from policies.robustness import Trial
 
     torch.set_num_threads(1)
+    if options.what == "claims":
+        from cli.claims import write_claims
+
+        write_claims(options, _tries(options.policies, options))
+        return
     picture = options.out / f"{options.what}.png"
     refuse_overwrite(picture, options.force)
-    tries: Tries = []
-    for path in options.policies:
-        policy, run = policy_at(path)
-        task, servos = simulator(policy, run, options.actuator, options.feedback)
-        trial = Trial(
-            task, servos, options.command, options.robots, options.seconds, options.seed
-        )  # fmt: skip
-        tries.append((_name(path), policy, trial))
-    found, figure, table = _ANALYSES[options.what](tries, np.random.default_rng(options.seed))
+    if options.what == "servo":
+        found, figure, table = _servo(options)
+    else:
+        analysis = _ANALYSES[options.what]
+        tries = _tries(options.policies, options)
+        found, figure, table = analysis(tries, np.random.default_rng(options.seed))
     save(figure, picture, options.force)
     if options.json:
         print_json(found | {"picture": str(picture)})
     else:
         out.print(table)
         err.print(f"Picture: {picture}")
+
+
+def _tries(paths: Sequence[Path], options: Analyze) -> Tries:
+    """Policies by their short names, and how each is tried."""
+    from policies.robustness import Trial
+
+    tries: Tries = []
+    for path in paths:
+        policy, run = policy_at(path)
+        task, servos = simulator(policy, run, options.actuator, options.feedback)
+        trial = Trial(
+            task, servos, options.command, options.robots, options.seconds, options.seed
+        )  # fmt: skip
+        tries.append((_name(path), policy, trial))
+    return tries
 
 
 def _name(path: Path) -> str:
@@ -132,6 +163,7 @@ def _gait(tries: Tries, rng: np.random.Generator) -> Found:
 
 def _attractor(tries: Tries, rng: np.random.Generator) -> Found:
     from policies.analysis_figures import orbit_figure
+    from policies.evidence import DELAYS_MS
     from policies.robustness import orbits
 
     table = terminal.table(
@@ -143,6 +175,7 @@ def _attractor(tries: Tries, rng: np.random.Generator) -> Found:
     for name, policy, trial in tries:
         for states, seen in orbits(policy, trial, DELAYS_MS).items():
             drawn[f"{name} {states}"] = seen.pop("orbits")
+            del seen["states"]
             found.setdefault(name, {})[states] = seen
             table.add_row(
                 f"{name} {states}", terminal.number(seen["explained_3"], 3),
@@ -174,12 +207,117 @@ def _ablation(tries: Tries, rng: np.random.Generator) -> Found:
 
 def _autonomy(tries: Tries, rng: np.random.Generator) -> Found:
     from policies.analysis_figures import autonomy_figure
-    from policies.robustness import autonomy
+    from policies.phase_reset import push_response, rate_exponent, rate_response
+    from policies.robustness import frozen
 
-    tables = {name: autonomy(policy, trial) for name, policy, trial in tries}
-    columns = ("test", "frequency_hz", "amplitude_rad", "share")
-    shown = _table("Does the rhythm go on? (replay)", tables, columns)
-    return {"autonomy": tables}, autonomy_figure(tables), shown
+    tests = {
+        name: {
+            "frozen": frozen(policy, trial),
+            "push": push_response(policy, trial),
+            "rate": rate_response(policy, trial),
+        }
+        for name, policy, trial in tries
+    }
+    shown = terminal.table(
+        "Is the rhythm its own?", "policy", "test", "gait Hz", "share of amplitude", "still up",
+        "phase shift", "of it kept",
+    )  # fmt: skip
+    number = terminal.number
+    for name, found in tests.items():
+        for r in found["frozen"]:
+            shown.add_row(
+                name, r["test"], number(r["frequency_hz"], 2), number(r["share"], 2), "", "", ""
+            )  # fmt: skip
+        for r in found["push"]:
+            shown.add_row(
+                name, f"push of {r['push_m_s']:g} m/s", "", "", number(r["survival"], 2),
+                number(r["shift_late"], 3), number(r["kept"], 2),
+            )  # fmt: skip
+        for r in found["rate"]:
+            shown.add_row(
+                name, f"asked at {r['rate_hz']:.4g} Hz", number(r["frequency_hz"], 2), "",
+                number(r["survival"], 2), "", "",
+            )  # fmt: skip
+        found["rate_exponent"] = rate_exponent(found["rate"])
+    return {"autonomy": tests}, autonomy_figure(tests), shown
+
+
+def _terrain(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import terrain_figure
+    from policies.robustness import terrain
+
+    tables = {name: terrain(policy, trial) for name, policy, trial in tries}
+    columns = ("ground", "survival", "frequency_hz", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
+    return {"terrain": tables}, terrain_figure(tables), _table("On other ground", tables, columns)
+
+
+def _compliance(tries: Tries, rng: np.random.Generator) -> Found:
+    from policies.analysis_figures import compliance_figure
+    from policies.paths import compliance
+
+    tables = {name: compliance(policy, trial) for name, policy, trial in tries}
+    figure = compliance_figure(tables)
+    shown = terminal.table(
+        "Does it go where it is told? (90 % intervals over robots)", "policy", "direction",
+        "still up", "share of speed", "drift m/m", "arc rad/m", "wander m/turn",
+    )  # fmt: skip
+    for name, rows in tables.items():
+        for row in rows:
+            del row["path"]
+            shown.add_row(
+                name, row["direction"], terminal.number(row["survival"], 2),
+                *(_interval(row[k], 2) for k in ("share", "drift", "arc_rad_m", "wander_m")),
+            )  # fmt: skip
+    return {"compliance": tables}, figure, shown
+
+
+def _servo(options: Analyze) -> Found:
+    """Four ways to say where a servo will be, on a recording, or on a policy's emulated walk."""
+    from sysid.four_way import four_way
+    from sysid.servo_compare import to_json
+    from sysid.servo_figures import compare_figure
+
+    (path,) = options.policies if len(options.policies) == 1 else (None,)
+    if path is None:
+        raise InputError("Servo models are compared on one recording or policy at a time.")
+    if path.is_dir():
+        path = _walked(path, options)
+    (recording,) = terminal.load_all([path])
+    with terminal.share_progress("fitting") as advance:
+        compared = four_way(recording, recording.joints, options.seed, advance)
+    found = to_json(compared, options.seed)
+    shown = terminal.table(
+        "RMS error on unseen readings, mrad, mean of the joints", "model", "one step", "free run",
+        "90 % interval",
+    )  # fmt: skip
+    for name, one in found["models"].items():
+        low, high = one["mean"]["rmse_free_run_interval_rad"]
+        shown.add_row(
+            name, *(terminal.ms(one["mean"][f"rmse_{k}_rad"]) for k in ("one_step", "free_run")),
+            f"{terminal.ms(low)} … {terminal.ms(high)}",
+        )  # fmt: skip
+    still = float(np.nanmean(list(compared.persistence.values())))
+    shown.add_row("stays put", terminal.ms(still), "", "")
+    return found | {"recording": str(path)}, compare_figure(compared), shown
+
+
+def _walked(folder: Path, options: Analyze) -> Path:
+    """A recording of the servos of an emulated robot that a policy walks."""
+    from policies.stack_trials import walk_once
+    from policies.stacks import STACKS
+    from sysid.recording import RecordingWriter
+
+    policy, run = policy_at(folder)
+    actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
+    path = options.out / f"{_name(folder)}-walk.csv"
+    about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
+    with RecordingWriter(path, about | {"policy": str(folder)}, options.force) as rows:
+        outcome, _ = walk_once(
+            policy, STACKS["closed-loop"], options.command, options.seconds, options.seed, actuator,
+            rows=rows,
+        )  # fmt: skip
+        rows.close({"stop_reason": outcome.stop_reason})
+    return path
 
 
 def _table(title: str, tables: dict[str, list[dict[str, Any]]], columns: Sequence[str]) -> Table:
@@ -201,7 +339,7 @@ def _interval(value: Any, digits: int) -> str:
 
 _ANALYSES: dict[str, Callable[[Tries, np.random.Generator], Found]] = {
     "gait": _gait, "attractor": _attractor, "delay": _delay, "ablation": _ablation,
-    "autonomy": _autonomy,
+    "autonomy": _autonomy, "terrain": _terrain, "compliance": _compliance,
 }  # fmt: skip
 
 

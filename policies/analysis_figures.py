@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from common.figure_style import BLUE, GREEN, INK, JOINT_COLOURS, RED, axes_column, styled
 from common.joints import LEGS
-from policies.gait import intervals
+from policies.gait import SETTLE_S, intervals
 from policies.rollouts import Rollout
 
 _MODES = {"fixed": "-", "jittered": "--", "replay": ":"}
 _SHOWN_S = 2.0
-_SETTLE_S = 2.0
 _THIGH = 1  # LF thigh, as the paper draws
 
 Rows = Sequence[Mapping[str, Any]]
@@ -79,24 +78,9 @@ def orbit_figure(orbits: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms
 
 
 @styled
-def autonomy_figure(tables: Mapping[str, Rows]) -> Figure:
-    """Amplitude that is left with inputs frozen, a group of bars per policy."""
-    figure, (axes,) = axes_column(1, 3.0)
-    for k, (policy, rows) in enumerate(tables.items()):
-        places = np.arange(len(rows)) + 0.8 * k / len(tables)
-        shares = [r["share"] for r in rows]
-        axes.barh(places, shares, 0.8 / len(tables), color=JOINT_COLOURS[k], label=policy)
-    tests = [r["test"] for r in next(iter(tables.values()))]
-    axes.set_yticks(np.arange(len(tests)) + 0.2, tests, fontsize=7)
-    axes.set_xlabel("amplitude of the actions, share of that before")
-    axes.legend(fontsize=7)
-    return figure
-
-
-@styled
 def gait_figure(rollout: Rollout, robot: int = 0) -> Figure:
     """Stance bars of the four feet, LF thigh's angle, and its action, over two seconds."""
-    start = round(_SETTLE_S / rollout.step_s)
+    start = round(SETTLE_S / rollout.step_s)
     stop = start + round(_SHOWN_S / rollout.step_s)
     time = np.arange(stop - start) * rollout.step_s
     figure, (feet, thigh, action) = axes_column(3, 6.0)
@@ -111,4 +95,86 @@ def gait_figure(rollout: Rollout, robot: int = 0) -> Figure:
     thigh.set(ylabel="LF thigh [rad]", xlim=(0, time[-1]))
     action.plot(time, rollout.action_rad[start:stop, robot, _THIGH], color=GREEN)
     action.set(ylabel="its action [rad]", xlabel="time [s]", xlim=(0, time[-1]))
+    return figure
+
+
+@styled
+def delay_trace_figure(
+    actions: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms: Sequence[float], step_s: float
+) -> Figure:
+    """The LF thigh's action over two seconds, a panel per delay, a line per policy."""
+    figure, axes = axes_column(len(delays_ms), 1.9 * len(delays_ms))
+    count = round(_SHOWN_S / step_s)
+    time = step_s * np.arange(count)
+    for i, (one, delay) in enumerate(zip(axes, delays_ms, strict=True)):
+        for k, (policy, conditions) in enumerate(actions.items()):
+            one.plot(
+                time, conditions[i][:count, _THIGH], "-" if k == 0 else "--",
+                color=JOINT_COLOURS[k % len(JOINT_COLOURS)], label=policy,
+            )  # fmt: skip
+        one.set(title=f"joints late by {delay:g} ms", ylabel="rad", xlim=(0, time[-1]))
+    axes[-1].set_xlabel("time [s]")
+    axes[0].legend(fontsize=7, loc="upper right")
+    return figure
+
+
+@styled
+def autonomy_figure(tests: Mapping[str, Mapping[str, Rows]]) -> Figure:
+    """Amplitude left with inputs frozen, phase shift by pushes, and frequency against rate."""
+    figure, (bars, shifts, rates) = axes_column(3, 8.0)
+    count = len(tests)
+    for k, (policy, found) in enumerate(tests.items()):
+        colour = JOINT_COLOURS[k % len(JOINT_COLOURS)]
+        rows = found["frozen"]
+        places = np.arange(len(rows)) + 0.8 * k / count
+        bars.barh(places, [r["share"] for r in rows], 0.8 / count, color=colour, label=policy)
+        for row, mark in zip(found["push"], ("x", "o"), strict=True):
+            shifts.plot(
+                row["phases"], row["shifts"], mark, ms=3, color=colour, ls="",
+                label=f"{policy}, {row['push_m_s']:g} m/s",
+            )  # fmt: skip
+        rates.plot(
+            [r["rate_hz"] for r in found["rate"]], [r["frequency_hz"] for r in found["rate"]],
+            marker="o", ms=3, color=colour, label=policy,
+        )  # fmt: skip
+    names = [r["test"] for r in next(iter(tests.values()))["frozen"]]
+    bars.set_yticks(np.arange(len(names)) + 0.4 * (count - 1) / count, names, fontsize=7)
+    bars.set_xlabel("amplitude of the actions, share of that before")
+    shifts.set(xlabel="phase at the push [cycles]", ylabel="shift [cycles]", ylim=(-0.52, 0.52))
+    rates.set(xlabel="control rate [Hz]", ylabel="gait [Hz]", ylim=(0, None))
+    for axes in (bars, shifts, rates):
+        axes.legend(fontsize=6.5)
+    return figure
+
+
+@styled
+def terrain_figure(tables: Mapping[str, Rows]) -> Figure:
+    """Survival and forward error on every kind of ground, a group of bars per ground."""
+    names = {"survival": "share still up", "mae_vx_m_s": "forward error [m/s]"}
+    figure, axes = axes_column(len(names), 2.4 * len(names))
+    for one, (key, title) in zip(axes, names.items(), strict=True):
+        for k, (policy, rows) in enumerate(tables.items()):
+            places = np.arange(len(rows)) + 0.8 * k / len(tables)
+            colour = JOINT_COLOURS[k % len(JOINT_COLOURS)]
+            one.bar(places, [r[key] for r in rows], 0.8 / len(tables), color=colour, label=policy)
+        grounds = [r["ground"] for r in next(iter(tables.values()))]
+        one.set_xticks(np.arange(len(grounds)) + 0.4 * (len(tables) - 1) / len(tables), grounds)
+        one.set_ylabel(title)
+    axes[-1].legend(fontsize=7, loc="lower right")
+    return figure
+
+
+@styled
+def compliance_figure(tables: Mapping[str, Rows]) -> Figure:
+    """Paths of one robot told to go in six directions, a panel per policy, as seen from above."""
+    figure, axes = axes_column(len(tables), 3.4 * len(tables))
+    for one, (policy, rows) in zip(axes, tables.items(), strict=True):
+        for row, colour in zip(rows, JOINT_COLOURS, strict=False):
+            path = np.asarray(row["path"])
+            if len(path):
+                # forward is up, left is left
+                one.plot(-path[:, 1], path[:, 0], color=colour, lw=1.2, label=row["direction"])
+        one.set_aspect("equal")
+        one.set(title=policy, xlabel="to the right [m]", ylabel="forward [m]")
+    axes[0].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure

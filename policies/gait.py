@@ -22,16 +22,17 @@ from policies.rhythm import (
     Estimate,
     Signal,
     frequency,
+    mean_of,
     null_r2,
     sine_fit_r2,
     sine_frequency,
     standardised,
-    t_quantile,
     times,
 )
 from policies.rollouts import Rollout
 
-_SETTLE_S = 2.0  # from a stand to a steady walk
+SETTLE_S = 2.0
+"""From a stand to a steady walk [s]."""
 _FALL_S = 0.5  # before a fall is recognised, it is no gait any more
 _NULL_DRAWS = 100
 _NULL_QUANTILE = 0.95
@@ -106,6 +107,18 @@ class GaitReport:
     joint_deviation_rad: tuple[Estimate, ...]
 
 
+def steady(rollout: Rollout) -> dict[int, slice]:
+    """Which steps of which robots belong to a gait: from `SETTLE_S` to the end or before a fall.
+
+    Robots that fell too soon are left out.
+    """
+    step_s = rollout.step_s
+    start, shortest = round(SETTLE_S / step_s), round(SHORTEST_S / step_s)
+    up = rollout.alive.sum(axis=0)
+    ends = np.where(rollout.alive[-1], up, up - round(_FALL_S / step_s))
+    return {int(i): slice(start, ends[i]) for i in np.flatnonzero(ends - start >= shortest)}
+
+
 def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
     """Describe the gait in a rollout, from two seconds after its start.
 
@@ -123,18 +136,15 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
         If no robot walked for long enough.
     """
     step_s = rollout.step_s
-    start, shortest = round(_SETTLE_S / step_s), round(SHORTEST_S / step_s)
-    up = rollout.alive.sum(axis=0)
-    ends = np.where(rollout.alive[-1], up, up - round(_FALL_S / step_s))
-    walked = np.flatnonzero(ends - start >= shortest)
-    if not len(walked):
+    walked = steady(rollout)
+    if not walked:
         raise InputError(
-            f"No robot walked for {_SETTLE_S + SHORTEST_S:g} s: the longest was up for "
-            f"{up.max() * step_s:.1f} s. Collect a longer rollout, or describe no gait here."
+            f"No robot walked for {SETTLE_S + SHORTEST_S:g} s: the longest was up for "
+            f"{rollout.alive.sum(axis=0).max() * step_s:.1f} s. Collect a longer rollout, or "
+            "describe no gait here."
         )
     found = []
-    for i in walked:
-        now = slice(start, ends[i])
+    for i, now in walked.items():
         found.append(
             _describe_one(
                 rollout.action_rad[now, i], rollout.joint_position[now, i],
@@ -143,14 +153,16 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
         )  # fmt: skip
     each = {name: np.array([f[name] for f in found]) for name in found[0]}
     rate, low, high = each["frequency"].T
+    alone = Estimate(float(rate[0]), float(low[0]), float(high[0]))
+    whole_rate = mean_of(rate) if len(walked) > 1 else alone
     return GaitReport(
-        len(walked), len(ends) - len(walked),
-        _mean(rate) if len(walked) > 1 else Estimate(float(rate[0]), float(low[0]), float(high[0])),
+        len(walked), rollout.alive.shape[1] - len(walked),
+        whole_rate,
         float((each["action_r2"].mean(axis=1) > each["null_r2"]).mean()),
-        _mean(each["action_r2"].mean(axis=1)), _mean(each["joint_r2"].mean(axis=1)),
+        mean_of(each["action_r2"].mean(axis=1)), mean_of(each["joint_r2"].mean(axis=1)),
         float(each["null_r2"].mean()), _means(each["action_r2"]), _means(each["joint_r2"]),
         tuple(_mean_phase(p) for p in each["phase"].T), _means(each["duty"]),
-        _mean(each["diagonal"]), _mean(each["jitter"]), _mean(each["fast_share"]),
+        mean_of(each["diagonal"]), mean_of(each["jitter"]), mean_of(each["fast_share"]),
         *(_means(each[f"{which}_{name}"]) for which in ("action", "joint")
           for name in ("half_range", "deviation")),
     )  # fmt: skip
@@ -363,21 +375,9 @@ def _wrapped(cycles: NDArray[np.floating]) -> Array:
     return np.asarray((cycles + 0.25) % 1.0 - 0.25, float)
 
 
-def _mean(values: Array) -> Estimate:
-    """Mean over robots, without those that have no value."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return Estimate(*[float("nan")] * 3)
-    mean = float(values.mean())
-    half = float("nan")
-    if len(values) > 1:
-        half = t_quantile(len(values) - 1) * float(values.std(ddof=1) / np.sqrt(len(values)))
-    return Estimate(mean, mean - half, mean + half)
-
-
 def _means(values: Array) -> tuple[Estimate, ...]:
     """The same for each column."""
-    return tuple(_mean(column) for column in values.T)
+    return tuple(mean_of(column) for column in values.T)
 
 
 def _mean_phase(cycles: Array) -> Estimate:
@@ -386,6 +386,6 @@ def _mean_phase(cycles: Array) -> Estimate:
     if not len(known):
         return Estimate(*[float("nan")] * 3)
     centre = float(np.angle(np.exp(2j * np.pi * known).mean()) / (2 * np.pi))
-    away = _mean((known - centre + 0.5) % 1.0 - 0.5)
+    away = mean_of((known - centre + 0.5) % 1.0 - 0.5)
     start = float(_wrapped(np.array(centre)))
     return Estimate(*(start + x for x in away))

@@ -198,6 +198,18 @@ def t_quantile(freedom: int) -> float:
     return float(student_t.ppf((1 + LEVEL) / 2, freedom))
 
 
+def mean_of(values: Array) -> Estimate:
+    """Mean over robots (or seeds), without those that have no value."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return Estimate(*[float("nan")] * 3)
+    mean = float(values.mean())
+    half = float("nan")
+    if len(values) > 1:
+        half = t_quantile(len(values) - 1) * float(values.std(ddof=1) / np.sqrt(len(values)))
+    return Estimate(mean, mean - half, mean + half)
+
+
 def _peak(y: Array, step_s: float) -> float:
     """Highest point of the periodogram, all channels together [Hz]."""
     size = 1 << (8 * len(y) - 1).bit_length()

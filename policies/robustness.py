@@ -9,34 +9,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import InputError
 from policies import perturbations
 from policies.attractor import closure, collapse, principal_components
-from policies.gait import amplitude, correlation, describe, jitter
+from policies.gait import SETTLE_S, amplitude, correlation, jitter, steady
 from policies.perturbations import JOINTS
 from policies.policy_file import Policy
 from policies.rhythm import frequency
-from policies.rollouts import Change, Rollout, collect, replay
+from policies.rollouts import Change, Disturb, Rollout, collect, replay
 from sim.servo_ranges import ServoRanges
+from sim.terrain import Terrain
 from sim.walking_config import Walking
 from sim.walking_env import OBSERVATION_PARTS as PARTS
 
 EXTRA_DELAYS_MS = (0, 40, 80, 160, 240, 320, 400)
 NOISE_SHARES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+SCALES_RAD = (0.45, 0.6, 0.75)
+"""Of the published deployments."""
 HOLD_MS = (40, 80, 160, 320)
 CHANNELS = {
     name: PARTS[name]
     for name in ("joint_position_relative", "joint_velocity", "joint_effort", "last_action")
 } | {"all joints": JOINTS}
 """Parts of the observation that are ablated."""
-_SETTLE_S = 2.0
 _MOST_LAG = 5
 _STILL_RAD = 1e-3  # less moves no servo by a count
 _LAST_ACTION = PARTS["last_action"]
@@ -57,16 +58,16 @@ class Trial:
     threads: int = 0
 
     def walk(
-        self, policy: Policy, change: Change | None = None, servos: ServoRanges | None = None
+        self, policy: Policy, change: Change | None = None, disturb: Disturb | None = None
     ) -> Rollout:
-        """One rollout, with an altered observation or other servos."""
+        """One rollout, with altered observations or disturbed robots."""
         return collect(
-            policy, self.task, servos or self.servos, self.command, self.robots, self.seconds,
-            self.seed, self.threads, change,
+            policy, self.task, self.servos, self.command, self.robots, self.seconds,
+            self.seed, self.threads, change, disturb,
         )  # fmt: skip
 
 
-def outcome(rollout: Rollout, rng: np.random.Generator) -> dict[str, float]:
+def outcome(rollout: Rollout) -> dict[str, float]:
     """Survival, tracking and gait of a rollout; NaN where no robot walked long enough."""
     alive = rollout.alive
     error = np.abs(rollout.velocity - np.array(rollout.command))[alive].mean(axis=0)
@@ -76,15 +77,13 @@ def outcome(rollout: Rollout, rng: np.random.Generator) -> dict[str, float]:
         "mae_vy_m_s": float(error[1]),
         "mae_yaw_rad_s": float(error[2]),
     }
-    try:
-        gait = describe(rollout, rng)
-    except InputError:
-        return found | dict.fromkeys(("frequency_hz", "amplitude_rad", "jitter_rad"), float("nan"))
-    return found | {
-        "frequency_hz": gait.frequency_hz.value,
-        "amplitude_rad": float(np.mean([e.value for e in gait.half_range_rad])),
-        "jitter_rad": gait.jitter_rad.value,
-    }
+    gaits = [
+        (frequency(action, rollout.step_s).value, np.mean(amplitude(action)[0]), jitter(action))
+        for i, now in steady(rollout).items()
+        if (action := rollout.action_rad[now, i]).std() > _STILL_RAD
+    ]
+    means = np.mean(gaits, axis=0).tolist() if gaits else [float("nan")] * 3
+    return found | dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True))
 
 
 def delay_curve(
@@ -113,11 +112,12 @@ def delay_curve(
             {"extra_delay_ms": extra, "mode": "replay", "survival": float("nan")}
             | _gait_of_actions(plain, actions)
         )
-        fixed = plain if extra == 0 else trial.walk(policy, None, trial.servos.later(extra / 1e3))
-        found.append({"extra_delay_ms": extra, "mode": "fixed"} | outcome(fixed, rng))
+        later = replace(trial, servos=trial.servos.later(extra / 1e3))
+        fixed = plain if extra == 0 else later.walk(policy)
+        found.append({"extra_delay_ms": extra, "mode": "fixed"} | outcome(fixed))
         change = perturbations.jittered(JOINTS, steps, rng)
         moving = plain if extra == 0 else trial.walk(policy, change)
-        found.append({"extra_delay_ms": extra, "mode": "jittered"} | outcome(moving, rng))
+        found.append({"extra_delay_ms": extra, "mode": "jittered"} | outcome(moving))
     return found
 
 
@@ -138,7 +138,7 @@ def ablation(
     """
     rng = np.random.default_rng(trial.seed)
     plain = trial.walk(policy)
-    settled = round(_SETTLE_S / plain.step_s)
+    settled = round(SETTLE_S / plain.step_s)
     found: list[dict[str, float | str]] = []
     for name in channels:
         part = CHANNELS[name]
@@ -154,7 +154,7 @@ def ablation(
             for ms in HOLD_MS
         ]
         for kind, level, size, change in cases:
-            walked = outcome(trial.walk(policy, change()), rng)
+            walked = outcome(trial.walk(policy, change()))
             actions, _ = replay(policy, perturbations.applied(change(), plain.observation))
             agreement = _agreement(plain.action[settled:], actions[settled:])
             found.append(
@@ -164,8 +164,38 @@ def ablation(
     return found
 
 
-def autonomy(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
-    """Whether the rhythm is the network's own: tests that the paper lacks.
+def terrain(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+    """Survival, tracking and gait on every kind of ground.
+
+    Returns
+    -------
+    list of dict
+        `ground` and what `outcome` gives.
+    """
+    return [
+        {"ground": kind}
+        | outcome(replace(trial, task=replace(trial.task, terrain=kind)).walk(policy))
+        for kind in get_args(Terrain)
+    ]
+
+
+def scales(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+    """The walk with other scales of what is sent than that of the training, as deployed robots had.
+
+    Returns
+    -------
+    list of dict
+        `scale_rad` and what `outcome` gives.
+    """
+    return [
+        {"scale_rad": scale}
+        | outcome(replace(trial, task=replace(trial.task, action_scale=scale)).walk(policy))
+        for scale in sorted({*SCALES_RAD, trial.task.action_scale})
+    ]
+
+
+def frozen(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+    """Whether the rhythm goes on without its inputs.
 
     In replay, from two seconds on: everything frozen but the policy's own last action; everything
     frozen; only the last action frozen. A rhythm that goes on with all inputs frozen is made
@@ -178,7 +208,7 @@ def autonomy(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
         `test`, `frequency_hz`, `amplitude_rad`, `share` (of the amplitude before) and `rhythmic`.
     """
     plain = trial.walk(policy)
-    start = round(_SETTLE_S / plain.step_s)
+    start = round(SETTLE_S / plain.step_s)
     own = _LAST_ACTION
     before = float(np.mean(amplitude(plain.action_rad[start:, 0])[0]))
     found: list[dict[str, float | str]] = []
@@ -201,12 +231,13 @@ def orbits(policy: Policy, trial: Trial, delays_ms: Sequence[float]) -> dict[str
     Returns
     -------
     dict of str to dict
-        For `actions` and `hidden`: `orbits` (of one robot, per delay), `explained` and
+        For `actions` [rad] and `hidden`: `states` and `orbits` (of one robot, per delay; arrays of
+        shape (steps, k)), `explained` and
         `explained_3` (shares of variance), `participation_ratio`, `closure` and `area_ratio`
         (to no delay) per delay.
     """
     plain = trial.walk(policy)
-    start = round(_SETTLE_S / plain.step_s)
+    start = round(SETTLE_S / plain.step_s)
     acted, minds = [], []
     for delay in delays_ms:
         change = perturbations.delayed(JOINTS, round(delay / 1e3 / plain.step_s))
@@ -215,10 +246,11 @@ def orbits(policy: Policy, trial: Trial, delays_ms: Sequence[float]) -> dict[str
         minds.append(hidden[start:, 0].astype(float))
     rate = _rate(acted[0], plain.step_s)
     found = {}
-    for name, conditions, count in (("actions", acted, 3), ("hidden", minds, 3)):
-        axes = principal_components(conditions, count)
+    for name, conditions in (("actions", acted), ("hidden", minds)):
+        axes = principal_components(conditions, 3)
         paths = [axes.orbit(c) for c in conditions]
         found[name] = {
+            "states": conditions,
             "orbits": paths,
             "explained": axes.explained.tolist(),
             "explained_3": float(axes.explained[:3].sum()),
@@ -254,7 +286,7 @@ def _driven(
 
 def _gait_of_actions(plain: Rollout, actions: NDArray[np.floating]) -> dict[str, float]:
     """Frequency, amplitude and jitter of replayed actions, means over robots, once settled."""
-    radians = plain.action_scale * actions[round(_SETTLE_S / plain.step_s) :].astype(float)
+    radians = plain.action_scale * actions[round(SETTLE_S / plain.step_s) :].astype(float)
     robots = range(radians.shape[1])
     return {
         "frequency_hz": float(np.mean([_rate(radians[:, i], plain.step_s) for i in robots])),

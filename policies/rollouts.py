@@ -36,6 +36,9 @@ Change = Callable[[int, NDArray[np.float32]], NDArray[np.floating]]
 """`change(step, observation)` gives the observation, shape (n, 60), that the policy sees instead;
 it may alter and return the one it got."""
 
+Disturb = Callable[[int, PupperEnv], None]
+"""`disturb(step, environment)` does something to the robots before they act, such as a push."""
+
 _LAST_ACTION = slice(-ACTIONS, None)  # of an observation
 
 
@@ -100,10 +103,11 @@ def collect(
     seed: int,
     threads: int = 0,
     change: Change | None = None,
+    disturb: Disturb | None = None,
 ) -> Rollout:
-    """Let a policy walk, without pushes, from a gentle start.
+    """Let a policy walk from a gentle start, without pushes but those of `disturb`.
 
-    Rollouts of one seed differ only by what follows from `change`, policy or command: servos,
+    Rollouts of one seed differ only by what follows from these, policy or command: servos,
     ground, start and noise are the same until a robot falls.
 
     Parameters
@@ -121,6 +125,8 @@ def collect(
     seed, threads : int
     change : callable, optional
         What to do to observations before the policy sees them.
+    disturb : callable, optional
+        What to do to the robots before they act.
 
     Raises
     ------
@@ -143,6 +149,8 @@ def collect(
         for step in range(steps):
             shown = observation if change is None else change(step, observation)
             action = own.act(shown)
+            if disturb:
+                disturb(step, env)
             found = env.step(action)
             observation, facts = found.observation, found.facts
             alive = alive & ~found.done

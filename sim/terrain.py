@@ -1,8 +1,9 @@
-"""The ground: flat, rough, hills and troughs, as MJCF and as a height anyone can look up.
+"""The ground: flat, rough, hills, troughs and steps, as MJCF and as a height anyone can look up.
 
 Simulations of a batch do not see each other, so one field of tiles serves all of them; a robot
 starts on a tile and its episode ends (as a time-out) before the field does. Sizes follow the
 paper's terrain: tiles of 8 m, 5 cm between heights, rough ground of 1 to 2 cm, slopes up to 8.5°.
+Steps (not in the paper) are 3 to 10 mm high and rise, as all of a field of heights, over 5 cm.
 """
 
 from __future__ import annotations
@@ -15,16 +16,18 @@ from numpy.typing import NDArray
 
 from sim.mini_pupper import FLAT_GROUND
 
-Terrain = Literal["flat", "rough", "slopes", "troughs", "mixed"]
+Terrain = Literal["flat", "rough", "slopes", "troughs", "steps", "mixed"]
 
 TILE_M, SPACING_M = 8.0, 0.05
 _PLATFORM_M = 0.6
 _ROUGH_M = (0.01, 0.02)
 _STEEPEST = 0.15
+_TREAD_M, _RISER_M = 0.3, (0.003, 0.01)  # up to what a foot is lifted in the reference trot
 _TILES = {
     "rough": ("rough",) * 4,
     "slopes": ("slope",) * 4,
     "troughs": ("trough",) * 4,
+    "steps": ("steps",) * 4,
     "mixed": ("flat", "rough", "slope", "trough"),
 }
 
@@ -108,6 +111,8 @@ def _tile(name: str, count: int, rng: np.random.Generator) -> NDArray[np.float64
     x = (np.arange(count) + 0.5) * SPACING_M - TILE_M / 2
     far = np.maximum(np.abs(x)[:, None], np.abs(x)[None, :])
     pyramid = TILE_M / 2 - np.maximum(far, _PLATFORM_M / 2)
+    if name == "steps":
+        return np.floor(pyramid / _TREAD_M) * rng.uniform(*_RISER_M)
     slope = rng.uniform(0.3, 1.0) * _STEEPEST
     return pyramid * slope * (1 if name == "slope" else -1)
 

@@ -198,7 +198,9 @@ class PupperEnv:
         broken = self.robots.broken()
         self.nan_resets += int(broken.sum())
         terms = walking_rewards.weighted(what, config.rewards, self._easy(self.level))
-        terms = {k: np.where(broken, 0.0, v * span) for k, v in terms.items()}
+        terms = {k: v * span for k, v in terms.items()}
+        if broken.any():
+            terms = {k: np.where(broken, 0.0, v) for k, v in terms.items()}
         reward = np.sum(list(terms.values()), axis=0)
         timed_out = (self.episode_step >= config.episode_steps) | self._outside()
         timed_out &= ~(fallen | broken)

@@ -6,7 +6,7 @@ differs from the others in more than its colour. `save` writes a figure as PNG.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,6 +44,7 @@ from sysid.figure_data import (
     tracks,
     window,
 )
+from sysid.recording import Trial
 
 if TYPE_CHECKING:  # it brings python-control, which is not needed to draw
     from sysid.frequency_response import FrequencyResponse
@@ -56,6 +57,7 @@ __all__ = [
     "png",
     "residual_figure",
     "save",
+    "sweep_figure",
 ]
 
 
@@ -323,6 +325,34 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     over_time.set_xlabel("time, trials end to end [s]")
     over_time.set_ylabel("fresh − model [mrad]")
     figure.legend(*over_speed.get_legend_handles_labels(), loc="outside upper left", ncols=1)
+    return figure
+
+
+@styled
+def sweep_figure(trials: Sequence[Trial], periods: float = 3.0) -> Figure:
+    """Commands and what the encoder said, a panel per frequency; old readings are faint.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        Tones of one joint.
+    periods : float
+        How many to show, from the middle of each trial.
+    """
+    figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
+    for axes, trial in zip(panels, trials, strict=True):
+        start = float(np.median(trial.send_time_s))
+        shown = _inside(trial.send_time_s, start, start + periods / trial.frequency_hz)
+        time = trial.send_time_s[shown] - start
+        reading = trial.position_rad[shown]
+        fresh = np.diff(reading, prepend=np.nan) != 0
+        axes.plot(time, trial.command_rad[shown], "--", color=BLUE, lw=1.2, label="command")
+        axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="old reading")
+        axes.plot(time[fresh], reading[fresh], "o", ms=3.0, color=RED, label="fresh reading")
+        axes.set_title(f"{trial.joint}, {trial.frequency_hz:g} Hz")
+        axes.set_ylabel("rad")
+    panels[0].legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    panels[-1].set_xlabel("time [s]")
     return figure
 
 

@@ -3,6 +3,10 @@
 import os
 from pathlib import Path
 
+# the workers share the cores; networks this small only wait for other threads
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 
 

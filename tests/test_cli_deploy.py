@@ -112,8 +112,13 @@ def test_the_gait_of_the_shipped_policy_is_a_trot(capsys, here):
     assert gait["diagonal"][0] > 0.6 and gait["rhythmic"] == 1.0
 
 
-def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(capsys, here):
-    rows = {r["test"]: r for r in analyze(capsys, "autonomy")["autonomy"]["lstm"]}
+def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
+    capsys, here, monkeypatch
+):
+    monkeypatch.setattr("policies.phase_reset._PUSHES", 1)
+    monkeypatch.setattr("policies.phase_reset.RATES_HZ", (50.0,))
+    found = analyze(capsys, "autonomy")["autonomy"]["lstm"]
+    rows = {r["test"]: r for r in found["frozen"]}
     assert rows["nothing frozen"]["share"] == pytest.approx(1.0, abs=0.1)
     assert rows["senses frozen, its own last action"]["share"] > 0.5
     assert rows["senses and last action frozen"]["share"] < 0.2
@@ -122,6 +127,18 @@ def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(capsys
 def test_orbits_close(capsys, here):
     orbits = analyze(capsys, "attractor")["orbits"]["lstm"]
     assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
+
+
+@pytest.mark.parametrize("what", ["terrain", "compliance"])
+def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what):
+    rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
+    assert len(rows) == 6 and all(0 <= r["survival"] <= 1 for r in rows)
+
+
+def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):
+    assert "one recording or policy" in refused(
+        capsys, cli.pupper_analyze, "servo", POLICY, POLICY, "--actuator", CALIBRATION
+    )
 
 
 def test_pictures_are_not_written_over(capsys, here):

@@ -12,7 +12,7 @@ from sim.servo_mjcf import mujoco
 from sim.servo_ranges import servo_ranges
 from sim.terrain import SPACING_M, TILE_M, Ground, make_ground
 
-KINDS = ("flat", "rough", "slopes", "troughs", "mixed")
+KINDS = ("flat", "rough", "slopes", "troughs", "steps", "mixed")
 
 
 def ground_of(kind) -> Ground:
@@ -73,6 +73,15 @@ def test_hills_rise_and_troughs_fall_to_a_flat_platform_of_60_centimetres(kind, 
             assert middle.max() == tile.max() > 0.1
             assert tile.min() >= 0.0
             assert np.ptp(tile[count // 2 - 7 : count // 2 + 7, count // 2]) > 0
+
+
+def test_steps_are_level_and_as_high_as_a_foot_is_lifted_at_most():
+    heights, count = heights_of(ground_of("steps")), round(TILE_M / SPACING_M)
+    tile = heights[:count, :count]
+    risers = np.unique(np.round(np.diff(tile[count // 2, : count // 2]), 9))
+    assert len(risers) == 2 and risers[0] == 0 and 0.003 <= risers[1] <= 0.01
+    # mostly treads
+    assert (np.diff(tile[count // 2]) == 0).mean() > 0.8
 
 
 def test_rough_ground_is_one_or_two_centimetres_high_with_a_flat_border_around_each_tile():

@@ -16,7 +16,6 @@ from policies.run_file import Run
 from sim.walking_config import Walking
 
 CALIBRATION = str(Path(__file__).resolve().parents[1] / "data" / "samples" / "calibrated.yaml")
-torch.set_num_threads(1)  # networks so small only wait for other threads
 ALL_KINDS = ("mlp", "mlp-actions", "lstm", "gru", "transformer")
 WITH_MEMORY = ("lstm", "gru", "transformer")
 PRIVILEGED, HISTORY = 7, 3

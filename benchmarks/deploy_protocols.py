@@ -1,0 +1,187 @@
+"""Deployment stacks on an emulated robot, in real time, over both protocols.
+
+    .venv/bin/python benchmarks/deploy_protocols.py [--seconds 60]
+
+The robot (physics, servos, polls, protocol) runs in a process of its own and writes down where its
+trunk really goes; the stack drives it through `deploy`, as `pupper-deploy` does: forward, backward,
+left, right, and a turn, `--seconds` each. Printed per stack, protocol and direction: falls, errors,
+missed deadlines, the controller's step, and whether the log's replay repeats every action.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import multiprocessing
+import os
+import tempfile
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import torch
+from emulators import SPECS
+
+from cli.fit_servo import FitServo
+from hardware.connect import open_guarded, parse_address
+from hardware.esp32_bus import Esp32Bus
+from hardware.feetech_registers import STS3215
+from hardware.joint_map import load_joint_map
+from hardware.loop import real_time_priority
+from policies.assembly import assemble, reassemble
+from policies.commands import constant
+from policies.deployment import deploy
+from policies.policy_file import load_policy
+from policies.stack_trials import walk_once
+from policies.stacks import STACKS
+from policies.walk_log import read_walk, replay
+from sim.bus_faults import BusFaults
+from sim.emulated_robot import draw_robot
+from sim.esp32_emulator import ImuProxy, ProxyEmulator
+from sim.esp32_socket import ProxySocket
+from sim.feetech_emulator import FeetechEmulator
+from sim.feetech_pty import FeetechPty
+from sim.servo_bench import ServoBench
+from sim.walking_robot import WalkingRobot
+from sysid.recording import RecordingWriter
+
+CALIBRATION = "data/samples/calibrated.yaml"
+POLICIES = Path("data/samples/policies")
+DIRECTIONS = {
+    "forward": (0.15, 0.0, 0.0), "backward": (-0.15, 0.0, 0.0), "left": (0.0, 0.08, 0.0),
+    "right": (0.0, -0.08, 0.0), "turn": (0.0, 0.0, 0.4),
+}  # fmt: skip
+STACK_OF = (
+    ("lstm", "closed-loop"), ("lstm", "lstm-servo"), ("mlp", "closed-loop"),
+    ("mlp", "mlp-observer"),
+)  # fmt: skip
+SEED = 0
+_TRUNK_S = 0.02
+
+
+def robot(kind: str, folder: Path, stop) -> None:
+    """Serve one walking robot until told to stop, then save where its trunk was."""
+    rng = np.random.default_rng(SEED)
+    drawn = draw_robot(rng, SPECS[kind])
+    own, imu, shown = rng.spawn(3)
+    plant = WalkingRobot(drawn, imu)
+    layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+    bench = ServoBench(drawn, layout, own, keep_log=False, plant=plant)
+    faults = BusFaults.parse("", rng)
+    servers: list = []
+    if kind == "esp32":
+        servers.append(ProxySocket(ProxyEmulator(bench, rng, faults), folder / "socket"))
+    else:
+        servers.append(FeetechPty(FeetechEmulator(bench, STS3215, rng), folder / "servos"))
+        polled = ServoBench(
+            draw_robot(np.random.default_rng(SEED)), load_joint_map("mini_pupper_2"), shown,
+            keep_log=False, plant=plant,
+        )  # fmt: skip
+        servers.append(ProxySocket(ImuProxy(polled, shown.spawn(1)[0]), folder / "socket"))
+    for server in servers:
+        threading.Thread(target=server.serve, daemon=True).start()
+    rows = []
+    (folder / "ready").touch()
+    while not stop.is_set():
+        trunk = plant.trunk(servers[0].now())
+        rows.append([time.monotonic(), *trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s])
+        time.sleep(_TRUNK_S)
+    np.save(folder / "trunk.npy", np.array(rows))
+    for server in servers:
+        server.stop()
+
+
+def servo_model(folder: Path) -> Path:
+    """Servo networks of this robot, from walks of it that were recorded before."""
+    policy = load_policy(POLICIES / "lstm")
+    recordings = []
+    for name, command in DIRECTIONS.items():
+        path = folder / f"{name}.csv"
+        about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
+        with RecordingWriter(path, about) as rows:
+            walk_once(policy, STACKS["closed-loop"], command, 12.0, SEED, CALIBRATION, rows=rows)
+            rows.close({})
+        recordings.append(path)
+    with contextlib.redirect_stdout(io.StringIO()):
+        FitServo(recordings=tuple(recordings), arch="mlp", out=folder / "servo", json=True).run()
+    return folder / "servo"
+
+
+def drive(kind: str, seconds: float, servo: Path) -> None:
+    """All stacks on one served robot; a row of the table each."""
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as name:
+        folder, stop = Path(name), context.Event()
+        process = context.Process(target=robot, args=(kind, folder, stop))
+        process.start()
+        while not (folder / "ready").exists():
+            time.sleep(0.05)
+        walks = []
+        socket = folder / "socket"
+        address = parse_address(
+            f"esp32:{socket}" if kind == "esp32" else f"feetech:{folder / 'servos'}"
+        )
+        joint_map = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+        for policy_name, stack in STACK_OF:
+            policy = load_policy(POLICIES / policy_name)
+            for direction, command in DIRECTIONS.items():
+                log = folder / f"{policy_name}-{stack}-{direction}.csv"
+                path = servo if stack == "lstm-servo" else None
+                parts = assemble(policy, STACKS[stack], joint_map, CALIBRATION, path)
+                ticks: list[float] = []
+                with closing(open_guarded(address, joint_map)) as bus, real_time_priority():
+                    imu = bus.bus if kind == "esp32" else Esp32Bus(socket)
+                    outcome = deploy(
+                        bus, imu, parts.controller, constant(command), seconds, log, parts.header,
+                        None, [lambda tick, t=ticks: t.append(time.monotonic())],
+                    )  # fmt: skip
+                    if kind != "esp32":
+                        imu.close()
+                walk = read_walk(log)
+                same = replay(walk, reassemble(policy, walk.header, log)) is None
+                walks.append((policy_name, stack, direction, command, outcome, ticks, same))
+        stop.set()
+        process.join()
+        trunk = np.load(folder / "trunk.npy")
+    for policy_name, stack, direction, command, outcome, ticks, same in walks:
+        errors = ["–"] * 3
+        if ticks:
+            inside = (trunk[:, 0] >= ticks[0]) & (trunk[:, 0] <= ticks[-1])
+            errors = [
+                f"{e:.3f}" for e in np.abs(trunk[inside, 1:] - np.array(command)).mean(axis=0)
+            ]
+        step = 1e3 * np.array(outcome.step_s or [np.nan])
+        print(
+            f"| {kind} | {policy_name}, {stack} | {direction} | {outcome.seconds:.0f} | "
+            f"{'yes' if outcome.fell else 'no'} | {errors[0]} | {errors[1]} | {errors[2]} | "
+            f"{outcome.deadline_misses} | {np.percentile(step, 50):.2f} | "
+            f"{np.percentile(step, 99):.2f} | {'equal' if same else 'differs'} | "
+            f"{outcome.stop_reason} |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as name:
+        servo = servo_model(Path(name))
+        print(
+            "| protocol | policy, stack | direction | s | fell | forward m/s | sideways m/s | "
+            "turn rad/s | misses | step p50 ms | p99 ms | replay | ended |"
+        )
+        print("|" + "---|" * 13)
+        for kind in ("esp32", "feetech"):
+            drive(kind, options.seconds, servo)
+
+
+if __name__ == "__main__":
+    main()

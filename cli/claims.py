@@ -1,0 +1,251 @@
+"""`pupper-analyze claims`: every published claim beside what is found here, as a page."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cli import terminal
+from cli.policy_choice import policy_at
+from cli.terminal import err, out, print_json
+from common.errors import InputError
+from common.files import refuse_overwrite, write_text
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from cli.pupper_analyze import Analyze, Tries
+    from common.claims import Claim
+    from policies.evidence import PolicyEvidence
+    from sysid.servo_claims import ServoEvidence
+
+PAGE = "claims.md"
+_STACK_ROBOTS, _STACK_SECONDS = 8, 10.0
+_STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
+_KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
+
+
+def write_claims(options: Analyze, tries: Tries) -> None:
+    """Gather, judge, draw and write."""
+    from policies.claims import judge
+    from policies.evidence import gather
+    from sysid import servo_claims
+
+    page = options.out / PAGE
+    refuse_overwrite(page, options.force)
+    names = [name for name, _, _ in tries]
+    twice = {n for n in names if names.count(n) > 1}
+    if twice:
+        raise InputError(f"Two policies are called {min(twice)}; rename a folder to tell them.")
+    recordings = terminal.load_all(options.recordings) if options.recordings else []
+    say = _say
+    robot = servo_claims.gather(recordings, options.seed, say)
+    evidence = []
+    for (name, policy, trial), path in zip(tries, options.policies, strict=True):
+        folder = path.parent if path.name.startswith("policy_") else path
+        evidence.append(gather(name, policy, trial, folder, say))
+    stacks = _stacks(options, say)
+    found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
+    pictures = _draw(options.out, evidence, robot, options.force)
+    text = _page(found, evidence, pictures, options)
+    write_text(page, text, options.force)
+    if options.json:
+        print_json(
+            {"claims": [asdict(c) for c in found], "page": str(page), "pictures": list(pictures)}
+        )
+        return
+    shown = terminal.table("Published claims", "", "claim", "paper", "here", "verdict")
+    for c in found:
+        shown.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
+    out.print(shown)
+    err.print(f"Wrote {page} and {len(pictures)} pictures beside it.")
+
+
+def _say(what: str) -> None:
+    err.print(f"{what} …", style="dim")
+
+
+def _stacks(options: Analyze, say: Any) -> list[dict[str, Any]]:
+    """Closed loop against the servo model's prediction, walked by the first policy."""
+    if options.servo is None:
+        return []
+    from dataclasses import replace
+
+    from policies.stack_trials import compare_stacks
+    from policies.stacks import STACKS
+
+    policy, run = policy_at(options.policies[0])
+    actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
+    closed = STACKS["closed-loop"]
+    # the same smoothing in both: only what the policy is shown differs
+    predicted = replace(closed, observer="servo-model")
+    return compare_stacks(
+        policy,
+        {"encoders": (closed, None), "servo model": (predicted, options.servo)},
+        _STACK_COMMANDS, range(options.seed, options.seed + _STACK_ROBOTS), _STACK_SECONDS,
+        actuator, say,
+    )  # fmt: skip
+
+
+def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Longest trial of each joint of the playback."""
+    if robot.played is None:
+        return {}
+    found = {}
+    for joint in robot.played.joints:
+        trial = max(robot.played.trials(joint), key=lambda t: len(t.send_time_s))
+        found[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
+    return found
+
+
+def _draw(
+    folder: Path, evidence: list[PolicyEvidence], robot: ServoEvidence, force: bool
+) -> dict[str, str]:
+    """The pictures; file name to caption."""
+    from common.figure_style import save
+    from policies import analysis_figures as figures
+    from policies.evidence import DELAYS_MS
+    from sysid.figures import sweep_figure
+    from sysid.servo_figures import compare_figure
+
+    made: dict[str, tuple[Any, str]] = {}
+    if robot.sweep is not None:
+        joint = robot.sweep.joints[-1]
+        trials = [t for t in robot.sweep.trials(joint) if np.isfinite(t.frequency_hz)]
+        made["sweep.png"] = (
+            sweep_figure(trials),
+            "As the paper's figure 2: commands and readings by frequency. Faint ones are old.",
+        )
+    for kind in ("lstm", "mlp"):
+        first = next((e for e in evidence if e.kind == kind), None)
+        if first:
+            made[f"gait-{kind}.png"] = (
+                figures.gait_figure(first.walk), f"As figure 4: the gait of {first.name}.",
+            )  # fmt: skip
+    moving = [e for e in evidence if e.orbits]
+    shown = _one_per_kind(moving)
+    if shown:
+        made["orbits.png"] = (
+            figures.orbit_figure(
+                {f"{e.name} {k}": v["orbits"] for e in shown for k, v in e.orbits.items()},
+                DELAYS_MS,
+            ),
+            "As figure 5: orbits of actions and hidden states, joints late by 0, 160, 320 ms.",
+        )
+        made["late.png"] = (
+            figures.delay_trace_figure(
+                {e.name: e.orbits["actions"]["states"] for e in shown}, DELAYS_MS,
+                shown[0].walk.step_s,
+            ),
+            "As figure 6: the LF thigh's action in replay with late joints.",
+        )  # fmt: skip
+    every = _one_per_kind(evidence)
+    made["ablation.png"] = (
+        figures.ablation_figure({e.name: e.ablation for e in every}),
+        "As figure 7a: correlation of actions against noise in all that comes from the joints.",
+    )
+    made["delay.png"] = (
+        figures.delay_figure({e.name: e.delay for e in every}),
+        "Closed loop and replay against more delay, which the paper shows in replay only.",
+    )
+    made["autonomy.png"] = (
+        figures.autonomy_figure(
+            {e.name: {"frozen": e.frozen, "push": e.push, "rate": e.rate} for e in every}
+        ),
+        "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
+    )
+    made["terrain.png"] = (
+        figures.terrain_figure({e.name: e.terrain for e in every}), "Other ground.",
+    )  # fmt: skip
+    made["compliance.png"] = (
+        figures.compliance_figure({e.name: e.compliance for e in every}),
+        "As figure 7b: where one robot goes in six directions in ten seconds.",
+    )
+    if robot.servos is not None:
+        made["servos.png"] = (
+            compare_figure(robot.servos),
+            "As the extension's figure: four ways to say where a servo will be, unseen loop.",
+        )
+    for name, (figure, _) in made.items():
+        save(figure, folder / name, force)
+    return {name: caption for name, (_, caption) in made.items()}
+
+
+def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
+    """The first policy of each architecture."""
+    return list({e.kind: e for e in reversed(evidence)}.values())[::-1]
+
+
+def _page(
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str], options: Analyze
+) -> str:
+    """The report as Markdown."""
+    verdicts = [c.verdict for c in found]
+    tally = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    parts = ["pupper-analyze claims", *(str(p) for p in options.policies)]
+    if options.recordings:
+        parts += ["--recordings", *(p.name for p in options.recordings)]
+    for flag in ("servo", "actuator", "feedback"):
+        if getattr(options, flag):
+            parts += [f"--{flag}", str(getattr(options, flag))]
+    parts += ["--robots", str(options.robots), "--out", str(options.out)]
+    lines = [
+        "# The published claims, one by one", "",
+        f"{len(found)} claims: {tally}.", "",
+        "Made by", "", "```", " ".join(parts), "```", "",
+        "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
+        "stretches of time. Policies were trained and walked in simulation with a calibrated "
+        "robot; what needs the physical one is said to.", "",
+        "| | claim | paper | here | interval | verdict | how |", "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for c in found:
+        bounds = "; ".join(
+            f"{k} {_number(v[0])} to {_number(v[1])}" for k, v in (c.interval or {}).items()
+        )
+        lines.append(
+            f"| {c.id} | {c.claim} | {c.paper} | {c.ours} | {bounds or '–'} | **{c.verdict}** | "
+            f"{c.how} |"
+        )
+    lines += ["", "## Table I, regenerated", "", *_table_one(evidence), "", "## Pictures", ""]
+    for name, caption in pictures.items():
+        lines += [f"![{caption}]({name})", "", caption, ""]
+    return "\n".join(lines)
+
+
+def _table_one(evidence: list[PolicyEvidence]) -> list[str]:
+    """A column per architecture."""
+    from policies.evidence import over
+
+    kinds = [k for k in _KINDS if any(e.kind == k for e in evidence)]
+    known = [e for e in evidence if e.trained]
+    rows: dict[str, Any] = {
+        "reward per second": (known, lambda e: e.trained["reward"], 2),
+        "action noise": (known, lambda e: e.trained["std"], 4),
+        "updates of PPO": (known, lambda e: e.trained["updates"], 0),
+        "steps/s in training": (known, lambda e: e.trained["steps_per_s"], 0),
+        "still up after 10 s, flat": (evidence, lambda e: e.terrain[0]["survival"], 2),
+        "still up, other ground": (
+            evidence, lambda e: float(np.mean([r["survival"] for r in e.terrain[1:]])), 2,
+        ),
+        "forward error, m/s": (evidence, lambda e: e.terrain[0]["mae_vx_m_s"], 3),
+    }  # fmt: skip
+    lines = [
+        "| | " + " | ".join(_KINDS[k] for k in kinds) + " |",
+        "|---|" + "---|" * len(kinds),
+        "| policies | " + " | ".join(str(sum(e.kind == k for e in evidence)) for k in kinds) + " |",
+    ]
+    for title, (where, value, digits) in rows.items():
+        cells = []
+        for kind in kinds:
+            found = over(where, kind, value)
+            cells.append(terminal.number(found.value, digits))
+            if np.isfinite(found.low):
+                cells[-1] += f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"

@@ -1,0 +1,116 @@
+"""What the claims about policies rest on: every analysis of each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from common.errors import InputError
+from policies.curves import PROGRESS
+from policies.gait import GaitReport, describe
+from policies.paths import compliance
+from policies.phase_reset import push_response, rate_response
+from policies.policy_file import Policy
+from policies.rhythm import Estimate, mean_of
+from policies.robustness import Trial, ablation, delay_curve, frozen, orbits, scales, terrain
+from policies.rollouts import Rollout
+
+DELAYS_MS = (0.0, 160.0, 320.0)
+"""Of the published orbits."""
+_LAST_UPDATES = 10
+
+Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class PolicyEvidence:
+    """All analyses of one policy; see the functions of the same names."""
+
+    name: str
+    kind: str
+    trained: dict[str, float]
+    """Last updates of its training: `reward` per second, `std`, `updates`, `steps_per_s`; empty if
+    not known."""
+    walk: Rollout
+    gait: GaitReport | None
+    """None if no robot walked long enough."""
+    orbits: dict[str, dict[str, Any]]
+    delay: Rows
+    ablation: Rows
+    frozen: Rows
+    push: Rows
+    rate: Rows
+    scale: Rows
+    terrain: Rows
+    compliance: Rows
+
+
+def gather(
+    name: str,
+    policy: Policy,
+    trial: Trial,
+    run_folder: Path | None,
+    say: Callable[[str], None] = lambda what: None,
+) -> PolicyEvidence:
+    """Run every analysis.
+
+    Parameters
+    ----------
+    name : str
+    policy : Policy
+    trial : Trial
+    run_folder : Path or None
+        Where its training's curve is.
+    say : callable
+        Told what is about to be done.
+    """
+    rng = np.random.default_rng(trial.seed)
+
+    def step(what: str, made: Callable[[], Any]) -> Any:
+        say(f"{name}: {what}")
+        return made()
+
+    walk = step("gait", lambda: trial.walk(policy))
+    try:
+        gait = describe(walk, rng)
+    except InputError:
+        gait = None
+    return PolicyEvidence(
+        name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s), walk, gait,
+        step("orbits", lambda: orbits(policy, trial, DELAYS_MS)) if gait else {},
+        step("delay", lambda: delay_curve(policy, trial)),
+        step("ablation", lambda: ablation(policy, trial, ("all joints",))),
+        step("frozen inputs", lambda: frozen(policy, trial)),
+        step("pushes", lambda: push_response(policy, trial)),
+        step("control rate", lambda: rate_response(policy, trial)),
+        step("action scale", lambda: scales(policy, trial)),
+        step("terrain", lambda: terrain(policy, trial)),
+        step("directions", lambda: compliance(policy, trial)),
+    )  # fmt: skip
+
+
+def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyEvidence], float]):
+    """Mean over the policies of a kind, with the interval over them (NaN for one policy)."""
+    values = [value(e) for e in evidence if e.kind == kind]
+    return mean_of(np.array(values, float)) if values else Estimate(*[float("nan")] * 3)
+
+
+def _trained(folder: Path | None, step_s: float) -> dict[str, float]:
+    """Means over the last updates of a training."""
+    file = folder / PROGRESS if folder else None
+    if file is None or not file.is_file():
+        return {}
+    table = pd.read_csv(file).tail(_LAST_UPDATES)
+    seconds = table["collect_s"] + table["update_s"]
+    samples = np.gradient(table["samples"]) if len(table) > 1 else np.full(len(table), np.nan)
+    return {
+        "reward": float(table["reward"].mean()) / step_s,
+        "std": float(table["std"].mean()),
+        "updates": float(table["update"].iloc[-1]),
+        "steps_per_s": float(np.nanmean(samples / seconds)),
+    }

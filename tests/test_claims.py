@@ -1,0 +1,208 @@
+"""Claims are judged by what the evidence says, and unknown evidence is said to be unknown."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import refused, run_program
+from test_paths import walked
+
+import cli.claims
+import cli.pupper_analyze
+from cli.sweep import Sweep
+from policies.claims import judge
+from policies.evidence import DELAYS_MS, PolicyEvidence
+from policies.phase_reset import NUDGE_M_S, PUSH_M_S
+from policies.rhythm import Estimate
+from sysid import servo_claims
+from sysid.four_way import FITTED, PUBLISHED, four_way
+from sysid.recording import load
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLES = ROOT / "data/samples"
+CURVE = np.random.default_rng(0).random((50, 3))
+
+
+def known(value: float) -> Estimate:
+    return Estimate(value, value - 0.1, value + 0.1)
+
+
+def evidence(kind: str, name: str | None = None) -> PolicyEvidence:
+    """A policy that walks well whatever is done to it."""
+    delays = sorted({*DELAYS_MS, 160.0})
+    orbit = {
+        "states": [np.zeros((500, 12))] * 3, "orbits": [CURVE[:, :3]] * 3,
+        "explained_3": 0.9, "closure": [0.1] * 3, "area_ratio": [1.0] * 3,
+    }  # fmt: skip
+    frozen = [
+        {"test": test, "frequency_hz": 3.0, "amplitude_rad": 0.2, "share": share}
+        for test, share in (
+            ("nothing frozen", 1.0), ("senses frozen, its own last action", 1.0),
+            ("senses and last action frozen", 0.0), ("last action frozen, senses recorded", 0.5),
+        )
+    ]  # fmt: skip
+    gait = {"survival": 1.0, "frequency_hz": 3.0, "amplitude_rad": 0.2, "mae_vx_m_s": 0.02}
+    directions = ("forward", "backward", "left", "right", "turn left", "turn right")
+    return PolicyEvidence(
+        name or kind, kind, {"reward": 7.0, "std": 0.01, "updates": 60.0, "steps_per_s": 1000.0},
+        walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
+        {"actions": orbit, "hidden": orbit},
+        [
+            gait | {"extra_delay_ms": d, "mode": m}
+            for d in delays for m in ("replay", "fixed", "jittered")
+        ],
+        [
+            gait | {"channel": "all joints", "kind": k, "level": level, "correlation": r}
+            for k, level, r in (("noise", 0.1, 0.99), ("noise", 0.5, 0.6), ("zero", 0.0, 0.7))
+        ],
+        frozen,
+        [
+            {"push_m_s": speed, "survival": 1.0, "shift_early": s, "shift_late": s, "kept": 1.0,
+             "phases": [0.1, 0.6], "shifts": [s, -s]}
+            for speed, s in ((NUDGE_M_S, 0.01), (PUSH_M_S, 0.2))
+        ],
+        [gait | {"rate_hz": r, "cycles_per_step": 0.06} for r in (25.0, 50.0)],
+        [gait | {"scale_rad": s} for s in (0.45, 0.5, 0.6, 0.75)],
+        [gait | {"ground": g} for g in ("flat", "rough")],
+        [
+            {"direction": d, "command": (0.1, 0, 0), "survival": 1.0, "share": known(0.9),
+             "drift": known(0.0), "arc_rad_m": known(-0.2), "wander_m": known(0.0),
+             "path": CURVE[:, :2]}
+            for d in directions
+        ],
+    )  # fmt: skip
+
+
+def verdicts(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, str]:
+    return {c.id: c.verdict for c in judge(policies, played or {}, stacks)}
+
+
+BOTH = (evidence("mlp"), evidence("lstm"))
+
+
+def test_every_claim_has_a_row_with_all_its_parts():
+    found = [*servo_claims.judge(servo_claims.ServoEvidence()), *judge(BOTH, {}, [])]
+    assert len(found) >= 30 and len({c.id for c in found}) == len(found)
+    for claim in found:
+        assert claim.claim and claim.paper and claim.ours and claim.how
+
+
+def test_without_evidence_nothing_is_decided():
+    found = verdicts(evidence("gru"))
+    for id_ in ("T1", "G2", "G3", "P1", "P2", "B1", "B3", "X1", "X2", "D2", "D3", "G1"):
+        assert found[id_] == "not testable here", id_
+    nothing = servo_claims.judge(servo_claims.ServoEvidence())
+    assert {c.verdict for c in nothing} == {"not testable here"}
+    assert all("--recordings" in c.how for c in nothing)
+
+
+def test_a_gru_with_the_lstms_reward_contradicts_and_one_with_a_third_confirms():
+    gru = evidence("gru")
+    assert verdicts(*BOTH, gru)["T1"] == "does not hold here"
+    poor = replace(gru, trained=gru.trained | {"reward": 2.0})
+    assert verdicts(*BOTH, poor)["T1"] == "holds"
+
+
+def test_an_oscillator_in_the_cell_would_be_one_and_a_loop_through_the_action_is_half_of_one():
+    mlp, lstm = BOTH
+    assert verdicts(mlp, lstm)["X1"] == "holds partly"
+    inside = [r | {"share": 0.9} for r in lstm.frozen]
+    assert verdicts(mlp, replace(lstm, frozen=inside))["X1"] == "holds"
+    driven = [r | {"share": 0.1} for r in lstm.frozen]
+    assert verdicts(mlp, replace(lstm, frozen=driven))["X1"] == "does not hold here"
+
+
+def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
+    mlp, lstm = BOTH
+    assert verdicts(mlp, lstm)["G2"] == "holds" and verdicts(mlp, lstm)["G3"] == (
+        "does not hold here"
+    )
+    wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in mlp.delay]
+    assert verdicts(replace(mlp, delay=wild), lstm)["G3"] == "holds"
+    assert verdicts(mlp, replace(lstm, delay=wild))["G2"] == "does not hold here"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [(-0.03, -0.01, "holds"), (0.01, 0.03, "does not hold here"), (-0.01, 0.01, "holds partly")],
+)
+def test_stacks_differ_only_if_the_interval_of_their_difference_says_so(low, high, verdict):
+    keys = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
+    row = {"falls": 0.0} | {k: known(0.05) for k in keys}
+    less = {f"less_{k}": Estimate((low + high) / 2, low, high) for k in keys}
+    stacks = [row | {"stack": "encoders"}, row | {"stack": "servo model"} | less]
+    assert verdicts(*BOTH, stacks=stacks)["D3"] == verdict
+
+
+def test_servos_that_make_a_saw_tooth_rounder_are_seen_in_the_sine_fit():
+    time = 0.02 * np.arange(500)
+    saw = 2 * (2.8 * time % 1.0) - 1
+    smooth = np.sin(2 * np.pi * 2.8 * time)
+    found = {c.id: c for c in judge(BOTH, {"LF_thigh": (time, saw, smooth)}, [])}
+    assert found["G1"].verdict == "holds partly" and "2.80 Hz" in found["G1"].ours
+
+
+def test_intervals_are_over_policies_of_a_kind():
+    second = replace(evidence("lstm", "lstm-1"), trained=BOTH[1].trained | {"reward": 6.0})
+    claim = next(c for c in judge([*BOTH, second, evidence("gru")], {}, []) if c.id == "T1")
+    low, high = claim.interval["LSTM"]
+    assert low < 6.5 < high and "MLP" not in claim.interval
+
+
+def test_four_ways_on_the_sample_playback_score_unseen_readings_only():
+    recording = load(SAMPLES / "playback.csv")
+    found = four_way(recording, ["LF_thigh"], seed=0)
+    assert set(found.tracks) == {PUBLISHED, "LSTM", "MLP"} and FITTED in found.errors
+    whole = sum(len(t.send_time_s) for t in recording.trials("LF_thigh"))
+    scored = {n: len(e["LF_thigh"].free_run) for n, e in found.errors.items()}
+    assert len(set(scored.values())) == 1 and next(iter(scored.values())) < 0.5 * whole
+    rms = {n: np.sqrt(np.mean(e["LF_thigh"].free_run ** 2)) for n, e in found.errors.items()}
+    assert rms["MLP"] < rms[PUBLISHED]
+    claims = {
+        c.id: c for c in servo_claims.judge(
+            servo_claims.ServoEvidence(servos=found, played=recording)
+        )
+    }  # fmt: skip
+    assert claims["S1"].verdict in ("holds", "does not hold here") and "mrad" in claims["S1"].ours
+    assert claims["A1"].verdict == "not testable here"
+
+
+def test_a_sweep_says_how_much_of_the_lag_is_stale_feedback(tmp_path):
+    path = tmp_path / "sweep.csv"
+    Sweep(joints="LF_thigh", freqs="2,4", duration=2.0, out=path, seed=3, json=True).run()
+    found = servo_claims.gather([load(path)], seed=0)
+    claims = {c.id: c for c in servo_claims.judge(found)}
+    assert claims["A1"].verdict == "holds partly" and "bus and stale" in claims["A1"].how
+    assert claims["A3"].verdict == "does not hold here"
+
+
+def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "policies.evidence.gather",
+        lambda name, policy, *rest: evidence(policy.contract.kind, name),
+    )
+    policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
+    arguments = ("claims", *policies, "--actuator", SAMPLES / "calibrated.yaml")
+    code, out, err = run_program(capsys, cli.pupper_analyze, *arguments, "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert set(found["claims"][0]) == {
+        "id", "claim", "paper", "ours", "interval", "verdict", "how",
+    }  # fmt: skip
+    page = Path(found["page"]).read_text()
+    for claim in found["claims"]:
+        assert f"| {claim['id']} |" in page
+    for picture in found["pictures"]:
+        assert f"({picture})" in page and (tmp_path / "analysis" / picture).stat().st_size > 5000
+    assert "Table I" in page
+    again = refused(capsys, cli.pupper_analyze, *arguments)
+    assert "claims.md exists already" in again
+    twice = refused(
+        capsys, cli.pupper_analyze, "claims", policies[0], policies[0], *arguments[3:], "--out", "b"
+    )
+    assert "rename" in twice
