@@ -1,6 +1,6 @@
 """Deployment stacks on an emulated robot, in real time, over both protocols.
 
-    .venv/bin/python benchmarks/deploy_protocols.py [--seconds 60]
+    .venv/bin/python benchmarks/deploy_protocols.py [--seconds 60] [--servo servo/]
 
 The robot (physics, servos, polls, protocol) runs in a process of its own and writes down where its
 trunk really goes; the stack drives it through `deploy`, as `pupper-deploy` does: forward, backward,
@@ -56,16 +56,14 @@ DIRECTIONS = {
     "forward": (0.15, 0.0, 0.0), "backward": (-0.15, 0.0, 0.0), "left": (0.0, 0.08, 0.0),
     "right": (0.0, -0.08, 0.0), "turn": (0.0, 0.0, 0.4),
 }  # fmt: skip
-STACK_OF = (
-    ("lstm", "closed-loop"), ("lstm", "lstm-servo"), ("mlp", "closed-loop"),
-    ("mlp", "mlp-observer"),
-)  # fmt: skip
+STACK_OF = (("lstm", "lstm-servo"), ("mlp", "mlp-observer"))
 SEED = 0
 _TRUNK_S = 0.02
+_RECORD_S, _FIT_S = 8.0, 6.5
 
 
 def robot(kind: str, folder: Path, stop) -> None:
-    """Serve one walking robot until told to stop, then save where its trunk was."""
+    """Serve one walking robot until told to stop, and write down how its trunk moves."""
     rng = np.random.default_rng(SEED)
     drawn = draw_robot(rng, SPECS[kind])
     own, imu, shown = rng.spawn(3)
@@ -85,13 +83,14 @@ def robot(kind: str, folder: Path, stop) -> None:
         servers.append(ProxySocket(ImuProxy(polled, shown.spawn(1)[0]), folder / "socket"))
     for server in servers:
         threading.Thread(target=server.serve, daemon=True).start()
-    rows = []
-    (folder / "ready").touch()
-    while not stop.is_set():
-        trunk = plant.trunk(servers[0].now())
-        rows.append([time.monotonic(), *trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s])
-        time.sleep(_TRUNK_S)
-    np.save(folder / "trunk.npy", np.array(rows))
+    with (folder / "trunk.csv").open("w", buffering=1) as file:
+        (folder / "ready").touch()
+        while not stop.is_set():
+            trunk = plant.trunk(servers[0].now())
+            print(
+                time.monotonic(), *trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s, sep=",", file=file
+            )
+            time.sleep(_TRUNK_S)
     for server in servers:
         server.stop()
 
@@ -104,11 +103,16 @@ def servo_model(folder: Path) -> Path:
         path = folder / f"{name}.csv"
         about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
         with RecordingWriter(path, about) as rows:
-            walk_once(policy, STACKS["closed-loop"], command, 12.0, SEED, CALIBRATION, rows=rows)
+            walk_once(
+                policy, STACKS["closed-loop"], command, _RECORD_S, SEED, CALIBRATION, rows=rows
+            )
             rows.close({})
         recordings.append(path)
     with contextlib.redirect_stdout(io.StringIO()):
-        FitServo(recordings=tuple(recordings), arch="mlp", out=folder / "servo", json=True).run()
+        FitServo(
+            recordings=tuple(recordings), arch="mlp", out=folder / "servo", json=True,
+            train_before=_FIT_S, test_after=_FIT_S,
+        ).run()  # fmt: skip
     return folder / "servo"
 
 
@@ -121,7 +125,6 @@ def drive(kind: str, seconds: float, servo: Path) -> None:
         process.start()
         while not (folder / "ready").exists():
             time.sleep(0.05)
-        walks = []
         socket = folder / "socket"
         address = parse_address(
             f"esp32:{socket}" if kind == "esp32" else f"feetech:{folder / 'servos'}"
@@ -142,38 +145,38 @@ def drive(kind: str, seconds: float, servo: Path) -> None:
                     )  # fmt: skip
                     if kind != "esp32":
                         imu.close()
+                errors = ["–"] * 3
+                if ticks:
+                    # the last line may still be in the writing
+                    lines = (folder / "trunk.csv").read_text().splitlines()[:-1]
+                    trunk = np.array([line.split(",") for line in lines], float)
+                    inside = trunk[(trunk[:, 0] >= ticks[0]) & (trunk[:, 0] <= ticks[-1])]
+                    away = np.abs(inside[:, 1:] - np.array(command)).mean(axis=0)
+                    errors = [f"{e:.3f}" for e in away]
                 walk = read_walk(log)
                 same = replay(walk, reassemble(policy, walk.header, log)) is None
-                walks.append((policy_name, stack, direction, command, outcome, ticks, same))
+                step = 1e3 * np.array(outcome.step_s or [np.nan])
+                print(
+                    f"| {kind} | {policy_name}, {stack} | {direction} | {outcome.seconds:.0f} | "
+                    f"{'yes' if outcome.fell else 'no'} | {' | '.join(errors)} | "
+                    f"{outcome.deadline_misses} | {np.percentile(step, 50):.2f} | "
+                    f"{np.percentile(step, 99):.2f} | {'equal' if same else 'differs'} | "
+                    f"{outcome.stop_reason} |",
+                    flush=True,
+                )
         stop.set()
         process.join()
-        trunk = np.load(folder / "trunk.npy")
-    for policy_name, stack, direction, command, outcome, ticks, same in walks:
-        errors = ["–"] * 3
-        if ticks:
-            inside = (trunk[:, 0] >= ticks[0]) & (trunk[:, 0] <= ticks[-1])
-            errors = [
-                f"{e:.3f}" for e in np.abs(trunk[inside, 1:] - np.array(command)).mean(axis=0)
-            ]
-        step = 1e3 * np.array(outcome.step_s or [np.nan])
-        print(
-            f"| {kind} | {policy_name}, {stack} | {direction} | {outcome.seconds:.0f} | "
-            f"{'yes' if outcome.fell else 'no'} | {errors[0]} | {errors[1]} | {errors[2]} | "
-            f"{outcome.deadline_misses} | {np.percentile(step, 50):.2f} | "
-            f"{np.percentile(step, 99):.2f} | {'equal' if same else 'differs'} | "
-            f"{outcome.stop_reason} |",
-            flush=True,
-        )
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--servo", type=Path, help="servo model of robot 0; fitted if not given")
     options = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
-        servo = servo_model(Path(name))
+        servo = options.servo or servo_model(Path(name))
         print(
             "| protocol | policy, stack | direction | s | fell | forward m/s | sideways m/s | "
             "turn rad/s | misses | step p50 ms | p99 ms | replay | ended |"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sysid.servo_claims import ServoEvidence
 
 PAGE = "claims.md"
-_STACK_ROBOTS, _STACK_SECONDS = 8, 10.0
+_STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 _KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
 
@@ -73,7 +73,7 @@ def _stacks(options: Analyze, say: Any) -> list[dict[str, Any]]:
         return []
     from dataclasses import replace
 
-    from policies.stack_trials import compare_stacks
+    from policies.stack_trials import Walker, compare_stacks
     from policies.stacks import STACKS
 
     policy, run = policy_at(options.policies[0])
@@ -81,11 +81,11 @@ def _stacks(options: Analyze, say: Any) -> list[dict[str, Any]]:
     closed = STACKS["closed-loop"]
     # the same smoothing in both: only what the policy is shown differs
     predicted = replace(closed, observer="servo-model")
+    # a servo model is one robot's: the one of --seed
+    walkers = [Walker(options.seed, options.servo, k) for k in range(_STACK_ROUNDS)]
     return compare_stacks(
-        policy,
-        {"encoders": (closed, None), "servo model": (predicted, options.servo)},
-        _STACK_COMMANDS, range(options.seed, options.seed + _STACK_ROBOTS), _STACK_SECONDS,
-        actuator, say,
+        policy, {"encoders": closed, "servo model": predicted}, walkers, _STACK_COMMANDS,
+        _STACK_SECONDS, actuator, say,
     )  # fmt: skip
 
 

@@ -70,7 +70,8 @@ class Analyze:
     recordings: tuple[Path, ...] = ()
     """For `claims`: sweeps and a playback of a robot."""
     servo: Path | None = None
-    """For `claims`: servo model's folder, to compare its stack with the closed loop."""
+    """For `claims`: servo model of the emulated robot of --seed, to compare its stack with the
+    closed loop."""
     out: Path = Path("analysis")
     """Folder for the pictures."""
     seed: int = 0
@@ -210,7 +211,7 @@ def _autonomy(tries: Tries, rng: np.random.Generator) -> Found:
     from policies.phase_reset import push_response, rate_exponent, rate_response
     from policies.robustness import frozen
 
-    tests = {
+    tests: dict[str, dict[str, Any]] = {
         name: {
             "frozen": frozen(policy, trial),
             "push": push_response(policy, trial),

@@ -105,12 +105,12 @@ def _trained(folder: Path | None, step_s: float) -> dict[str, float]:
     file = folder / PROGRESS if folder else None
     if file is None or not file.is_file():
         return {}
-    table = pd.read_csv(file).tail(_LAST_UPDATES)
-    seconds = table["collect_s"] + table["update_s"]
-    samples = np.gradient(table["samples"]) if len(table) > 1 else np.full(len(table), np.nan)
+    table = pd.read_csv(file).tail(_LAST_UPDATES).astype(float)
+    columns = {name: table[name].to_numpy() for name in table.columns}
+    samples = np.gradient(columns["samples"]) if len(table) > 1 else np.full(len(table), np.nan)
     return {
-        "reward": float(table["reward"].mean()) / step_s,
-        "std": float(table["std"].mean()),
-        "updates": float(table["update"].iloc[-1]),
-        "steps_per_s": float(np.nanmean(samples / seconds)),
+        "reward": float(columns["reward"].mean()) / step_s,
+        "std": float(columns["std"].mean()),
+        "updates": float(columns["update"][-1]),
+        "steps_per_s": float(np.nanmean(samples / (columns["collect_s"] + columns["update_s"]))),
     }

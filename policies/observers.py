@@ -29,7 +29,7 @@ from common.joints import JOINT_NAMES
 from policies.stacks import ObserverKind
 from servo_models.control_rate import substeps as physics_substeps
 from servo_models.delayed_pd import DelayedPD, DelayedPDParameters, integrate
-from servo_models.joint_arrays import JointArrays
+from servo_models.joint_arrays import JointArrays, same_rate
 
 Array = NDArray[np.float64]
 
@@ -265,7 +265,7 @@ class ServoModelObserver:
                 f"The servo model is of {', '.join(model.joints)}; an observer needs all twelve "
                 "joints, in order. Fit it with --joints all."
             )
-        if abs(model.time_step_s - period_s) > 1e-9:
+        if not same_rate(model.time_step_s, period_s):
             raise InputError(
                 f"The servo model steps every {model.time_step_s:g} s, the controller every "
                 f"{period_s:g} s. Fit a model at the controller's rate, or run it at the model's."

@@ -33,7 +33,7 @@ _PUSHES = 6  # spread over one period
 _EARLY_S, _LATE_S = (1.0, 3.0), (3.0, 5.0)  # after the push
 
 
-def push_response(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+def push_response(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     """What is left of the phase shift that a push made.
 
     Each robot walks twice, once with a sideways push and once without; pushes come at times spread
@@ -53,12 +53,12 @@ def push_response(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
     if not steady.any():
         return []
     begin = round(_PUSH_S / step_s)
-    robots = np.flatnonzero(steady)
+    robots = np.flatnonzero(steady).tolist()
     rates = {
         i: sine_frequency(plain.action_rad[round(SETTLE_S / step_s) :, i], step_s) for i in robots
     }
     period = 1 / float(np.median(list(rates.values())))
-    found: list[dict[str, float | str]] = []
+    found: list[dict[str, Any]] = []
     for speed in (NUDGE_M_S, PUSH_M_S):
         shifts, phases, survived = [], [], []
         for k in range(_PUSHES):
@@ -81,7 +81,7 @@ def push_response(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
     return found
 
 
-def rate_response(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+def rate_response(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     """The gait when the policy is asked more or less often than it was trained to be.
 
     Returns

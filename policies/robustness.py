@@ -78,17 +78,21 @@ def outcome(rollout: Rollout) -> dict[str, float]:
         "mae_yaw_rad_s": float(error[2]),
     }
     gaits = [
-        (frequency(action, rollout.step_s).value, np.mean(amplitude(action)[0]), jitter(action))
+        (
+            frequency(action, rollout.step_s).value,
+            float(amplitude(action)[0].mean()),
+            jitter(action),
+        )
         for i, now in steady(rollout).items()
         if (action := rollout.action_rad[now, i]).std() > _STILL_RAD
     ]
-    means = np.mean(gaits, axis=0).tolist() if gaits else [float("nan")] * 3
+    means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [float("nan")] * 3
     return found | dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True))
 
 
 def delay_curve(
     policy: Policy, trial: Trial, extra_ms: Sequence[float] = EXTRA_DELAYS_MS
-) -> list[dict[str, float | str]]:
+) -> list[dict[str, Any]]:
     """Against more delay: in replay as published, and closed loop, fixed and jittered.
 
     Fixed delay is the servos' own, on top of what the calibration says; jittered delay is of what
@@ -103,7 +107,7 @@ def delay_curve(
     step_ms = 1e3 * trial.task.control_step_s
     rng = np.random.default_rng(trial.seed)
     plain = trial.walk(policy)
-    found: list[dict[str, float | str]] = []
+    found: list[dict[str, Any]] = []
     for extra in extra_ms:
         steps = round(extra / step_ms)
         seen = perturbations.applied(perturbations.delayed(JOINTS, steps), plain.observation)
@@ -123,7 +127,7 @@ def delay_curve(
 
 def ablation(
     policy: Policy, trial: Trial, channels: Sequence[str] = tuple(CHANNELS)
-) -> list[dict[str, float | str]]:
+) -> list[dict[str, Any]]:
     """Noise, zeros and staleness on what comes from the servos, by channel and jointly.
 
     Noise is in shares of a channel's own standard deviation while walking; `sigma` is that in the
@@ -139,7 +143,7 @@ def ablation(
     rng = np.random.default_rng(trial.seed)
     plain = trial.walk(policy)
     settled = round(SETTLE_S / plain.step_s)
-    found: list[dict[str, float | str]] = []
+    found: list[dict[str, Any]] = []
     for name in channels:
         part = CHANNELS[name]
         spread = plain.observation[settled:, :, part].std(axis=(0, 1))
@@ -164,7 +168,7 @@ def ablation(
     return found
 
 
-def terrain(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+def terrain(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     """Survival, tracking and gait on every kind of ground.
 
     Returns
@@ -179,7 +183,7 @@ def terrain(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
     ]
 
 
-def scales(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+def scales(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     """The walk with other scales of what is sent than that of the training, as deployed robots had.
 
     Returns
@@ -194,7 +198,7 @@ def scales(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
     ]
 
 
-def frozen(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
+def frozen(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     """Whether the rhythm goes on without its inputs.
 
     In replay, from two seconds on: everything frozen but the policy's own last action; everything
@@ -211,7 +215,7 @@ def frozen(policy: Policy, trial: Trial) -> list[dict[str, float | str]]:
     start = round(SETTLE_S / plain.step_s)
     own = _LAST_ACTION
     before = float(np.mean(amplitude(plain.action_rad[start:, 0])[0]))
-    found: list[dict[str, float | str]] = []
+    found: list[dict[str, Any]] = []
     tests = {
         "nothing frozen": (None, False),
         "senses frozen, its own last action": (slice(0, own.start), True),

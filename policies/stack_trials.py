@@ -2,6 +2,7 @@
 
 Every robot has servos of its own, drawn as `sim.emulated_robot` draws them, and each stack walks
 the same robots under the same commands, in virtual time, through guard, bus and log as on a robot.
+A servo model is one robot's, and walks only that one.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,7 @@ def walk_once(
     servo: Path | None = None,
     log: Path | None = None,
     rows: Rows | None = None,
+    noise: int = 0,
 ) -> tuple[Outcome, WalkScore]:
     """One walk of one emulated robot, in virtual time.
 
@@ -59,10 +62,12 @@ def walk_once(
         Where to keep the log; thrown away if not given.
     rows : Rows, optional
         Is given the servos' rows, as of a recording.
+    noise : int
+        Seed of what is not the robot: lost polls, noise, timing.
     """
-    rng = np.random.default_rng(seed)
+    truth = draw_robot(np.random.default_rng(seed))
     joint_map = load_joint_map("mini_pupper_2")
-    inner = WalkingBus(draw_robot(rng), rng)
+    inner = WalkingBus(truth, np.random.default_rng([seed, noise]))
     with closing(GuardedBus(inner)) as bus, tempfile.TemporaryDirectory() as folder:
         parts = assemble(policy, stack, joint_map, actuator, servo)
         score = WalkScore(bus, inner.robot)
@@ -73,61 +78,74 @@ def walk_once(
     return outcome, score
 
 
+@dataclass(frozen=True)
+class Walker:
+    """One robot for one round of walks: its seed, its servo model, and the seed of the noise."""
+
+    seed: int
+    servo: Path | None = None
+    noise: int = 0
+
+
 def compare_stacks(
     policy: Policy,
-    stacks: Mapping[str, tuple[Stack, Path | None]],
+    stacks: Mapping[str, Stack],
+    walkers: Sequence[Walker],
     commands: Sequence[Command],
-    seeds: Sequence[int],
     seconds: float,
     actuator: str,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda what: None,
 ) -> list[dict[str, Any]]:
     """Each stack on each robot.
 
     Parameters
     ----------
     policy : Policy
-    stacks : dict of str to (Stack, Path or None)
-        By name: the stack and its servo model's folder.
+    stacks : dict of str to Stack
+    walkers : sequence of Walker
     commands : sequence of (float, float, float)
-        One after the other, a walk each; a robot's errors are means over them.
-    seeds : sequence of int
-        Of the robots.
+        One after the other, a walk each; a walker's errors are means over them.
     seconds : float
         Of each walk.
     actuator : str
-    progress : callable, optional
+    progress : callable
         Told what is about to be done.
 
     Returns
     -------
     list of dict
         `stack`, `falls` (share of walks), `mae_vx_m_s`, `mae_vy_m_s`, `mae_yaw_rad_s` as (value,
-        low, high) over robots, and from the second stack on `less_...`: this stack's error less
-        the first one's, robot by robot.
+        low, high) over walkers, and from the second stack on `less_...`: this stack's error less
+        the first one's, walker by walker.
     """
     found: list[dict[str, Any]] = []
     first: np.ndarray | None = None
-    for name, (stack, servo) in stacks.items():
+    for name, stack in stacks.items():
         errors, falls = [], []
-        for seed in seeds:
-            if progress:
-                progress(f"{name}, robot {seed}")
+        for walker in walkers:
+            progress(f"{name}, robot {walker.seed}, round {walker.noise}")
+            servo = walker.servo if stack.observer == "servo-model" else None
             each = []
             for command in commands:
-                outcome, score = walk_once(policy, stack, command, seconds, seed, actuator, servo)
+                outcome, score = walk_once(
+                    policy, stack, command, seconds, walker.seed, actuator, servo,
+                    noise=walker.noise,
+                )  # fmt: skip
                 falls.append(outcome.fell)
                 summary = score.summary()
                 each.append([summary[key] for key in WalkScore.NAMES])
             errors.append(np.mean(np.array(each, float), axis=0))
         table = np.array(errors)
         row: dict[str, Any] = {"stack": name, "falls": float(np.mean(falls))}
-        row |= {key: mean_of(column) for key, column in zip(WalkScore.NAMES, table.T, strict=True)}
+        row |= _means("", table)
         if first is not None:
-            row |= {
-                f"less_{key}": mean_of(column)
-                for key, column in zip(WalkScore.NAMES, (table - first).T, strict=True)
-            }
+            row |= _means("less_", table - first)
         first = table if first is None else first
         found.append(row)
     return found
+
+
+def _means(prefix: str, table: np.ndarray) -> dict[str, Any]:
+    """A mean over walkers per error."""
+    named = zip(WalkScore.NAMES, table.T, strict=True)
+    return {prefix + key: mean_of(column) for key, column in named}

@@ -15,6 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.errors import InputError
 
+_SAME_RATE = 0.02
+
+
+def same_rate(one_s: float, other_s: float) -> bool:
+    """Whether a model may step every `other_s` that was fitted to commands every `one_s`.
+
+    A recorded rate is never quite the one that was asked for.
+    """
+    return abs(one_s / other_s - 1) <= _SAME_RATE
+
 
 class JointArrays(ABC):
     """Parameters per joint, normalisation, and the way in and out of the inner layout.

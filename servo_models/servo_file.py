@@ -29,13 +29,13 @@ from common.joints import JOINT_NAMES
 from servo_models.command_network import CommandNetwork
 from servo_models.control_rate import AtControlRate, substeps
 from servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from servo_models.joint_arrays import same_rate
 from servo_models.recurrent_network import RecurrentNetwork
 from servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
 SCHEMA_VERSION = 1
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 ARCHITECTURES = ("fir", "mlp", "lstm", "delayed-pd", "sindy")
-_SAME_RATE = 0.02
 _LARGEST_BYTES = 50_000_000
 _LONGEST_DELAY_S = 1.0
 _MAY_BE_INFINITE = ("effort_limit", "velocity_limit", "saturation_error_rad")
@@ -198,7 +198,7 @@ def load_servo_model(
     """
     folder = Path(folder)
     contract = _read_contract(folder)
-    if time_step_s is not None and abs(time_step_s / contract.time_step_s - 1) > _SAME_RATE:
+    if time_step_s is not None and not same_rate(contract.time_step_s, time_step_s):
         raise InputError(
             f"{folder} is a model for a command every {1e3 * contract.time_step_s:.1f} ms, but "
             f"commands come every {1e3 * time_step_s:.1f} ms. A learned model cannot change its "

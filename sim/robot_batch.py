@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from common.errors import InputError
 from common.joints import JOINT_NAMES, LEGS
-from servo_models.joint_arrays import JointArrays
+from servo_models.joint_arrays import JointArrays, same_rate
 from sim.mini_pupper import (
     CONTACT_BODIES,
     FOOT_RADIUS_M,
@@ -350,7 +350,7 @@ class RobotBatch:
         if model.joints != JOINT_NAMES:
             raise InputError("The servo model must have all twelve joints, in order.")
         span = self.config.control_step_s
-        if abs(model.time_step_s - span) > 1e-9:
+        if not same_rate(model.time_step_s, span):
             raise InputError(
                 f"The servo model steps every {model.time_step_s} s, the policy every {span} s. "
                 "Refit it at this rate, or set --task.control-step-s."

@@ -38,8 +38,9 @@ def gather(
     """Lag and staleness from sweeps, servo models from the recording with most joints."""
     found = ServoEvidence()
     rng = np.random.default_rng(seed)
-    sweeps = [r for r in recordings if np.isfinite(r.table["frequency_hz"]).any()]
-    others = [r for r in recordings if r not in sweeps]
+    tones = [bool(np.isfinite(r.table["frequency_hz"]).any()) for r in recordings]
+    sweeps = [r for r, tone in zip(recordings, tones, strict=True) if tone]
+    others = [r for r, tone in zip(recordings, tones, strict=True) if not tone]
     for recording in sweeps:
         found.health |= {
             f"{recording.name} {name}": one for name, one in examine(recording, rng).joints.items()

@@ -149,6 +149,7 @@ def test_servos_that_make_a_saw_tooth_rounder_are_seen_in_the_sine_fit():
 def test_intervals_are_over_policies_of_a_kind():
     second = replace(evidence("lstm", "lstm-1"), trained=BOTH[1].trained | {"reward": 6.0})
     claim = next(c for c in judge([*BOTH, second, evidence("gru")], {}, []) if c.id == "T1")
+    assert claim.interval is not None
     low, high = claim.interval["LSTM"]
     assert low < 6.5 < high and "MLP" not in claim.interval
 

@@ -325,3 +325,7 @@ def test_zero_stays_whatever_happens():
     assert (found.position == 0.7).all()
     assert (found.velocity == 0).all()
     assert (found.effort == 0).all()
+
+
+def test_a_recorded_rate_is_never_quite_the_one_that_was_asked_for():
+    assert ServoModelObserver(servo_model(period_s=1.0002 * P), P).period_s == P
