@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +17,12 @@ from hardware.joint_map import load_joint_map
 from sim.bus_faults import BusFaults
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import RobotSpec, draw_robot
-from sim.esp32_emulator import ProxyEmulator
+from sim.esp32_emulator import ImuProxy, ProxyEmulator
 from sim.esp32_socket import ProxySocket
 from sim.feetech_emulator import FeetechEmulator
 from sim.feetech_pty import FeetechPty
 from sim.servo_bench import ServoBench
+from sim.walking_robot import WalkingRobot
 
 KINDS = ("feetech", "esp32")
 
@@ -68,3 +70,36 @@ def served(
             server.stop()
             thread.join(5.0)
             server.close()
+
+
+def walking_servers(
+    kind: str, seed: int, folder: Path
+) -> tuple[WalkingRobot, ServoBench, FeetechEmulator | ProxyEmulator, list[Any]]:
+    """A robot that stands on the ground behind a real protocol, served by threads.
+
+    Returns its body, its servos, the emulator that answers for them, and the servers: the one of
+    the servos first, at `folder`/socket or `folder`/servos; a serial line's IMU is at
+    `folder`/socket.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = draw_robot(rng, SPECS[kind])
+    own, imu, shown = rng.spawn(3)
+    plant = WalkingRobot(drawn, imu)
+    layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+    bench = ServoBench(drawn, layout, own, keep_log=False, plant=plant)
+    faults = BusFaults.parse("", rng)
+    servers: list[Any] = []
+    if kind == "esp32":
+        emulator = ProxyEmulator(bench, rng, faults)
+        servers.append(ProxySocket(emulator, folder / "socket"))
+    else:
+        emulator = FeetechEmulator(bench, STS3215, rng, faults=faults)
+        servers.append(FeetechPty(emulator, folder / "servos"))
+        polled = ServoBench(
+            draw_robot(np.random.default_rng(seed)), load_joint_map("mini_pupper_2"), shown,
+            keep_log=False, plant=plant,
+        )  # fmt: skip
+        servers.append(ProxySocket(ImuProxy(polled, shown.spawn(1)[0]), folder / "socket"))
+    for server in servers:
+        threading.Thread(target=server.serve, daemon=True).start()
+    return plant, bench, emulator, servers

@@ -216,6 +216,8 @@ def _affine(source: JointMap, target: JointMap) -> tuple[Array, Array]:
 def _apply(affine: tuple[Array, Array], angles: Array) -> Array:
     """Each row of the matrix is what one source angle moves; a missing angle stays its own."""
     matrix, constant = affine
-    known = np.nan_to_num(angles)
-    lost = np.isnan(angles) @ (matrix != 0) > 0
-    return np.where(lost, np.nan, known @ matrix + constant)
+    missing = np.isnan(angles)
+    if not missing.any():
+        return angles @ matrix + constant
+    lost = missing @ (matrix != 0) > 0
+    return np.where(lost, np.nan, np.where(missing, 0.0, angles) @ matrix + constant)

@@ -34,6 +34,8 @@ STAND_S = 3.0
 SETTLE_S = 0.5
 REST_SAMPLES = 50
 IMU_SILENT_S = 0.2
+STALL_S = 0.25
+"""A loop that stood still for so long does not go on: the robot has gone on without it."""
 _REST_PERIOD_S = 0.02
 _GRAVITY = OBSERVATION_PARTS["projected_gravity"]
 
@@ -185,7 +187,8 @@ def _walk(
     outcome: Outcome,
 ) -> None:
     """The control loop."""
-    loop = FixedRateLoop(bus, controller.period_s)
+    period = controller.period_s
+    loop = FixedRateLoop(bus, period, most_misses=max(round(STALL_S / period) - 1, 1))
     imu_s = bus.now()
     load_nm = np.zeros(len(JOINT_NAMES))
     try:

@@ -84,7 +84,7 @@ def outcome(rollout: Rollout) -> dict[str, float]:
             jitter(action),
         )
         for i, now in steady(rollout).items()
-        if (action := rollout.action_rad[now, i]).std() > _STILL_RAD
+        if not _still(action := rollout.action_rad[now, i])
     ]
     means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [float("nan")] * 3
     return found | dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True))
@@ -303,9 +303,14 @@ def _steps(ms: float, step_s: float) -> int:
     return max(round(ms / 1e3 / step_s), 1)
 
 
+def _still(signal: Array) -> bool:
+    """Whether no joint moves, wherever each of them stands."""
+    return bool(signal.std(axis=0).max() < _STILL_RAD)
+
+
 def _rate(signal: Array, step_s: float) -> float:
     """Frequency of a signal; NaN if it stands still."""
-    if signal.std() < _STILL_RAD:
+    if _still(signal):
         return float("nan")
     return frequency(signal, step_s).value
 

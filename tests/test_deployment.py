@@ -198,6 +198,19 @@ def test_a_policy_that_gives_nan_ends_the_walk_with_its_inputs_logged(policy, tm
     assert len(read_walk(tmp_path / "walk.csv").senses) == 19
 
 
+@pytest.mark.parametrize(("stall_s", "goes_on"), [(0.1, True), (0.3, False)])
+def test_a_loop_that_stood_still_for_long_does_not_go_on(policy, tmp_path, stall_s, goes_on):
+    bus = robot()
+    trouble = Trouble(lambda b: b.sleep_until(b.now() + stall_s))
+    found = run(policy, tmp_path, 2.0, bus, watchers=[trouble.watch(bus)])
+    if goes_on:
+        assert found.stop_reason == "time is up" and found.deadline_misses == 4
+        return
+    assert "deadlines" in found.stop_reason and limp(bus)
+    assert found.seconds < 0.7
+    assert read_walk(tmp_path / "walk.csv").ended == found.stop_reason
+
+
 def test_ctrl_c_parks_the_robot(policy, tmp_path):
     def interrupt(_):
         raise KeyboardInterrupt

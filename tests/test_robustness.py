@@ -10,7 +10,7 @@ import pytest
 from policies import perturbations
 from policies.perturbations import JOINTS
 from policies.policy_file import load_policy
-from policies.robustness import Trial, ablation, delay_curve
+from policies.robustness import Trial, _rate, ablation, delay_curve
 from sim.servo_ranges import servo_ranges
 from sim.walking_config import Walking
 from sim.walking_env import OBSERVATION_PARTS as PARTS
@@ -94,3 +94,10 @@ def test_an_ablation_hurts_more_the_more_is_taken(walker):
     noise = [r["correlation"] for r in rows if r["kind"] == "noise"]
     assert noise[0] > 0.9 and noise[-1] < noise[0] - 0.2
     assert {r["kind"] for r in rows} == {"noise", "zero", "hold"}
+
+
+def test_joints_that_stand_apart_but_do_not_move_have_no_frequency():
+    still = np.tile(np.linspace(-1.0, 1.0, 12), (400, 1))
+    assert np.isnan(_rate(still, 0.02))
+    swing = still + 0.1 * np.sin(2 * np.pi * 3.0 * 0.02 * np.arange(400))[:, None]
+    assert _rate(swing, 0.02) == pytest.approx(3.0, abs=0.01)
