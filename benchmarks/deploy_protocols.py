@@ -155,12 +155,12 @@ def drive(kind: str, seconds: float, servo: Path) -> None:
                     errors = [f"{e:.3f}" for e in away]
                 walk = read_walk(log)
                 same = replay(walk, reassemble(policy, walk.header, log)) is None
-                step = 1e3 * np.array(outcome.step_s or [np.nan])
+                steps = outcome.steps
                 print(
                     f"| {kind} | {policy_name}, {stack} | {direction} | {outcome.seconds:.0f} | "
                     f"{'yes' if outcome.fell else 'no'} | {' | '.join(errors)} | "
-                    f"{outcome.deadline_misses} | {np.percentile(step, 50):.2f} | "
-                    f"{np.percentile(step, 99):.2f} | {'equal' if same else 'differs'} | "
+                    f"{outcome.deadline_misses} | {1e3 * steps.quantile(0.5):.2f} | "
+                    f"{1e3 * steps.quantile(0.99):.2f} | {'equal' if same else 'differs'} | "
                     f"{outcome.stop_reason} |",
                     flush=True,
                 )

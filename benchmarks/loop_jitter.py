@@ -44,11 +44,11 @@ def busy(bus: GuardedBus, seconds: float) -> tuple[FixedRateLoop, list[float]]:
 
 def row(name: str, loop: FixedRateLoop, missing: str, spent: list[float]) -> str:
     """One line of the table."""
-    late = np.abs(np.diff(loop.starts_s[-1]) - loop.period_s) * 1e3
+    late = loop.jitter
     exchange = f"{1e3 * np.median(spent):.1f}" if spent else "–"
     return (
-        f"| {name} | {loop.ticks_done} | {loop.missed_deadlines} | {np.median(late):.3f} "
-        f"| {np.percentile(late, 99):.3f} | {late.max():.2f} | {exchange} | {missing} |"
+        f"| {name} | {loop.ticks_done} | {loop.missed_deadlines} | {1e3 * late.quantile(0.5):.3f} "
+        f"| {1e3 * late.quantile(0.99):.3f} | {1e3 * late.largest_s:.2f} | {exchange} | {missing} |"
     )
 
 

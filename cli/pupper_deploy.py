@@ -237,7 +237,7 @@ def _walk(
             bus, imu, controller, told, options.seconds, log, header, rows, watchers, options.force
         )
         rows.close({"stop_reason": outcome.stop_reason})
-    step = 1e3 * np.array(outcome.step_s or [np.nan])
+    steps = outcome.steps
     # only an emulated robot says where it really went
     motion: dict[str, Any] = score.summary() if score else dict.fromkeys(WalkScore.NAMES)
     found = {
@@ -245,8 +245,8 @@ def _walk(
         "seconds": outcome.seconds,
         "deadline_misses": outcome.deadline_misses,
         "step_ms": {
-            "p50": float(np.percentile(step, 50)), "p99": float(np.percentile(step, 99)),
-            "max": float(step.max()),
+            "p50": 1e3 * steps.quantile(0.5), "p99": 1e3 * steps.quantile(0.99),
+            "max": 1e3 * steps.largest_s,
         },
         "fell": outcome.fell,
         **motion,

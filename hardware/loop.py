@@ -19,6 +19,7 @@ from typing import Protocol
 
 import numpy as np
 
+from common.durations import Durations
 from common.errors import InputError, SafetyStop
 
 MOST_MISSES_IN_A_ROW = 10
@@ -50,8 +51,8 @@ class FixedRateLoop:
     ticks_done : int
     missed_deadlines : int
         Ticks left out because the one before took too long.
-    starts_s : list of list of float
-        When each tick began, per call of `ticks`.
+    periods, jitter : Durations
+        From one tick to the next, and how far that was from `period_s`.
     """
 
     timed: Timed
@@ -59,7 +60,8 @@ class FixedRateLoop:
     most_misses: int = MOST_MISSES_IN_A_ROW
     ticks_done: int = 0
     missed_deadlines: int = 0
-    starts_s: list[list[float]] = field(default_factory=list)
+    periods: Durations = field(default_factory=Durations)
+    jitter: Durations = field(default_factory=Durations)
 
     def __post_init__(self):
         if not (np.isfinite(self.period_s) and self.period_s > 0):
@@ -74,12 +76,14 @@ class FixedRateLoop:
             If the loop has missed `most_misses` deadlines in a row.
         """
         timed, start, tick, late = self.timed, self.timed.now(), 0, 0
-        starts: list[float] = []
-        self.starts_s.append(starts)
+        before = None
         while tick * self.period_s < duration_s:
             timed.sleep_until(start + tick * self.period_s)
             began = timed.now()
-            starts.append(began)
+            if before is not None:
+                self.periods.add(began - before)
+                self.jitter.add(abs(began - before - self.period_s))
+            before = began
             yield began - start
             self.ticks_done += 1
             due = int((timed.now() - start) / self.period_s)
@@ -97,18 +101,16 @@ class FixedRateLoop:
     def summary(self) -> dict[str, float]:
         """Numbers for the recording's footer, in seconds."""
         counts = {"ticks": self.ticks_done, "missed_deadlines": self.missed_deadlines}
-        gaps = np.concatenate([np.diff(s) for s in self.starts_s] or [[]])
-        if not len(gaps):
+        if not self.periods.count:
             return {"period_s": self.period_s} | counts
-        jitter = np.abs(gaps - self.period_s)
         return (
             {"period_s": self.period_s}
             | counts
             | {
-                "mean_period_s": round(float(gaps.mean()), 7),
-                "sd_period_s": round(float(gaps.std()), 7),
-                "longest_period_s": round(float(gaps.max()), 7),
-                "jitter_p99_s": round(float(np.percentile(jitter, 99)), 7),
+                "mean_period_s": round(self.periods.mean_s, 7),
+                "sd_period_s": round(self.periods.sd_s, 7),
+                "longest_period_s": round(self.periods.largest_s, 7),
+                "jitter_p99_s": round(self.jitter.quantile(0.99), 7),
             }
         )
 

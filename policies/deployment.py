@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from common.durations import Durations
 from common.errors import BusError, PupperError, SafetyStop
 from common.joints import JOINT_NAMES
 from hardware.bus import BusSample, Sent
@@ -77,7 +78,7 @@ class Outcome:
     ----------
     seconds : float
         Walked.
-    step_s : list of float
+    steps : Durations
         What the controller took per tick, on the host's clock.
     deadline_misses : int
     fell : bool
@@ -88,7 +89,7 @@ class Outcome:
     """
 
     seconds: float = 0.0
-    step_s: list[float] = field(default_factory=list)
+    steps: Durations = field(default_factory=Durations)
     deadline_misses: int = 0
     fell: bool = False
     stop_reason: str = "time is up"
@@ -214,7 +215,7 @@ def _walk(
             senses = Senses(elapsed, command, reading.position_rad, load_nm, *_motion(sample))
             begun = time.perf_counter()
             decision = controller.step(senses)
-            outcome.step_s.append(time.perf_counter() - begun)
+            outcome.steps.add(time.perf_counter() - begun)
             sent = bus.write(decision.target)
             writer.append(senses, decision, sent.position_rad)
             if rows:

@@ -25,20 +25,20 @@ class WalkScore:
 
     def __init__(self, bus: ServoBus, robot: WalkingRobot):
         self._bus, self._robot = bus, robot
-        self._errors: list[np.ndarray] = []
-        self._moved: list[np.ndarray] = []
+        self._ticks, self._errors, self._moved = 0, np.zeros(3), np.zeros(3)
 
     def __call__(self, tick: Tick) -> None:
         """Look at the robot."""
         trunk = self._robot.trunk(self._bus.now())
         moved = np.array([*trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s])
-        self._moved.append(moved)
-        self._errors.append(np.abs(moved - tick.senses.command))
+        self._ticks += 1
+        self._moved += moved
+        self._errors += np.abs(moved - tick.senses.command)
 
     def summary(self) -> dict[str, Any]:
         """Mean absolute errors and the mean motion."""
-        if not self._errors:
+        if not self._ticks:
             return dict.fromkeys((*self.NAMES, "mean_motion"))
-        errors = np.mean(self._errors, axis=0)
+        errors, moved = (x / self._ticks for x in (self._errors, self._moved))
         found: dict[str, Any] = dict(zip(self.NAMES, errors.tolist(), strict=True))
-        return found | {"mean_motion": np.mean(self._moved, axis=0).tolist()}
+        return found | {"mean_motion": moved.tolist()}

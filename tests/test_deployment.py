@@ -90,7 +90,7 @@ def test_a_trot_walks_through_controller_guard_and_bus(policy, tmp_path):
     trotting = Trotting(policy.network, policy.contract)
     found = run(trotting, tmp_path, 6.0, bus, watchers=[score])
     assert found.stop_reason == "time is up" and not found.fell
-    assert found.deadline_misses == 0 and len(found.step_s) == 300
+    assert found.deadline_misses == 0 and found.steps.count == 300
     assert score.summary()["mean_motion"][0] == pytest.approx(0.15, abs=0.04)
     assert bus.robot.trunk(bus.now()).upright > 0.95
 
