@@ -16,7 +16,6 @@ import io
 import multiprocessing
 import os
 import tempfile
-import threading
 import time
 from contextlib import closing
 from pathlib import Path
@@ -25,12 +24,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import torch
-from emulators import SPECS
+from emulators import KINDS, walking_servers
 
 from cli.fit_servo import FitServo
 from hardware.connect import open_guarded, parse_address
 from hardware.esp32_bus import Esp32Bus
-from hardware.feetech_registers import STS3215
 from hardware.joint_map import load_joint_map
 from hardware.loop import real_time_priority
 from policies.assembly import assemble, reassemble
@@ -40,14 +38,6 @@ from policies.policy_file import load_policy
 from policies.stack_trials import walk_once
 from policies.stacks import STACKS
 from policies.walk_log import read_walk, replay
-from sim.bus_faults import BusFaults
-from sim.emulated_robot import draw_robot
-from sim.esp32_emulator import ImuProxy, ProxyEmulator
-from sim.esp32_socket import ProxySocket
-from sim.feetech_emulator import FeetechEmulator
-from sim.feetech_pty import FeetechPty
-from sim.servo_bench import ServoBench
-from sim.walking_robot import WalkingRobot
 from sysid.recording import RecordingWriter
 
 CALIBRATION = "data/samples/calibrated.yaml"
@@ -64,33 +54,15 @@ _RECORD_S, _FIT_S = 8.0, 6.5
 
 def robot(kind: str, folder: Path, stop) -> None:
     """Serve one walking robot until told to stop, and write down how its trunk moves."""
-    rng = np.random.default_rng(SEED)
-    drawn = draw_robot(rng, SPECS[kind])
-    own, imu, shown = rng.spawn(3)
-    plant = WalkingRobot(drawn, imu)
-    layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
-    bench = ServoBench(drawn, layout, own, keep_log=False, plant=plant)
-    faults = BusFaults.parse("", rng)
-    servers: list = []
-    if kind == "esp32":
-        servers.append(ProxySocket(ProxyEmulator(bench, rng, faults), folder / "socket"))
-    else:
-        servers.append(FeetechPty(FeetechEmulator(bench, STS3215, rng), folder / "servos"))
-        polled = ServoBench(
-            draw_robot(np.random.default_rng(SEED)), load_joint_map("mini_pupper_2"), shown,
-            keep_log=False, plant=plant,
-        )  # fmt: skip
-        servers.append(ProxySocket(ImuProxy(polled, shown.spawn(1)[0]), folder / "socket"))
-    for server in servers:
-        threading.Thread(target=server.serve, daemon=True).start()
-    with (folder / "trunk.csv").open("w", buffering=1) as file:
-        (folder / "ready").touch()
-        while not stop.is_set():
-            trunk = plant.trunk(servers[0].now())
-            print(
-                time.monotonic(), *trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s, sep=",", file=file
-            )
-            time.sleep(_TRUNK_S)
+    with real_time_priority():  # the servers' threads have it, too
+        plant, _, _, servers = walking_servers(kind, SEED, folder)
+        with (folder / "trunk.csv").open("w", buffering=1) as file:
+            (folder / "ready").touch()
+            while not stop.is_set():
+                trunk = plant.trunk(servers[0].now())
+                moved = (*trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s)
+                print(time.monotonic(), *moved, sep=",", file=file)
+                time.sleep(_TRUNK_S)
     for server in servers:
         server.stop()
 
@@ -172,6 +144,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--protocol", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--servo", type=Path, help="servo model of robot 0; fitted if not given")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -182,7 +155,7 @@ def main() -> None:
             "turn rad/s | misses | step p50 ms | p99 ms | replay | ended |"
         )
         print("|" + "---|" * 13)
-        for kind in ("esp32", "feetech"):
+        for kind in options.protocol:
             drive(kind, options.seconds, servo)
 
 

@@ -325,12 +325,8 @@ def _table(title: str, tables: dict[str, list[dict[str, Any]]], columns: Sequenc
     made = terminal.table(title, "policy", *columns)
     for name, rows in tables.items():
         for row in rows:
-            made.add_row(name, *(_cell(row.get(c)) for c in columns))
+            made.add_row(name, *(terminal.cell(row.get(c), 3) for c in columns))
     return made
-
-
-def _cell(value: Any) -> str:
-    return terminal.number(float(value), 3) if isinstance(value, float | int) else str(value)
 
 
 def _interval(value: Any, digits: int) -> str:

@@ -203,10 +203,11 @@ def _say_match(match: Any) -> None:
         err.print(match.sentence())
         return
     warn([match.sentence()])
-    rows = match.table()
-    table = terminal.table("Swing over command, and phase", *rows[0])
+    rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
+    titles = (name.replace("_", " ") for name in rows[0])
+    table = terminal.table("Swing over command, and phase", *titles)
     for row in rows:
-        table.add_row(*(str(v) for v in row.values()))
+        table.add_row(*(terminal.cell(v, 2) for v in row.values()))
     err.print(table)
 
 
@@ -260,9 +261,7 @@ def _walk(
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
     for key, value in found.items():
-        shown.add_row(
-            key, str(value) if not isinstance(value, float) else terminal.number(value, 3)
-        )
+        shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)
     err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}")
 

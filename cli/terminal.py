@@ -89,6 +89,15 @@ def number(value: float | None, digits: int = 2) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
+def cell(value: Any, digits: int) -> str:
+    """What a table shows of a value: numbers rounded, those of lists and dicts, too."""
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {cell(v, digits)}" for k, v in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(cell(v, digits) for v in value)
+    return number(value, digits) if isinstance(value, float) else str(value)
+
+
 @contextmanager
 def progress(label: str, total: int) -> Iterator[Any]:
     """A progress bar on stderr if that is a terminal; yields `advance(what)`."""

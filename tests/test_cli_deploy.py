@@ -70,6 +70,8 @@ def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(cap
         "published-pd", "--seconds", 1, "--name", "paper",
     )  # fmt: skip
     assert code == 0 and "warning" in err and "Hz" in err
+    # a row per kind of joint and whole hertz, rounded; the published resonance is in it
+    assert "hip 3.00 2.80 0.98 -276.31" in err and err.count("thigh ") == 6
 
 
 @pytest.mark.parametrize(
