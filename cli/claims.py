@@ -187,7 +187,9 @@ def _page(
     parts = ["pupper-analyze claims", *(str(p) for p in options.policies)]
     if options.recordings:
         parts += ["--recordings", *(p.name for p in options.recordings)]
-    for flag in ("servo", "actuator", "feedback"):
+    if options.servo:
+        parts += ["--servo", options.servo.name]
+    for flag in ("actuator", "feedback"):
         if getattr(options, flag):
             parts += [f"--{flag}", str(getattr(options, flag))]
     parts += ["--robots", str(options.robots), "--out", str(options.out)]

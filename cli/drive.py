@@ -102,7 +102,7 @@ def _table(tick: Tick, age_s: np.ndarray) -> Table:
     forward, left, turn = tick.senses.command
     shown = terminal.table(
         f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
-        f"{turn:+.2f} rad/s   {_HELP}",
+        f"{turn:+.2f} rad/s\n{_HELP}",
         "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "room rad",
     )  # fmt: skip
     for i, joint in enumerate(JOINT_NAMES):

@@ -108,7 +108,7 @@ class Controller:
         refuse_other_observation(contract)
         if joint_map.joint_names != JOINT_NAMES or joint_map.coordinates != "joint":
             raise InputError("A policy needs a bus of all twelve joints, in joint coordinates.")
-        self.policy, self.stack, self.observer = policy, stack, observer
+        self.policy, self.stack, self.observer = policy.for_one(), stack, observer
         self.stall_torque_nm = stall_torque_nm
         self.period_s = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
         self._to_servo = _affine(joint_map, joint_map.per_servo())

@@ -7,6 +7,7 @@ itself (`policies.controller`) is pure, the guard (`hardware.guard`) stands befo
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -190,6 +191,9 @@ def _walk(
     """The control loop."""
     period = controller.period_s
     loop = FixedRateLoop(bus, period, most_misses=max(round(STALL_S / period) - 1, 1))
+    # what is there already is not searched for garbage in the middle of a step
+    gc.collect()
+    gc.freeze()
     imu_s = bus.now()
     load_nm = np.zeros(len(JOINT_NAMES))
     try:
@@ -227,6 +231,7 @@ def _walk(
                 outcome.fell = True
                 raise SafetyStop(f"the robot fell after {elapsed:.2f} s.")
     finally:
+        gc.unfreeze()
         outcome.loop = loop.summary()
         outcome.deadline_misses = loop.missed_deadlines
 

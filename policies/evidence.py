@@ -22,6 +22,7 @@ from policies.rollouts import Rollout
 
 DELAYS_MS = (0.0, 160.0, 320.0)
 """Of the published orbits."""
+_EXTRA_DELAYS_MS = (0, 80, 160, 320)
 _LAST_UPDATES = 10
 
 Rows = list[dict[str, Any]]
@@ -83,7 +84,7 @@ def gather(
     return PolicyEvidence(
         name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s), walk, gait,
         step("orbits", lambda: orbits(policy, trial, DELAYS_MS)) if gait else {},
-        step("delay", lambda: delay_curve(policy, trial)),
+        step("delay", lambda: delay_curve(policy, trial, _EXTRA_DELAYS_MS)),
         step("ablation", lambda: ablation(policy, trial, ("all joints",))),
         step("frozen inputs", lambda: frozen(policy, trial)),
         step("pushes", lambda: push_response(policy, trial)),

@@ -29,7 +29,7 @@ NUDGE_M_S = 0.01
 """For comparison: a push that changes nothing but the numbers."""
 RATES_HZ = (25.0, 31.25, 50.0, 71.43, 100.0)
 _PUSH_S = 4.0
-_PUSHES = 6  # spread over one period
+_PUSHES = 4  # spread over one period
 _EARLY_S, _LATE_S = (1.0, 3.0), (3.0, 5.0)  # after the push
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, get_args
 
@@ -56,15 +56,28 @@ class Trial:
     seconds: float = 10.0
     seed: int = 0
     threads: int = 0
+    _plain: list[tuple[Policy, Rollout]] = field(
+        init=False, repr=False, compare=False, default_factory=list
+    )
 
     def walk(
         self, policy: Policy, change: Change | None = None, disturb: Disturb | None = None
     ) -> Rollout:
-        """One rollout, with altered observations or disturbed robots."""
-        return collect(
+        """One rollout, with altered observations or disturbed robots.
+
+        One without either is made once per policy: most analyses begin with it.
+        """
+        plain = change is None and disturb is None
+        known = next((r for p, r in self._plain if p is policy), None)
+        if plain and known:
+            return known
+        found = collect(
             policy, self.task, self.servos, self.command, self.robots, self.seconds,
             self.seed, self.threads, change, disturb,
         )  # fmt: skip
+        if plain:
+            self._plain.append((policy, found))
+        return found
 
 
 def outcome(rollout: Rollout) -> dict[str, float]:

@@ -314,3 +314,19 @@ def test_a_policy_is_evaluated_on_the_learned_servos_it_was_trained_with(monkeyp
     with pytest.raises(ZeroDivisionError):
         walk(None, evaluation_task(Walking()), servos, 2, 3, threads=1)
     assert given[-1] == (model, str(tmp_path), 0.02)
+
+
+@pytest.mark.parametrize("kind", ALL_KINDS)
+def test_a_policy_for_one_robot_acts_with_the_same_bits_and_keeps_its_own_state(kind, tmp_path):
+    write(tmp_path, kind)
+    policy = load_policy(tmp_path)
+    own = policy.for_one()
+    rng = np.random.default_rng(0)
+    for robot in (policy, own):
+        robot.reset(np.zeros((1, 12)))
+    for _ in range(30):
+        seen = rng.standard_normal((1, 60)).astype(np.float32)
+        np.testing.assert_array_equal(own.act(seen), policy.act(seen))
+    policy.reset(np.zeros((3, 12)))
+    assert policy.act(np.zeros((3, 60), np.float32)).shape == (3, 12)
+    assert own.act(seen).shape == (1, 12)
