@@ -74,7 +74,7 @@ class GuardedBus:
         self.report = GuardReport()
         self._watchdog = watchdog
         self._on = False
-        self._stopped_for_safety = False
+        self._stopped_for_safety = self._left_on = False
         self._found: Angles | None = None
         self._present = np.full(len(bus.joint_names), np.nan)
         self._sent: Angles | None = None
@@ -218,16 +218,23 @@ class GuardedBus:
                 if off:
                     break
                 self.bus.sleep_until(self.bus.now() + 0.02)
+            self._left_on = not off
             if self._watchdog and off:
                 self._watchdog.disarm()
 
     def close(self) -> None:
-        """Park if that has not been done, and release the bus."""
+        """Park if that has not been done, and release the bus.
+
+        A robot that could not be told to go limp, such as one that was unplugged, is left to the
+        watchdog, which tries for some seconds more.
+        """
         try:
             self.park()
         finally:
             self.bus.close()
-            if self._watchdog:
+            if self._watchdog and self._left_on:
+                self._watchdog.leave_limp()
+            elif self._watchdog:
                 self._watchdog.close()
 
     def _alive(self) -> None:

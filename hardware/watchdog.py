@@ -41,7 +41,7 @@ PARK_WITHIN_S = 0.5
 
 _BEAT_S = 0.05
 _OPEN_WITHIN_S = 0.4
-_GIVE_UP_S = 3.0
+_GIVE_UP_S = 10.0  # a cable has been put back by then, or someone is at the switch
 _START_WITHIN_S = 20.0
 
 
@@ -102,6 +102,14 @@ class Watchdog:
             self._beaten = now
             self._say({"beat": True})
 
+    def leave_limp(self) -> None:
+        """Say that the robot would not go limp, and leave the bus: it is to be tried further."""
+        self._say({"limp": True})
+        pipe = self._process.stdin
+        with contextlib.suppress(OSError):
+            if pipe is not None and not pipe.closed:
+                pipe.close()
+
     def close(self) -> None:
         """Say goodbye; may be called twice."""
         self._say({"bye": True})
@@ -131,7 +139,7 @@ def main() -> None:
 
     sys.stdout.write("ready\n")
     sys.stdout.flush()
-    pipe, heard, pose = sys.stdin.fileno(), b"", None
+    pipe, heard, pose, only_limp = sys.stdin.fileno(), b"", None, False
     last = time.monotonic()
     while True:
         ready, _, _ = select.select([pipe], [], [], 0.1)
@@ -147,6 +155,7 @@ def main() -> None:
                     pose = message["arm"]
                 if "disarm" in message:
                     pose = None
+                only_limp |= "limp" in message
             if not data:
                 break
         elif pose is not None and time.monotonic() - last > HANG_S:
@@ -154,11 +163,11 @@ def main() -> None:
                 os.kill(orders["driver"], signal.SIGKILL)
             break
     if pose is not None:
-        park(orders, pose)
+        park(orders, pose, only_limp)
 
 
-def park(orders: dict[str, Any], pose_rad: dict[str, float]) -> None:
-    """Open the bus that the driver has left, and park the robot.
+def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = False) -> None:
+    """Open the bus that the driver has left, and park the robot, or let it go where it is.
 
     All joints are taken home together if they answer soon, and those that do not are left behind:
     they get further chances of their own.
@@ -179,6 +188,10 @@ def park(orders: dict[str, Any], pose_rad: dict[str, float]) -> None:
             continue
         guard = GuardedBus(bus, GuardLimits(park_within_s=PARK_WITHIN_S))
         try:
+            if only_limp:
+                if guard.torque(False):
+                    left = [name for name in left if name not in guard.joint_names]
+                continue
             guard.take_over()
             guard.park(np.array([pose_rad[name] for name in guard.joint_names]))
         except PupperError:

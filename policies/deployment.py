@@ -161,16 +161,18 @@ def deploy(
             _walk(bus, imu, controller, commands, seconds, writer, rows, watchers, outcome)
             glide(standing, lambda pose: _send(bus, pose), bus.sent, controller.default, SETTLE_S)
         except (SafetyStop, BusError) as fault:
+            outcome.stop_reason = str(fault)  # first: a bus in trouble takes its time
             bus.limp()
-            outcome.stop_reason = str(fault)
         except KeyboardInterrupt:
             outcome.stop_reason = "Ctrl-C"
         except PupperError as fault:
             outcome.stop_reason = str(fault)
             raise
         finally:
-            bus.park()
-            writer.close(outcome.stop_reason)
+            try:
+                bus.park()
+            finally:
+                writer.close(outcome.stop_reason)
     finally:
         bus.park()
         outcome.guard = bus.report.summary()

@@ -103,6 +103,19 @@ def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_se
     np.testing.assert_allclose(angles(server), found, atol=0.06)
 
 
+def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_back(robot):
+    server, address = robot
+    bus = open_guarded(parse_address(address))
+    while not np.isfinite(bus.read().position_rad).all():
+        time.sleep(0.02)
+    bus.torque(True)
+    server.emulator.unplug_for_s = 2.0
+    time.sleep(0.1)
+    bus.limp()
+    bus.close()
+    wait_for(lambda: limp(server), 8.0)
+
+
 def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
     server, address = robot
     process = drive(address)
