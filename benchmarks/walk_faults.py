@@ -42,7 +42,7 @@ def _bus(kind: str) -> Strike:
         emulator.faults = BusFaults({kind: 1.0}, emulator.faults.rng, lasts_s=_LASTS_S)
         while not emulator.faults.counts:
             time.sleep(0.001)
-        emulator.faults = BusFaults({}, emulator.faults.rng)
+        emulator.faults = BusFaults({}, emulator.faults.rng, lasts_s=_LASTS_S)
 
     return strike
 

@@ -20,7 +20,7 @@ from cli.buses import chosen_map
 from cli.policy_choice import policy_at
 from cli.sweep import EMULATED, Sweep
 from cli.terminal import err, need_positive, out, print_json, warn
-from cli.user_errors import run_program
+from cli.user_errors import end_politely, run_program
 from common.errors import InputError
 from hardware.connect import open_guarded, parse_address
 from hardware.esp32_bus import SOCKET, Esp32Bus
@@ -102,6 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: Deploy) -> None:
+    end_politely()
     need_positive("--seconds", options.seconds)
     if options.playback:
         Sweep(

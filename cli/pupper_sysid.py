@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -27,7 +25,7 @@ from cli.report import Report
 from cli.scan import Scan
 from cli.sindy import Sindy
 from cli.sweep import Sweep
-from cli.user_errors import user_errors
+from cli.user_errors import end_politely, user_errors
 
 Command = (
     Annotated[Scan, tyro.conf.subcommand("scan")]
@@ -63,20 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=rest or ["--help"],
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
-        _end_politely()
+        end_politely()
         command.run()
-
-
-def _end_politely() -> None:
-    """End on SIGTERM and a closed terminal as on Ctrl-C: the robot is parked first."""
-
-    def stop(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), stop)
 
 
 if __name__ == "__main__":

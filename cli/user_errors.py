@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
@@ -35,6 +37,18 @@ def run_program(
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
         )  # fmt: skip
+
+
+def end_politely() -> None:
+    """End on SIGTERM and a closed terminal as on Ctrl-C: the robot is parked first."""
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), stop)
 
 
 @contextmanager

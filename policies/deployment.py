@@ -161,7 +161,9 @@ def deploy(
             _walk(bus, imu, controller, commands, seconds, writer, rows, watchers, outcome)
             glide(standing, lambda pose: _send(bus, pose), bus.sent, controller.default, SETTLE_S)
         except (SafetyStop, BusError) as fault:
-            outcome.stop_reason = str(fault)  # first: a bus in trouble takes its time
+            outcome.stop_reason = str(fault)
+            # first: a bus in trouble takes its time, and the watchdog may lose its patience
+            writer.close(outcome.stop_reason)
             bus.limp()
         except KeyboardInterrupt:
             outcome.stop_reason = "Ctrl-C"
