@@ -442,14 +442,13 @@ def _closed_loop(stacks: Sequence[dict[str, Any]]) -> Claim:
     first = stacks[0]
     parts = [f"{first['stack']} {_errors(first, keys)}, falls {100 * first['falls']:.0f} %"]
     parts.append(f"{other['stack']} {_errors(other, keys)}, falls {100 * other['falls']:.0f} %")
-    gain: Estimate = other["less_mae_vx_m_s"]
-    verdict: Verdict = (
-        "holds" if gain.high < 0 else "does not hold here" if gain.low > 0 else "holds partly"
-    )
+    gains: list[Estimate] = [other[f"less_{k}"] for k in keys]
+    better, worse = all(g.high < 0 for g in gains), all(g.low > 0 for g in gains)
+    verdict: Verdict = "holds" if better else "does not hold here" if worse else "holds partly"
     bounds = {k: [other[f"less_{k}"].low, other[f"less_{k}"].high] for k in keys}
     return Claim(
         *about, "; ".join(parts), bounds, verdict,
-        f"{how} Intervals are of the prediction's error less the encoders'; partly if they hold 0.",
+        f"{how} Intervals are of the prediction's error less the encoders'; partly if they are not all on one side of 0.",
     )  # fmt: skip
 
 
