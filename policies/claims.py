@@ -448,7 +448,8 @@ def _closed_loop(stacks: Sequence[dict[str, Any]]) -> Claim:
     bounds = {k: [other[f"less_{k}"].low, other[f"less_{k}"].high] for k in keys}
     return Claim(
         *about, "; ".join(parts), bounds, verdict,
-        f"{how} Intervals are of the prediction's error less the encoders'; partly if they are not all on one side of 0.",
+        f"{how} Intervals are of the prediction's error less the encoders'; partly if they are not "
+        "all on one side of 0.",
     )  # fmt: skip
 
 
