@@ -103,7 +103,9 @@ def _above_three_hertz(found: ServoEvidence) -> Claim:
     verdict: Verdict = (
         "does not hold here" if lost < 0.05 else "holds partly" if lost < 0.3 else "holds"
     )
-    return Claim(*about, ours, None, verdict, f"{how} Lost: {100 * lost:.0f} % (5, 30 %).")
+    return Claim(
+        *about, ours, None, verdict, f"{how} Lost: {100 * lost:.0f} %; 30 % would hold, 5 % partly."
+    )
 
 
 def _reading_noise(found: ServoEvidence) -> Claim:
@@ -164,7 +166,13 @@ def _one_step(found: ServoEvidence) -> Claim:
     still = 1e3 * float(np.nanmean(list(found.servos.persistence.values())))
     ours = f"LSTM {ahead['LSTM']:.1f}, MLP {ahead['MLP']:.1f}, stays put {still:.1f} mrad"
     better = ahead["LSTM"] < 0.95 * ahead["MLP"]
-    return Claim(*about, ours, None, "holds" if better else "does not hold here", f"{how} (5 %)")
+    return Claim(
+        *about,
+        ours,
+        None,
+        "holds" if better else "does not hold here",
+        f"{how} Holds if 5 % better.",
+    )
 
 
 def _enough_data(found: ServoEvidence) -> Claim:
