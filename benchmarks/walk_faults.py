@@ -4,8 +4,8 @@
 
 An emulated robot on the ground is walked by `pupper-deploy` in a process of its own, in real time;
 two seconds into the walk something happens to it. Printed per protocol and fault: the time until
-no servo has torque (or the walk went on), how much of the last second is missing in the log, how
-far the robot is from upright, and the log's last line.
+no servo has torque, and none gets it again (or the walk went on), how much of the last second is
+missing in the log, how far the robot is from upright, and the log's last line.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import numpy as np
 from emulators import KINDS, walking_servers
 
-from hardware.joint_map import load_joint_map
+from common.joints import JOINT_NAMES
 from policies.walk_log import read_walk
 from sim.bus_faults import BusFaults
+from sim.esp32_emulator import ProxyEmulator
 
 ROOT = Path(__file__).resolve().parents[1]
 POLICY, CALIBRATION = ROOT / "data/samples/policies/lstm", ROOT / "data/samples/calibrated.yaml"
@@ -47,6 +49,21 @@ def _bus(kind: str) -> Strike:
     return strike
 
 
+def _frozen(joint: str) -> Strike:
+    """A servo whose reading stays as it is, although it goes on."""
+
+    def strike(emulator: Any, servers: list[Any], process: subprocess.Popen) -> None:
+        k = JOINT_NAMES.index(joint)
+        if isinstance(emulator, ProxyEmulator):
+            emulator._stuck_until[emulator.bench.map.ids[k] - 1] = np.inf
+        else:
+            servo = emulator.servos[emulator.bench.map.ids[k]]
+            servo.frozen_count = emulator.bench.count(k, servers[0].now())
+            servo.frozen_until = np.inf
+
+    return strike
+
+
 def _imu(emulator: Any, servers: list[Any], process: subprocess.Popen) -> None:
     servers[-1].emulator._imu = lambda now: b""
 
@@ -62,7 +79,8 @@ def _signal(number: int) -> Strike:
 
 
 FAULTS: dict[str, Strike] = {
-    "servo frozen": _bus("frozen"), "brown-out": _bus("brown-out"), "unplugged": _bus("unplugged"),
+    "thigh frozen": _frozen("LF_thigh"), "hip frozen": _frozen("LF_hip"),
+    "brown-out": _bus("brown-out"), "unplugged": _bus("unplugged"),
     "IMU lost": _imu, "host stalls 300 ms": _stall, "Ctrl-C": _signal(signal.SIGINT),
     "SIGTERM": _signal(signal.SIGTERM), "SIGKILL": _signal(signal.SIGKILL),
 }  # fmt: skip
@@ -80,25 +98,28 @@ def walk(kind: str, strike: Strike) -> str:
                 "--bus", bus, "--imu", folder / "socket", "--seconds", "20", "--name", "w",
             ],
             cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)},
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
         )  # fmt: skip
         log = folder / "walks/w/walk.csv"
         while not (log.exists() and log.read_text().count("\n") > 50 * _BEGIN_S):
+            if process.poll() is not None:
+                raise SystemExit(f"the walk over {bus} ended before the fault.")
             time.sleep(0.01)
         begun = time.monotonic()
         strike(emulator, servers, process)
-        took = None
-        while took is None and time.monotonic() - begun < _PATIENCE_S:
-            if not any(bench.is_on(k) for k in range(len(load_joint_map("sts3215").ids))):
-                took = time.monotonic() - begun
+        held = begun
+        while time.monotonic() - begun < _PATIENCE_S:
+            if any(map(bench.is_on, range(len(JOINT_NAMES)))):
+                held = time.monotonic()
             time.sleep(0.002)
+        took = held - begun
         upright = plant.trunk(servers[0].now()).upright
         process.send_signal(signal.SIGINT)
         process.wait(10)
         found = read_walk(log)
         for server in servers:
             server.stop()
-    end = "goes on" if took is None else f"{took:.2f}"
+    end = "goes on" if took > _PATIENCE_S - 0.1 else f"{took:.2f}"
     return (
         f"{end} | {found.senses[-1].elapsed_s:.2f} | {upright:.2f} | "
         f"{found.ended or 'none: the log is whole up to its last tick'}"

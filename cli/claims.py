@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 PAGE = "claims.md"
 _STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
-_KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
 
 
 def write_claims(options: Analyze, tries: Tries) -> None:
@@ -218,9 +217,9 @@ def _page(
 
 def _table_one(evidence: list[PolicyEvidence]) -> list[str]:
     """A column per architecture."""
-    from policies.evidence import over
+    from policies.evidence import KINDS, over
 
-    kinds = [k for k in _KINDS if any(e.kind == k for e in evidence)]
+    kinds = [k for k in KINDS if any(e.kind == k for e in evidence)]
     known = [e for e in evidence if e.trained]
     rows: dict[str, Any] = {
         "reward per second": (known, lambda e: e.trained["reward"], 2),
@@ -234,7 +233,7 @@ def _table_one(evidence: list[PolicyEvidence]) -> list[str]:
         "forward error, m/s": (evidence, lambda e: e.terrain[0]["mae_vx_m_s"], 3),
     }  # fmt: skip
     lines = [
-        "| | " + " | ".join(_KINDS[k] for k in kinds) + " |",
+        "| | " + " | ".join(KINDS[k] for k in kinds) + " |",
         "|---|" + "---|" * len(kinds),
         "| policies | " + " | ".join(str(sum(e.kind == k for e in evidence)) for k in kinds) + " |",
     ]

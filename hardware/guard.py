@@ -200,6 +200,8 @@ class GuardedBus:
         """
         if not self._on:
             return
+        if self._watchdog and self._stopped_for_safety:
+            self._watchdog.only_limp()
         try:
             pose = self._found if pose_rad is None else pose_rad
             if pose is not None and not self._stopped_for_safety:

@@ -34,8 +34,8 @@ class GuardLimits:
     """How far from the present position the first goal may lie."""
     frozen_command_rad: float = 0.1
     """A reading must change when its goal has moved by this much within `frozen_after_s`."""
-    frozen_after_s: float = 1.2
-    """Longer than any run of lost polls: at a loss of 0.6, 45 in a row."""
+    frozen_after_s: float = 0.85
+    """Longer than any run of lost polls: at a loss of 0.6, 30 in a row."""
     astray_rad: float = 0.35
     """A joint at rest must be nearer than this to its goal, `astray_after_s` after it got there."""
     astray_after_s: float = 0.8
@@ -169,7 +169,7 @@ class Watch:
             k = int(frozen[0])
             raise SafetyStop(
                 f"{self._names[k]} was told to move by {np.ptp(told[:, k]):.2f} rad within "
-                f"{window:.1f} s, and its reading did not change once. It is blocked, without "
+                f"{window:g} s, and its reading did not change once. It is blocked, without "
                 "power, or has stopped answering; switch the servos' power off and on."
             )
 

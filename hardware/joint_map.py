@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -162,51 +163,41 @@ class JointMap:
 
     def counts_per_rad(self) -> NDArray[np.float64]:
         """Counts per radian, shape (joints,)."""
-        return np.array([self._entry(j).counts_per_rad for j in self.joint_names])
+        return np.abs(self._scale)
 
     def zero_rad(self) -> NDArray[np.float64]:
         """Servo-coordinate angle of each joint's neutral count, shape (joints,) [rad]."""
-        return self.per_servo().to_angles(self._zero_count())
+        return self.per_servo().to_angles(self._zero_count)
 
     def sign(self) -> NDArray[np.float64]:
         """Direction of the counts, shape (joints,)."""
-        return np.array([float(self._entry(j).sign) for j in self.joint_names])
+        return np.sign(self._scale)
 
     def to_counts(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
         """Counts, not rounded, of angles, both shape (..., joints)."""
         servo = self._servo_from_joint(np.asarray(position_rad, float), +1)
-        return self._zero_count() + self.sign() * self.counts_per_rad() * (servo - self._neutral())
+        return self._zero_count + self._scale * (servo - self._neutral)
 
     def to_angles(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Angles of counts, both shape (..., joints); NaN stays NaN."""
-        counts = np.asarray(counts, float)
-        servo = self._neutral() + self.sign() * (counts - self._zero_count()) / (
-            self.counts_per_rad()
-        )
+        servo = self._neutral + (np.asarray(counts, float) - self._zero_count) / self._scale
         return self._servo_from_joint(servo, -1)
 
     def clip_counts(self, counts: NDArray[np.float64]) -> NDArray[np.int64]:
         """Whole counts within the servos' limits: the last word before anything is packed."""
-        limits = np.array([self._entry(j).limits_counts for j in self.joint_names])
-        return np.clip(np.rint(counts), limits[:, 0], limits[:, 1]).astype(np.int64)
+        low, high = self._ends.T
+        return np.clip(np.rint(counts), low, high).astype(np.int64)
 
     def position_limits(self) -> PositionLimits:
         """Bounds of both the servos' counts and the joints' angles, in this map's coordinates."""
-        ends = np.array([self._entry(j).limits_counts for j in self.joint_names], float)
-        servo = (
-            self._neutral()[:, None]
-            + self.sign()[:, None]
-            * (ends - self._zero_count()[:, None])
-            / (self.counts_per_rad()[:, None])
-        )
-        servo.sort(axis=1)
+        turned = (self._ends - self._zero_count[:, None]) / self._scale[:, None]
+        servo = np.sort(self._neutral[:, None] + turned, axis=1)
         joint = np.array([self._entry(j).limits_rad for j in self.joint_names])
-        calf, thigh = self._legs()
+        calf, thigh = self._legs
         both = np.stack([np.maximum(servo, joint)[:, 0], np.minimum(servo, joint)[:, 1]], axis=1)
         if self.coordinates == "servo" and self.file.linkage != "none":
             # a calf without its thigh: the thigh is taken to rest at its neutral
-            calves = (i for i, j in enumerate(self.joint_names) if j.endswith("_calf"))
-            alone = [i for i in calves if i not in calf]
+            alone = [i for i in self._calves.tolist() if i not in calf]
             own = servo[alone] - self._thigh_neutral(alone)[:, None]
             both[alone, 0] = np.maximum(own, joint[alone])[:, 0]
             both[alone, 1] = np.minimum(own, joint[alone])[:, 1]
@@ -252,8 +243,49 @@ class JointMap:
     def _entry(self, joint: str) -> JointEntry:
         return self.file.joints[joint]
 
+    # cached: a file does not change, and a control loop asks in every tick
+
+    @cached_property
     def _neutral(self) -> NDArray[np.float64]:
         return np.array([self._entry(j).neutral_rad for j in self.joint_names])
+
+    @cached_property
+    def _scale(self) -> NDArray[np.float64]:
+        """Counts per radian, with the sign."""
+        entries = [self._entry(j) for j in self.joint_names]
+        return np.array([e.sign * e.counts_per_rad for e in entries])
+
+    @cached_property
+    def _zero_count(self) -> NDArray[np.float64]:
+        offsets = np.array([float(self._entry(j).offset_counts) for j in self.joint_names])
+        return self.file.counts / 2 + offsets
+
+    @cached_property
+    def _ends(self) -> NDArray[np.float64]:
+        """Lowest and highest count, shape (joints, 2)."""
+        return np.array([self._entry(j).limits_counts for j in self.joint_names], float)
+
+    @cached_property
+    def _calves(self) -> NDArray[np.intp]:
+        names = self.joint_names
+        return np.array([i for i, j in enumerate(names) if j.endswith("_calf")], np.intp)
+
+    @cached_property
+    def _bend(self) -> NDArray[np.float64]:
+        """Neutrals of the thighs of `_calves`."""
+        return self._thigh_neutral(self._calves)
+
+    @cached_property
+    def _legs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indices of the calves that hang on a thigh, and of those thighs."""
+        names = self.joint_names
+        pairs = [
+            (i, names.index(names[i].replace("calf", "thigh")))
+            for i in self._calves.tolist()
+            if self.file.linkage != "none" and names[i].replace("calf", "thigh") in names
+        ]
+        found = np.array(pairs, np.intp).reshape(-1, 2)
+        return found[:, 0], found[:, 1]
 
     def _thigh_neutral(self, calf: Sequence[int] | NDArray[np.intp]) -> NDArray[np.float64]:
         """Neutral of the thighs that the calves at these indices hang on."""
@@ -265,33 +297,15 @@ class JointMap:
             ]
         )
 
-    def _zero_count(self) -> NDArray[np.float64]:
-        offsets = np.array([float(self._entry(j).offset_counts) for j in self.joint_names])
-        return self.file.counts / 2 + offsets
-
-    def _legs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices of the calves that hang on a thigh, and of those thighs."""
-        names = self.joint_names
-        pairs = [
-            (i, names.index(j.replace("calf", "thigh")))
-            for i, j in enumerate(names)
-            if j.endswith("_calf") and j.replace("calf", "thigh") in names
-        ]
-        if self.file.linkage == "none":
-            pairs = []
-        found = np.array(pairs, np.intp).reshape(-1, 2)
-        return found[:, 0], found[:, 1]
-
     def _servo_from_joint(self, angle: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
         """The linkage: servo angles of joint angles (+1), or joint angles of servo angles (-1)."""
         angle = angle.copy()
         if self.file.linkage == "none":
             return angle
         if self.coordinates == "servo":
-            calf = [i for i, j in enumerate(self.joint_names) if j.endswith("_calf")]
-            angle[..., calf] += direction * self._thigh_neutral(calf)
+            angle[..., self._calves] += direction * self._bend
         else:
-            calf, thigh = self._legs()
+            calf, thigh = self._legs
             angle[..., calf] += direction * angle[..., thigh]
         return angle
 

@@ -102,9 +102,13 @@ class Watchdog:
             self._beaten = now
             self._say({"beat": True})
 
+    def only_limp(self) -> None:
+        """There is no way home any more: whatever happens to the driver now, torque off."""
+        self._say({"limp": True})
+
     def leave_limp(self) -> None:
         """Say that the robot would not go limp, and leave the bus: it is to be tried further."""
-        self._say({"limp": True})
+        self.only_limp()
         pipe = self._process.stdin
         with contextlib.suppress(OSError):
             if pipe is not None and not pipe.closed:
@@ -152,7 +156,7 @@ def main() -> None:
                 if "bye" in message:
                     return
                 if "arm" in message:
-                    pose = message["arm"]
+                    pose, only_limp = message["arm"], False
                 if "disarm" in message:
                     pose = None
                 only_limp |= "limp" in message

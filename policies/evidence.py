@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from common.claims import Interval, NotTestable
 from common.errors import InputError
 from policies.curves import PROGRESS
 from policies.gait import GaitReport, describe
@@ -20,6 +21,8 @@ from policies.rhythm import Estimate, mean_of
 from policies.robustness import Trial, ablation, delay_curve, frozen, orbits, scales, terrain
 from policies.rollouts import Rollout
 
+KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
+"""The architectures compared, and how they are called."""
 DELAYS_MS = (0.0, 160.0, 320.0)
 """Of the published orbits."""
 _EXTRA_DELAYS_MS = (0, 80, 160, 320)
@@ -99,6 +102,49 @@ def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyE
     """Mean over the policies of a kind, with the interval over them (NaN for one policy)."""
     values = [value(e) for e in evidence if e.kind == kind]
     return mean_of(np.array(values, float)) if values else Estimate(*[float("nan")] * 3)
+
+
+def of_kinds(
+    evidence: Sequence[PolicyEvidence], value: Callable[[PolicyEvidence], float], *needed: str
+) -> dict[str, Estimate]:
+    """`over` for each of `KINDS` of which there is a number.
+
+    Raises
+    ------
+    NotTestable
+        If there is none of one of the kinds `needed`.
+    """
+    found = {k: over(evidence, k, value) for k in KINDS}
+    found = {k: v for k, v in found.items() if np.isfinite(v.value)}
+    if not found or not set(needed) <= set(found):
+        wanted = " and of the ".join(KINDS[k] for k in needed or ("lstm",))
+        raise NotTestable(f"Give a run of the {wanted}.")
+    return found
+
+
+def of_kind(evidence: Sequence[PolicyEvidence], kind: str) -> list[PolicyEvidence]:
+    """Those of one kind.
+
+    Raises
+    ------
+    NotTestable
+        If there is none.
+    """
+    mine = [e for e in evidence if e.kind == kind]
+    if not mine:
+        raise NotTestable(f"Give a run of the {KINDS[kind]}.")
+    return mine
+
+
+def several(found: dict[str, Estimate], digits: int) -> str:
+    """The values by architecture, in words."""
+    return ", ".join(f"{KINDS[k]} {v.value:,.{digits}f}" for k, v in found.items())
+
+
+def bounds(found: dict[str, Estimate]) -> Interval:
+    """Their intervals, where there are any."""
+    known = {KINDS[k]: [v.low, v.high] for k, v in found.items() if np.isfinite(v.low)}
+    return known or None
 
 
 def _trained(folder: Path | None, step_s: float) -> dict[str, float]:

@@ -3,9 +3,9 @@
     faults = BusFaults.parse("lost=0.02,late=0.01", rng)
 
 Some faults happen to single answers (lost, late, truncated, corrupted, duplicated, foreign, wrong
-length), some to a servo for a while (error bits, frozen, brown-out), some to the line itself
-(unplugged, a second writer). `counts` and `ended`
-keep account.
+length), some to servos for a while (error bits, frozen; in a brown-out all are limp and deaf, and
+hold nothing afterwards until they are told to), some to the line itself (unplugged, a second
+writer). `counts` and `ended` keep account.
 """
 
 from __future__ import annotations

@@ -51,6 +51,9 @@ class EmulatedBus:
         Live by the host's clock instead of virtual time.
     plant : ServoPlant, optional
         What moves; by default the robot's servos in free air.
+    keep_log : bool
+        Whether the truth of every read is remembered, for `truth_rows`; not for a robot that
+        walks for a day.
     """
 
     name = "emulated"
@@ -62,8 +65,9 @@ class EmulatedBus:
         rng: np.random.Generator,
         real_time: bool = False,
         plant: ServoPlant | None = None,
+        keep_log: bool = True,
     ):
-        self.robot = robot
+        self.robot, self._keep_log = robot, keep_log
         spec = robot.spec
         polls, self._noise, clock = rng.spawn(3)
         self._clock: Clock = (
@@ -130,7 +134,8 @@ class EmulatedBus:
         goal = self._truncated(goal)
         for i in np.flatnonzero(goal != self._goal).tolist():
             self._plant.command(i, sent, goal[i])
-            self._changes[i].append(sent)
+            if self._keep_log:
+                self._changes[i].append(sent)
         self._goal = goal
         self._clock.spend(self.robot.spec.write_duration_s)
         return Sent(sent, asked)
@@ -153,8 +158,9 @@ class EmulatedBus:
         position = np.array([self._plant.angle(i, measured[i]) for i in fresh.tolist()])
         self._reading[fresh], self._count[fresh] = self._quantised(position + noise, fresh)
         self._measured_s = measured
-        true = np.array([self._plant.angle(i, time_s) for i in range(len(JOINT_NAMES))])
-        self._log.append((time_s, true, measured))
+        if self._keep_log:
+            true = np.array([self._plant.angle(i, time_s) for i in range(len(JOINT_NAMES))])
+            self._log.append((time_s, true, measured))
         at = np.full(len(JOINT_NAMES), time_s)
         return BusSample(at, self._reading.copy(), self._count.copy())
 

@@ -68,6 +68,8 @@ class ProxyEmulator:
         self._measured = np.full(servos, -np.inf)
         self._stuck_until = np.full(servos, -np.inf)
         self._deaf_until = -np.inf
+        self._block: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+        self._undone = False
         self._calibration = np.zeros(servos, int)
         self._time = 0.0
         self.unplug_for_s = 0.0
@@ -94,6 +96,11 @@ class ProxyEmulator:
                 return struct.pack("<BB2f", 10, opcode, self.bench.supply_v, 0.4)
         return previous or self.rng.bytes(2)
 
+    def resend(self, now: float) -> None:
+        """What the proxy does all the time, asked or not: orders reach deaf servos later."""
+        if self._undone and self._block and now >= self._deaf_until:
+            self._obey(*self._block, now)
+
     def strike(self, now: float) -> str | None:
         """Draw a fault for the next answer; begin those that last."""
         kind = self.faults.draw()
@@ -106,6 +113,9 @@ class ProxyEmulator:
             self._refresh(now)
             self._stuck_until[:] = now + self.faults.lasts_s
             self._deaf_until = max(self._deaf_until, now + self.faults.lasts_s)
+            self._undone = True
+            for k in self._index:
+                self.bench.torque(k, now, False)
             self.faults.ended.append((kind, now + self.faults.lasts_s))
         elif kind == "unplugged":
             self.unplug_for_s = self.faults.lasts_s
@@ -133,11 +143,13 @@ class ProxyEmulator:
             # the present goals become the new centre; then the firmware stands up anew
             shifted = self._calibration + _CENTRE - np.array(counts)
             self._calibration = np.clip(shifted, -_CENTRE, _CENTRE - 1)
-            self._deaf_until = now + STAND_UP_S
+            self._deaf_until, self._block = now + STAND_UP_S, None
             for k in self._index:
                 self.bench.torque(k, now, False)
             return
-        if now < self._deaf_until or self.bench.supply_v < LOW_VOLTAGE_V:
+        self._block = torque, counts
+        self._undone = now < self._deaf_until
+        if self._undone or self.bench.supply_v < LOW_VOLTAGE_V:
             return
         at = math.ceil(now / TICK_S) * TICK_S
         raw = np.clip(np.array(counts) - self._calibration, 0, datagrams.HIGHEST_COUNT)

@@ -50,6 +50,7 @@ class ProxySocket:
             if self.emulator.unplug_for_s > 0:
                 self._die_and_return()
             self._deliver()
+            self.emulator.resend(self.now())
             wait = min((d[0] for d in self._due), default=self.now() + _IDLE_S) - self.now()
             watched = [self._server, *self._previous]
             ready, _, _ = select.select(watched, [], [], max(min(wait, _IDLE_S), 0))

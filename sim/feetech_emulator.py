@@ -219,6 +219,9 @@ class FeetechEmulator:
             servo.error = int(self._rng.choice([1, 2, 4, 8, 32, 33]))
         elif kind == "brown-out":
             self._brown_out_until = at + self.faults.lasts_s
+            for other in self.servos:
+                self._set(other, "torque_enable", 0)
+                self.bench.torque(self.bench.index_of_id[other], at, False)
             self.faults.ended.append((kind, self._brown_out_until))
         elif kind == "unplugged":
             self.unplug_for_s = self.faults.lasts_s

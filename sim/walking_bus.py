@@ -54,7 +54,7 @@ class WalkingBus:
 
     def __init__(self, truth: EmulatedRobot, rng: np.random.Generator, real_time: bool = False):
         self.robot = WalkingRobot(truth, rng.spawn(1)[0])
-        self._bus = EmulatedBus(truth, rng, real_time, self.robot)
+        self._bus = EmulatedBus(truth, rng, real_time, self.robot, keep_log=False)
         self._map = load_joint_map("mini_pupper_2")
         self._servo_map = self._map.per_servo()
         self.limits = self._map.position_limits()

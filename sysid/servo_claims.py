@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common.claims import Claim, Verdict, untested
+from common.claims import Claim, Finding, NotTestable, claim, holds
 from sysid import servo_scores
 from sysid.calibrate import DeadTime, dead_times
 from sysid.doctor import JointExamination, examine
@@ -58,17 +58,16 @@ def gather(
 
 def judge(evidence: ServoEvidence) -> list[Claim]:
     """All claims about servos."""
-    return [claim(evidence) for claim in _CLAIMS]
+    return [one(evidence) for one in _CLAIMS]
 
 
-def _constant_lag(found: ServoEvidence) -> Claim:
-    about = (
-        "A1", "Transport delay is a constant 76 ms from 1 to 6 Hz", "76 ms, same at all rates",
-    )  # fmt: skip
-    how = "Sweeps: lag of all rows, of fresh rows, and of the servo (`pupper-sysid delay`)."
-    if not found.lag:
-        return untested(about, f"{how} Give sweeps with --recordings.")
-    budgets = [d.budget for d in found.lag.values()]
+@claim(
+    "A1", "Transport delay is a constant 76 ms from 1 to 6 Hz", "76 ms, same at all rates",
+    "Sweeps: lag of all rows, of fresh rows, and of the servo (`pupper-sysid delay`).",
+)  # fmt: skip
+def constant_lag(found: ServoEvidence) -> Finding:
+    """A1."""
+    budgets = [d.budget for d in _sweeps(found).values()]
     naive, fresh, servo = (
         1e3 * np.mean([getattr(b, k).value for b in budgets]) for k in ("naive", "fresh", "lag")
     )
@@ -81,120 +80,128 @@ def _constant_lag(found: ServoEvidence) -> Claim:
     bounds = {
         "servo": [1e3 * min(b.lag.low for b in budgets), 1e3 * max(b.lag.high for b in budgets)]
     }
-    stale = 1 - servo / naive
-    return Claim(
-        *about, ours, bounds, "holds partly" if stale > 0.15 else "holds",
-        f"{how} It holds as a sum; {100 * stale:.0f} % of it is bus and stale feedback.",
+    stale = float(1 - servo / naive)
+    return Finding(
+        ours, bounds, holds(stale <= 0.15, True),
+        f"It holds as a sum; {100 * stale:.0f} % of it is bus and stale feedback.",
     )  # fmt: skip
 
 
-def _above_three_hertz(found: ServoEvidence) -> Claim:
-    about = ("A2", "Tracking degrades above 3 Hz", "visible loss of amplitude above 3 Hz")
-    how = "Sweeps: gain per tone, of all rows and of fresh ones."
+@claim(
+    "A2", "Tracking degrades above 3 Hz", "visible loss of amplitude above 3 Hz",
+    "Sweeps: gain per tone, of all rows and of fresh ones.",
+)  # fmt: skip
+def above_three_hertz(found: ServoEvidence) -> Finding:
+    """A2."""
     tones = [f for d in found.lag.values() for f in d.budget.by_frequency]
     high = [f for f in tones if f.frequency_hz > 3.0]
     if not high:
-        return untested(about, f"{how} Give sweeps above 3 Hz with --recordings.")
+        raise NotTestable("Give sweeps above 3 Hz with --recordings.")
     low = [f.gain for f in tones if f.frequency_hz <= 3.0]
     before, after = float(np.mean(low)), float(np.mean([f.gain for f in high]))
     naive = float(np.mean([f.naive_gain for f in high]))
-    ours = f"gain {before:.2f} up to 3 Hz, {after:.2f} above (all rows, as the paper: {naive:.2f})"
     lost = 1 - after / before
-    verdict: Verdict = (
-        "does not hold here" if lost < 0.05 else "holds partly" if lost < 0.3 else "holds"
-    )
-    return Claim(
-        *about, ours, None, verdict, f"{how} Lost: {100 * lost:.0f} %; 30 % would hold, 5 % partly."
-    )
+    return Finding(
+        f"gain {before:.2f} up to 3 Hz, {after:.2f} above (all rows, as the paper: {naive:.2f})",
+        None, holds(lost >= 0.3, lost >= 0.05),
+        f"Lost: {100 * lost:.0f} %; 30 % would hold, 5 % partly.",
+    )  # fmt: skip
 
 
-def _reading_noise(found: ServoEvidence) -> Claim:
-    about = ("A3", "Readings are noisy", "σ 0.101 rad in position, 3.17 rad/s in velocity")
-    how = "Sweeps: noise of fresh readings about their tone; share of rows that repeat an old value"
-    if not found.lag:
-        return untested(about, f"{how}. Give sweeps with --recordings.")
-    noise = float(np.mean([d.budget.noise_rad for d in found.lag.values()]))
+@claim(
+    "A3", "Readings are noisy", "σ 0.101 rad in position, 3.17 rad/s in velocity",
+    "Sweeps: noise of fresh readings about their tone; share of rows that repeat an old value.",
+)  # fmt: skip
+def reading_noise(found: ServoEvidence) -> Finding:
+    """A3."""
+    noise = float(np.mean([d.budget.noise_rad for d in _sweeps(found).values()]))
     fresh = float(np.mean([h.fresh_fraction for h in found.health.values()]))
-    ours = f"σ {1e3 * noise:.1f} mrad in fresh readings; {100 * (1 - fresh):.0f} % of rows are old"
-    verdict: Verdict = "does not hold here" if noise < 0.03 else "holds"
-    return Claim(
-        *about, ours, None, verdict,
-        f"{how}. It is staleness, not noise: √2 · 0.101 · 25 Hz gives their velocity, too.",
+    return Finding(
+        f"σ {1e3 * noise:.1f} mrad in fresh readings; {100 * (1 - fresh):.0f} % of rows are old",
+        None, holds(noise >= 0.03),
+        "It is staleness, not noise: √2 · 0.101 · 25 Hz gives their velocity, too.",
     )  # fmt: skip
 
 
-def _servo_error(found: ServoEvidence) -> Claim:
-    about = (
-        "S1",
-        "A servo network is far better than a PD",
-        "PD 0.1 to 1.8 rad, MLP 0.003 to 0.03 rad",
-    )
-    how = "Playback, last loop held out, free run from commands alone, per joint."
-    if found.servos is None:
-        return untested(about, f"{how} Give a playback or walk with --recordings.")
+@claim(
+    "S1", "A servo network is far better than a PD", "PD 0.1 to 1.8 rad, MLP 0.003 to 0.03 rad",
+    "Playback, last loop held out, free run from commands alone, per joint.",
+)  # fmt: skip
+def servo_error(found: ServoEvidence) -> Finding:
+    """S1."""
     published, fitted, mlp = (_by_joint(found, name) for name in (PUBLISHED, FITTED, "MLP"))
-    ours = f"published PD {_range(published)}, a fitted PD {_range(fitted)}, MLP {_range(mlp)} mrad"
-    verdict: Verdict = "holds" if np.mean(fitted) > 3 * np.mean(mlp) else "does not hold here"
-    return Claim(*about, ours, None, verdict, f"{how} Holds if a fitted PD is 3 times worse.")
-
-
-def _free_run(found: ServoEvidence) -> Claim:
-    about = ("S2", "In free run the LSTM servo drifts", "RMSE LSTM 0.070, MLP 0.028 rad")
-    how = "As S1, mean of the joints, 90 % intervals over stretches of time."
-    if found.servos is None:
-        return untested(about, f"{how} Give a playback or walk with --recordings.")
-    mean = {k: 1e3 * float(np.mean(_by_joint(found, k))) for k in ("LSTM", "MLP")}
-    bounds = {k: [1e3 * x for x in servo_scores.interval(found.servos.errors[k], 0)] for k in mean}
-    ours = f"LSTM {mean['LSTM']:.1f}, MLP {mean['MLP']:.1f} mrad"
-    worse = mean["LSTM"] > 1.5 * mean["MLP"]
-    return Claim(
-        *about, ours, bounds, "holds" if worse else "does not hold here",
-        f"{how} Ours is driven by commands only; holds if it is 1.5 times worse.",
+    return Finding(
+        f"published PD {_range(published)}, a fitted PD {_range(fitted)}, MLP {_range(mlp)} mrad",
+        None, holds(bool(np.mean(fitted) > 3 * np.mean(mlp))),
+        "Holds if a fitted PD is 3 times worse.",
     )  # fmt: skip
 
 
-def _one_step(found: ServoEvidence) -> Claim:
-    about = ("S3", "One step ahead the LSTM servo is better", "LSTM better in one step")
-    how = "As S1, one step ahead of the last reading; beside it a servo that stays put."
-    if found.servos is None:
-        return untested(about, f"{how} Give a playback or walk with --recordings.")
+@claim(
+    "S2", "In free run the LSTM servo drifts", "RMSE LSTM 0.070, MLP 0.028 rad",
+    "As S1, mean of the joints, 90 % intervals over stretches of time.",
+)  # fmt: skip
+def free_run(found: ServoEvidence) -> Finding:
+    """S2."""
+    mean = {k: 1e3 * float(np.mean(_by_joint(found, k))) for k in ("LSTM", "MLP")}
+    errors = _servos(found).errors
+    return Finding(
+        f"LSTM {mean['LSTM']:.1f}, MLP {mean['MLP']:.1f} mrad",
+        {k: [1e3 * x for x in servo_scores.interval(errors[k], 0)] for k in mean},
+        holds(mean["LSTM"] > 1.5 * mean["MLP"]),
+        "Ours is driven by commands only; holds if it is 1.5 times worse.",
+    )  # fmt: skip
+
+
+@claim(
+    "S3", "One step ahead the LSTM servo is better", "LSTM better in one step",
+    "As S1, one step ahead of the last reading; beside it a servo that stays put.",
+)  # fmt: skip
+def one_step(found: ServoEvidence) -> Finding:
+    """S3."""
+    servos = _servos(found)
     ahead = {
-        k: 1e3
-        * float(np.mean([servo_scores.rms(e.one_step) for e in found.servos.errors[k].values()]))
+        k: 1e3 * float(np.mean([servo_scores.rms(e.one_step) for e in servos.errors[k].values()]))
         for k in ("LSTM", "MLP")
     }
-    still = 1e3 * float(np.nanmean(list(found.servos.persistence.values())))
-    ours = f"LSTM {ahead['LSTM']:.1f}, MLP {ahead['MLP']:.1f}, stays put {still:.1f} mrad"
-    better = ahead["LSTM"] < 0.95 * ahead["MLP"]
-    return Claim(
-        *about,
-        ours,
-        None,
-        "holds" if better else "does not hold here",
-        f"{how} Holds if 5 % better.",
-    )
+    still = 1e3 * float(np.nanmean(list(servos.persistence.values())))
+    return Finding(
+        f"LSTM {ahead['LSTM']:.1f}, MLP {ahead['MLP']:.1f}, stays put {still:.1f} mrad", None,
+        holds(ahead["LSTM"] < 0.95 * ahead["MLP"]), "Holds if 5 % better.",
+    )  # fmt: skip
 
 
-def _enough_data(found: ServoEvidence) -> Claim:
-    about = ("S4", "390 samples per joint are enough", "390 samples in 3 loops")
-    how = "As S1: MLP against how well the robot repeats itself."
-    if found.servos is None:
-        return untested(about, f"{how} Give a playback or walk with --recordings.")
+@claim(
+    "S4", "390 samples per joint are enough", "390 samples in 3 loops",
+    "As S1: MLP against how well the robot repeats itself.",
+)  # fmt: skip
+def enough_data(found: ServoEvidence) -> Finding:
+    """S4."""
     mlp = 1e3 * float(np.mean(_by_joint(found, "MLP")))
-    known = [v for v in found.servos.repeatability.values() if np.isfinite(v)]
+    known = [v for v in _servos(found).repeatability.values() if np.isfinite(v)]
     floor = 1e3 * float(np.mean(known)) if known else float("nan")
     rows = len(found.played.table) // len(found.played.joints) if found.played else 0
-    ours = f"{rows} rows per joint: MLP {mlp:.1f} mrad, the robot repeats to {floor:.1f}"
-    return Claim(
-        *about, ours, None, "holds partly" if mlp > 1.1 * floor else "holds",
-        f"{how} More data: the data curve of the servo report.",
+    return Finding(
+        f"{rows} rows per joint: MLP {mlp:.1f} mrad, the robot repeats to {floor:.1f}", None,
+        holds(not mlp > 1.1 * floor, True), "More data: the data curve of the servo report.",
     )  # fmt: skip
+
+
+def _sweeps(found: ServoEvidence) -> dict[str, DeadTime]:
+    if not found.lag:
+        raise NotTestable("Give sweeps with --recordings.")
+    return found.lag
+
+
+def _servos(found: ServoEvidence) -> Comparison:
+    if found.servos is None:
+        raise NotTestable("Give a playback or walk with --recordings.")
+    return found.servos
 
 
 def _by_joint(found: ServoEvidence, model: str) -> np.ndarray:
     """Free-run error of each joint [rad]."""
-    assert found.servos is not None
-    return np.array([servo_scores.rms(e.free_run) for e in found.servos.errors[model].values()])
+    return np.array([servo_scores.rms(e.free_run) for e in _servos(found).errors[model].values()])
 
 
 def _range(values: np.ndarray) -> str:
@@ -203,6 +210,5 @@ def _range(values: np.ndarray) -> str:
 
 
 _CLAIMS = (
-    _constant_lag, _above_three_hertz, _reading_noise, _servo_error, _free_run, _one_step,
-    _enough_data,
+    constant_lag, above_three_hertz, reading_noise, servo_error, free_run, one_step, enough_data,
 )  # fmt: skip

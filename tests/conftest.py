@@ -1,4 +1,4 @@
-"""Fixtures: the recordings of a real robot, where they are at hand."""
+"""Fixtures: the recordings of a real robot, where they are at hand, and a policy that walks."""
 
 import os
 from pathlib import Path
@@ -26,3 +26,18 @@ def real_data() -> Path:
 def real_sweeps(real_data: Path) -> list[Path]:
     """The hip and thigh sweeps."""
     return sorted(real_data.glob("real_motor_*.csv"))
+
+
+@pytest.fixture(scope="module")
+def walker():
+    """The shipped LSTM, and two robots with calibrated servos to walk on."""
+    from policies.policy_file import load_policy
+    from policies.robustness import Trial
+    from sim.servo_ranges import servo_ranges
+    from sim.walking_config import Walking
+
+    samples = Path(__file__).resolve().parents[1] / "data/samples"
+    trial = Trial(
+        Walking(), servo_ranges(samples / "calibrated.yaml"), robots=2, seconds=7.5, threads=1
+    )
+    return load_policy(samples / "policies/lstm"), trial

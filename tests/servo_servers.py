@@ -100,6 +100,9 @@ class ScriptedProxy(ProxyEmulator):
         self.requests.append(request)
         return self.answers(request) or b""
 
+    def resend(self, now: float) -> None:
+        """See `ProxyEmulator`."""
+
     def strike(self, now: float) -> str | None:
         return None
 

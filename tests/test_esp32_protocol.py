@@ -15,6 +15,7 @@ from hardware import esp32_bus
 from hardware import esp32_datagrams as datagrams
 from hardware.esp32_bus import Esp32Bus
 from hardware.joint_map import joint_map_from, load_joint_map
+from sim.bus_faults import BusFaults
 from sim.esp32_emulator import ProxyEmulator
 from sim.esp32_socket import ProxySocket
 
@@ -380,3 +381,25 @@ def test_two_clients_share_one_block_and_the_last_writer_wins(path):
             client.send(setpoint([1] * 12, [count] * 12))
             assert client.recv(64) == b"\x02\x01"
         assert bench_of(proxy).goals[-1] == (12, 600)
+
+
+def test_servos_come_limp_out_of_a_brown_out_and_then_get_the_last_order_as_the_proxy_resends_it():
+    proxy = still_proxy()
+    proxy.faults = BusFaults({"brown-out": 1.0}, np.random.default_rng(0))
+    bench = bench_of(proxy)
+    proxy.answer(setpoint([1] * 12, [500] * 12), b"", 0.5)
+    bench.goals.clear()
+    bench.torques.clear()
+    proxy.strike(1.0)
+    assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
+    # let go, asked for once, while nobody could hear it
+    assert proxy.answer(setpoint([0] * 12, [500] * 12), b"", 1.05) == b"\x02\x01"
+    bench.torques.clear()
+    proxy.resend(1.1)
+    assert bench.torques == []
+    proxy.resend(1.0 + proxy.faults.lasts_s)
+    assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
+    assert bench.goals == []
+    bench.torques.clear()
+    proxy.resend(2.0)
+    assert bench.torques == []

@@ -11,11 +11,8 @@ import pytest
 from policies.evaluation import DIRECTIONS
 from policies.paths import _measured, compliance
 from policies.phase_reset import _pusher, _shift, push_response, rate_exponent, rate_response
-from policies.policy_file import load_policy
-from policies.robustness import Trial, scales, terrain
+from policies.robustness import scales, terrain
 from policies.rollouts import Rollout
-from sim.servo_ranges import servo_ranges
-from sim.walking_config import Walking
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP = 0.02
@@ -79,15 +76,6 @@ def test_the_shift_between_two_walks_is_that_of_their_phases(ahead):
         walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(3.1, a, steps)) for a in (0.0, ahead)
     )
     assert _shift(plain, pushed, 200, (1.0, 3.0), 0, 3.1) == pytest.approx(ahead, abs=0.01)
-
-
-@pytest.fixture(scope="module")
-def walker():
-    trial = Trial(
-        Walking(), servo_ranges(ROOT / "data/samples/calibrated.yaml"), robots=2, seconds=7.5,
-        threads=1,
-    )  # fmt: skip
-    return load_policy(ROOT / "data/samples/policies/lstm"), trial
 
 
 def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):

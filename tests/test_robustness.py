@@ -9,10 +9,7 @@ import pytest
 
 from policies import perturbations
 from policies.perturbations import JOINTS
-from policies.policy_file import load_policy
-from policies.robustness import Trial, _rate, ablation, delay_curve
-from sim.servo_ranges import servo_ranges
-from sim.walking_config import Walking
+from policies.robustness import _rate, ablation, delay_curve
 from sim.walking_env import OBSERVATION_PARTS as PARTS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,15 +60,6 @@ def test_noise_has_the_size_that_was_asked_for_per_number():
 def test_zeros_are_zeros():
     seen = perturbations.applied(perturbations.zeroed(JOINTS), counting())
     assert not seen[..., JOINTS].any() and seen[5, 0, 0] == 5
-
-
-@pytest.fixture(scope="module")
-def walker():
-    trial = Trial(
-        Walking(), servo_ranges(ROOT / "data/samples/calibrated.yaml"), robots=2, seconds=7.5,
-        threads=1,
-    )  # fmt: skip
-    return load_policy(ROOT / "data/samples/policies/lstm"), trial
 
 
 def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker):
