@@ -12,6 +12,7 @@ at rest. Gravity is its direction in the trunk's frame, (0, 0, -1) when level.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -267,10 +268,12 @@ def at_rest(gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike) -> Rest:
 
 def _turned(vector: Array, rotation: Array) -> Array:
     """`vector` turned about the axis of `rotation`, by its length [rad] (Rodrigues' formula)."""
-    angle = float(np.linalg.norm(rotation))
+    angle = math.hypot(*rotation.tolist())
+    if angle == 0:
+        return vector
     across = _cross(rotation, vector)
-    half = np.sinc(angle / (2 * np.pi))
-    return vector + np.sinc(angle / np.pi) * across + 0.5 * half**2 * _cross(rotation, across)
+    half = math.sin(angle / 2) / (angle / 2)
+    return vector + math.sin(angle) / angle * across + 0.5 * half**2 * _cross(rotation, across)
 
 
 def _cross(a: Array, b: Array) -> Array:

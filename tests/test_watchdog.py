@@ -46,6 +46,9 @@ while True:
     bus.write(goal)
     bus.read()
     bus.sleep_until(bus.now() + 0.02)
+    if len(sys.argv) > 2 and bus.now() - start > 0.5:  # farthest out
+        bus.bus.torque = lambda on: time.sleep(100)
+        bus.limp()
 """
 
 
@@ -83,9 +86,9 @@ def wait_for(condition, seconds: float) -> float:
     return time.monotonic() - start
 
 
-def drive(address: str) -> subprocess.Popen:
+def drive(address: str, *hang: str) -> subprocess.Popen:
     process = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, address], stdout=subprocess.PIPE, cwd=ROOT
+        [sys.executable, "-c", DRIVER, address, *hang], stdout=subprocess.PIPE, cwd=ROOT
     )
     assert process.stdout is not None and process.stdout.readline() == b"driving\n"
     return process
@@ -122,6 +125,15 @@ def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
     os.kill(process.pid, signal.SIGSTOP)
     took = wait_for(lambda: limp(server), 6.0)
     assert 0.9 < took < 3.5
+    assert process.wait(2.0) == -signal.SIGKILL
+
+
+def test_a_driver_that_hangs_after_a_stop_for_safety_leaves_its_robot_limp_where_it_is(robot):
+    server, address = robot
+    found = angles(server)
+    process = drive(address, "hang when it should go limp")
+    wait_for(lambda: limp(server), 6.0)
+    assert np.abs(angles(server) - found).max() > 0.15
     assert process.wait(2.0) == -signal.SIGKILL
 
 
