@@ -11,14 +11,19 @@ import tyro
 from cli import terminal
 from cli.policy_choice import is_policy, policy_at
 from common.errors import InputError
-from servo_models.calibration import PRESETS, load_calibration
+from common.files import write_text
+from servo_models.calibration import PRESETS, Calibration, load_calibration
 from sysid.export import to_csv
 from sysid.recording import load
+
+_MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
 
 
 @dataclass(frozen=True)
 class Export:
     """Write a calibration, a preset, a recording, a servo model or a policy for other programs.
+
+    Example: pupper-sysid export calibrated.yaml --to isaaclab --physics-step 0.005
 
     Example: pupper-sysid export calibrated.yaml --to csv --out calibrated.csv
 
@@ -30,10 +35,15 @@ class Export:
     source: tyro.conf.Positional[str]
     """calibrated.yaml, the name of a preset (paper, release), a recording, or the folder of a servo
     model, a policy or a training run."""
-    to: Literal["csv", "onnx", "torchscript"] = "csv"
-    """Format: csv, a tidy table; onnx and torchscript of learned servo models and policies."""
+    to: Literal["csv", "mjcf", "isaaclab", "mjlab", "newton", "json", "onnx", "torchscript"] = "csv"
+    """Format: csv, a tidy table; mjcf, isaaclab, mjlab, newton and json of calibrations, for other
+    simulators; onnx and torchscript of learned servo models and policies."""
+    physics_step: float | None = None
+    """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf and
+    0.005 for the others."""
     out: Path | None = None
-    """File to write; by default the source's name with the format's ending, in this folder."""
+    """File to write (newton: folder); by default the source's name with the format's ending, in
+    this folder."""
     force: bool = False
     """Replace the file if it exists."""
     json: bool = False
@@ -52,7 +62,7 @@ class Export:
             terminal.err.print(f"Wrote {target}.")
 
     def _policy(self, folder: Path) -> Path:
-        if self.to == "csv":
+        if self.to not in ("onnx", "torchscript"):
             raise InputError(
                 f"{folder} is a policy: export it with `--to onnx` or `--to torchscript`."
             )
@@ -68,6 +78,12 @@ class Export:
         from servo_models.servo_file import load_servo_model
         from sysid.servo_export import ENDINGS, export_servo_model
 
+        if self.to not in ENDINGS:
+            raise InputError(
+                f"{folder} is a servo model, which says where a servo will be and not how strong "
+                f"it is; {self.to} needs a calibration (`pupper-sysid calibrate`). A servo model "
+                f"becomes {', '.join(ENDINGS)}."
+            )
         saved = load_servo_model(folder)
         # not with_suffix: a folder may be called servo-0.5
         target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
@@ -83,16 +99,40 @@ class Export:
                 f"{self.source}: neither a calibration (.yaml), nor a recording (.csv), nor the "
                 f"folder of a servo model, nor one of the presets {', '.join(PRESETS)}."
             )
-        if self.to != "csv":
+        if self.to in ("onnx", "torchscript"):
             raise InputError(
                 f"{self.source} cannot become {self.to}: only a learned servo model can, a folder "
                 "that `pupper-sysid fit-servo` wrote. Export it with `--to csv`."
             )
         if self.source in PRESETS or kind != ".csv":
             found = load_calibration(self.source)
+            if self.to != "csv":
+                return self._simulator(path, found)
+        elif self.to != "csv":
+            raise InputError(
+                f"{self.source} is a recording; {self.to} needs a calibration. Make one with "
+                f"`pupper-sysid calibrate {self.source}`."
+            )
         else:
             found = load(path)
             terminal.warn(found.warnings)
         target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
         to_csv(found, target, self.force)
+        return target
+
+    def _simulator(self, path: Path, calibration: Calibration) -> Path:
+        """The calibration for another simulator."""
+        from sim.newton_export import export_newton
+        from sim.simulator_export import ENDINGS, SIMULATORS
+
+        step = self.physics_step
+        if step is None:
+            step = _MJCF_STEP_S if self.to == "mjcf" else _TRAINING_STEP_S
+        if self.to == "newton":
+            target = self.out or Path(f"{path.stem}_newton")
+            export_newton(calibration, step, target, self.force)
+        else:
+            target = self.out or Path(f"{path.stem}{ENDINGS[self.to]}")
+            write_text(target, SIMULATORS[self.to](calibration, step), self.force)
+        terminal.err.print(f"For a physics step of {1e3 * step:g} ms (--physics-step).")
         return target

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,8 @@ class Report:
     """Write one HTML page that opens anywhere, with its figures as PNG and its tables as CSV.
 
     Example: pupper-sysid report recordings/sweep.csv --out reports/sweep
+
+    Example: pupper-sysid report --open
     """
 
     recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -33,6 +36,8 @@ class Report:
     """Calibration made from these recordings: its numbers and its seed are used."""
     servo: tuple[str, ...] = ()
     """Servo models of fit-servo to show on these recordings, beside the calibration."""
+    open: bool = False
+    """Show it in the browser when it is written."""
     force: bool = False
     """Replace files of a report that is there already."""
     json: bool = False
@@ -88,7 +93,10 @@ class Report:
                 }
             )
         else:
-            terminal.err.print(f"Wrote {written.path}. Open it in a browser.", soft_wrap=True)
+            hint = "" if self.open else " Open it in a browser, or add --open."
+            terminal.err.print(f"Wrote {written.path}.{hint}", soft_wrap=True)
+        if self.open and not webbrowser.open(written.path.resolve().as_uri()):
+            terminal.warn([f"No browser could be started here; open {written.path} yourself."])
 
     def _stored(self, recordings: list[Recording], joints: list[str]) -> Calibration | None:
         """The calibration given, if it belongs to the recordings."""

@@ -1,6 +1,7 @@
 """How every command ends: 0, or 2 for what the user gave, or 1, and never with a traceback.
 
-`--debug` shows the traceback after all.
+`--debug` shows the traceback after all. Every program also answers `--version`, and
+`--install-completion`, which teaches the shell its words.
 """
 
 from __future__ import annotations
@@ -11,12 +12,19 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 import tyro
 
-from cli.terminal import err
-from common.errors import PupperError
+from cli.terminal import err, out
+from common.errors import InputError, PupperError
+from common.files import versions
+
+_COMPLETIONS = {
+    "bash": ".local/share/bash-completion/completions/{}",
+    "zsh": ".zfunc/_{}",
+}
 
 Options = TypeVar("Options")
 
@@ -56,6 +64,10 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     """Yields the arguments without `--debug`; what goes wrong inside becomes a sentence."""
     debug = "--debug" in arguments
     try:
+        if "--version" in arguments:
+            _tell_version(program)
+        if "--install-completion" in arguments:
+            arguments = _completion(program)
         yield [a for a in arguments if a != "--debug"]
     except PupperError as error:
         if debug:
@@ -77,3 +89,28 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
             soft_wrap=True,
         )
         sys.exit(1)
+
+
+def _tell_version(program: str) -> None:
+    """Name, version, and what shapes its numbers; ends the process."""
+    own, *rest = versions().items()
+    out.print(f"{program} {own[1]} ({', '.join(f'{k} {v}' for k, v in rest)})")
+    sys.exit(0)
+
+
+def _completion(program: str) -> list[str]:
+    """Arguments with which tyro writes the completion of the user's shell where it looks for it."""
+    shell = Path(os.environ.get("SHELL", "")).name
+    if shell not in _COMPLETIONS:
+        raise InputError(
+            f"Completion is for {' and '.join(_COMPLETIONS)}; $SHELL is "
+            f"'{os.environ.get('SHELL', '')}'. `{program} --tyro-print-completion tcsh` prints "
+            "another one."
+        )
+    path = Path.home() / _COMPLETIONS[shell].format(program)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hint = "Open a new terminal to use it."
+    if shell == "zsh":
+        hint = f"With `fpath+=({path.parent})` before compinit in ~/.zshrc, open a new terminal."
+    err.print(f"Writing {path}. {hint}", soft_wrap=True)
+    return ["--tyro-write-completion", shell, str(path)]

@@ -29,7 +29,7 @@ from common.errors import InputError
 from common.files import write_text
 from common.joints import JOINT_NAMES
 from common.strict_yaml import dump, read
-from servo_models.calibration_parts import JointCalibration, Part, Whole
+from servo_models.calibration_parts import PARAMETER_KEYS, JointCalibration, Part, Whole
 from servo_models.calibration_refusals import explain
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from servo_models.held_feedback import HeldFeedback
@@ -173,17 +173,11 @@ class Calibration(Part):
         if not actuators:
             raise InputError("No joint was named. Name at least one.")
 
-        def values(field: str) -> np.ndarray:
-            return np.array([getattr(actuator, field).value for actuator in actuators])
-
         parameters = DelayedPDParameters(
-            stiffness=values("stiffness_nm_per_rad"),
-            damping=values("damping_nm_s_per_rad"),
-            friction_loss=values("friction_loss_nm"),
-            armature=values("armature_kg_m2"),
-            effort_limit=values("effort_limit_nm"),
-            velocity_limit=values("velocity_limit_rad_s"),
-            delay_s=values("delay_s"),
+            **{
+                field: np.array([getattr(actuator, key).value for actuator in actuators])
+                for field, key in PARAMETER_KEYS.items()
+            }
         )
         return DelayedPD(parameters, time_step_s)
 

@@ -16,6 +16,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from servo_models.delayed_pd import DelayedPDParameters
+
 UNIT_OF_SUFFIX = {
     "nm_s_per_rad": "N·m·s/rad",
     "nm_per_rad": "N·m/rad",
@@ -173,6 +175,18 @@ class Scale(Part):
     """Where that torque comes from."""
 
 
+PARAMETER_KEYS = {
+    "stiffness": "stiffness_nm_per_rad",
+    "damping": "damping_nm_s_per_rad",
+    "friction_loss": "friction_loss_nm",
+    "armature": "armature_kg_m2",
+    "effort_limit": "effort_limit_nm",
+    "velocity_limit": "velocity_limit_rad_s",
+    "delay_s": "delay_s",
+}
+"""Field of `DelayedPDParameters` and its name in `Actuator`."""
+
+
 class Actuator(Part):
     """What the servo does with a command: see `servo_models.delayed_pd`."""
 
@@ -202,6 +216,22 @@ class Actuator(Part):
     """The ratios that were identified."""
     scale: Scale
     """The torque anchor that set the scale."""
+
+    @property
+    def parameters(self) -> DelayedPDParameters:
+        """The numbers themselves, without intervals."""
+        values = {field: getattr(self, key).value for field, key in PARAMETER_KEYS.items()}
+        return DelayedPDParameters(**values)
+
+    @property
+    def delay_interval_s(self) -> tuple[float, float]:
+        """Delays to train with [s]: the interval, or the whole steps that a preset publishes."""
+        if self.delay_s.low is not None and self.delay_s.high is not None:
+            return self.delay_s.low, self.delay_s.high
+        return (
+            self.delay_steps_min * self.physics_step_s,
+            self.delay_steps_max * self.physics_step_s,
+        )
 
     @model_validator(mode="after")
     def _check(self) -> Actuator:

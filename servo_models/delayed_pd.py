@@ -47,6 +47,18 @@ def friction_solref(time_step_s: float) -> tuple[float, float]:
     return 0.0, -FRICTION_IMPEDANCE / time_step_s
 
 
+def whole_steps(low_s: float, high_s: float, time_step_s: float) -> tuple[int, int]:
+    """An interval of a delay [s] in whole time steps, rounded outward.
+
+    Examples
+    --------
+    >>> whole_steps(0.0247, 0.0268, 0.002), whole_steps(0.024, 0.026, 0.002)
+    ((12, 14), (12, 13))
+    """
+    low = int(np.floor(low_s / time_step_s + 1e-9))
+    return low, int(np.ceil(high_s / time_step_s - 1e-9))
+
+
 @dataclass(frozen=True)
 class DelayedPDParameters:
     """Numbers of a DelayedPD servo; floats or arrays that broadcast against each other.

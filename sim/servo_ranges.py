@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from common.errors import InputError
 from common.joints import JOINT_NAMES
 from servo_models.calibration import PRESETS, Calibration, load_calibration
-from servo_models.calibration_parts import JointCalibration, Quantity
+from servo_models.calibration_parts import PARAMETER_KEYS, JointCalibration, Quantity
 from servo_models.delayed_pd import DelayedPDParameters
 from servo_models.held_feedback import HeldFeedback
 from servo_models.joint_arrays import JointArrays
@@ -25,15 +25,6 @@ from servo_models.servo_file import load_servo_model
 
 IDEAL = "ideal"
 _NO_LIMIT_NM, _NO_LIMIT_RAD_S = 1e3, 1e3
-_FIELDS = {
-    "stiffness": "stiffness_nm_per_rad",
-    "damping": "damping_nm_s_per_rad",
-    "friction_loss": "friction_loss_nm",
-    "armature": "armature_kg_m2",
-    "effort_limit": "effort_limit_nm",
-    "velocity_limit": "velocity_limit_rad_s",
-    "delay_s": "delay_s",
-}
 
 
 @dataclass(frozen=True)
@@ -75,7 +66,7 @@ class ServoRanges:
     def nominal(self) -> dict[str, DelayedPDParameters]:
         """The middle of every interval, by joint."""
         return {
-            name: DelayedPDParameters(**{f: self.value[f][i] for f in _FIELDS})
+            name: DelayedPDParameters(**{f: self.value[f][i] for f in PARAMETER_KEYS})
             for i, name in enumerate(JOINT_NAMES)
         }
 
@@ -98,7 +89,8 @@ class ServoRanges:
             By field of `DelayedPDParameters`.
         """
         drawn = {
-            f: rng.uniform(self.low[f], self.high[f], (count, len(JOINT_NAMES))) for f in _FIELDS
+            f: rng.uniform(self.low[f], self.high[f], (count, len(JOINT_NAMES)))
+            for f in PARAMETER_KEYS
         }
         scale = rng.uniform(*torque_scale, (count, 1))
         for f in ("stiffness", "damping", "friction_loss", "armature", "effort_limit"):
@@ -145,17 +137,13 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
             borrowed[name] = lender
         parts.append(calibration.joint(lender))
     low, value, high = {}, {}, {}
-    for field, key in _FIELDS.items():
+    for field, key in PARAMETER_KEYS.items():
         found: list[Quantity] = [getattr(p.actuator, key) for p in parts]
         value[field] = np.array([q.value for q in found])
         low[field] = np.array([q.value if q.low is None else q.low for q in found])
         high[field] = np.array([q.value if q.high is None else q.high for q in found])
-    for i, part in enumerate(parts):
-        # presets publish a range of whole steps instead of an interval
-        if part.actuator.delay_s.low is None:
-            step = part.actuator.physics_step_s
-            low["delay_s"][i] = part.actuator.delay_steps_min * step
-            high["delay_s"][i] = part.actuator.delay_steps_max * step
+    delays = np.array([p.actuator.delay_interval_s for p in parts])
+    low["delay_s"], high["delay_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
     feedback = tuple(calibration.held_feedback(borrowed.get(n, n)) for n in JOINT_NAMES)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import norm
 
 from common.joints import JOINT_NAMES
-from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
 from sysid.delay import LEVEL, Interval, LagBudget, lag_budget
 from sysid.ladder import LADDER, Rung, rung
 from sysid.ladder_fit import (
@@ -83,8 +83,7 @@ class JointCalibrationResult:
     @property
     def delay_steps(self) -> tuple[int, int]:
         """Dead-time interval in whole physics steps, rounded outward."""
-        low = int(np.floor(self.dead_time.low / TIME_STEP_S + 1e-9))
-        return low, int(np.ceil(self.dead_time.high / TIME_STEP_S - 1e-9))
+        return whole_steps(self.dead_time.low, self.dead_time.high, TIME_STEP_S)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""Do the released simulators know the names that our exports use, and delay as we say?
+
+    .venv/bin/python benchmarks/peers/check_exports.py
+
+Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
+fields of their configuration classes, and compares them with what `tests/test_simulator_export.py`
+holds the exports against. mjlab's delay buffer is run with the exported settings, and with the ones
+that its documentation suggests.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+import tempfile
+import types
+import zipfile
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tests"))
+
+_CLASSES = {
+    "isaaclab": ("actuators/", ("ActuatorBaseCfg", "IdealPDActuatorCfg", "DelayedPDActuatorCfg")),
+    "mjlab": ("actuator/", ("ActuatorCfg", "BuiltinPositionActuatorCfg")),
+}
+_NEWTON = {
+    "add_actuator": {"drive_class", "index", "clamping", "delay_steps"},
+    "builder": {"joint_armature", "joint_friction", "joint_target_ke", "joint_target_kd"},
+    "drive_neural_mlp": {"input_order", "input_idx", "pos_scale", "vel_scale", "effort_scale"},
+    "clamping_max_effort": {"max_effort"},
+}
+
+
+def fetched(package: str, folder: Path) -> tuple[str, Path]:
+    """The newest wheel's version, and where it lies unpacked."""
+    subprocess.run(
+        [sys.executable, "-m", "pip", "download", "--no-deps", "-q", "-d", folder, package],
+        check=True, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    wheel = next(folder.glob(f"{package}-*.whl"))
+    with zipfile.ZipFile(wheel) as file:
+        file.extractall(folder / package)
+    return wheel.name.split("-")[1], folder / package
+
+
+def fields(root: Path, part: str, names: tuple[str, ...]) -> set[str]:
+    """Annotated fields of some classes, wherever below `part` they stand."""
+    found: set[str] = set()
+    for path in root.rglob("*.py"):
+        if part not in path.as_posix():
+            continue
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and node.name in names:
+                found |= {
+                    b.target.id
+                    for b in node.body
+                    if isinstance(b, ast.AnnAssign) and isinstance(b.target, ast.Name)
+                }
+    return found
+
+
+def delivered(root: Path, **settings) -> list[int]:
+    """Which command mjlab's buffer gives in each of 40 steps after a reset."""
+    for name in ("mjlab", "mjlab.utils"):
+        package = types.ModuleType(name)
+        package.__path__ = [str(root / name.replace(".", "/"))]
+        sys.modules[name] = package
+    buffers = importlib.import_module("mjlab.utils.buffers")
+    buffer = buffers.DelayBuffer(
+        batch_size=1, generator=torch.Generator().manual_seed(0), **settings
+    )
+    buffer.reset()
+    given = []
+    for k in range(40):
+        buffer.append(torch.tensor([[float(k)]]))
+        given.append(int(buffer.compute()[0, 0]))
+    return given
+
+
+def main() -> None:
+    """Print what was found; ends with 1 if a name is unknown."""
+    import test_simulator_export as ours
+
+    bad = 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        print("| simulator | released | fields we write that it does not know |")
+        print("|---|---|---|")
+        for package, held in (("isaaclab", ours.ISAACLAB), ("mjlab", ours.MJLAB)):
+            version, root = fetched(package, folder)
+            there = fields(root, *_CLASSES[package])
+            bad += len(held - there)
+            print(f"| {package} | {version} | {', '.join(sorted(held - there)) or 'none'} |")
+        version, root = fetched("newton", folder)
+        text = {p.stem: p.read_text() for p in root.rglob("*.py") if p.stem in _NEWTON}
+        text["add_actuator"] = text["builder"][text["builder"].index("def add_actuator") :]
+        unknown = sorted(n for k, names in _NEWTON.items() for n in names if n not in text[k])
+        bad += len(unknown)
+        print(f"| newton | {version} | {', '.join(unknown) or 'none'} |")
+
+        exported = {"min_lag": 5, "max_lag": 5, "update_period": 0, "hold_prob": 0.0}
+        print("\n| settings of mjlab's delay | age of the command in steps 20 to 29 |\n|---|---|")
+        for settings in (
+            exported | {"per_env_phase": False},
+            {"min_lag": 3, "max_lag": 7},
+            {"min_lag": 5, "max_lag": 5, "hold_prob": 1.0},
+            {"min_lag": 5, "max_lag": 5, "update_period": 1000},
+        ):
+            ages = [k - g for k, g in enumerate(delivered(folder / "mjlab", **settings))][20:30]
+            print(f"| {', '.join(f'{k}={v}' for k, v in settings.items())} | {ages} |")
+    sys.exit(1 if bad else 0)
+
+
+if __name__ == "__main__":
+    main()

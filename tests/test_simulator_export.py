@@ -1,0 +1,256 @@
+"""Calibrations in other simulators: they read them, and they move as ours does."""
+
+from __future__ import annotations
+
+import ast
+import json
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import refused, run_program
+
+import cli.pupper_sysid
+from servo_models.calibration import load_calibration
+from servo_models.delayed_pd import TIME_STEP_S
+from servo_models.held_feedback import HeldFeedback
+from sim.servo_mjcf import mujoco, rest_at
+from sim.simulator_export import SIMULATORS, to_isaaclab, to_json, to_mjcf, to_mjlab
+from sysid.recording import load
+
+ROOT = Path(__file__).resolve().parents[1]
+CALIBRATED = ROOT / "data/samples/calibrated.yaml"
+
+# as released: isaaclab 2.3.2.post1, mjlab 1.6.0 (benchmarks/peers/check_exports.py reads them)
+ISAACLAB = {
+    "class_type", "joint_names_expr", "effort_limit", "velocity_limit", "effort_limit_sim",
+    "velocity_limit_sim", "stiffness", "damping", "armature", "friction", "dynamic_friction",
+    "viscous_friction", "min_delay", "max_delay",
+}  # fmt: skip
+MJLAB = {
+    "target_names_expr", "transmission_type", "armature", "frictionloss", "viscous_damping",
+    "delay_min_lag", "delay_max_lag", "delay_hold_prob", "delay_update_period",
+    "delay_per_env_phase", "stiffness", "damping", "effort_limit",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return load_calibration(CALIBRATED)
+
+
+def in_free_air(snippet: str, names: tuple[str, ...]) -> Any:
+    """A model of hinges without load that includes an exported file."""
+    bodies = "".join(
+        f'<body><joint name="{n}" class="servo_{n}" type="hinge" axis="0 1 0"/>'
+        '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/></body>'
+        for n in names
+    )
+    text = (
+        '<mujoco><include file="servos.xml"/><option gravity="0 0 0"/>'
+        f"<worldbody>{bodies}</worldbody></mujoco>"
+    )
+    return mujoco.MjModel.from_xml_string(text, {"servos.xml": snippet.encode()})
+
+
+def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(calibration):
+    names = calibration.joint_names
+    model = in_free_air(to_mjcf(calibration, TIME_STEP_S), names)
+    data = mujoco.MjData(model)
+    sweep = load(ROOT / "data/samples/sweep.csv")
+    trials = [sweep.trials(n) for n in names]
+    assert len(trials[0]) >= 4
+    for together in zip(*trials, strict=True):
+        first = np.array([t.command_rad[0] for t in together])
+        steps = min(int((t.send_time_s[-1] - t.send_time_s[0]) / TIME_STEP_S) for t in together)
+        at = TIME_STEP_S * np.arange(steps)
+        commands = np.stack([_held(t, at) for t in together], axis=1)
+        servo = calibration.delayed_pd(time_step_s=TIME_STEP_S)
+        servo.reset(first)
+        rest_at(model, data, list(first))
+        ours, theirs = servo.rollout(commands), []
+        for command in commands:
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data)
+            theirs.append(data.qpos.copy())
+        assert np.ptp(ours, axis=0).min() > 0.1
+        np.testing.assert_allclose(theirs, ours, atol=1e-6)
+
+
+def _held(trial, at: np.ndarray) -> np.ndarray:
+    """The command in force at times since the trial's first."""
+    sent = trial.send_time_s - trial.send_time_s[0]
+    return trial.command_rad[np.searchsorted(sent, at, side="right") - 1]
+
+
+def test_readings_of_the_mjcf_export_are_held_for_a_poll_and_of_the_measured_age(calibration):
+    names = calibration.joint_names
+    model = in_free_air(to_mjcf(calibration, TIME_STEP_S), names)
+    data = mujoco.MjData(model)
+    rest_at(model, data, [0.0] * len(names))
+    times, read = [], []
+    for k in range(3000):
+        # nothing else moves it: a ramp of 1 rad/s says how old a reading is
+        data.qpos[:], data.qvel[:] = k * TIME_STEP_S, 0.0
+        mujoco.mj_forward(model, data)
+        mujoco.mj_step(model, data)
+        times.append(k * TIME_STEP_S)
+        read.append(data.sensordata.copy())
+    ages = np.array(times)[500:, None] - np.array(read)[500:]
+    held = [joint.feedback for joint in calibration.joints.values()]
+    np.testing.assert_allclose(ages.mean(axis=0), [f.mean_age_s.value for f in held], atol=2e-3)
+    for column, feedback in zip(np.array(read).T, held, strict=True):
+        runs = np.diff(np.flatnonzero(np.diff(column)))
+        assert np.mean(runs) * TIME_STEP_S == pytest.approx(feedback.poll_period_s.value, rel=0.02)
+
+
+class _Recorder:
+    """Stands in for a configuration class: takes its released field names and no others."""
+
+    def __init__(self, fields: set[str]):
+        self.fields, self.made = fields, []
+
+    def __call__(self, **given: Any) -> dict[str, Any]:
+        assert set(given) <= self.fields, set(given) - self.fields
+        self.made.append(given)
+        return given
+
+
+def executed(text: str, package: str, name: str, recorder: _Recorder, monkeypatch) -> dict:
+    parts = package.split(".")
+    for k in range(len(parts)):
+        monkeypatch.setitem(
+            __import__("sys").modules, ".".join(parts[: k + 1]), types.ModuleType(parts[k])
+        )
+    setattr(__import__("sys").modules[package], name, recorder)
+    space: dict[str, Any] = {}
+    exec(compile(text, "exported.py", "exec"), space)
+    return space
+
+
+def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
+    calibration, monkeypatch
+):
+    recorder = _Recorder(ISAACLAB)
+    text = to_isaaclab(calibration, 0.005)
+    space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
+    assert list(space["ACTUATORS"]) == list(calibration.joint_names)
+    for name, made in space["ACTUATORS"].items():
+        own = calibration.joint(name).actuator
+        assert made["joint_names_expr"] == [name]
+        assert made["stiffness"] == own.stiffness_nm_per_rad.value
+        assert made["armature"] == own.armature_kg_m2.value
+        assert made["min_delay"] * 0.005 <= own.delay_s.low
+        assert own.delay_s.high <= made["max_delay"] * 0.005
+        assert made["max_delay"] - made["min_delay"] <= 2
+    assert space["FEEDBACK"]["LF_hip"]["loss"] == calibration.joint("LF_hip").feedback.loss.value
+
+
+def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibration, monkeypatch):
+    recorder = _Recorder(MJLAB)
+    text = to_mjlab(calibration, 0.005)
+    space = executed(text, "mjlab.actuator", "BuiltinPositionActuatorCfg", recorder, monkeypatch)
+    assert len(space["ACTUATORS"]) == 3
+    for made, (name, joint) in zip(space["ACTUATORS"], calibration.joints.items(), strict=True):
+        assert made["delay_min_lag"] == made["delay_max_lag"] == 5
+        assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
+        assert made["frictionloss"] == joint.actuator.friction_loss_nm.value
+        low, high = space["DELAY_STEPS"][name]
+        assert low <= made["delay_min_lag"] <= high
+
+
+def test_the_feedback_in_an_export_is_as_old_and_as_coarse_as_the_servos_say(
+    calibration, monkeypatch
+):
+    text = to_isaaclab(calibration, 0.005)
+    recorder = _Recorder(ISAACLAB)
+    space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
+    names, robots, step = ["LF_hip", "LF_calf"], 200, 0.002
+    generator = torch.Generator().manual_seed(0)
+    feedback = space["HeldFeedback"](space["FEEDBACK"], names, robots, step, generator=generator)
+    feedback.reset(torch.zeros(robots, 2))
+    ages = []
+    for k in range(1, 1500):
+        reading = feedback.step(torch.full((robots, 2), k * step))
+        ages.append(k * step - reading.numpy())
+    held = [calibration.joint(n).feedback for n in names]
+    offset = np.array([f.offset_rad.value for f in held])
+    mean = np.mean(ages[500:], axis=(0, 1)) + offset
+    expected = [HeldFeedback(f.poll_period_s.value, f.loss.value).mean_age_s for f in held]
+    np.testing.assert_allclose(mean, expected, atol=2e-3)
+    counts = reading[:, 0].numpy() / held[0].quantum_rad.value
+    np.testing.assert_allclose(counts, np.round(counts), atol=0.01)
+    before = feedback.reading.clone()
+    feedback.reset(torch.full((robots, 2), 9.0), torch.tensor([3]))
+    assert (feedback.reading[3] > 8.9).all() and (feedback.reading[4] == before[4]).all()
+
+
+def test_the_json_export_holds_every_number_with_its_interval(calibration):
+    found = json.loads(to_json(calibration, 0.005))
+    assert found["schema"] == "pupper-actuators" and found["physics_step_s"] == 0.005
+    own = calibration.joint("LF_calf")
+    there, stiffness = found["joints"]["LF_calf"], own.actuator.stiffness_nm_per_rad
+    assert there["actuator"]["stiffness_nm_per_rad"] == stiffness.model_dump(mode="json")
+    assert there["feedback"]["loss"]["value"] == own.feedback.loss.value
+    assert found["inputs"][0]["sha256"] == calibration.inputs[0].sha256
+
+
+@pytest.mark.parametrize("to", sorted(SIMULATORS))
+def test_every_export_says_where_its_numbers_come_from_and_a_wild_name_cannot_break_it(
+    calibration, to
+):
+    wild = calibration.model_copy(update={"robot": 'a"""b-->c & <d>\\'})
+    text = SIMULATORS[to](wild, 0.004)
+    assert calibration.inputs[0].sha256[:12] in text and "data sheet" in text
+    if to == "mjcf":
+        in_free_air(text, calibration.joint_names)
+    elif to == "json":
+        json.loads(text)
+    else:
+        assert ast.get_docstring(ast.parse(text))
+
+
+def test_newton_networks_give_the_effort_of_the_pd(calibration, tmp_path, capsys):
+    onnx = pytest.importorskip("onnx")
+    from onnx.reference import ReferenceEvaluator
+
+    folder = tmp_path / "newton"
+    code, _, err = run_program(
+        capsys, cli.pupper_sysid, "export", CALIBRATED, "--to", "newton", "--out", folder
+    )
+    assert code == 0, err
+    own = calibration.joint("LF_thigh").actuator
+    model = onnx.load(folder / "LF_thigh.onnx")
+    error, velocity = 0.02, -1.5
+    (effort,) = ReferenceEvaluator(model).run(
+        None, {"input": np.array([[error, velocity]], np.float32)}
+    )
+    expected = own.stiffness_nm_per_rad.value * error - own.damping_nm_s_per_rad.value * velocity
+    assert effort.shape == (1, 1) and effort[0, 0] == pytest.approx(expected, rel=1e-6)
+    contract = json.loads({p.key: p.value for p in model.metadata_props}["metadata"])
+    assert contract["input_order"] == "pos_vel" and contract["sample_dt_s"] == 0.005
+    ast.parse((folder / "newton_actuators.py").read_text())
+
+
+def test_exports_are_written_by_name_and_never_over_something(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ("export", CALIBRATED, "--to", "isaaclab")
+    code, _, err = run_program(capsys, cli.pupper_sysid, *arguments)
+    assert code == 0 and "5 ms" in err
+    assert (tmp_path / "calibrated_isaaclab.py").exists()
+    assert "exists already" in refused(capsys, cli.pupper_sysid, *arguments)
+
+
+def test_what_cannot_become_an_actuator_is_refused_with_the_way_out(capsys, tmp_path):
+    sweep = ROOT / "data/samples/sweep.csv"
+    assert "pupper-sysid calibrate" in refused(
+        capsys, cli.pupper_sysid, "export", sweep, "--to", "mjcf"
+    )
+    policy = ROOT / "data/samples/policies/lstm"
+    assert "--to onnx" in refused(capsys, cli.pupper_sysid, "export", policy, "--to", "mjlab")
+    assert "--physics-step" in refused(
+        capsys, cli.pupper_sysid, "export", CALIBRATED, "--to", "mjlab", "--physics-step", "5"
+    )
