@@ -13,9 +13,9 @@ Field names are those of Isaac Lab 2.3.2 (3.0 takes them, too), mjlab 1.6.0 and 
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Callable, Iterator, Sequence
+from importlib import resources
 from textwrap import indent, wrap
 from typing import Any
 
@@ -26,7 +26,6 @@ from common.files import versions
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Actuator, Quantity, unit_of
 from servo_models.delayed_pd import whole_steps
-from sim import held_feedback_torch
 from sim.servo_mjcf import INTEGRATOR, actuator_attributes, attributes, joint_attributes
 
 SCHEMA = "pupper-actuators"
@@ -328,7 +327,8 @@ def _module(
     actuators: str,
 ) -> str:
     """A Python module: what it is, the actuators, the feedback and the code that applies it."""
-    code = inspect.getsource(held_feedback_torch)
+    # read, not imported: that would load torch
+    code = (resources.files("sim") / "held_feedback_torch.py").read_text()
     rows = [
         f'"{name}": '
         + json.dumps({key: getattr(joint.feedback, key).value for key in FEEDBACK_KEYS})
