@@ -1,17 +1,20 @@
 """The command line as a user meets it: JSON alone on stdout, sentences, exit codes."""
 
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
+from command_line import refused, run, run_program
 
+import cli.pupper_sysid
 from servo_models.calibration import load_calibration
 from sysid.recording import load
 
@@ -198,3 +201,41 @@ def test_help_of_every_command_has_an_example(capsys):
     for command in ("sweep", "doctor", "delay", "bode", "calibrate", "export", "report"):
         code, out, _ = run(capsys, command, "--help")
         assert code == 0 and f"Example: pupper-sysid {command}" in " ".join(out.split())
+
+
+PROGRAMS = ("pupper_sysid", "pupper_train", "pupper_play", "pupper_eval", "pupper_deploy",
+            "pupper_analyze")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_every_program_says_its_version(capsys, name):
+    module = importlib.import_module(f"cli.{name}")
+    code, out, _ = run_program(capsys, module, "--version")
+    assert code == 0
+    assert out.startswith(f"{name.replace('_', '-')} {version('pupper-sysid')} (numpy ")
+
+
+def test_completion_is_written_where_bash_looks_for_it(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("SHELL", "/bin/bash")
+    code, _, err = run_program(capsys, cli.pupper_sysid, "--install-completion")
+    assert code == 0, err
+    script = tmp_path / ".local/share/bash-completion/completions/pupper-sysid"
+    assert "fit-servo" in script.read_text() and str(script) in err
+    monkeypatch.setenv("SHELL", "/usr/bin/fish")
+    assert "fish" in refused(capsys, cli.pupper_sysid, "--install-completion")
+
+
+def test_a_report_opens_in_the_browser_that_there_is(capsys, tmp_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or False)
+    sweep = tmp_path / "s.csv"
+    code, _, err = run_program(
+        capsys, cli.pupper_sysid, "sweep", "--freqs", "2,4", "--joints", "LF_hip",
+        "--duration", "2", "--out", sweep,
+    )  # fmt: skip
+    assert code == 0, err
+    page = tmp_path / "page"
+    code, _, err = run_program(capsys, cli.pupper_sysid, "report", sweep, "--out", page, "--open")
+    assert code == 0 and "No browser could be started" in err
+    assert opened == [(page / "report.html").resolve().as_uri()]
