@@ -1,9 +1,14 @@
-"""The twelve joints of the robot, in the one order that every array of this project has."""
+"""The twelve joints of the Mini Pupper, in the one order that its arrays have; rules for others'.
+
+What measures, fits and exports servos takes any robot's joints, by name; what simulates and walks
+is of the Mini Pupper.
+"""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 
 from common.errors import InputError
 
@@ -15,6 +20,46 @@ JOINT_NAMES: tuple[str, ...] = tuple(f"{leg}_{kind}" for leg in LEGS for kind in
 DEFAULT_POSE: dict[str, float] = {
     name: {"hip": 0.0, "thigh": 0.785, "calf": -1.57}[name.split("_")[1]] for name in JOINT_NAMES
 }
+
+
+# names become names of files, of XML elements and of columns
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Each name once: the Mini Pupper's in its order, then others as they come."""
+    given = list(dict.fromkeys(names))
+    return [n for n in JOINT_NAMES if n in given] + [n for n in given if n not in JOINT_NAMES]
+
+
+def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
+    """The first name that can be no joint's, and what to do; None if all are well.
+
+    Joints are all the Mini Pupper's or none is, so that a misspelt one among them is found.
+
+    Examples
+    --------
+    >>> strange_joint(["LF_hip", "LF_tigh"])
+    ('LF_tigh', 'did you mean LF_thigh?')
+    >>> strange_joint(["shoulder_pan", "gripper"]) is None
+    True
+    """
+    given = list(dict.fromkeys(map(str, names)))
+    own = any(n in JOINT_NAMES for n in given)
+    by_case = {n.lower(): n for n in JOINT_NAMES}
+    for name in given:
+        if name in JOINT_NAMES:
+            continue
+        # without a sister to tell by, only a slip of one letter is taken for one
+        near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.4 if own else 0.9)
+        meant = by_case.get(name.lower()) or (near[0] if near else None)
+        if meant:
+            return name, f"did you mean {meant}?"
+        if own:
+            return name, f"known are {', '.join(JOINT_NAMES)}."
+        if not _NAME.fullmatch(name):
+            return name, "use letters, digits and _, beginning with a letter."
+    return None
 
 
 def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str]:

@@ -27,7 +27,7 @@ from pydantic_core import PydanticCustomError
 
 from common.errors import InputError
 from common.files import write_text
-from common.joints import JOINT_NAMES
+from common.joints import in_order, strange_joint
 from common.strict_yaml import dump, read
 from servo_models.calibration_parts import PARAMETER_KEYS, JointCalibration, Part, Whole
 from servo_models.calibration_refusals import explain
@@ -116,18 +116,16 @@ class Calibration(Part):
     @field_validator("joints")
     @classmethod
     def _check_joints(cls, joints: dict[str, JointCalibration]) -> dict[str, JointCalibration]:
-        for name in joints:
-            if name not in JOINT_NAMES:
-                near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.5)
-                hint = f"did you mean {near[0]}" if near else f"use {', '.join(JOINT_NAMES)}"
-                raise PydanticCustomError(
-                    "joint", "{name} is no joint; {hint}", {"name": name, "hint": hint}
-                )
-        return {name: joints[name] for name in JOINT_NAMES if name in joints}
+        if strange := strange_joint(joints):
+            name, hint = strange
+            raise PydanticCustomError(
+                "joint", "{name} is no joint; {hint}", {"name": name, "hint": hint.rstrip(".?")}
+            )
+        return {name: joints[name] for name in in_order(joints)}
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The joints of this calibration, in the order of `common.joints.JOINT_NAMES`."""
+        """The joints of this calibration, in the order of `common.joints.in_order`."""
         return tuple(self.joints)
 
     def joint(self, name: str) -> JointCalibration:
@@ -160,7 +158,7 @@ class Calibration(Part):
         Returns
         -------
         DelayedPD
-            Its batch has shape (joints,), in the order of `JOINT_NAMES`, however they were named.
+            Its batch has shape (joints,), in the order of `joint_names`, however they were named.
 
         Raises
         ------
@@ -169,7 +167,7 @@ class Calibration(Part):
         """
         wanted = self.joint_names if joints is None else tuple(joints)
         parts = {name: self.joint(name).actuator for name in wanted}
-        actuators = [parts[name] for name in JOINT_NAMES if name in parts]
+        actuators = [parts[name] for name in self.joint_names if name in parts]
         if not actuators:
             raise InputError("No joint was named. Name at least one.")
 

@@ -25,7 +25,7 @@ from safetensors.numpy import save as save_tensors
 
 from common.errors import InputError
 from common.files import refuse_overwrite, write_bytes, write_text
-from common.joints import JOINT_NAMES
+from common.joints import strange_joint
 from servo_models.command_network import CommandNetwork
 from servo_models.control_rate import AtControlRate, substeps
 from servo_models.delayed_pd import DelayedPD, DelayedPDParameters
@@ -342,9 +342,8 @@ def _validated(found: dict[str, Any], path: Path) -> Contract:
         place = ".".join(str(p) for p in fault["loc"])
         said = "unknown entry" if fault["type"] == "extra_forbidden" else fault["msg"]
         raise InputError(f"{path}: {place}: {said}. Fit the model again.") from error
-    unknown = [j for j in contract.joints if j not in JOINT_NAMES]
-    if unknown:
-        raise InputError(f"{path}: {unknown[0]} is no joint. Use {', '.join(JOINT_NAMES)}.")
+    if strange := strange_joint(contract.joints):
+        raise InputError(f"{path}: {strange[0]} is no joint; {strange[1]}")
     return contract
 
 

@@ -14,11 +14,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from scipy.stats import norm
 
-from common.joints import JOINT_NAMES
+from common.joints import JOINT_NAMES, in_order
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
 from sysid.delay import LEVEL, Interval, LagBudget, lag_budget
 from sysid.ladder import LADDER, Rung, rung
@@ -187,8 +188,7 @@ def _each_joint(
     progress: Callable[[str], None] | None,
 ) -> dict[str, Any]:
     """`work` on each joint, in processes; results in joint order."""
-    chosen = [j for j in JOINT_NAMES if any(j in r.joints for r in recordings)]
-    chosen = [j for j in chosen if joints is None or j in joints]
+    chosen = in_order(j for r in recordings for j in r.joints if joints is None or j in joints)
     tasks = []
     for joint in chosen:
         trials, truncation = joint_trials(recordings, joint)
@@ -233,7 +233,8 @@ def joint_trials(
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:
     """Generator of one joint: repeatable whatever other joints are computed."""
-    return np.random.default_rng([seed, JOINT_NAMES.index(joint)])
+    place = JOINT_NAMES.index(joint) if joint in JOINT_NAMES else crc32(joint.encode())
+    return np.random.default_rng([seed, place])
 
 
 @dataclass(frozen=True)

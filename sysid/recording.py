@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from common.errors import InputError
 from common.files import SyncedText, versions
-from common.joints import JOINT_NAMES
+from common.joints import in_order
 
 SCHEMA_VERSION = 1
 TITLE = "# pupper-sysid recording"
@@ -101,8 +101,8 @@ class Recording:
 
     @property
     def joints(self) -> list[str]:
-        """Recorded joints, in the project's order."""
-        return [j for j in JOINT_NAMES if j in self._trials]
+        """Recorded joints, in the order of `common.joints.in_order`."""
+        return in_order(self._trials)
 
     def trials(self, joint: str) -> list[Trial]:
         """Trials of `joint` in time order."""

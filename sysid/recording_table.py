@@ -15,7 +15,7 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from common.errors import InputError
-from common.joints import JOINT_NAMES
+from common.joints import strange_joint
 
 _LEAST_ROWS = 20
 _LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
@@ -110,11 +110,8 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
         If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
     """
     warnings: list[str] = []
-    for name in dict.fromkeys(table["joint"].to_list()):
-        if name not in JOINT_NAMES:
-            near = difflib.get_close_matches(str(name), JOINT_NAMES, n=1, cutoff=0.4)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(JOINT_NAMES)}."
-            raise InputError(f"{path}, column joint: '{name}' is no joint; {hint}")
+    if strange := strange_joint(table["joint"].to_list()):
+        raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
     lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
     if lost.any():

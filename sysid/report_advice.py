@@ -53,7 +53,7 @@ def advice(
         "record the same sweep: that gives the scale."
     )
     missing = [j for j in JOINT_NAMES if j not in results]
-    if missing:
+    if 0 < len(missing) < len(JOINT_NAMES):  # of a Mini Pupper; how many others have is not known
         said.append(
             f"Nothing is known of {', '.join(missing)}. "
             "`pupper-sysid sweep --joints all` records them."
