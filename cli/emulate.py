@@ -83,8 +83,10 @@ class Feetech(Common):
 
     model: Literal["sts3215", "scs0009"] = "sts3215"
     """Which servos."""
-    ids: str = "1-12"
-    """Which of them are there: 1-12 or 4,5,6."""
+    joint_map: str | None = None
+    """Joint map of another robot, such as `init-robot` writes."""
+    ids: str = "all"
+    """Which of them are there: 1-12, 4,5,6, or all."""
     baud: int | None = None
     """Rate at which they listen; default 1000000 (STS3215) or 500000 (SCS0009)."""
     link: Path | None = None
@@ -98,13 +100,17 @@ class Feetech(Common):
         """Serve until Ctrl-C."""
         rng = np.random.default_rng(self.seed)
         series = STS3215 if self.model == "sts3215" else SCS0009
-        layout = load_joint_map("sts3215" if series is STS3215 else "mini_pupper_2_direct")
+        preset = "sts3215" if series is STS3215 else "mini_pupper_2_direct"
+        layout = load_joint_map(self.joint_map or preset)
+        if self.joint_map and self.walking:
+            raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
         baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
         if baud not in BAUD_RATES:
             raise InputError(f"--baud {baud}: servos know {', '.join(map(str, BAUD_RATES))}.")
         # read directly, a servo answers for the very moment: no polls in between, none lost
         spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
-        bench = _bench(self, draw_robot(rng, spec), layout, rng)
+        robot = draw_robot(rng, spec, layout if self.joint_map else None)
+        bench = _bench(self, robot, layout, rng)
         emulator = FeetechEmulator(
             bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
             BusFaults.parse(self.faults, rng), self.echo,
@@ -114,7 +120,7 @@ class Feetech(Common):
             _write_truth(self, bench)
             what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
             what += f"; IMU at {self.imu_socket}." if self.imu_socket else "."
-            _serve(server, what, f"feetech:{server.device}", self.walking)
+            _serve(server, what, f"feetech:{server.device}", self.walking, self.joint_map)
 
 
 Emulate = (
@@ -162,12 +168,19 @@ def _write_truth(options: Common, bench: ServoBench) -> None:
         write_text(options.truth, text, options.force)
 
 
-def _serve(server: ProxySocket | FeetechPty, what: str, name: str, walking: bool) -> None:
+def _serve(
+    server: ProxySocket | FeetechPty,
+    what: str,
+    name: str,
+    walking: bool,
+    own_map: str | None = None,
+) -> None:
     terminal.out.print(what, soft_wrap=True)
+    which, bus = ("", f"{name} --joint-map {own_map}") if own_map else (" --joints LF", name)
     # a sweep is for legs in free air
-    sweep = "" if walking else f"  pupper-sysid sweep --freqs 1-10 --joints LF --bus {name}\n"
+    sweep = "" if walking else f"  pupper-sysid sweep --freqs 1-10{which} --bus {bus}\n"
     terminal.out.print(
-        f"In another terminal:\n{sweep}  pupper-sysid monitor --bus {name}\nCtrl-C ends it.",
+        f"In another terminal:\n{sweep}  pupper-sysid monitor --bus {bus}\nCtrl-C ends it.",
         soft_wrap=True,
     )
     try:
@@ -178,7 +191,9 @@ def _serve(server: ProxySocket | FeetechPty, what: str, name: str, walking: bool
 
 
 def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
-    """Ids that `text` names: 1-12, or 4,5,6."""
+    """Ids that `text` names: 1-12, 4,5,6, or all."""
+    if text == "all":
+        return sorted(known)
     ids: list[int] = []
     for part in (piece.strip() for piece in text.split(",")):
         low, dash, high = part.partition("-")

@@ -20,6 +20,7 @@ from cli.compare import Compare
 from cli.emulate import Emulate
 from cli.export import Export
 from cli.fit_servo import FitServo
+from cli.init_robot import InitRobot
 from cli.monitor import Monitor
 from cli.report import Report
 from cli.scan import Scan
@@ -28,7 +29,8 @@ from cli.sweep import Sweep
 from cli.user_errors import end_politely, user_errors
 
 Command = (
-    Annotated[Scan, tyro.conf.subcommand("scan")]
+    Annotated[InitRobot, tyro.conf.subcommand("init-robot")]
+    | Annotated[Scan, tyro.conf.subcommand("scan")]
     | Annotated[Monitor, tyro.conf.subcommand("monitor")]
     | Annotated[CalibrateJoints, tyro.conf.subcommand("calibrate-joints")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]

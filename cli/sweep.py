@@ -12,16 +12,17 @@ from typing import Any, Literal
 import numpy as np
 
 from cli import terminal
-from cli.buses import connect
+from cli.buses import JOINTS_FILE, connect
 from common.errors import BusError, InputError
 from common.files import refuse_overwrite
-from common.joints import select_joints
+from common.joints import JOINT_NAMES, select_joints
 from hardware.bus import ServoBus
+from hardware.joint_map import load_joint_map
 from hardware.loop import real_time_priority
 from sim.emulated_bus import EmulatedBus
-from sim.emulated_robot import draw_robot
+from sim.emulated_robot import directly_read, draw_robot
 from sysid.command_playback import playback
-from sysid.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan, start_pose
+from sysid.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan
 from sysid.recorder import LOOP_PERIOD_S, record
 from sysid.recording import FOLDER
 from sysid.resume import footer, header_of, resume_point
@@ -45,7 +46,7 @@ class Sweep:
     feetech:/dev/ttyUSB0."""
     joint_map: str | None = None
     """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
-    fits the bus."""
+    fits the bus. With the emulated bus, the robot that is emulated."""
     kind: Literal["sine", "chirp", "multisine", "steps", "square"] = "sine"
     """Shape of the motion."""
     playback: Path | None = None
@@ -143,13 +144,19 @@ class Sweep:
             "seed": self.seed,
             "loop_period_s": 1.0 / self.rate,
             "kind": self.kind,
-            "joints": select_joints(self.joints),
+            "joints": select_joints(self.joints, self._joints_there()),
             "frequencies_hz": parse_frequencies(self.freqs),
             "amplitude_rad": self.amplitude,
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
             "loops": self.loops,
         }
+
+    def _joints_there(self) -> tuple[str, ...]:
+        """Joints to choose from: of the joint map, if one was named or lies here."""
+        here = JOINTS_FILE if self.bus != EMULATED and JOINTS_FILE.exists() else None
+        chosen = self.joint_map or here
+        return load_joint_map(chosen).joint_names if chosen else JOINT_NAMES
 
     def _say(
         self, request: dict[str, Any], chosen: Plan, written: list[Path], elapsed: float
@@ -185,14 +192,15 @@ class Sweep:
 def _open(request: dict[str, Any]) -> ServoBus:
     """The bus that a request names."""
     if request["bus"] == EMULATED:
-        if request["joint_map"]:
-            raise InputError("--joint-map: the emulated robot has its own; leave it out.")
         rng = np.random.default_rng(request["seed"])
         real_time = bool(request["real_time"])
+        own = load_joint_map(request["joint_map"]) if request["joint_map"] else None
+        whose = f"one with the servos of {own.file.name}" if own else "the emulated one"
         terminal.err.print(
-            "No robot: using the emulated one" + (", in real time." if real_time else ".")
+            f"No robot: using {whose}" + (", in real time." if real_time else "."), soft_wrap=True
         )
-        return EmulatedBus(draw_robot(rng), rng, real_time=real_time)
+        robot = draw_robot(rng, directly_read(own) if own else None, own)
+        return EmulatedBus(robot, rng, real_time=real_time)
     return connect(request["bus"], request["joint_map"], request["joints"])
 
 
@@ -202,12 +210,13 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
     if request["playback"]:
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
-    room = bus.limits.room(start_pose(bus.joint_names))
+    pose = bus.metadata["rest_pose_rad"]
+    room = bus.limits.room(np.array([pose[name] for name in bus.joint_names]))
     return plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
         request["duration_s"], request["loop_period_s"], bus.metadata["speed_limit_rad_s"],
         bus.metadata.get("poll_rate_hz", POLL_RATE_HZ),
-        dict(zip(bus.joint_names, map(float, room), strict=True)),
+        dict(zip(bus.joint_names, map(float, room), strict=True)), pose,
     )  # fmt: skip
 
 

@@ -51,7 +51,7 @@ def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
         if name in JOINT_NAMES:
             continue
         # without a sister to tell by, only a slip of one letter is taken for one
-        near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.4 if own else 0.9)
+        near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.7 if own else 0.9)
         meant = by_case.get(name.lower()) or (near[0] if near else None)
         if meant:
             return name, f"did you mean {meant}?"

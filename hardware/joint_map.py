@@ -33,12 +33,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from common.errors import InputError
 from common.files import write_text
-from common.joints import DEFAULT_POSE, JOINT_NAMES
+from common.joints import DEFAULT_POSE, JOINT_NAMES, in_order, strange_joint
 from common.strict_yaml import dump, place_text, read
 from hardware.limits import Coupling, PositionLimits
 
 SCHEMA = "pupper-sysid joint map"
 SCHEMA_VERSION = 1
+REST_ROOM_RAD = 0.4
+"""What a sweep's start leaves to both sides, where the limits allow it."""
 PRESETS = ("mini_pupper_2", "mini_pupper_2_300deg", "mini_pupper_2_direct", "sts3215")
 
 Frame = Literal["proxy", "raw"]
@@ -101,9 +103,10 @@ class JointMapFile(BaseModel):
 
     @model_validator(mode="after")
     def _names_and_ids(self) -> JointMapFile:
-        unknown = [j for j in self.joints if j not in JOINT_NAMES]
-        if unknown:
-            raise ValueError(f"{unknown[0]} is no joint; known are {', '.join(JOINT_NAMES)}")
+        if strange := strange_joint(self.joints):
+            raise ValueError(f"{strange[0]} is no joint; {strange[1].rstrip('.?')}")
+        if self.linkage != "none" and not set(self.joints) <= set(JOINT_NAMES):
+            raise ValueError("linkage: push rods are the Mini Pupper's; write none")
         ids: dict[int, str] = {}
         for joint, entry in self.joints.items():
             if entry.id in ids:
@@ -155,11 +158,25 @@ class JointMap:
                     raise InputError(
                         f"{calf} hangs on {thigh} by a push rod: use both, or neither."
                     )
-        return replace(self, joint_names=tuple(j for j in JOINT_NAMES if j in joints))
+        chosen = in_order(j for j in self.file.joints if j in joints)
+        return replace(self, joint_names=tuple(chosen))
 
     def per_servo(self) -> JointMap:
         """The same map in servo coordinates."""
         return replace(self, coordinates="servo")
+
+    def rest_pose(self) -> NDArray[np.float64]:
+        """Where a joint stands before it is swept, shape (joints,) [rad].
+
+        The Mini Pupper's standing pose; of another robot the servos' neutral, or as near to it as
+        leaves `REST_ROOM_RAD` to both limits.
+        """
+        limits = self.per_servo().position_limits()
+        room = np.minimum(REST_ROOM_RAD, (limits.high_rad - limits.low_rad) / 2)
+        pose = np.clip(self.zero_rad(), limits.low_rad + room, limits.high_rad - room)
+        return np.array(
+            [DEFAULT_POSE.get(n, x) for n, x in zip(self.joint_names, pose, strict=True)]
+        )
 
     def counts_per_rad(self) -> NDArray[np.float64]:
         """Counts per radian, shape (joints,)."""
@@ -224,6 +241,7 @@ class JointMap:
             "command_quantum_rad": {j: 1 / self._entry(j).counts_per_rad for j in names},
             "command_rounding": dict.fromkeys(names, "nearest"),
             "count_zero_rad": {j: float(z) for j, z in zip(names, zero, strict=True)},
+            "rest_pose_rad": {j: float(x) for j, x in zip(names, self.rest_pose(), strict=True)},
         }
 
     def save(self, path: Path, force: bool = False) -> None:
@@ -365,7 +383,7 @@ def joint_map_from(data: dict[str, Any], name: str, lines: dict | None = None) -
         what = message[:1].lower() + message[1:] if what == message else what
         where = f": {place_text(place)}" if place else ""
         raise InputError(f"{name}{at}{where}: {what}.") from error
-    return JointMap(file, tuple(j for j in JOINT_NAMES if j in file.joints))
+    return JointMap(file, tuple(in_order(file.joints)))
 
 
 def _load(path: Path) -> JointMap:

@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 
 from common.errors import BusError
 from common.files import refuse_overwrite, write_text
-from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.bus import BusSample, Sent
-from hardware.joint_map import load_joint_map
 from sim.clocks import Clock, RealClock, VirtualClock
 from sim.emulated_robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
 from sim.poll_schedule import PollSchedule
@@ -57,7 +55,6 @@ class EmulatedBus:
     """
 
     name = "emulated"
-    joint_names: tuple[str, ...] = JOINT_NAMES
 
     def __init__(
         self,
@@ -68,6 +65,7 @@ class EmulatedBus:
         keep_log: bool = True,
     ):
         self.robot, self._keep_log = robot, keep_log
+        self.joint_names = robot.joint_names
         spec = robot.spec
         polls, self._noise, clock = rng.spawn(3)
         self._clock: Clock = (
@@ -89,21 +87,23 @@ class EmulatedBus:
         self._centre = (
             round(CENTRE_COUNT * RADIANS_PER_COUNT / spec.quantum_rad) if spec.quantum_rad else 0
         )
-        joints = len(JOINT_NAMES)
+        joints = len(self.joint_names)
         self._reading = np.full(joints, np.nan)
         self._count = np.full(joints, -1)
         self._measured_s = np.full(joints, -np.inf)
-        self._goal = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
-        self._changes: list[list[float]] = [[] for _ in JOINT_NAMES]
+        pose = robot.joint_map.rest_pose()
+        self._goal = pose.copy()
+        self._changes: list[list[float]] = [[] for _ in self.joint_names]
         self._log: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
         self._closed = False
-        self.limits = load_joint_map("mini_pupper_2").per_servo().position_limits()
+        self.limits = robot.joint_map.per_servo().position_limits()
         self.metadata: dict[str, Any] = {
             "kind": "emulated",
             "coordinates": "servo",
             "command_quantum_rad": {s.joint: spec.quantum_rad for s in robot.servos},
             "command_rounding": {s.joint: s.command_rounding for s in robot.servos},
             "count_zero_rad": {s.joint: s.zero_rad for s in robot.servos},
+            "rest_pose_rad": dict(zip(self.joint_names, map(float, pose), strict=True)),
             "speed_limit_rad_s": NOMINAL_SPEED_LIMIT_RAD_S,
             "real_time": real_time,
         }
@@ -128,7 +128,7 @@ class EmulatedBus:
         goal = np.asarray(position_rad, float)
         if goal.shape != self._goal.shape or not np.isfinite(goal).all():
             raise BusError(
-                f"emulated bus: goals must be {len(JOINT_NAMES)} finite angles, got {goal}."
+                f"emulated bus: goals must be {len(self.joint_names)} finite angles, got {goal}."
             )
         sent, asked = self._clock.now(), goal
         goal = self._truncated(goal)
@@ -159,19 +159,19 @@ class EmulatedBus:
         self._reading[fresh], self._count[fresh] = self._quantised(position + noise, fresh)
         self._measured_s = measured
         if self._keep_log:
-            true = np.array([self._plant.angle(i, time_s) for i in range(len(JOINT_NAMES))])
+            true = np.array([self._plant.angle(i, time_s) for i in range(len(self.joint_names))])
             self._log.append((time_s, true, measured))
-        at = np.full(len(JOINT_NAMES), time_s)
+        at = np.full(len(self.joint_names), time_s)
         return BusSample(at, self._reading.copy(), self._count.copy())
 
     def torque(self, on: bool) -> bool:
         """Hold the present pose, or let every joint go limp."""
         self._refuse_closed()
         now = self._clock.now()
-        for i in range(len(JOINT_NAMES)):
+        for i in range(len(self.joint_names)):
             self._plant.torque(i, now, on)
         # the next write must reach the servos even if it repeats the last one
-        self._goal = np.full(len(JOINT_NAMES), np.nan)
+        self._goal = np.full(len(self.joint_names), np.nan)
         return True
 
     def close(self) -> None:
@@ -192,7 +192,7 @@ class EmulatedBus:
         used = np.stack([_near(times, np.array(changes)) for changes in self._changes], axis=-1)
         for (time_s, true, measured), row in zip(self._log, used, strict=True):
             for i in np.flatnonzero(row):
-                yield time_s, JOINT_NAMES[i], float(true[i]), float(measured[i])
+                yield time_s, self.joint_names[i], float(true[i]), float(measured[i])
 
     def write_truth(self, stem: Path, force: bool = False) -> tuple[Path, Path]:
         """Write `<stem>.truth.yaml` and `<stem>.truth.csv`; returns their paths.
@@ -218,7 +218,7 @@ class EmulatedBus:
         """When each joint's present reading was measured [s]."""
         if self._schedule is not None:
             return self._schedule.advance(time_s)
-        succeeded = self._polls.random(len(JOINT_NAMES)) >= self.robot.spec.loss
+        succeeded = self._polls.random(len(self.joint_names)) >= self.robot.spec.loss
         return np.where(succeeded, time_s, self._measured_s)
 
     def _truncated(self, goal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,8 +16,7 @@ from dataclasses import asdict, dataclass, fields, replace
 import numpy as np
 
 from common.errors import InputError
-from common.joints import JOINT_NAMES
-from hardware.joint_map import load_joint_map
+from hardware.joint_map import JointMap, load_joint_map
 from servo_models import DelayedPDParameters, HeldFeedback
 
 RADIANS_PER_COUNT = np.pi / 550
@@ -116,10 +115,16 @@ class EmulatedServo:
 
 @dataclass(frozen=True)
 class EmulatedRobot:
-    """The truth about one robot: its spec and its servos in the order of `JOINT_NAMES`."""
+    """The truth about one robot: its spec, and its servos in the order of its joint map."""
 
     spec: RobotSpec
     servos: tuple[EmulatedServo, ...]
+    joint_map: JointMap
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Of the servos."""
+        return tuple(servo.joint for servo in self.servos)
 
     def truth(self) -> dict:
         """All of it as plain numbers and strings, ready for YAML."""
@@ -139,14 +144,24 @@ class EmulatedRobot:
         return {"spec": asdict(self.spec), "joints": joints}
 
 
-def draw_robot(rng: np.random.Generator, spec: RobotSpec | None = None) -> EmulatedRobot:
-    """One robot made to `spec` (default: like the published Mini Pupper 2)."""
+def draw_robot(
+    rng: np.random.Generator, spec: RobotSpec | None = None, joint_map: JointMap | None = None
+) -> EmulatedRobot:
+    """One robot made to `spec` (default: like the published Mini Pupper 2).
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    spec : RobotSpec, optional
+    joint_map : JointMap, optional
+        Of another robot.
+    """
     spec = spec or RobotSpec()
     start = rng.uniform(0.0, spec.poll_period_s)
-    layout = load_joint_map("mini_pupper_2").per_servo()
+    layout = (joint_map or load_joint_map("mini_pupper_2")).per_servo()
     servos = []
-    for joint, servo_id, sign, zero in zip(
-        JOINT_NAMES, layout.ids, layout.sign(), layout.zero_rad(), strict=True
+    for turn, (joint, sign, zero) in enumerate(
+        zip(layout.joint_names, layout.sign(), layout.zero_rad(), strict=True)
     ):
         kp, kd, friction, effort = np.exp(spec.gain_spread * rng.standard_normal(4))
         speed = np.exp(spec.velocity_spread * rng.standard_normal())
@@ -167,9 +182,17 @@ def draw_robot(rng: np.random.Generator, spec: RobotSpec | None = None) -> Emula
             quantum_rad=spec.quantum_rad,
             offset_rad=float(spec.offset_sd_rad * rng.standard_normal()),
         )
-        phase = float(start + (servo_id - 1) / len(JOINT_NAMES) * spec.poll_period_s)
+        # the firmware polls in the order of ids; another bus in that of the map
+        place = layout.ids[turn] - 1 if joint_map is None else turn
+        phase = float(start + place / len(layout.ids) * spec.poll_period_s)
         servos.append(EmulatedServo(joint, actuator, feedback, phase, float(zero), int(sign)))
-    return EmulatedRobot(spec, tuple(servos))
+    return EmulatedRobot(spec, tuple(servos), layout)
+
+
+def directly_read(joint_map: JointMap) -> RobotSpec:
+    """Servos of a map on a serial line: each answers for the very moment, nothing is lost."""
+    quantum = float(1 / joint_map.counts_per_rad().max())
+    return RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=quantum)
 
 
 def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from common.joints import JOINT_NAMES
 from hardware.imu import ImuSample
 from hardware.joint_map import JointMap
 from sim.emulated_robot import EmulatedRobot
@@ -30,7 +29,7 @@ class ServoBench:
     ----------
     robot : EmulatedRobot
     joint_map : JointMap
-        What counts mean; used in servo coordinates, all twelve joints.
+        What counts mean; used in servo coordinates, all joints of the robot.
     rng : numpy.random.Generator
         Reading noise.
     by_hand : bool
@@ -50,16 +49,16 @@ class ServoBench:
         keep_log: bool = True,
         plant: ServoPlant | None = None,
     ):
-        self.robot, self.map = robot, joint_map.select(JOINT_NAMES).per_servo()
+        self.robot, self.map = robot, joint_map.select(robot.joint_names).per_servo()
         self._rng, self._by_hand = rng, by_hand
         self.plant = plant or FreeAirServos(robot)
         """What moves."""
         self._offset = np.array([s.feedback.offset_rad for s in robot.servos])
         self._noise = robot.spec.reading_noise_rad
-        self._limp_since = np.full(len(JOINT_NAMES), np.inf)
+        self._limp_since = np.full(len(robot.servos), np.inf)
         self._top = self.map.file.counts - 1
         self._scale = self.map.sign() * self.map.counts_per_rad()
-        self._zero = self.map.to_counts(np.zeros(len(JOINT_NAMES)))
+        self._zero = self.map.to_counts(np.zeros(len(robot.servos)))
         self.index_of_id = {i: k for k, i in enumerate(self.map.ids)}
         self.supply_v, self.keep_log = SUPPLY_V, keep_log
         self.commands: list[tuple[float, int, int]] = []

@@ -11,7 +11,6 @@ from typing import Protocol
 
 import numpy as np
 
-from common.joints import DEFAULT_POSE
 from hardware.imu import GRAVITY_M_S2, ImuSample
 from sim.emulated_robot import EmulatedRobot
 from sim.free_air_servo import FreeAirServo
@@ -49,7 +48,10 @@ class FreeAirServos:
     """The servos of a robot on a stand, level and at rest, with its legs in free air."""
 
     def __init__(self, robot: EmulatedRobot):
-        self._servos = [FreeAirServo(s.actuator, DEFAULT_POSE[s.joint]) for s in robot.servos]
+        pose = robot.joint_map.rest_pose().tolist()
+        self._servos = [
+            FreeAirServo(s.actuator, x) for s, x in zip(robot.servos, pose, strict=True)
+        ]
 
     def command(self, index: int, time_s: float, angle_rad: float) -> None:
         """Goal of one servo from `time_s` on; a limp one ignores it."""

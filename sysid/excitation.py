@@ -106,6 +106,7 @@ def plan(
     speed_limit_rad_s: float = 7.5,
     poll_rate_hz: float = POLL_RATE_HZ,
     room_rad: Mapping[str, float] | None = None,
+    start_pose_rad: Mapping[str, float] | None = None,
 ) -> Plan:
     """The trials of an excitation, one joint after the other.
 
@@ -132,6 +133,8 @@ def plan(
         Feedback polls per second, 0 if there are none.
     room_rad : mapping of joint to float, optional
         How far each joint may swing to both sides of its start pose.
+    start_pose_rad : mapping of joint to float, optional
+        Default: the Mini Pupper's standing pose.
 
     Raises
     ------
@@ -197,12 +200,8 @@ def plan(
         "speed_limit_rad_s": speed_limit_rad_s,
         "warnings": list(dict.fromkeys(warnings)),
     }
-    return Plan(trials, dict(DEFAULT_POSE), description, tuple(dict.fromkeys(warnings)))
-
-
-def start_pose(joints: Sequence[str]) -> NDArray[np.float64]:
-    """The pose from which excitations start, shape (joints,) [rad]."""
-    return np.array([DEFAULT_POSE[joint] for joint in joints])
+    pose = dict(DEFAULT_POSE if start_pose_rad is None else start_pose_rad)
+    return Plan(trials, pose, description, tuple(dict.fromkeys(warnings)))
 
 
 def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
