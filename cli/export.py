@@ -78,7 +78,7 @@ class Export:
         from servo_models.servo_file import load_servo_model
         from sysid.servo_export import ENDINGS, export_servo_model
 
-        if self.to not in ENDINGS:
+        if self.to not in ("csv", "onnx", "torchscript"):
             raise InputError(
                 f"{folder} is a servo model, which says where a servo will be and not how strong "
                 f"it is; {self.to} needs a calibration (`pupper-sysid calibrate`). A servo model "
