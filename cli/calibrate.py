@@ -9,7 +9,9 @@ from pathlib import Path
 import tyro
 
 from cli import terminal
+from common.errors import InputError
 from common.files import refuse_overwrite
+from common.joints import JOINT_NAMES
 from servo_models.calibration import Calibration
 from sysid.calibrate import JointCalibrationResult, calibrate
 from sysid.calibration_file import (
@@ -20,22 +22,32 @@ from sysid.calibration_file import (
 )
 from sysid.report_data import calibrate_json
 
+_SHOWN = {"lag_ms": 1, "delay_ms": 1, "stiffness_per_s2": 0, "speed_rad_s": 2, "loss": 2}
+
 
 @dataclass(frozen=True)
 class Calibrate:
     """Fit a servo model per joint and write it as YAML, with intervals and caveats.
 
     Example: pupper-sysid calibrate recordings/sweep.csv --out calibrated.yaml
+
+    Example: pupper-sysid calibrate robots/ --jobs 4
     """
 
     recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Recordings, pooled per joint; by default the newest in recordings/."""
-    out: Path = Path("calibrated.yaml")
-    """Calibration file to write."""
+    """Recordings, pooled per joint; by default the newest in recordings/. A folder is a fleet: each
+    recording in it is a robot of its own."""
+    out: Path | None = None
+    """Calibration file to write, calibrated.yaml by default; of a fleet the folder, by default the
+    given one's name and _calibrated."""
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     stall_torque: float = STALL_TORQUE_NM
     """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature."""
+    jobs: int = 2
+    """Robots of a fleet that are calibrated at the same time."""
+    cluster: str | None = None
+    """Dask scheduler to calibrate a fleet on, such as tcp://host:8786."""
     force: bool = False
     """Replace the calibration file if it exists."""
     json: bool = False
@@ -47,25 +59,88 @@ class Calibrate:
         """Calibrate, print, write."""
         started = time.perf_counter()
         terminal.need_positive("--stall-torque", self.stall_torque)
-        refuse_overwrite(self.out, self.force)  # before the work, not after it
+        if len(self.recordings) == 1 and self.recordings[0].is_dir():
+            self._fleet(self.recordings[0], started)
+            return
+        if self.cluster:
+            raise InputError("--cluster is for a fleet: give the folder of its recordings.")
+        out = self.out or Path("calibrated.yaml")
+        refuse_overwrite(out, self.force)  # before the work, not after it
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.progress("calibrating", len(joints)) as advance:
             results = calibrate(
                 recordings, joints, self.seed, preset_parameters(), progress=advance
             )
-        given = self.stall_torque != STALL_TORQUE_NM
-        source = "given with --stall-torque" if given else STALL_TORQUE_SOURCE
-        made = to_calibration(results, recordings, self.seed, self.stall_torque, source)
-        made.save(self.out, force=self.force)
+        made = to_calibration(results, recordings, self.seed, self.stall_torque, self._source())
+        made.save(out, force=self.force)
         elapsed = time.perf_counter() - started
         if self.json:
             terminal.print_json(calibrate_json(results, made, elapsed))
         else:
-            self._print(results, made, elapsed)
+            self._print(results, made, out, elapsed)
+
+    def _source(self) -> str:
+        """Where the torque anchor comes from."""
+        given = self.stall_torque != STALL_TORQUE_NM
+        return "given with --stall-torque" if given else STALL_TORQUE_SOURCE
+
+    def _fleet(self, root: Path, started: float) -> None:
+        """Many robots, one after the other or side by side."""
+        from sysid.fleet import TABLE, Settings, calibrate_fleet, recordings_in
+
+        if self.jobs < 1:
+            raise InputError(f"--jobs is {self.jobs}; it must be at least 1.")
+        if self.joints != "all":
+            raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
+        out = self.out or root.with_name(f"{root.resolve().name}_calibrated")
+        settings = Settings(self.seed, self.stall_torque, self._source())
+        with terminal.progress("calibrating", len(recordings_in(root))) as advance:
+            fleet = calibrate_fleet(
+                root, out, settings, self.jobs, self.cluster, self.force, advance
+            )
+        elapsed = time.perf_counter() - started
+        if self.json:
+            terminal.print_json(
+                {
+                    "table": str(out / TABLE), "made": fleet.made, "kept": fleet.kept,
+                    "failed": fleet.failed, "elapsed_s": elapsed,
+                }
+            )  # fmt: skip
+            return
+        known = fleet.table[fleet.table["problem"] == ""]
+        shown = terminal.table(
+            "Fleet: median and middle 90 % of the robots", "joint", "robots", "lag ms",
+            "dead time ms", "stiffness 1/s²", "speed rad/s", "loss",
+        )  # fmt: skip
+        for joint, rows in known.groupby("joint", sort=False):
+            cells = [
+                "{} ({} … {})".format(*(terminal.number(x, digits) for x in spread))
+                for key, digits in _SHOWN.items()
+                for spread in [rows[key].quantile([0.5, 0.05, 0.95])]
+            ]
+            shown.add_row(str(joint), str(len(rows)), *cells)
+        terminal.out.print(shown)
+        for _, row in known[known["unlike"] != ""].iterrows():
+            terminal.out.print(
+                f"{row['robot']} {row['joint']} is unlike its sisters: "
+                f"{row['unlike'].replace(';', ', ')}.",
+                soft_wrap=True,
+            )
+        for _, row in fleet.table[fleet.table["problem"] != ""].iterrows():
+            terminal.warn([f"{row['robot']} was left out: {row['problem']}"])
+        terminal.err.print(
+            f"{len(fleet.made)} calibrated, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
+            f"{elapsed:.0f} s. Wrote {out / TABLE} and a calibration per robot beside it.",
+            soft_wrap=True,
+        )
 
     def _print(
-        self, results: dict[str, JointCalibrationResult], made: Calibration, elapsed: float
+        self,
+        results: dict[str, JointCalibrationResult],
+        made: Calibration,
+        out: Path,
+        elapsed: float,
     ) -> None:
         shown = terminal.table(
             "DelayedPD per joint", "joint", "delay ms", "steps @500 Hz", "Kp", "Kd", "friction",
@@ -91,6 +166,13 @@ class Calibrate:
         )
         for r in results.values():
             terminal.warn(r.warnings)
+        if self.stall_torque == STALL_TORQUE_NM and not set(results) <= set(JOINT_NAMES):
+            terminal.warn(
+                [
+                    f"{self.stall_torque:g} N·m is the stall torque of the Mini Pupper's servo. "
+                    "Give --stall-torque from your servo's data sheet: all torques scale with it."
+                ]
+            )
         terminal.err.print(
-            f"Wrote {self.out} in {elapsed:.1f} s. Next: pupper-sysid report", soft_wrap=True
+            f"Wrote {out} in {elapsed:.1f} s. Next: pupper-sysid report", soft_wrap=True
         )

@@ -103,6 +103,7 @@ class EmulatedBus:
             "command_quantum_rad": {s.joint: spec.quantum_rad for s in robot.servos},
             "command_rounding": {s.joint: s.command_rounding for s in robot.servos},
             "count_zero_rad": {s.joint: s.zero_rad for s in robot.servos},
+            "joint_map": robot.joint_map.file.name,
             "rest_pose_rad": dict(zip(self.joint_names, map(float, pose), strict=True)),
             "speed_limit_rad_s": NOMINAL_SPEED_LIMIT_RAD_S,
             "real_time": real_time,

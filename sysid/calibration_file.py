@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from common.files import versions
+from common.joints import JOINT_NAMES
 from servo_models.calibration import (
     PRESETS,
     Calibration,
@@ -66,9 +67,13 @@ def to_calibration(
     source : str
         Where the anchor comes from.
     """
-    robots = {str((r.metadata.get("bus") or {}).get("kind", "unknown bus")) for r in recordings}
+    buses = [r.metadata.get("bus") or {} for r in recordings]
+    kinds = {str(bus.get("kind", "unknown bus")) for bus in buses}
+    maps = {str(bus["joint_map"]) for bus in buses if bus.get("joint_map")}
+    pupper = set(results) <= set(JOINT_NAMES)
+    own = "Mini Pupper 2" if pupper else ", ".join(sorted(maps)) or "another robot"
     return Calibration(
-        robot=f"Mini Pupper 2 ({', '.join(sorted(robots))})",
+        robot=f"{own} ({', '.join(sorted(kinds))})",
         created=utc_now(),
         inputs=tuple(
             InputFile(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
