@@ -12,10 +12,11 @@ in the table. Servos that are unlike their sisters on the other robots are named
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -146,8 +147,8 @@ def calibrate_fleet(
             todo.append((path, target))
     problems: dict[str, str] = {}
     with _backend(cluster) as parallel:
-        made = parallel(jobs)(delayed(_one)(path, target, settings) for path, target in todo)
-        for name, problem in made:
+        work = parallel(jobs)(delayed(_one)(path, target, settings) for path, target in todo)
+        for name, problem in cast(Iterable[tuple[str, str]], work):
             (fleet.failed if problem else fleet.made).append(name)
             if problem:
                 problems[name] = problem
