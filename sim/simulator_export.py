@@ -125,23 +125,20 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
         a = joint.actuator
         low, high = whole_steps(*a.delay_interval_s, physics_step_s)
         groups.append(
-            f'"{name}": DelayedPDActuatorCfg(\n'
-            + indent(
-                _arguments(
-                    ("joint_names_expr", [name], ""),
-                    ("stiffness", a.stiffness_nm_per_rad, "stiffness_nm_per_rad"),
-                    ("damping", a.damping_nm_s_per_rad, "damping_nm_s_per_rad"),
-                    ("armature", a.armature_kg_m2, "armature_kg_m2"),
-                    ("friction", a.friction_loss_nm, "friction_loss_nm"),
-                    ("dynamic_friction", a.friction_loss_nm.value, ""),
-                    ("effort_limit", a.effort_limit_nm, "effort_limit_nm"),
-                    ("velocity_limit", a.velocity_limit_rad_s, "velocity_limit_rad_s"),
-                    ("min_delay", low, ""),
-                    ("max_delay", high, ""),
-                ),
-                "    ",
+            f'"{name}": '
+            + _call(
+                "DelayedPDActuatorCfg",
+                ("joint_names_expr", [name], ""),
+                ("stiffness", a.stiffness_nm_per_rad, "stiffness_nm_per_rad"),
+                ("damping", a.damping_nm_s_per_rad, "damping_nm_s_per_rad"),
+                ("armature", a.armature_kg_m2, "armature_kg_m2"),
+                ("friction", a.friction_loss_nm, "friction_loss_nm"),
+                ("dynamic_friction", a.friction_loss_nm.value, ""),
+                ("effort_limit", a.effort_limit_nm, "effort_limit_nm"),
+                ("velocity_limit", a.velocity_limit_rad_s, "velocity_limit_rad_s"),
+                ("min_delay", low, ""),
+                ("max_delay", high, ""),
             )
-            + "),"
         )
     notes = (
         *origin(calibration),
@@ -177,24 +174,20 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
         a = joint.actuator
         steps = max(round(a.delay_s.value / physics_step_s), 0)
         groups.append(
-            "BuiltinPositionActuatorCfg(\n"
-            + indent(
-                _arguments(
-                    ("target_names_expr", (name,), ""),
-                    ("stiffness", a.stiffness_nm_per_rad, "stiffness_nm_per_rad"),
-                    ("damping", a.damping_nm_s_per_rad, "damping_nm_s_per_rad"),
-                    ("effort_limit", a.effort_limit_nm, "effort_limit_nm"),
-                    ("armature", a.armature_kg_m2, "armature_kg_m2"),
-                    ("frictionloss", a.friction_loss_nm, "friction_loss_nm"),
-                    ("delay_min_lag", steps, ""),
-                    ("delay_max_lag", steps, ""),
-                    ("delay_hold_prob", 0.0, ""),
-                    ("delay_update_period", 0, ""),
-                    ("delay_per_env_phase", False, ""),
-                ),
-                "    ",
+            _call(
+                "BuiltinPositionActuatorCfg",
+                ("target_names_expr", (name,), ""),
+                ("stiffness", a.stiffness_nm_per_rad, "stiffness_nm_per_rad"),
+                ("damping", a.damping_nm_s_per_rad, "damping_nm_s_per_rad"),
+                ("effort_limit", a.effort_limit_nm, "effort_limit_nm"),
+                ("armature", a.armature_kg_m2, "armature_kg_m2"),
+                ("frictionloss", a.friction_loss_nm, "friction_loss_nm"),
+                ("delay_min_lag", steps, ""),
+                ("delay_max_lag", steps, ""),
+                ("delay_hold_prob", 0.0, ""),
+                ("delay_update_period", 0, ""),
+                ("delay_per_env_phase", False, ""),
             )
-            + "),"
         )
         low, high = whole_steps(*a.delay_interval_s, physics_step_s)
         bounds.append(f'"{name}": ({low}, {high}),')
@@ -304,8 +297,8 @@ def _plain(quantity: Quantity) -> dict[str, Any]:
     return quantity.model_dump(mode="json")
 
 
-def _arguments(*arguments: tuple[str, Any, str]) -> str:
-    """Keyword arguments, one per line; a measured one with what is known of it behind it."""
+def _call(function: str, *arguments: tuple[str, Any, str]) -> str:
+    """A call with a keyword argument per line; behind a measured one what is known of it."""
     lines = []
     for name, value, key in arguments:
         if isinstance(value, Quantity):
@@ -315,7 +308,7 @@ def _arguments(*arguments: tuple[str, Any, str]) -> str:
             lines.append(f"{name}={value.value!r},  # {text}\n")
         else:
             lines.append(f"{name}={value!r},\n")
-    return "".join(lines)
+    return f"{function}(\n{indent(''.join(lines), '    ')}),"
 
 
 def _module(
