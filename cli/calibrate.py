@@ -108,7 +108,7 @@ class Calibrate:
                 }
             )  # fmt: skip
             return
-        known = fleet.table[fleet.table["problem"] == ""]
+        known = fleet.table.query("problem == ''")
         shown = terminal.table(
             "Fleet: median and middle 90 % of the robots", "joint", "robots", "lag ms",
             "dead time ms", "stiffness 1/s²", "speed rad/s", "loss",
@@ -121,13 +121,13 @@ class Calibrate:
             ]
             shown.add_row(str(joint), str(len(rows)), *cells)
         terminal.out.print(shown)
-        for _, row in known[known["unlike"] != ""].iterrows():
+        for _, row in known.query("unlike != ''").iterrows():
             terminal.out.print(
                 f"{row['robot']} {row['joint']} is unlike its sisters: "
-                f"{row['unlike'].replace(';', ', ')}.",
+                f"{', '.join(str(row['unlike']).split(';'))}.",
                 soft_wrap=True,
             )
-        for _, row in fleet.table[fleet.table["problem"] != ""].iterrows():
+        for _, row in fleet.table.query("problem != ''").iterrows():
             terminal.warn([f"{row['robot']} was left out: {row['problem']}"])
         terminal.err.print(
             f"{len(fleet.made)} calibrated, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
