@@ -89,12 +89,14 @@ def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str
             continue
         found = [n for n in available if word.lower() in (n.lower(), *n.lower().split("_"))]
         if not found:
-            known = [*available, *LEGS, *KINDS, "all"]
-            near = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
+            own = any(n in JOINT_NAMES for n in available)
+            groups = [*LEGS, *KINDS] if own else []
+            near = difflib.get_close_matches(word, [*available, *groups, "all"], n=1, cutoff=0.4)
             hint = f" Did you mean {near[0]}?" if near else ""
+            more = ", legs (LF, …), kinds (hip, …)" if own else ""
             raise InputError(
-                f"--joints: '{word}' is no joint, leg or kind.{hint} "
-                f"Use names ({', '.join(available[:3])}, …), legs (LF, …), kinds (hip, …) or all."
+                f"--joints: '{word}' is no joint{', leg or kind' if own else ''}.{hint} "
+                f"Use names ({', '.join(available[:3])}, …){more} or all."
             )
         chosen.update(found)
     return [n for n in available if n in chosen]

@@ -6,7 +6,7 @@ and effort limit are components of their own there (`delay_steps`, `ClampingMaxE
 and dry friction belong to the joint. Learned servo models cannot be exported: they say where a
 servo will be, and Newton asks for its effort.
 
-Names are those of Newton 1.8.0; `benchmarks/peers/check_exports.py` runs the files in it.
+Names are those of Newton 1.8.0; `benchmarks/peers/check_exports.py` holds them against the release.
 """
 
 from __future__ import annotations

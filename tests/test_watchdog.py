@@ -16,6 +16,7 @@ from servo_servers import moving_servos, on_a_port, on_a_socket
 
 from common.joints import JOINT_NAMES
 from hardware.connect import open_guarded, parse_address
+from hardware.guard import GuardedBus
 from hardware.joint_map import load_joint_map
 from sim.emulated_robot import draw_robot
 from sim.esp32_emulator import ProxyEmulator
@@ -94,6 +95,15 @@ def drive(address: str, *hang: str) -> subprocess.Popen:
     return process
 
 
+def switched_on(address: str) -> GuardedBus:
+    """A bus whose servos hold where they stand."""
+    bus = open_guarded(parse_address(address))
+    while not np.isfinite(bus.read().position_rad).all():
+        time.sleep(0.02)
+    bus.torque(True)
+    return bus
+
+
 def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second(robot):
     server, address = robot
     found = angles(server)
@@ -108,10 +118,7 @@ def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_se
 
 def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_back(robot):
     server, address = robot
-    bus = open_guarded(parse_address(address))
-    while not np.isfinite(bus.read().position_rad).all():
-        time.sleep(0.02)
-    bus.torque(True)
+    bus = switched_on(address)
     server.emulator.unplug_for_s = 2.0
     time.sleep(0.1)
     bus.limp()
@@ -139,10 +146,7 @@ def test_a_driver_that_hangs_after_a_stop_for_safety_leaves_its_robot_limp_where
 
 def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
     server, address = robot
-    bus = open_guarded(parse_address(address))
-    while not np.isfinite(bus.read().position_rad).all():
-        time.sleep(0.02)
-    bus.torque(True)
+    bus = switched_on(address)
     bus.close()
     assert limp(server)
     commands = len(server.emulator.bench.commands)
