@@ -15,6 +15,7 @@ import os
 import resource
 import time
 from contextlib import closing
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +76,12 @@ class Hourly:
 def commands(seed: int):
     """Something else every ten seconds, repeatably."""
 
-    def told(elapsed_s: float) -> np.ndarray:
-        rng = np.random.default_rng([seed, int(elapsed_s / _EVERY_S)])
+    @lru_cache(maxsize=1)
+    def drawn(number: int) -> np.ndarray:
+        rng = np.random.default_rng([seed, number])
         return rng.uniform([-0.2, -0.1, -0.5], [0.2, 0.1, 0.5])
 
-    return told
+    return lambda elapsed_s: drawn(int(elapsed_s / _EVERY_S))
 
 
 def main() -> None:
