@@ -29,10 +29,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from common.joints import DEFAULT_POSE, JOINT_NAMES
+from common.joints import JOINT_NAMES
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import EmulatedRobot, draw_robot, random_spec
 from sim.free_air_servo import FreeAirServo
+from sim.servo_plant import FreeAirServos
 from sysid.delay import lag_budget, tone_lags, tone_weights
 from sysid.excitation import parse_frequencies, plan
 from sysid.poll_lattice import Readings, find_poll_lattice, readings
@@ -116,14 +117,22 @@ class RememberingServo(FreeAirServo):
         return now
 
 
+class WitnessedServos(FreeAirServos):
+    """Servos in free air, one of which remembers."""
+
+    def __init__(self, robot: EmulatedRobot, witnessed: int):
+        super().__init__(robot)
+        rest = robot.joint_map.rest_pose()[witnessed]
+        self._servos[witnessed] = RememberingServo(robot.servos[witnessed].actuator, float(rest))
+
+
 class WitnessedBus(EmulatedBus):
     """An emulated bus that writes down where one joint is, every millisecond."""
 
     def __init__(self, robot: EmulatedRobot, rng: np.random.Generator, joint: str):
-        super().__init__(robot, rng)
-        self._joint = JOINT_NAMES.index(joint)
-        truth = robot.servos[self._joint].actuator
-        self._servos[self._joint] = RememberingServo(truth, DEFAULT_POSE[joint])
+        self._witnessed = JOINT_NAMES.index(joint)
+        self._servos = WitnessedServos(robot, self._witnessed)
+        super().__init__(robot, rng, plant=self._servos)
         self.time: list[float] = []
         self.position: list[float] = []
 
@@ -133,7 +142,7 @@ class WitnessedBus(EmulatedBus):
         super().sleep_until(time_s)
         for now in np.arange(start, self.now(), 1e-3):
             self.time.append(float(now))
-            self.position.append(self._servos[self._joint].position_at(float(now)))
+            self.position.append(self._servos.angle(self._witnessed, float(now)))
 
     def motion(self, trial: Trial) -> Readings:
         """The joint's true motion during `trial`."""

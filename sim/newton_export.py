@@ -22,8 +22,14 @@ from common.errors import InputError
 from common.files import refuse_overwrite, write_bytes, write_text
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Actuator
-from servo_models.delayed_pd import whole_steps
-from sim.simulator_export import FEEDBACK_KEYS, docstring, origin, refuse_step
+from sim.simulator_export import (
+    FEEDBACK_KEYS,
+    Delay,
+    delays_at_step,
+    docstring,
+    origin,
+    step_note,
+)
 
 MODULE = "newton_actuators.py"
 _OPSET, _IR_VERSION = 17, 8
@@ -61,16 +67,16 @@ def export_newton(
         If a file exists and `force` is not given, the step is no sensible one, or the package for
         ONNX is not installed.
     """
-    refuse_step(physics_step_s)
-    files = {f"{n}.onnx": j.actuator for n, j in calibration.joints.items()}
-    for name in (*files, MODULE):
+    delays = delays_at_step(calibration, physics_step_s)
+    for name in (*(f"{joint}.onnx" for joint in calibration.joint_names), MODULE):
         refuse_overwrite(folder / name, force)
-    for name, actuator in files.items():
-        write_bytes(folder / name, servo_network(actuator, physics_step_s), force)
-    write_text(folder / MODULE, _module(calibration, physics_step_s), force)
+    for name, joint in calibration.joints.items():
+        network = servo_network(joint.actuator, delays[name].value_s, physics_step_s)
+        write_bytes(folder / f"{name}.onnx", network, force)
+    write_text(folder / MODULE, _module(calibration, delays, physics_step_s), force)
 
 
-def servo_network(actuator: Actuator, physics_step_s: float) -> bytes:
+def servo_network(actuator: Actuator, delay_s: float, physics_step_s: float) -> bytes:
     """The PD as ONNX: (N, 2) of position error [rad] and velocity [rad/s] to (N, 1) effort [N·m].
 
     Raises
@@ -100,7 +106,7 @@ def servo_network(actuator: Actuator, physics_step_s: float) -> bytes:
     contract = {
         "input_order": "pos_vel", "input_idx": [0], "pos_scale": 1.0, "vel_scale": 1.0,
         "effort_scale": 1.0, "sample_dt_s": physics_step_s,
-        "effort_limit_nm": actuator.effort_limit_nm.value, "delay_s": actuator.delay_s.value,
+        "effort_limit_nm": actuator.effort_limit_nm.value, "delay_s": delay_s,
     }  # fmt: skip
     entry = model.metadata_props.add()
     entry.key, entry.value = "metadata", json.dumps(contract)
@@ -108,14 +114,14 @@ def servo_network(actuator: Actuator, physics_step_s: float) -> bytes:
     return model.SerializeToString()
 
 
-def _module(calibration: Calibration, physics_step_s: float) -> str:
+def _module(calibration: Calibration, delays: dict[str, Delay], physics_step_s: float) -> str:
     servos, feedback = [], []
     for name, joint in calibration.joints.items():
-        actuator = joint.actuator
-        low, high = whole_steps(*actuator.delay_interval_s, physics_step_s)
+        actuator, delay = joint.actuator, delays[name]
+        low, high = delay.steps(physics_step_s)
         row: dict[str, Any] = {
             "model": f"{name}.onnx",
-            "delay_steps": round(actuator.delay_s.value / physics_step_s),
+            "delay_steps": round(delay.value_s / physics_step_s),
             "delay_steps_min": low,
             "delay_steps_max": high,
             "effort_limit": actuator.effort_limit_nm.value,
@@ -129,6 +135,7 @@ def _module(calibration: Calibration, physics_step_s: float) -> str:
         *origin(calibration),
         f"Delays are whole physics steps of {1e3 * physics_step_s:g} ms: the nearest one, and the "
         "interval rounded outward.",
+        *step_note(calibration, delays, physics_step_s),
         "Not carried over: the limit on the set-point's speed, parts of a step, and the feedback, "
         "which is no part of an actuator: readings are old, lost at times, coarse and off. See "
         "FEEDBACK, and the HeldFeedback that `pupper-sysid export --to isaaclab` writes.",

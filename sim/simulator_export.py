@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from textwrap import indent, wrap
 from typing import Any
@@ -26,6 +27,7 @@ from common.files import versions
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Actuator, Quantity, unit_of
 from servo_models.delayed_pd import whole_steps
+from servo_models.step_size import delay_at_step
 from sim.servo_mjcf import INTEGRATOR, actuator_attributes, attributes, joint_attributes
 
 SCHEMA = "pupper-actuators"
@@ -58,10 +60,10 @@ def to_mjcf(calibration: Calibration, physics_step_s: float) -> str:
     InputError
         If the step is not a sensible one.
     """
-    refuse_step(physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s)
     defaults, actuators, sensors = [], [], []
     for name, joint in calibration.joints.items():
-        servo = joint.actuator.parameters
+        servo = replace(joint.actuator.parameters, delay_s=delays[name].value_s)
         feedback = joint.feedback
         period, age = feedback.poll_period_s.value, feedback.mean_age_s.value
         told = ", ".join(_said(joint.actuator, key) for key in (*_TORQUES, "delay_s"))
@@ -85,8 +87,9 @@ def to_mjcf(calibration: Calibration, physics_step_s: float) -> str:
         sensors += [f"<!-- {_xml(name)}: {_xml(said)} -->", f"<jointpos {attributes(sensor)}/>"]
     notes = (
         *origin(calibration),
-        f"For a time step of {physics_step_s:g} s: the dry friction's reference time depends on "
-        "it, so export again for another one.",
+        f"For a time step of {physics_step_s:g} s: delay and the dry friction's reference time "
+        "depend on it, so export again for another one.",
+        *step_note(calibration, delays, physics_step_s),
         "Include this file in your model, and give each servo's joint its class, such as class=\""
         f'servo_{calibration.joint_names[0]}". A position in ctrl is what the servo is told.',
         "After a reset fill the delay lines (mj_initCtrlHistory), which MuJoCo sets to zero: a "
@@ -119,11 +122,11 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
     InputError
         If the step is not a sensible one.
     """
-    refuse_step(physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s)
     groups = []
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        low, high = whole_steps(*a.delay_interval_s, physics_step_s)
+        low, high = delays[name].steps(physics_step_s)
         groups.append(
             f'"{name}": '
             + _call(
@@ -145,6 +148,7 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
         f"Delays are whole physics steps of {1e3 * physics_step_s:g} ms, the measured interval "
         "rounded outward; one delay is drawn per robot and reset, for each joint alone. Set "
         "sim.dt to this, or export again with --physics-step.",
+        *step_note(calibration, delays, physics_step_s),
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave both "
         "friction lines out with it.",
         "Not carried over: the limit on the set-point's speed (velocity_limit is only told to "
@@ -168,11 +172,11 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
     InputError
         If the step is not a sensible one.
     """
-    refuse_step(physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s)
     groups, bounds = [], []
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        steps = max(round(a.delay_s.value / physics_step_s), 0)
+        steps = round(delays[name].value_s / physics_step_s)
         groups.append(
             _call(
                 "BuiltinPositionActuatorCfg",
@@ -189,12 +193,13 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
                 ("delay_per_env_phase", False, ""),
             )
         )
-        low, high = whole_steps(*a.delay_interval_s, physics_step_s)
+        low, high = delays[name].steps(physics_step_s)
         bounds.append(f'"{name}": ({low}, {high}),')
     notes = (
         *origin(calibration),
         f"Delays are whole physics steps of {1e3 * physics_step_s:g} ms, the nearest one; the "
         "interval, rounded outward, is in DELAY_STEPS.",
+        *step_note(calibration, delays, physics_step_s),
         "The least and the greatest lag are equal on purpose. With two different ones mjlab draws "
         "a lag in every physics step, so that commands overtake each other; with "
         "delay_hold_prob=1, or with a long delay_update_period, robots begin without any delay.",
@@ -221,11 +226,11 @@ def to_json(calibration: Calibration, physics_step_s: float) -> str:
     InputError
         If the step is not a sensible one.
     """
-    refuse_step(physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s)
     joints = {}
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        low, high = whole_steps(*a.delay_interval_s, physics_step_s)
+        low, high = delays[name].steps(physics_step_s)
         numbers = {key: _plain(getattr(a, key)) for key in (*_TORQUES, "velocity_limit_rad_s")}
         joints[name] = {
             "actuator": numbers
@@ -238,7 +243,10 @@ def to_json(calibration: Calibration, physics_step_s: float) -> str:
             "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "robot": calibration.robot,
             "created": calibration.created, "exported_by": versions(),
             "inputs": [f.model_dump(mode="json") for f in calibration.inputs],
-            "notes": [*calibration.notes, "Delays in steps are rounded outward."],
+            "notes": [
+                *calibration.notes, "Delays in steps are rounded outward.",
+                *step_note(calibration, delays, physics_step_s),
+            ],
             "units": calibration.units, "physics_step_s": physics_step_s, "joints": joints,
         },
         indent=1, ensure_ascii=False,
@@ -251,6 +259,55 @@ SIMULATORS: dict[str, Callable[[Calibration, float], str]] = {
 
 
 # ------------------------------------------------------------------------------------- parts
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A joint's delay for one physics step: its value and the interval to train with [s]."""
+
+    value_s: float
+    low_s: float
+    high_s: float
+
+    def steps(self, physics_step_s: float) -> tuple[int, int]:
+        """The interval in whole steps, rounded outward."""
+        return whole_steps(self.low_s, self.high_s, physics_step_s)
+
+
+def delays_at_step(calibration: Calibration, physics_step_s: float) -> dict[str, Delay]:
+    """Each joint's delay for another physics step than the calibration's (`step_size`).
+
+    Raises
+    ------
+    InputError
+        If the step is not a sensible one, or too long for the servos.
+    """
+    refuse_step(physics_step_s)
+    found = {}
+    for name, joint in calibration.joints.items():
+        a = joint.actuator
+        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s)
+        more = float(fitting) - a.delay_s.value
+        numbers = (max(t + more, 0.0) for t in (a.delay_s.value, *a.delay_interval_s))
+        found[name] = Delay(*numbers)
+    return found
+
+
+def step_note(
+    calibration: Calibration, delays: dict[str, Delay], physics_step_s: float
+) -> Iterator[str]:
+    """What was added to the delays for the length of a step, if anything was."""
+    added = [
+        1e3 * (delays[name].value_s - joint.actuator.delay_s.value)
+        for name, joint in calibration.joints.items()
+    ]
+    steps = {1e3 * joint.actuator.physics_step_s for joint in calibration.joints.values()}
+    if steps != {1e3 * physics_step_s}:
+        yield (
+            f"Measured delays are for steps of {' or '.join(f'{s:g}' for s in sorted(steps))} ms; "
+            f"a longer step answers sooner, so {np.mean(added):+.1f} ms (mean of the joints) are "
+            "in the ones here."
+        )
 
 
 def refuse_step(physics_step_s: float) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import differential_evolution
 from scipy.stats import qmc
 
 from servo_models.delay_line import fractional_shift
@@ -23,8 +24,9 @@ from sysid.poll_lattice import Readings
 from sysid.recording import Trial
 
 _PAD = 64  # steps of rest before each trial: the longest delay of the ladder, 0.12 s
-_DIFFERENCE = 1e-3  # relative step of the Jacobian; smaller ones drown in friction's stick-slip
+DIFFERENCE = 0.01  # relative step of the Jacobian; smaller ones drown in friction's stick-slip
 _WIDE_DIFFERENCE = 0.03  # for the covariance: the slope over a likely error, not of one kink
+_DELAY_GRID = 2.0  # steps between the delays tried for a start
 _BATCH = 3000  # simulations per call: more would leave the processor's cache
 
 
@@ -205,7 +207,11 @@ def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:
 
 
 def fit(
-    rung: Rung, problems: Sequence[Problem], starts: NDArray, iterations: int = 40
+    rung: Rung,
+    problems: Sequence[Problem],
+    starts: NDArray,
+    iterations: int = 40,
+    difference: float = DIFFERENCE,
 ) -> list[Fit]:
     """Levenberg-Marquardt on all problems at once.
 
@@ -217,6 +223,8 @@ def fit(
         Values to start from.
     iterations : int
         At most; problems that no longer improve drop out.
+    difference : float
+        Step of the Jacobian in fitted coordinates: a wide one looks past a rugged cost's dents.
 
     Returns
     -------
@@ -237,7 +245,7 @@ def fit(
             free[i, j], z[i, j] = False, float(par[j].encode(value))
     z = np.where(free, np.clip(z, low, high), z)
 
-    def evaluate(index: NDArray, points: NDArray, difference: float = _DIFFERENCE):
+    def evaluate(index: NDArray, points: NDArray, difference: float = difference):
         """Cost, gradient and curvature of the problems `index` at `points`."""
         step = difference * scale
         # the offset, last, moves every residual alike: no simulation needed for its column
@@ -298,12 +306,52 @@ def fit(
     return fits
 
 
+def evolve(
+    rung: Rung, problem: Problem, starts: NDArray, rng: np.random.Generator, generations: int
+) -> Fit:
+    """The best of a population that starts at `starts` and evolves, fitted to the end.
+
+    Differential evolution finds its way between the local optima of a servo with dry friction,
+    where a gradient does not.
+
+    Parameters
+    ----------
+    rung : Rung
+    problem : Problem
+        Without frozen parameters.
+    starts : ndarray, shape (population, parameters)
+    rng : numpy.random.Generator
+    generations : int
+    """
+    par = rung.parameters
+    low = np.array([float(p.encode(p.low)) for p in par])
+    high = np.array([float(p.encode(p.high)) for p in par])
+    centre = np.array([float(p.encode(p.nominal)) for p in par])
+    precision = np.array([p.prior_sd**-2.0 for p in par])
+
+    def cost(points: NDArray) -> NDArray:  # (parameters, candidates)
+        r = _residuals(rung, [problem], points.T[None])[0] / problem.noise_rad
+        prior = 0.5 * np.sum(precision * (points.T - centre) ** 2, axis=1)
+        return np.sum(np.sqrt(1 + r**2) - 1, axis=1) + prior
+
+    population = np.stack([p.encode(column) for p, column in zip(par, starts.T, strict=True)], 1)
+    found = differential_evolution(
+        cost, list(zip(low, high, strict=True)), init=np.clip(population, low, high), rng=rng,
+        maxiter=generations, mutation=(0.4, 0.9), recombination=0.9, tol=0.0, polish=False,
+        vectorized=True, updating="deferred",
+    )  # fmt: skip
+    values = np.array([float(p.decode(x)) for p, x in zip(par, found.x, strict=True)])
+    return fit(rung, [problem], values[None])[0]
+
+
 def global_starts(
     rung: Rung, problems: Sequence[Problem], rng: np.random.Generator, candidates: int, keep: int
 ) -> NDArray[np.float64]:
     """The `keep` best of `candidates` quasi-random parameter vectors, per problem.
 
-    The vectors fill the box of fitted coordinates, drawn toward the prior where there is one.
+    The vectors fill the box of fitted coordinates, drawn toward the prior where there is one. Each
+    gets the delay and the offset that suit it best: a servo does the same thing later, so every
+    delay can be read off one simulation, and the most rugged coordinate need not be searched.
 
     Returns
     -------
@@ -322,18 +370,41 @@ def global_starts(
         columns.append(low + u * (high - low))
     cloud = np.stack(columns, axis=1)
     cloud[0] = [float(p.encode(p.nominal)) for p in par]
-    tiled = np.broadcast_to(cloud, (len(problems), *cloud.shape))
-    residuals = _residuals(rung, problems, tiled)
+    values = np.stack([p.decode(c) for p, c in zip(par, cloud.T, strict=True)], axis=-1)
+    values[:, 0] = par[0].low
+    later = np.arange(0.0, (par[0].high - par[0].low) / TIME_STEP_S, _DELAY_GRID)
+    every = {id(problem.trials): problem.trials for problem in problems}
+    tracks = positions(rung, [(values, trials) for trials in every.values()])
+    errors = {
+        key: [_errors_if_later(track[:, :, n], t, later) for n, t in enumerate(trials)]
+        for (key, trials), track in zip(every.items(), tracks, strict=True)
+    }
     best = []
-    for problem, r in zip(problems, residuals, strict=True):
-        # the best constant offset costs nothing to know
+    for problem in problems:
+        own = [e for e, use in zip(errors[id(problem.trials)], problem.use, strict=True) if use]
+        count = sum(e.shape[-1] for e in own)
+        mean = sum(e.sum(axis=-1) for e in own) / count
+        spread = sum(np.square(e).sum(axis=-1) for e in own) / count - mean**2
+        at = np.argmin(spread, axis=0)
+        r = np.concatenate([e[at, np.arange(candidates)] for e in own], axis=-1)
         offset = -np.median(r, axis=1)
         robust = np.sqrt(1 + ((r + offset[:, None]) / problem.noise_rad) ** 2).sum(axis=1)
         order = np.argsort(robust)[:keep]
-        chosen = cloud[order].copy()
+        chosen = values[order].copy()
+        chosen[:, 0] += TIME_STEP_S * later[at[order]]
         chosen[:, -1] += offset[order]
-        best.append([[float(p.decode(v)) for p, v in zip(par, row, strict=True)] for row in chosen])
+        best.append(chosen)
     return np.array(best)
+
+
+def _errors_if_later(track: NDArray, trial: TrialData, later: NDArray) -> NDArray[np.float64]:
+    """Model minus fresh reading if the model had moved `later` steps later.
+
+    `track` has shape (steps, candidates), the result (later, candidates, samples).
+    """
+    moments = np.maximum(trial.sample_step - later[:, None], 0.0)
+    looked = look_up(track, moments.reshape(-1)).reshape(len(later), len(trial.sample_step), -1)
+    return looked.transpose(0, 2, 1) - trial.sample_rad
 
 
 def _residuals(rung: Rung, problems: Sequence[Problem], points: NDArray) -> list[NDArray]:

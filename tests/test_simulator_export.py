@@ -18,7 +18,14 @@ from servo_models.calibration import load_calibration
 from servo_models.delayed_pd import TIME_STEP_S
 from servo_models.held_feedback import HeldFeedback
 from sim.servo_mjcf import mujoco, rest_at
-from sim.simulator_export import SIMULATORS, to_isaaclab, to_json, to_mjcf, to_mjlab
+from sim.simulator_export import (
+    SIMULATORS,
+    delays_at_step,
+    to_isaaclab,
+    to_json,
+    to_mjcf,
+    to_mjlab,
+)
 from sysid.recording import load
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,6 +87,34 @@ def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(c
         np.testing.assert_allclose(theirs, ours, atol=1e-6)
 
 
+def lags_s(calibration, step_s: float, frequency_hz: float = 3.0) -> np.ndarray:
+    """Lag of every exported servo behind a tone that a loop of 50 Hz commands."""
+    model = in_free_air(to_mjcf(calibration, step_s), calibration.joint_names)
+    data = mujoco.MjData(model)
+    rest_at(model, data, [0.0] * model.nu)
+    at = step_s * np.arange(round(3.0 / step_s))
+    turn, moved = 2 * np.pi * frequency_hz, []
+    for now in at:
+        data.ctrl[:] = 0.15 * np.sin(turn * 0.02 * np.floor(now / 0.02 + 1e-9))
+        mujoco.mj_step(model, data)
+        moved.append(data.qpos.copy())
+    late = at > 1.0
+    angle = turn * (at[late] + step_s)
+    basis = np.stack([np.sin(angle), np.cos(angle), np.ones_like(angle)], axis=1)
+    sine, cosine, _ = np.linalg.lstsq(basis, np.array(moved)[late], rcond=None)[0]
+    return np.arctan2(-cosine, sine) / turn
+
+
+def test_an_export_for_longer_steps_lags_as_long_as_the_calibration_says(calibration):
+    expected = lags_s(calibration, TIME_STEP_S)
+    np.testing.assert_allclose(lags_s(calibration, 0.005), expected, atol=6e-4)
+    np.testing.assert_allclose(lags_s(calibration, 0.001), expected, atol=6e-4)
+    # what the step of 5 ms alone would have done
+    more = delays_at_step(calibration, 0.005)
+    for name, joint in calibration.joints.items():
+        assert 0.0015 < more[name].value_s - joint.actuator.delay_s.value < 0.004
+
+
 def _held(trial, at: np.ndarray) -> np.ndarray:
     """The command in force at times since the trial's first."""
     sent = trial.send_time_s - trial.send_time_s[0]
@@ -138,13 +173,14 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     text = to_isaaclab(calibration, 0.005)
     space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
     assert list(space["ACTUATORS"]) == list(calibration.joint_names)
+    delays = delays_at_step(calibration, 0.005)
     for name, made in space["ACTUATORS"].items():
         own = calibration.joint(name).actuator
         assert made["joint_names_expr"] == [name]
         assert made["stiffness"] == own.stiffness_nm_per_rad.value
         assert made["armature"] == own.armature_kg_m2.value
-        assert made["min_delay"] * 0.005 <= own.delay_s.low
-        assert own.delay_s.high <= made["max_delay"] * 0.005
+        assert made["min_delay"] * 0.005 <= delays[name].low_s
+        assert delays[name].high_s <= made["max_delay"] * 0.005
         assert made["max_delay"] - made["min_delay"] <= 2
     assert space["FEEDBACK"]["LF_hip"]["loss"] == calibration.joint("LF_hip").feedback.loss.value
 
@@ -154,8 +190,9 @@ def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibr
     text = to_mjlab(calibration, 0.005)
     space = executed(text, "mjlab.actuator", "BuiltinPositionActuatorCfg", recorder, monkeypatch)
     assert len(space["ACTUATORS"]) == 3
+    delays = delays_at_step(calibration, 0.005)
     for made, (name, joint) in zip(space["ACTUATORS"], calibration.joints.items(), strict=True):
-        assert made["delay_min_lag"] == made["delay_max_lag"] == 5
+        assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value_s / 0.005)
         assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
         assert made["frictionloss"] == joint.actuator.friction_loss_nm.value
         low, high = space["DELAY_STEPS"][name]

@@ -1,0 +1,316 @@
+"""The same recordings through pupper-sysid and through what people use now, in one run.
+
+    benchmarks/peers/install.sh                        # once: environments of the peers
+    .venv/bin/python benchmarks/peers/compare.py       # add --real FOLDER for a robot's recordings
+
+Emulated robots of random servos, losses and counts are swept by the recorder, one joint each; their
+servos' true motion and true dead time are known. Every method fits the whole recording, and again
+without each of its tones. Its model's free run is then held against all rows where their value was
+measured (held), against fresh readings of tones it has not seen (unseen), against rows as logged
+(raw), and against the servo's true motion (true). All on one core, in turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# lag_accuracy's witness is used here, too
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+from exchange import STEP_S, dump
+from exchange import Trial as PeerTrial
+from numpy.typing import NDArray
+
+from lag_accuracy import WitnessedBus
+
+from common.joints import JOINT_NAMES
+from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from servo_models.step_size import delay_at_step
+from sim.emulated_robot import draw_robot, random_spec
+from sim.free_air_servo import PHYSICS_STEP_S
+from sysid.calibrate import calibrate, joint_trials
+from sysid.excitation import parse_frequencies, plan
+from sysid.ladder import rung
+from sysid.ladder_fit import leave_one_out_folds
+from sysid.model_scores import rms, score
+from sysid.output_error import TrialData, look_up, positions
+from sysid.recorder import record
+from sysid.recording import Recording, load
+
+HERE = Path(__file__).parent
+if STEP_S != TIME_STEP_S:
+    raise SystemExit("the peers' grid is not the calibration's any more: change exchange.STEP_S.")
+
+PEERS = {
+    "cross-correlation, paper's gains": ("naive.py", ".venv"),
+    "python-control and SciPy by hand": ("control_by_hand.py", ".venv"),
+    "PACE's fit (CMA-ES)": ("pace_style.py", ".venv"),
+    "BAM 1.0.2, M4": ("bam_fit.py", ".venv-bam"),
+    "mujoco.sysid 4.0.0": ("mujoco_sysid.py", ".venv"),
+}
+RETIMED = "mujoco.sysid, times by pupper-sysid"
+OURS = "pupper-sysid calibrate"
+SLOW = {"BAM 1.0.2, M4", "PACE's fit (CMA-ES)"}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One joint's recording; `motion` (per trial, on step edges, relative to rest) if known."""
+
+    name: str
+    recording: Recording
+    joint: str
+    motion: list[NDArray] | None = None
+    servo: DelayedPDParameters | None = None
+
+    def dead_time_s(self, step_s: float) -> float:
+        """The servo's own, as a simulation in such steps has to have it; NaN if unknown."""
+        if self.servo is None:
+            return float("nan")
+        return float(delay_at_step(self.servo, step_s, PHYSICS_STEP_S)[0])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one method made of one case. Errors are RMS [rad]."""
+
+    method: str
+    case: str
+    raw: float
+    held: float
+    unseen: float
+    true: float
+    delay_error_s: float
+    covered: bool | None
+    width_s: float
+    seconds: float
+
+
+def emulated(seed: int) -> Case:
+    """A robot of its own, one of its joints swept at 1, 2, 4 and 8 Hz."""
+    rng = np.random.default_rng([20261122, seed])
+    spec = random_spec(
+        rng, loss=float(rng.uniform(0.0, 0.5)), reading_noise_rad=float(rng.uniform(0.002, 0.012))
+    )
+    joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
+    robot = draw_robot(rng, spec)
+    bus = WitnessedBus(robot, rng, joint)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sweep.csv"
+        record(bus, plan("sine", [joint], parse_frequencies("1,2,4,8")), path)
+        recording = load(path)
+    motion = []
+    for trial in recording.trials(joint):
+        steps = int(np.ceil((trial.read_time_s[-1] - trial.send_time_s[0]) / TIME_STEP_S)) + 3
+        edges = trial.send_time_s[0] + TIME_STEP_S * np.arange(steps)
+        motion.append(np.interp(edges, bus.time, bus.position) - trial.initial_command_rad)
+    servo = robot.servos[JOINT_NAMES.index(joint)].actuator
+    return Case(f"robot {seed}", recording, joint, motion, servo)
+
+
+def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:
+    """Through `calibrate`, exactly as the command does it."""
+    began = time.perf_counter()
+    result = calibrate([case.recording], [case.joint], workers=1)[case.joint]
+    seconds = time.perf_counter() - began
+    pd, dead = result.rungs["delayed_pd"], result.dead_time
+    values = np.array([pd.values[p] for p in rung("delayed_pd").names])
+    track = positions(rung("delayed_pd"), [(values[None], result.trials)])[0][:, 0]
+    true = case.dead_time_s(TIME_STEP_S)
+    outcome = Outcome(
+        OURS, case.name, pd.scores.naive, pd.scores.held, pd.scores.leave_one_out,
+        off_truth(track, case), dead.value - true,
+        dead.low <= true <= dead.high if case.motion else None, dead.high - dead.low, seconds,
+    )  # fmt: skip
+    return outcome, result.trials
+
+
+def off_truth(track: NDArray, case: Case) -> float:
+    """RMS distance of a model's positions, shape (steps + 1, trials), to the true motion."""
+    if case.motion is None:
+        return float("nan")
+    parts = []
+    for n, true in enumerate(case.motion):
+        length = min(len(track), len(true))
+        parts.append(track[:length, n] - true[:length])
+    return rms(parts)
+
+
+def peer_trials(case: Case, data: tuple[TrialData, ...], retimed: bool) -> list[PeerTrial]:
+    """The joint's trials as a peer gets them; `retimed`: fresh readings at the times we found."""
+    trials, _ = joint_trials([case.recording], case.joint)
+    given = []
+    for trial, one in zip(trials, data, strict=True):
+        start, seen = trial.send_time_s[0], np.isfinite(trial.position_rad)
+        if retimed:
+            moments, angles = TIME_STEP_S * one.sample_step, one.sample_rad + one.rest_rad
+            moments, first = np.unique(moments, return_index=True)
+            angles = angles[first]
+        else:
+            moments, angles = trial.read_time_s[seen] - start, trial.position_rad[seen]
+        given.append(
+            PeerTrial(
+                one.rest_rad, trial.send_time_s - start, trial.command_rad, moments, angles,
+                len(one.command),
+            )
+        )  # fmt: skip
+    return given
+
+
+def theirs(
+    method: str, script: str, environment: str, case: Case, data: tuple[TrialData, ...]
+) -> Outcome:
+    """Through a peer, in its own environment."""
+    folds = leave_one_out_folds(data)
+    fits = [list(range(len(data)))]
+    fits += [[i for i, used in enumerate(use) if used] for use in folds.values()]
+    answer = subprocess.run(
+        [HERE / environment / "bin" / "python", HERE / script],
+        input=dump(peer_trials(case, data, method == RETIMED), fits),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if answer.returncode:
+        raise SystemExit(f"{method} failed on {case.name}:\n{answer.stderr[-2000:]}")
+    answers = json.loads(answer.stdout.splitlines()[-1])
+    tracks = [track_of(a["positions_rad"], data) for a in answers]
+    held_out = {}
+    for (name, use), track in zip(folds.items(), tracks[1:], strict=True):
+        held_out[name] = np.concatenate(
+            [
+                look_up(track[:, n], one.sample_step) - one.sample_rad
+                for n, (one, used) in enumerate(zip(data, use, strict=True))
+                if not used
+            ]
+        )
+    scores = score(tracks[0], data, held_out)
+    whole, span = answers[0], answers[0]["delay_interval_s"]
+    true = case.dead_time_s(whole["step_s"])
+    off = float("nan") if whole["delay_s"] is None else whole["delay_s"] - true
+    return Outcome(
+        method, case.name, scores.naive, scores.held, scores.leave_one_out,
+        off_truth(tracks[0], case), off,
+        bool(span[0] <= true <= span[1]) if span and case.motion else None,
+        span[1] - span[0] if span else float("nan"), sum(a["seconds"] for a in answers),
+    )  # fmt: skip
+
+
+def track_of(positions_rad: list[list[float]], data: tuple[TrialData, ...]) -> NDArray:
+    """A peer's positions as the scores want them: relative to rest, as long as the longest."""
+    length = max(len(p) for p in positions_rad)
+    return np.stack(
+        [
+            np.pad(np.array(p) - one.rest_rad, (0, length - len(p)), mode="edge")
+            for p, one in zip(positions_rad, data, strict=True)
+        ],
+        axis=1,
+    )
+
+
+def code_lines(path: Path) -> int:
+    """Lines of a script that say something: no comments, no docstrings, no empty ones."""
+    text = path.read_text()
+    quoted: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            quoted |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("#") and number not in quoted
+        for number, line in enumerate(text.splitlines(), 1)
+    )
+
+
+def table(outcomes: list[Outcome], names: list[str]) -> str:
+    """Medians over the cases that every method of the table has seen, as Markdown."""
+    shared = {o.case for o in outcomes if o.method == names[0]}
+    shared &= set.intersection(*({o.case for o in outcomes if o.method == n} for n in names))
+    lines = [
+        "| method | held | unseen tone | raw | true motion | dead time off, ms | 90 % interval "
+        "holds it | its width ms | s per joint | lines |",
+        "|" + "---|" * 10,
+    ]
+    for name in names:
+        own = [o for o in outcomes if o.method == name and o.case in shared]
+        known = [o for o in outcomes if o.method == name and np.isfinite(o.true)]
+        spans = [o for o in known if o.covered is not None]
+        middle = [
+            np.median([getattr(o, key) for o in own])
+            for key in ("held", "unseen", "raw", "true", "seconds")
+        ]
+        errors = [f"{1e3 * m:.1f}" if np.isfinite(m) else "–" for m in middle[:4]]
+        off = np.median([abs(o.delay_error_s) for o in known]) if known else np.nan
+        script = PEERS["mujoco.sysid 4.0.0" if name == RETIMED else name][0] if name != OURS else ""
+        cells = [
+            *errors,
+            f"{1e3 * off:.1f}" if np.isfinite(off) else "–",
+            f"{sum(bool(o.covered) for o in spans)} of {len(spans)}" if spans else "none stated",
+            f"{1e3 * np.median([o.width_s for o in spans]):.1f}" if spans else "–",
+            f"{middle[4]:.1f}",
+            str(code_lines(HERE / script)) if script else "1 command",
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + f"\n\nErrors in mrad, medians of {len(shared)} recordings."
+
+
+def real_cases(folder: Path) -> list[Case]:
+    """The sweeps in a folder of the published recordings."""
+    cases = []
+    for path in sorted(folder.glob("real_motor_*.csv")):
+        recording = load(path)
+        cases += [Case(f"real {joint}", recording, joint) for joint in recording.joints]
+    return cases
+
+
+def say(outcome: Outcome) -> None:
+    """One line on standard error."""
+    o = outcome
+    print(
+        f"{o.case} | {o.method} | held {1e3 * o.held:.1f} unseen {1e3 * o.unseen:.1f} raw "
+        f"{1e3 * o.raw:.1f} true {1e3 * o.true:.1f} dead time {1e3 * o.delay_error_s:+.1f} ms "
+        f"{o.covered} {o.seconds:.1f} s",
+        file=sys.stderr, flush=True,
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robots", type=int, default=12)
+    parser.add_argument("--slow", type=int, default=2, help="robots given to BAM and PACE, too")
+    parser.add_argument("--real", type=Path, help="folder with real_motor_*.csv")
+    parser.add_argument("--only", help="part of a method's name: that one and ours")
+    options = parser.parse_args()
+    methods = {k: v for k, v in PEERS.items() if not options.only or options.only in k}
+    if any("mujoco" in name for name in methods):
+        methods[RETIMED] = PEERS["mujoco.sysid 4.0.0"]
+    real = real_cases(options.real) if options.real else []
+    groups = (("Real recordings", real), ("Emulated robots", range(options.robots)))
+    for title, members in groups:
+        outcomes: list[Outcome] = []
+        for number, member in enumerate(members):
+            case = emulated(member) if isinstance(member, int) else member
+            mine, data = ours(case)
+            outcomes.append(mine)
+            say(mine)
+            for name, (script, environment) in methods.items():
+                if name in SLOW and isinstance(member, int) and number >= options.slow:
+                    continue
+                outcomes.append(theirs(name, script, environment, case, data))
+                say(outcomes[-1])
+        if outcomes:
+            print(f"{title}\n\n{table(outcomes, [*methods, OURS])}\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
