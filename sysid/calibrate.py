@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 from zlib import crc32
@@ -247,6 +248,10 @@ class PreparedJoint:
     quantum_rad: float
     noise_rad: float
 
+    def fit_rng(self) -> np.random.Generator:
+        """The same generator for every fit, so that a fit does not depend on those before it."""
+        return deepcopy(self.rng)
+
 
 def _prepare(task: _Task) -> PreparedJoint:
     rng = joint_rng(task.seed, task.joint)
@@ -266,7 +271,7 @@ def _prepare(task: _Task) -> PreparedJoint:
 
 def _dead_time(task: _Task) -> DeadTime:
     ready, model = _prepare(task), rung(PREFERRED)
-    (best,) = fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.rng, {})
+    (best,) = fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.fit_rng(), {})
     dead_time, best = dead_time_profile(model, ready.data, ready.noise_rad, best)
     return DeadTime(ready.budget, dead_time, ready.quantum_rad, float(best.values[-1]))
 
@@ -278,7 +283,7 @@ def _calibrate_joint(task: _Task) -> JointCalibrationResult:
     best: dict[str, list[Fit]] = {}
     dead_time = Interval(*[float("nan")] * 3)
     for model in LADDER:
-        best[model.name] = fit_with_folds(model, data, folds, noise, ready.rng, best)
+        best[model.name] = fit_with_folds(model, data, folds, noise, ready.fit_rng(), best)
         if model.name == PREFERRED:
             dead_time, best[PREFERRED][0] = dead_time_profile(
                 model, data, noise, best[PREFERRED][0]

@@ -31,9 +31,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from exchange import STEP_S, dump
 from exchange import Trial as PeerTrial
-from numpy.typing import NDArray
-
 from lag_accuracy import WitnessedBus
+from numpy.typing import NDArray
 
 from common.joints import JOINT_NAMES
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
