@@ -1,8 +1,12 @@
-"""`pupper-analyze claims`: every published claim beside what is found here, as a page."""
+"""`pupper-analyze claims`: every published claim beside what is found here, as two pages.
+
+`claims.md` is for a repository, `claims.html` for reading: one file with its pictures inside.
+"""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,14 +18,12 @@ from common.errors import InputError
 from common.files import refuse_overwrite, write_text
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from cli.pupper_analyze import Analyze, Tries
     from common.claims import Claim
     from policies.evidence import PolicyEvidence
     from sysid.servo_claims import ServoEvidence
 
-PAGE = "claims.md"
+PAGE, REPORT = "claims.md", "claims.html"
 _STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 
@@ -32,8 +34,9 @@ def write_claims(options: Analyze, tries: Tries) -> None:
     from policies.evidence import gather
     from sysid import servo_claims
 
-    page = options.out / PAGE
-    refuse_overwrite(page, options.force)
+    page, report = options.out / PAGE, options.out / REPORT
+    for file in (page, report):
+        refuse_overwrite(file, options.force)
     names = [name for name, _, _ in tries]
     twice = {n for n in names if names.count(n) > 1}
     if twice:
@@ -50,16 +53,20 @@ def write_claims(options: Analyze, tries: Tries) -> None:
     pictures = _draw(options.out, evidence, robot, options.force)
     text = _page(found, evidence, pictures, options)
     write_text(page, text, options.force)
+    write_text(report, _report(found, evidence, pictures, options), options.force)
     if options.json:
         print_json(
-            {"claims": [asdict(c) for c in found], "page": str(page), "pictures": list(pictures)}
-        )
+            {
+                "claims": [asdict(c) for c in found], "page": str(page), "report": str(report),
+                "pictures": list(pictures),
+            }
+        )  # fmt: skip
         return
     shown = terminal.table("Published claims", "", "claim", "paper", "here", "verdict")
     for c in found:
         shown.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
     out.print(shown)
-    err.print(f"Wrote {page} and {len(pictures)} pictures beside it.")
+    err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.")
 
 
 def _say(what: str) -> None:
@@ -181,8 +188,86 @@ def _page(
     found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str], options: Analyze
 ) -> str:
     """The report as Markdown."""
+    lines = [
+        f"# {_TITLE}", "", _tally(found), "", "Made by", "", "```", _command(options), "```", "",
+        _ABOUT, "",
+        "| | claim | paper | here | interval | verdict | how |", "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for c in found:
+        lines.append(
+            f"| {c.id} | {c.claim} | {c.paper} | {c.ours} | {_bounds(c)} | **{c.verdict}** | "
+            f"{c.how} |"
+        )
+    kinds, rows = _table_one(evidence)
+    lines += ["", f"## {_TABLE_ONE}", "", "| | " + " | ".join(kinds) + " |"]
+    lines += ["|---|" + "---|" * len(kinds)]
+    lines += [f"| {title} | " + " | ".join(cells) + " |" for title, cells in rows]
+    lines += ["", "## Pictures", ""]
+    for name, caption in pictures.items():
+        lines += [f"![{caption}]({name})", "", caption, ""]
+    return "\n".join(lines)
+
+
+def _report(
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str], options: Analyze
+) -> str:
+    """The report as HTML."""
+    from common.page import Column, Picture, Section, Table, render
+
+    claims = tuple({**asdict(c), "bounds": _bounds(c)} for c in found)
+    columns = [
+        Column(heading, lambda row, key=key: str(row[key]), kind)
+        for heading, key, kind in (
+            ("", "id", "key"), ("claim", "claim", "prose"), ("paper", "paper", "prose"),
+            ("here", "ours", "prose"), ("interval", "bounds", "prose"),
+            ("verdict", "verdict", "words"), ("how", "how", "prose"),
+        )
+    ]  # fmt: skip
+    kinds, rows = _table_one(evidence)
+    one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
+    first = Column("", lambda row: row[""], "words")
+    return render(
+        _TITLE,
+        _tally(found),
+        [
+            Section(
+                "claims", "Claims", [_ABOUT],
+                tables=[Table("claims", "What the paper says, and what is found here",
+                              tuple(columns), claims)],
+            ),
+            Section(
+                "table", _TABLE_ONE,
+                tables=[Table("table_one", "Architectures, means and 90 % intervals",
+                              (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
+            ),
+            Section(
+                "pictures", "Pictures",
+                figures=[
+                    Picture(Path(name).stem, caption, (options.out / name).read_bytes())
+                    for name, caption in pictures.items()
+                ],
+            ),
+            Section("made", "Where this comes from", [f"Made by: {_command(options)}"]),
+        ],
+    )  # fmt: skip
+
+
+_TITLE, _TABLE_ONE = "The published claims, one by one", "Table I, regenerated"
+_ABOUT = (
+    "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
+    "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
+    "what needs the physical one is said to."
+)
+
+
+def _tally(found: list[Claim]) -> str:
     verdicts = [c.verdict for c in found]
     tally = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    return f"{len(found)} claims: {tally}."
+
+
+def _command(options: Analyze) -> str:
+    """What was typed, with files by their names."""
     parts = ["pupper-analyze claims", *(str(p) for p in options.policies)]
     if options.recordings:
         parts += ["--recordings", *(p.name for p in options.recordings)]
@@ -191,32 +276,16 @@ def _page(
     for flag in ("actuator", "feedback"):
         if getattr(options, flag):
             parts += [f"--{flag}", str(getattr(options, flag))]
-    parts += ["--robots", str(options.robots), "--out", str(options.out)]
-    lines = [
-        "# The published claims, one by one", "",
-        f"{len(found)} claims: {tally}.", "",
-        "Made by", "", "```", " ".join(parts), "```", "",
-        "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
-        "stretches of time. Policies were trained and walked in simulation with a calibrated "
-        "robot; what needs the physical one is said to.", "",
-        "| | claim | paper | here | interval | verdict | how |", "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
-    for c in found:
-        bounds = "; ".join(
-            f"{k} {_number(v[0])} to {_number(v[1])}" for k, v in (c.interval or {}).items()
-        )
-        lines.append(
-            f"| {c.id} | {c.claim} | {c.paper} | {c.ours} | {bounds or '–'} | **{c.verdict}** | "
-            f"{c.how} |"
-        )
-    lines += ["", "## Table I, regenerated", "", *_table_one(evidence), "", "## Pictures", ""]
-    for name, caption in pictures.items():
-        lines += [f"![{caption}]({name})", "", caption, ""]
-    return "\n".join(lines)
+    return " ".join([*parts, "--robots", str(options.robots), "--out", str(options.out)])
 
 
-def _table_one(evidence: list[PolicyEvidence]) -> list[str]:
-    """A column per architecture."""
+def _bounds(claim: Claim) -> str:
+    known = (claim.interval or {}).items()
+    return "; ".join(f"{k} {_number(v[0])} to {_number(v[1])}" for k, v in known) or "–"
+
+
+def _table_one(evidence: list[PolicyEvidence]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """A column per architecture: their names, and rows of a title and a cell for each."""
     from policies.evidence import KINDS, over
 
     kinds = [k for k in KINDS if any(e.kind == k for e in evidence)]
@@ -232,11 +301,7 @@ def _table_one(evidence: list[PolicyEvidence]) -> list[str]:
         ),
         "forward error, m/s": (evidence, lambda e: e.terrain[0]["mae_vx_m_s"], 3),
     }  # fmt: skip
-    lines = [
-        "| | " + " | ".join(KINDS[k] for k in kinds) + " |",
-        "|---|" + "---|" * len(kinds),
-        "| policies | " + " | ".join(str(sum(e.kind == k for e in evidence)) for k in kinds) + " |",
-    ]
+    made = [("policies", [str(sum(e.kind == k for e in evidence)) for k in kinds])]
     for title, (where, value, digits) in rows.items():
         cells = []
         for kind in kinds:
@@ -244,8 +309,8 @@ def _table_one(evidence: list[PolicyEvidence]) -> list[str]:
             cells.append(terminal.number(found.value, digits))
             if np.isfinite(found.low):
                 cells[-1] += f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
-    return lines
+        made.append((title, cells))
+    return [KINDS[k] for k in kinds], made
 
 
 def _number(value: float) -> str:

@@ -17,6 +17,7 @@ from cli.policy_choice import policy_at, simulator
 from cli.terminal import err, number, out, print_json
 from cli.user_errors import run_program
 from common.errors import InputError
+from common.files import refuse_overwrite
 from sim.terrain import Terrain
 
 DESCRIPTION = """How well a policy walks: falls, tracking errors, by direction, ground and delay.
@@ -45,6 +46,11 @@ class Eval:
     """Of commands, servos, friction and ground."""
     threads: int = 0
     """Of the physics; 0 for all cores."""
+    report: Path | None = None
+    """Folder for all of it as an HTML page, with the run's curves and settings; figures as PNG and
+    tables as CSV beside it."""
+    force: bool = False
+    """Replace a report that exists."""
     json: bool = False
     """Print one JSON object."""
 
@@ -57,6 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _run(options: Eval) -> None:
     if options.episodes < 1:
         raise InputError(f"--episodes is {options.episodes}; it must be at least 1.")
+    page = options.report / "walking.html" if options.report else None
+    if page:
+        refuse_overwrite(page, options.force)  # before the work, not after it
     import torch
 
     from policies.evaluation import evaluate, evaluation_task, summary, walk
@@ -85,10 +94,21 @@ def _run(options: Eval) -> None:
             walked = walk(policy, evaluation_task(flat), late, max(options.episodes // 2, 1),
                           options.seed, None, options.threads)  # fmt: skip
             found["by_extra_delay"].append({"extra_delay_ms": extra, **summary(walked)})
+    if page:
+        from common.page import write_page
+        from policies.walking_report import walking_sections
+
+        name = options.policy.resolve().name
+        folder = options.policy.parent if name.startswith("policy_") else options.policy
+        sections = walking_sections(policy, run, folder, found)
+        title = f"Walking report: {folder.resolve().name}"
+        write_page(page, title, f"{name}, seed {options.seed}", sections, options.force)
     if options.json:
-        print_json(found)
+        print_json(found | ({"report": str(page)} if page else {}))
         return
     _show(found)
+    if page:
+        err.print(f"Wrote {page}.", soft_wrap=True)
 
 
 def _show(found: dict[str, Any]) -> None:

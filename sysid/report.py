@@ -1,22 +1,18 @@
 """Report: everything found about a robot's servos, as one page that opens anywhere.
 
-`write_report` makes a folder with `report.html` (one file: figures inside, no network, no scripts),
-the same figures as PNG and the same tables as CSV. The page is a list of `Section` objects; each is
-built by one function below, from results that were computed elsewhere, and all are set by one
-template.
+`write_report` makes a folder with `report.html`, the same figures as PNG and the same tables as CSV
+(`common.page`). Each section is built by one function below, from results that were computed
+elsewhere.
 """
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
-from common.files import refuse_overwrite, versions, write_bytes, write_text
+from common.files import versions
+from common.page import Column, Picture, Section, Table, WrittenPage, write_page
 from servo_models.calibration import Calibration
 from sysid import figures
 from sysid import report_tables as tables
@@ -25,72 +21,11 @@ from sysid.figure_data import Track, hold_runs, lag_parts, tracks
 from sysid.ladder_fit import PREFERRED
 from sysid.recording import Recording
 from sysid.report_advice import advice
-from sysid.report_tables import MODEL_NAMES, Column, Table
+from sysid.report_tables import MODEL_NAMES
 
 if TYPE_CHECKING:  # both bring libraries that a page does not need
     from sysid.doctor import Examination
     from sysid.frequency_response import FrequencyResponse
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure of the report, drawn."""
-
-    name: str
-    """Of its PNG file, without ending."""
-    caption: str
-    """What to see in it; also its text for those who cannot see it."""
-    png: bytes
-
-    @property
-    def base64(self) -> str:
-        """The image as text, for a `data:` address."""
-        return base64.b64encode(self.png).decode("ascii")
-
-    @property
-    def width(self) -> int:
-        """Width [pixels], from the PNG's header."""
-        return int.from_bytes(self.png[16:20], "big")
-
-    @property
-    def height(self) -> int:
-        """Height [pixels]."""
-        return int.from_bytes(self.png[20:24], "big")
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the page; what it does not have is left out.
-
-    Attributes
-    ----------
-    anchor, title : str
-    text : sequence of str
-        Paragraphs.
-    findings : sequence of (str, str)
-        What was found, each under a name that may be empty.
-    figures : sequence of Picture
-    tables : sequence of Table
-    notes : sequence of str
-        What to keep in mind.
-    """
-
-    anchor: str
-    title: str
-    text: Sequence[str] = ()
-    findings: Sequence[tuple[str, str]] = ()
-    figures: Sequence[Picture] = ()
-    tables: Sequence[Table] = ()
-    notes: Sequence[str] = field(default=())
-
-
-@dataclass(frozen=True)
-class WrittenReport:
-    """The files of a report."""
-
-    path: Path
-    figures: tuple[Path, ...]
-    tables: tuple[Path, ...]
 
 
 def write_report(
@@ -102,7 +37,7 @@ def write_report(
     responses: Mapping[str, FrequencyResponse],
     force: bool = False,
     more: Sequence[Section] = (),
-) -> WrittenReport:
+) -> WrittenPage:
     """Write the report's page, figures and tables into `folder`.
 
     Parameters
@@ -131,29 +66,9 @@ def write_report(
     """
     page = sections(recordings, results, calibration, examinations, responses)
     page[-2:-2] = more
-    html = render(_title(recordings), _subtitle(results, calibration), page)
-    pictures = {folder / "figures" / f"{p.name}.png": p.png for s in page for p in s.figures}
-    csvs = {
-        folder / "tables" / f"{t.name}.csv": t.to_csv() for s in page for t in s.tables if t.rows
-    }
-    path = folder / "report.html"
-    for file in (path, *pictures, *csvs):
-        refuse_overwrite(file, force)
-    for file, image in pictures.items():
-        write_bytes(file, image, force)
-    for file, text in csvs.items():
-        write_text(file, text, force)
-    write_text(path, html, force)
-    return WrittenReport(path, tuple(pictures), tuple(csvs))
-
-
-def render(title: str, subtitle: str, page: Sequence[Section]) -> str:
-    """The page as HTML. Every text is escaped: names of files are the user's."""
-    environment = Environment(
-        loader=PackageLoader("sysid", "templates"), autoescape=True, undefined=StrictUndefined
+    return write_page(
+        folder / "report.html", _title(recordings), _subtitle(results, calibration), page, force
     )
-    template = environment.get_template("report.html.j2")
-    return template.render(title=title, subtitle=subtitle, sections=page)
 
 
 def sections(

@@ -6,13 +6,11 @@ unit, which is what goes to CSV; its columns say which of them the page shows, a
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
+from common.page import Column, Row, Table
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Quantity, unit_of
 from sysid.calibrate import JointCalibrationResult
@@ -31,61 +29,6 @@ MODEL_NAMES = {
     "delayed_pd": "DelayedPD",
     "delayed_pd_backlash": "DelayedPD + backlash",
 }
-
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of the page: its heading and what it shows of a row."""
-
-    heading: str
-    show: Callable[[Row], str]
-    kind: Literal["key", "number", "words", "prose"] = "number"
-    """How it is set: a key stays in sight when a table is scrolled, prose is broken into lines."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report.
-
-    Attributes
-    ----------
-    name : str
-        Of its CSV file, without ending.
-    title : str
-    columns : tuple of Column
-        What the page shows.
-    rows : tuple of dict
-        What the CSV holds; all rows have the same keys.
-    marked : str
-        Rows in which this key is true are set in bold on the page.
-    """
-
-    name: str
-    title: str
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    marked: str = ""
-
-    def cells(self, row: Row) -> list[tuple[str, str]]:
-        """The page's cells of `row`: their text and how each is set."""
-        return [(c.show(row), c.kind) for c in self.columns]
-
-    def is_marked(self, row: Row) -> bool:
-        """Whether `row` is to stand out."""
-        return bool(self.marked and row[self.marked])
-
-    def to_csv(self) -> str:
-        """All values of all rows; a number that is none is an empty cell."""
-        buffer = io.StringIO()
-        writer = csv.DictWriter(
-            buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n"
-        )
-        writer.writeheader()
-        writer.writerows({k: _plain(v) for k, v in row.items()} for row in self.rows)
-        return buffer.getvalue()
-
 
 _KEY = Column("joint", lambda row: row["joint"], "key")
 
@@ -382,12 +325,3 @@ def _significant(value: float) -> str:
         digits = 2 - math.floor(math.log10(abs(value))) if value else 0
         return _digits(value, max(digits, 0))
     return f"{value:.2e}".replace("-", "−")
-
-
-def _plain(value: Any) -> Any:
-    """A value for a CSV cell: no NaN, no NumPy, no infinity."""
-    if hasattr(value, "item"):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from common.figure_style import png
+from common.page import Column, Picture, Section, Table
 from sysid import servo_scores as scores
-from sysid.report import Picture, Section
-from sysid.report_tables import Column, Table
 from sysid.servo_compare import LINEAR, Comparison
 from sysid.servo_data_curve import MODELS, DataCurve, data_curve_figure, measured
 from sysid.servo_figures import compare_figure

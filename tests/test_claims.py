@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import looks_right
 from command_line import refused, run_program
 from test_paths import walked
 
@@ -201,6 +203,12 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     for picture in found["pictures"]:
         assert f"({picture})" in page and (tmp_path / "analysis" / picture).stat().st_size > 5000
     assert "Table I" in page
+    report = Path(found["report"]).read_text()
+    assert "Table I" in report and report.count("data:image/png") == len(found["pictures"])
+    assert all(claim["id"] in report for claim in found["claims"])
+    if shutil.which("chromium"):
+        looks_right(Path(found["report"]), tmp_path, 375, dark=False)
+        looks_right(Path(found["report"]), tmp_path, 1280, dark=True)
     again = refused(capsys, cli.pupper_analyze, *arguments)
     assert "claims.md exists already" in again
     twice = refused(

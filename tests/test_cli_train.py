@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from browser import looks_right
 from command_line import refused
 from command_line import run_program as run
 from tiny_training import CALIBRATION
@@ -199,14 +201,23 @@ def test_an_evaluation_elsewhere_says_where(capsys, trained):
     assert code == 0 and (found["actuator"], found["feedback"]) == ("ideal", "ideal")
 
 
-def test_an_evaluation_is_a_table_with_every_direction(capsys, trained, monkeypatch):
-    code, out, _ = run(
-        capsys, cli.pupper_eval, trained, "--episodes", "1", "--terrain", "flat",
-        "--extra-delay-ms", "0", "--threads", "1",
+def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
+    arguments = (
+        trained, "--episodes", "1", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+        "--report", tmp_path / "report",
     )  # fmt: skip
+    code, out, _ = run(capsys, cli.pupper_eval, *arguments)
     assert code == 0
-    for name in ("random commands", "a robot that stands", "forward", "turn right", "ground: flat"):
-        assert name in out
+    page = tmp_path / "report" / "walking.html"
+    text = page.read_text()
+    for name in ("random commands", "forward", "turn right", "ground: flat"):
+        assert name in out and name in text
+    assert "a robot that stands" in out and "How it was trained" in text
+    assert "learner.epochs" in text and CALIBRATION in text
+    assert (tmp_path / "report" / "figures" / "training.png").stat().st_size > 2000
+    if shutil.which("chromium"):
+        looks_right(page, tmp_path, 375, dark=True)
+    assert "walking.html exists already" in refused(capsys, cli.pupper_eval, *arguments)
 
 
 def test_no_episodes_are_refused(capsys, trained):

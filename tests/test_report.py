@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
@@ -14,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from browser import looks_right, needs_chromium
 from matplotlib.text import Text
 
 from common.errors import InputError
@@ -404,40 +402,8 @@ def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path)
     assert not re.search(r">\s*-?(nan|inf|None)\s*<", made.path.read_text(encoding="utf-8"))
 
 
-_PROBE = """<body style="margin:0">
-<iframe id=f src="{page}" style="width:{width}px;height:900px;border:0"></iframe>
-<pre id=o></pre><script>
-f.onload = () => {{
-  const d = f.contentDocument, dark = f.contentWindow.matchMedia('(prefers-color-scheme: dark)');
-  o.textContent = JSON.stringify({{
-    content: d.documentElement.scrollWidth, view: d.documentElement.clientWidth,
-    dark: dark.matches, paper: f.contentWindow.getComputedStyle(d.body).backgroundColor,
-    broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length,
-    images: d.images.length,
-  }});
-}};</script></body>"""
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no Chromium here")
+@needs_chromium
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", [375, 1280])
 def test_in_a_browser_nothing_overflows_or_complains(written, tmp_path, width, dark):
-    probe = tmp_path / "probe.html"
-    probe.write_text(_PROBE.format(page=written.path.resolve(), width=width))
-    done = subprocess.run(
-        [
-            "chromium", "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
-            "--allow-file-access-from-files", "--virtual-time-budget=5000",
-            "--window-size=1400,1000", f"--user-data-dir={tmp_path / 'profile'}",
-            f"--blink-settings=preferredColorScheme={0 if dark else 1}", "--dump-dom", str(probe),
-        ],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    said = re.search(r'<pre id="o">(\{.*?\})</pre>', done.stdout)
-    assert said, done.stdout[-500:] + done.stderr[-500:]
-    found = json.loads(said.group(1).replace("&quot;", '"'))
-    assert found["content"] <= found["view"] <= width
-    assert found["images"] > 0 and found["broken"] == 0
-    assert found["dark"] is dark
-    assert (found["paper"] == "rgb(255, 255, 255)") is not dark
-    assert ":CONSOLE" not in done.stderr
+    looks_right(written.path, tmp_path, width, dark)

@@ -1,0 +1,194 @@
+"""Reports as one HTML page that opens anywhere: figures inside, no network, no scripts.
+
+A page is a list of `Section` objects, each of words, pictures and tables, set by one template for
+phone, desk and paper, light and dark. `write_page` writes it with its figures as PNG and its tables
+as CSV beside it.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from common.files import refuse_overwrite, write_bytes, write_text
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the page: its heading and what it shows of a row."""
+
+    heading: str
+    show: Callable[[Row], str]
+    kind: Literal["key", "number", "words", "prose"] = "number"
+    """How it is set: a key stays in sight when a table is scrolled, prose is broken into lines."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report.
+
+    Attributes
+    ----------
+    name : str
+        Of its CSV file, without ending.
+    title : str
+    columns : tuple of Column
+        What the page shows.
+    rows : tuple of dict
+        What the CSV holds; all rows have the same keys.
+    marked : str
+        Rows in which this key is true are set in bold on the page.
+    """
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    marked: str = ""
+
+    def cells(self, row: Row) -> list[tuple[str, str]]:
+        """The page's cells of `row`: their text and how each is set."""
+        return [(c.show(row), c.kind) for c in self.columns]
+
+    def is_marked(self, row: Row) -> bool:
+        """Whether `row` is to stand out."""
+        return bool(self.marked and row[self.marked])
+
+    def to_csv(self) -> str:
+        """All values of all rows; a number that is none is an empty cell."""
+        buffer = io.StringIO()
+        writer = csv.DictWriter(
+            buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n"
+        )
+        writer.writeheader()
+        writer.writerows({k: _plain(v) for k, v in row.items()} for row in self.rows)
+        return buffer.getvalue()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report, drawn."""
+
+    name: str
+    """Of its PNG file, without ending."""
+    caption: str
+    """What to see in it; also its text for those who cannot see it."""
+    png: bytes
+
+    @property
+    def base64(self) -> str:
+        """The image as text, for a `data:` address."""
+        return base64.b64encode(self.png).decode("ascii")
+
+    @property
+    def width(self) -> int:
+        """Width [pixels], from the PNG's header."""
+        return int.from_bytes(self.png[16:20], "big")
+
+    @property
+    def height(self) -> int:
+        """Height [pixels]."""
+        return int.from_bytes(self.png[20:24], "big")
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page; what it does not have is left out.
+
+    Attributes
+    ----------
+    anchor, title : str
+    text : sequence of str
+        Paragraphs.
+    findings : sequence of (str, str)
+        What was found, each under a name that may be empty.
+    figures : sequence of Picture
+    tables : sequence of Table
+    notes : sequence of str
+        What to keep in mind.
+    """
+
+    anchor: str
+    title: str
+    text: Sequence[str] = ()
+    findings: Sequence[tuple[str, str]] = ()
+    figures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    notes: Sequence[str] = field(default=())
+
+
+@dataclass(frozen=True)
+class WrittenPage:
+    """The files of a report."""
+
+    path: Path
+    figures: tuple[Path, ...]
+    tables: tuple[Path, ...]
+
+
+def write_page(
+    path: Path, title: str, subtitle: str, sections: Sequence[Section], force: bool = False
+) -> WrittenPage:
+    """Write a page, and beside it its figures and tables.
+
+    Parameters
+    ----------
+    path : Path
+        Of the page; its folder gets `figures/*.png` and `tables/*.csv`.
+    title, subtitle : str
+    sections : sequence of Section
+    force : bool
+        Replace files that exist.
+
+    Raises
+    ------
+    InputError
+        If one of the files exists and `force` is not given (nothing has been written then), or if
+        one cannot be written.
+    """
+    html = render(title, subtitle, sections)
+    pictures = {
+        path.parent / "figures" / f"{p.name}.png": p.png for s in sections for p in s.figures
+    }
+    csvs = {
+        path.parent / "tables" / f"{t.name}.csv": t.to_csv()
+        for s in sections
+        for t in s.tables
+        if t.rows
+    }
+    for file in (path, *pictures, *csvs):
+        refuse_overwrite(file, force)
+    for file, image in pictures.items():
+        write_bytes(file, image, force)
+    for file, text in csvs.items():
+        write_text(file, text, force)
+    write_text(path, html, force)
+    return WrittenPage(path, tuple(pictures), tuple(csvs))
+
+
+def render(title: str, subtitle: str, sections: Sequence[Section]) -> str:
+    """The page as HTML. Every text is escaped: names of files are the user's."""
+    environment = Environment(
+        loader=PackageLoader("common", "templates"), autoescape=True, undefined=StrictUndefined
+    )
+    template = environment.get_template("page.html.j2")
+    return template.render(title=title, subtitle=subtitle, sections=sections)
+
+
+def _plain(value: Any) -> Any:
+    """A value for a CSV cell: no NaN, no NumPy, no infinity."""
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
