@@ -215,14 +215,16 @@ def _report(
     from common.page import Column, Picture, Section, Table, render
 
     claims = tuple({**asdict(c), "bounds": _bounds(c)} for c in found)
-    columns = [
-        Column(heading, lambda row, key=key: str(row[key]), kind)
-        for heading, key, kind in (
-            ("", "id", "key"), ("claim", "claim", "prose"), ("paper", "paper", "prose"),
-            ("here", "ours", "prose"), ("interval", "bounds", "prose"),
-            ("verdict", "verdict", "words"), ("how", "how", "prose"),
-        )
-    ]  # fmt: skip
+    columns = (
+        Column("", lambda row: row["id"], "key"),
+        *(
+            Column(heading, lambda row, key=key: row[key], "prose")
+            for heading, key in (
+                ("claim", "claim"), ("paper", "paper"), ("here", "ours"), ("interval", "bounds"),
+                ("verdict", "verdict"), ("how", "how"),
+            )
+        ),
+    )  # fmt: skip
     kinds, rows = _table_one(evidence)
     one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
     first = Column("", lambda row: row[""], "words")
@@ -233,7 +235,7 @@ def _report(
             Section(
                 "claims", "Claims", [_ABOUT],
                 tables=[Table("claims", "What the paper says, and what is found here",
-                              tuple(columns), claims)],
+                              columns, claims)],
             ),
             Section(
                 "table", _TABLE_ONE,

@@ -19,9 +19,9 @@ from policies.policy_file import Policy
 from policies.run_file import RUN_FILE, Run, plain
 
 ERRORS = {
-    "mae_vx_m_s": "forward, m/s",
-    "mae_vy_m_s": "sideways, m/s",
-    "mae_yaw_rad_s": "turn, rad/s",
+    "mae_vx_m_s": ("forward", "m/s"),
+    "mae_vy_m_s": ("sideways", "m/s"),
+    "mae_yaw_rad_s": ("in turning", "rad/s"),
 }
 _CURVES = {
     "reward": "reward per step",

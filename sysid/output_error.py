@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -334,9 +335,11 @@ def evolve(
         prior = 0.5 * np.sum(precision * (points.T - centre) ** 2, axis=1)
         return np.sum(np.sqrt(1 + r**2) - 1, axis=1) + prior
 
-    population = np.stack([p.encode(column) for p, column in zip(par, starts.T, strict=True)], 1)
+    population: Any = np.clip(  # SciPy's annotations know names of methods only
+        np.stack([p.encode(column) for p, column in zip(par, starts.T, strict=True)], 1), low, high
+    )
     found = differential_evolution(
-        cost, list(zip(low, high, strict=True)), init=np.clip(population, low, high), rng=rng,
+        cost, list(zip(low, high, strict=True)), init=population, rng=rng,
         maxiter=generations, mutation=(0.4, 0.9), recombination=0.9, tol=0.0, polish=False,
         vectorized=True, updating="deferred",
     )  # fmt: skip

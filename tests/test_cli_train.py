@@ -206,8 +206,8 @@ def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, traine
         trained, "--episodes", "1", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
         "--report", tmp_path / "report",
     )  # fmt: skip
-    code, out, _ = run(capsys, cli.pupper_eval, *arguments)
-    assert code == 0
+    code, out, err = run(capsys, cli.pupper_eval, *arguments)
+    assert code == 0, err
     page = tmp_path / "report" / "walking.html"
     text = page.read_text()
     for name in ("random commands", "forward", "turn right", "ground: flat"):
