@@ -89,8 +89,6 @@ class Calibrate:
         """Many robots, one after the other or side by side."""
         from sysid.fleet import TABLE, Settings, calibrate_fleet, recordings_in
 
-        if self.jobs < 1:
-            raise InputError(f"--jobs is {self.jobs}; it must be at least 1.")
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
         out = self.out or root.with_name(f"{root.resolve().name}_calibrated")
@@ -101,12 +99,7 @@ class Calibrate:
             )
         elapsed = time.perf_counter() - started
         if self.json:
-            terminal.print_json(
-                {
-                    "table": str(out / TABLE), "made": fleet.made, "kept": fleet.kept,
-                    "failed": fleet.failed, "elapsed_s": elapsed,
-                }
-            )  # fmt: skip
+            terminal.print_json(fleet.summary(out, elapsed))
             return
         known = fleet.table.query("problem == ''")
         shown = terminal.table(
@@ -114,26 +107,10 @@ class Calibrate:
             "dead time ms", "stiffness 1/s²", "speed rad/s", "loss",
         )  # fmt: skip
         for joint, rows in known.groupby("joint", sort=False):
-            cells = [
-                "{} ({} … {})".format(*(terminal.number(x, digits) for x in spread))
-                for key, digits in _SHOWN.items()
-                for spread in [rows[key].quantile([0.5, 0.05, 0.95])]
-            ]
+            cells = [terminal.spread(rows[key], digits) for key, digits in _SHOWN.items()]
             shown.add_row(str(joint), str(len(rows)), *cells)
         terminal.out.print(shown)
-        for _, row in known.query("unlike != ''").iterrows():
-            terminal.out.print(
-                f"{row['robot']} {row['joint']} is unlike its sisters: "
-                f"{', '.join(str(row['unlike']).split(';'))}.",
-                soft_wrap=True,
-            )
-        for _, row in fleet.table.query("problem != ''").iterrows():
-            terminal.warn([f"{row['robot']} was left out: {row['problem']}"])
-        terminal.err.print(
-            f"{len(fleet.made)} calibrated, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
-            f"{elapsed:.0f} s. Wrote {out / TABLE} and a calibration per robot beside it.",
-            soft_wrap=True,
-        )
+        terminal.fleet_end(fleet, out / TABLE, elapsed, "a calibration")
 
     def _print(
         self,

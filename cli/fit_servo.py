@@ -5,15 +5,18 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import tyro
 
 from cli import terminal
 from common.errors import InputError
-from common.files import refuse_overwrite, versions
+from common.files import refuse_overwrite
 from servo_models.servo_file import CONTRACT
+
+if TYPE_CHECKING:
+    from sysid.servo_fit import Split
 
 
 @dataclass(frozen=True)
@@ -21,10 +24,13 @@ class FitServo:
     """Fit a model per joint that predicts, from commands alone, where the servo is.
 
     Example: pupper-sysid fit-servo recordings/walk.csv --train-loops 0,1 --test-loops 2
+
+    Example: pupper-sysid fit-servo robots/ --arch fir --jobs 4
     """
 
     recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Recordings at one rate, pooled per joint; by default the newest in recordings/."""
+    """Recordings at one rate, pooled per joint; by default the newest in recordings/. A folder is a
+    fleet: each recording in it is a robot of its own."""
     arch: Literal["mlp", "lstm", "fir", "delayed-pd", "sindy"] = "mlp"
     """Kind of model: networks, the linear filter they build on, or a physical model."""
     preset: Literal["default", "paper"] = "default"
@@ -32,7 +38,8 @@ class FitServo:
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     out: Path | None = None
-    """Folder to write the model to; by default servo/, or the next free servo-2/, servo-3/, …"""
+    """Folder to write the model to; by default servo/, or the next free servo-2/, servo-3/, …; of a
+    fleet the folder of its models, by default the given one's name and _servos."""
     train_loops: str = ""
     """Trials (loops) to train on, such as 0,1; goes with --test-loops."""
     test_loops: str = ""
@@ -46,6 +53,10 @@ class FitServo:
     readings: Literal["auto", "fresh", "all"] = "auto"
     """Which readings count: fresh ones at the time they were taken, all rows as logged, or what
     suits the recording."""
+    jobs: int = 2
+    """Robots of a fleet that are fitted at the same time."""
+    cluster: str | None = None
+    """Dask scheduler to fit a fleet on, such as tcp://host:8786."""
     force: bool = False
     """Replace the model in --out."""
     json: bool = False
@@ -55,12 +66,15 @@ class FitServo:
 
     def run(self) -> None:
         """Fit, score, save, print."""
-        from servo_models.calibration import utc_now
-        from servo_models.servo_file import input_names, save_servo_model
         from sysid.recording import Recording
-        from sysid.servo_fit import ServoFit, fit_servo, to_json
+        from sysid.servo_fit import ServoFit, fit_servo, save_fit, to_json
 
         split = self._split()
+        if len(self.recordings) == 1 and self.recordings[0].is_dir():
+            self._fleet(self.recordings[0], split)
+            return
+        if self.cluster:
+            raise InputError("--cluster is for a fleet: give the folder of its recordings.")
         folder = self.out or _free_folder()
         refuse_overwrite(folder / CONTRACT, self.force)
         started = time.perf_counter()
@@ -72,31 +86,7 @@ class FitServo:
             )
         elapsed = time.perf_counter() - started
         found = to_json(fit, elapsed)
-        save_servo_model(
-            folder,
-            fit.parameters,
-            {
-                "arch": fit.arch, "preset": fit.preset, "created": utc_now(),
-                "time_step_s": fit.data.period_s,
-                "inputs": input_names(fit.parameters, fit.feedback),
-                "feedback": fit.feedback, "warm_up": fit.warm_up,
-                "joints": {
-                    j: {
-                        "scores": {k: _known(v) for k, v in entry.items() if k.endswith("_rad")},
-                        "band_noise_rad": _known(entry["band_noise_rad"]) or 0.0,
-                        "band_timing_s": _known(entry["band_timing_s"]) or 0.0,
-                        "readings": fit.readings[j],
-                    }
-                    for j, entry in found["joints"].items()
-                },
-                "readings_counted": fit.data.modes, "split": fit.split.name,
-                "choices": {k: float(v) for k, v in fit.choices.items()},
-                "recordings": [{"name": r.name, "sha256": r.sha256} for r in recordings],
-                "seed": self.seed, "versions": versions("torch", "safetensors"),
-                "notes": [fit.verdict, *fit.notes],
-            },
-            self.force,
-        )  # fmt: skip
+        save_fit(folder, fit, recordings, self.seed, self.force)
         if self.json:
             terminal.print_json(found | {"written": str(folder)})
             return
@@ -107,7 +97,37 @@ class FitServo:
             soft_wrap=True,
         )
 
-    def _split(self):
+    def _fleet(self, root: Path, split: Split | None) -> None:
+        """Many robots, one after the other or side by side."""
+        from sysid.fleet import TABLE, recordings_in
+        from sysid.servo_fleet import ServoSettings, fit_servo_fleet
+
+        if self.joints != "all":
+            raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
+        started = time.perf_counter()
+        out = self.out or root.with_name(f"{root.resolve().name}_servos")
+        settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
+        with terminal.progress(f"fitting {self.arch}", len(recordings_in(root))) as advance:
+            fleet = fit_servo_fleet(
+                root, out, settings, self.jobs, self.cluster, self.force, advance
+            )
+        elapsed = time.perf_counter() - started
+        if self.json:
+            terminal.print_json(fleet.summary(out, elapsed))
+            return
+        known = fleet.table.query("problem == ''")
+        shown = terminal.table(
+            "Fleet: median and middle 90 % of the robots, RMS error in mrad", "joint", "robots",
+            "free run", "linear", "delayed PD", "stays put",
+        )  # fmt: skip
+        keys = ("free_run_mrad", "linear_mrad", "delayed_pd_mrad", "persistence_mrad")
+        for joint, rows in known.groupby("joint", sort=False):
+            cells = [terminal.spread(rows[key], 1) for key in keys]
+            shown.add_row(str(joint), str(len(rows)), *cells)
+        terminal.out.print(shown)
+        terminal.fleet_end(fleet, out / TABLE, elapsed, "a servo model")
+
+    def _split(self) -> Split | None:
         from sysid.servo_fit import Split
 
         loops, times = (self.train_loops, self.test_loops), (self.train_before, self.test_after)
@@ -183,7 +203,3 @@ def _numbers(option: str, text: str) -> list[int]:
         return [int(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{option} is '{text}'; write loop numbers with commas: 0,1.") from None
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

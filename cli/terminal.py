@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -20,6 +20,9 @@ from rich.table import Table
 from common.errors import InputError
 from common.joints import select_joints
 from sysid.recording import Recording, load, newest_recording
+
+if TYPE_CHECKING:
+    from sysid.fleet import Fleet
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
@@ -87,6 +90,28 @@ def ms(seconds: float | None, digits: int = 1) -> str:
 def number(value: float | None, digits: int = 2) -> str:
     """A number, or a dash where there is none."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def spread(values: Any, digits: int) -> str:
+    """Median and middle 90 % of a pandas column."""
+    return "{} ({} … {})".format(*(number(x, digits) for x in values.quantile([0.5, 0.05, 0.95])))
+
+
+def fleet_end(fleet: Fleet, table_path: Path, elapsed_s: float, what: str) -> None:
+    """Which servos of a fleet are unlike the others, which recordings failed, where it all is."""
+    for _, row in fleet.table.query("problem == '' and unlike != ''").iterrows():
+        out.print(
+            f"{row['robot']} {row['joint']} is unlike its sisters: "
+            f"{', '.join(str(row['unlike']).split(';'))}.",
+            soft_wrap=True,
+        )
+    for name, problem in sorted(fleet.problems.items()):
+        warn([f"{name} was left out: {problem}"])
+    err.print(
+        f"{len(fleet.made)} made, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
+        f"{elapsed_s:.0f} s. Wrote {table_path} and {what} per robot beside it.",
+        soft_wrap=True,
+    )
 
 
 def cell(value: Any, digits: int) -> str:

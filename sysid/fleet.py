@@ -1,5 +1,7 @@
 """Calibrate the recordings of many robots at once, on some cores or on a Dask cluster.
 
+`run_fleet` does the same for whatever else is made of a robot's recording (`sysid.servo_fleet`).
+
     fleet = calibrate_fleet(paths, Path("fleet"), Settings(seed=0), jobs=2)
     fleet.table                   # one row per robot and joint
 
@@ -12,11 +14,12 @@ in the table. Servos that are unlike their sisters on the other robots are named
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -70,12 +73,38 @@ class Fleet:
         with semicolons), `problem` (a sentence; then the numbers are empty).
     kept, made, failed : list of str
         Robots whose calibration was there already, was made, could not be made.
+    problems : dict of str to str
+        Why, by robot.
     """
 
     table: pd.DataFrame = field(default_factory=pd.DataFrame)
     kept: list[str] = field(default_factory=list)
     made: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+
+    def tabulate(
+        self, rows: Sequence[dict[str, Any]], quantities: Sequence[str], out: Path
+    ) -> None:
+        """Make the table of `rows` (`robot`, `joint`, `quantities`), and write it to `out`.
+
+        Outliers are named, and robots that failed stand at the end with their problem.
+        """
+        table = pd.DataFrame(rows, columns=["robot", "joint", *quantities])
+        table["unlike"] = _unlike(table, quantities)
+        table["problem"] = ""
+        lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(self.problems.items())])
+        self.table = pd.concat([table, lost], ignore_index=True) if len(lost) else table
+        # it says nothing that the robots' own files do not, so it is made anew with each run
+        text = self.table.to_csv(index=False, lineterminator="\n")
+        write_text(out / TABLE, text, force=True)
+
+    def summary(self, out: Path, elapsed_s: float) -> dict[str, Any]:
+        """Object of `--json`."""
+        return {
+            "table": str(out / TABLE), "made": self.made, "kept": self.kept,
+            "failed": self.failed, "elapsed_s": elapsed_s,
+        }  # fmt: skip
 
 
 def recordings_in(folder: Path) -> list[Path]:
@@ -132,12 +161,59 @@ def calibrate_fleet(
     InputError
         If there is no recording, or the cluster cannot be reached.
     """
-    paths = recordings_in(root)
-    targets = {path: out / f"{_name(path, root)}.yaml" for path in paths}
+    targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
+    fleet = run_fleet(
+        targets,
+        lambda target, path: _is_of(target, path, settings),
+        partial(_calibrated, settings=settings),
+        jobs, cluster, force, progress,
+    )  # fmt: skip
+    rows = []
+    for path in (t for t in targets.values() if t.exists()):
+        calibration: Calibration = load_calibration(path)
+        rows += [
+            {"robot": path.stem, "joint": name}
+            | {key: value(joint) for key, value in QUANTITIES.items()}
+            for name, joint in calibration.joints.items()
+        ]
+    fleet.tabulate(rows, tuple(QUANTITIES), out)
+    return fleet
+
+
+def run_fleet(
+    targets: Mapping[Path, Path],
+    is_of: Callable[[Path, Path], bool],
+    make: Callable[[Path, Path], None],
+    jobs: int,
+    cluster: str | None,
+    force: bool,
+    progress: Callable[[str], None] | None,
+) -> Fleet:
+    """Make what is missing of `targets`, here or on a cluster; problems are told, not raised.
+
+    Parameters
+    ----------
+    targets : dict of Path to Path
+        By recording: what is made of it, called as its robot is.
+    is_of : callable
+        `(target, path) -> bool`: whether an existing target was made so from this recording.
+    make : callable
+        `(path, target) -> None`; must be picklable.
+    jobs, cluster, force, progress
+        As for `calibrate_fleet`.
+
+    Raises
+    ------
+    InputError
+        If `jobs` is not positive, a target exists that is of something else, or the cluster cannot
+        be reached.
+    """
+    if jobs < 1:
+        raise InputError(f"--jobs is {jobs}; it must be at least 1.")
     fleet, todo = Fleet(), []
     for path, target in targets.items():
-        if target.exists() and _is_of(target, path, settings):
-            fleet.kept.append(target.stem)
+        if target.exists() and is_of(target, path):
+            fleet.kept.append(_called(target))
         elif target.exists() and not force:
             raise InputError(
                 f"{target} was made from another recording or with other settings. Choose another "
@@ -145,24 +221,36 @@ def calibrate_fleet(
             )
         else:
             todo.append((path, target))
-    problems: dict[str, str] = {}
     with _backend(cluster) as parallel:
-        work = parallel(jobs)(delayed(_one)(path, target, settings) for path, target in todo)
+        work = parallel(jobs)(delayed(_one)(make, path, target) for path, target in todo)
         for name, problem in cast(Iterable[tuple[str, str]], work):
             (fleet.failed if problem else fleet.made).append(name)
             if problem:
-                problems[name] = problem
+                fleet.problems[name] = problem
             if progress:
                 progress(name)
-    fleet.table = _table([t for t in targets.values() if t.exists()], problems)
-    # it says nothing that the calibrations do not, so it is made anew with each run
-    write_text(out / TABLE, fleet.table.to_csv(index=False, lineterminator="\n"), force=True)
     return fleet
+
+
+def robots_in(root: Path) -> dict[Path, str]:
+    """Every recording in a folder, and what its robot is called.
+
+    Raises
+    ------
+    InputError
+        As `recordings_in`.
+    """
+    return {path: _name(path, root) for path in recordings_in(root)}
 
 
 def _name(path: Path, root: Path) -> str:
     """A robot's name: its file's, with its folder's where there are folders."""
     return "_".join(path.relative_to(root).with_suffix("").parts)
+
+
+def _called(target: Path) -> str:
+    """The robot of a calibration file or of a folder, whose name may have dots."""
+    return target.stem if target.suffix == ".yaml" else target.name
 
 
 def _is_of(target: Path, path: Path, settings: Settings) -> bool:
@@ -179,21 +267,26 @@ def _is_of(target: Path, path: Path, settings: Settings) -> bool:
     )
 
 
-def _one(path: Path, target: Path, settings: Settings) -> tuple[str, str]:
-    """Calibrate one robot; its name, and what went wrong or nothing."""
+def _calibrated(path: Path, target: Path, settings: Settings) -> None:
+    """Calibrate one robot."""
+    recording = load(path)
+    results = calibrate([recording], None, settings.seed, workers=1)
+    made = to_calibration(
+        results, [recording], settings.seed, settings.stall_torque_nm, settings.source
+    )
+    made.save(target, force=True)
+
+
+def _one(make: Callable[[Path, Path], None], path: Path, target: Path) -> tuple[str, str]:
+    """Make one robot's; its name, and what went wrong or nothing."""
     try:
-        recording = load(path)
-        results = calibrate([recording], None, settings.seed, workers=1)
-        made = to_calibration(
-            results, [recording], settings.seed, settings.stall_torque_nm, settings.source
-        )
-        made.save(target, force=True)
+        make(path, target)
     except PupperError as error:
-        return target.stem, str(error)
+        return _called(target), str(error)
     except Exception as error:  # a defect that one robot's log brings out must not cost the others
         at = traceback.extract_tb(error.__traceback__)[-1]
-        return target.stem, f"{type(error).__name__}: {error} ({Path(at.filename).name})"
-    return target.stem, ""
+        return _called(target), f"{type(error).__name__}: {error} ({Path(at.filename).name})"
+    return _called(target), ""
 
 
 @contextmanager
@@ -223,30 +316,13 @@ def _backend(cluster: str | None) -> Iterator[Callable[[int], Parallel]]:
         yield lambda jobs: Parallel(n_jobs=-1)
 
 
-def _table(files: Sequence[Path], problems: dict[str, str]) -> pd.DataFrame:
-    """Every joint of every robot, outliers named, then what went wrong."""
-    rows = []
-    for path in files:
-        calibration: Calibration = load_calibration(path)
-        rows += [
-            {"robot": path.stem, "joint": name}
-            | {key: value(joint) for key, value in QUANTITIES.items()}
-            for name, joint in calibration.joints.items()
-        ]
-    table = pd.DataFrame(rows, columns=["robot", "joint", *QUANTITIES])
-    table["unlike"] = _unlike(table)
-    table["problem"] = ""
-    lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(problems.items())])
-    return pd.concat([table, lost], ignore_index=True) if len(lost) else table
-
-
-def _unlike(table: pd.DataFrame) -> list[str]:
+def _unlike(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
     """Per row the quantities that are far from the same joint's on the other robots."""
     found: list[list[str]] = [[] for _ in range(len(table))]
     for _, rows in table.groupby("joint").groups.items():
         if len(rows) < FEWEST:
             continue
-        for key in QUANTITIES:
+        for key in quantities:
             values = table.loc[rows, key].to_numpy(float)
             middle = np.nanmedian(values)
             # 1.4826 makes the median deviation that of a normal distribution

@@ -10,14 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import InputError
+from common.files import versions
+from servo_models.calibration import utc_now
 from servo_models.interface import ServoModel
 from servo_models.recurrent_network import RecurrentNetwork
+from servo_models.servo_file import input_names, save_servo_model
 from sysid import servo_scores as scores
 from sysid.network_fit import Learned, fit_network, past_ticks
 from sysid.physics_fit import (
@@ -241,6 +245,48 @@ def fit_servo(
         (scored[arch].mean - scored["linear"].mean, low, high), readings, tuple(notes),
         scores.tracks(ours.model, data),
     )  # fmt: skip
+
+
+def save_fit(
+    folder: Path, fit: ServoFit, recordings: Sequence[Recording], seed: int, force: bool = False
+) -> None:
+    """Save the model with its contract: what it was fitted to, how, and how good it is.
+
+    Raises
+    ------
+    InputError
+        If the folder has a model and `force` is not given, or cannot be written.
+    """
+    found = to_json(fit, 0.0)["joints"]
+    save_servo_model(
+        folder,
+        fit.parameters,
+        {
+            "arch": fit.arch, "preset": fit.preset, "created": utc_now(),
+            "time_step_s": fit.data.period_s,
+            "inputs": input_names(fit.parameters, fit.feedback),
+            "feedback": fit.feedback, "warm_up": fit.warm_up,
+            "joints": {
+                j: {
+                    "scores": {k: _known(v) for k, v in entry.items() if k.endswith("_rad")},
+                    "band_noise_rad": _known(entry["band_noise_rad"]) or 0.0,
+                    "band_timing_s": _known(entry["band_timing_s"]) or 0.0,
+                    "readings": fit.readings[j],
+                }
+                for j, entry in found.items()
+            },
+            "readings_counted": fit.data.modes, "split": fit.split.name,
+            "choices": {k: float(v) for k, v in fit.choices.items()},
+            "recordings": [{"name": r.name, "sha256": r.sha256} for r in recordings],
+            "seed": seed, "versions": versions("torch", "safetensors"),
+            "notes": [fit.verdict, *fit.notes],
+        },
+        force,
+    )  # fmt: skip
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def to_json(fit: ServoFit, elapsed_s: float) -> dict[str, Any]:

@@ -13,9 +13,11 @@ from command_line import refused, run
 
 import cli.pupper_sysid
 from servo_models.calibration import load_calibration
+from servo_models.servo_file import load_servo_model
 from sysid import fleet
 from sysid.fleet import QUANTITIES, UNLIKE, _unlike
 
+NAMES = tuple(QUANTITIES)
 SWEEP = ("sweep", "--freqs", "2,4", "--joints", "LF_hip", "--duration", "2")
 
 
@@ -50,6 +52,25 @@ def test_a_folder_becomes_a_calibration_per_robot_and_one_table(sweeps, tmp_path
     )
 
 
+def test_a_folder_becomes_a_servo_model_per_robot_and_one_table(sweeps, tmp_path, capsys):
+    out = tmp_path / "models"
+    arguments = ("fit-servo", sweeps, "--arch", "fir", "--out", out)
+    code, said, err = run(capsys, *arguments, "--json")
+    assert code == 0, err
+    found = json.loads(said)
+    assert sorted(found["made"]) == ["r1", "r2"] and found["failed"] == ["torn"]
+    table = pd.read_csv(out / "fleet.csv")
+    assert table["robot"].to_list() == ["r1", "r2", "torn"]
+    assert "column" in table["problem"].iloc[2]
+    known = load_servo_model(out / "r2").contract.joints["LF_hip"].scores["rmse_free_run_rad"]
+    assert table["free_run_mrad"].iloc[1] == pytest.approx(1e3 * known)
+    assert 0 < known < 1e-3 * table["persistence_mrad"].iloc[1]
+
+    code, said, err = run(capsys, *arguments)
+    assert code == 0 and "2 kept" in err and "torn was left out" in err
+    assert "--force" in refused(capsys, cli.pupper_sysid, *arguments, "--seed", "3")
+
+
 def test_one_robot_alone_and_in_a_fleet_get_the_same_numbers(sweeps, tmp_path, capsys):
     code, _, err = run(capsys, "calibrate", sweeps / "r1.csv", "--out", tmp_path / "alone.yaml")
     assert code == 0, err
@@ -81,9 +102,9 @@ def test_a_servo_unlike_its_sisters_is_named_and_equal_ones_are_not():
         row["lag_ms"] = 40 + 0.1 * k
     # with it the median is 40.5, the median deviation 0.3
     rows[4]["lag_ms"] = 40.5 + 1.1 * UNLIKE * 1.4826 * 0.3
-    found = _unlike(pd.DataFrame(rows))
+    found = _unlike(pd.DataFrame(rows), NAMES)
     assert found == ["lag_ms" if k == 4 else "" for k in range(9)]
-    assert _unlike(pd.DataFrame(rows[2:6])) == [""] * 4  # too few to say what is usual
+    assert _unlike(pd.DataFrame(rows[2:6]), NAMES) == [""] * 4  # too few to say what is usual
 
 
 def test_what_is_no_fleet_is_refused_in_a_sentence(sweeps, tmp_path, capsys):
@@ -110,5 +131,5 @@ def test_outliers_do_not_depend_on_order():
     rows[7]["loss"] = 50.0
     table = pd.DataFrame(rows)
     turned = table.iloc[::-1].reset_index(drop=True)
-    assert _unlike(table) == _unlike(turned)[::-1]
-    assert "loss" in _unlike(table)[7]
+    assert _unlike(table, NAMES) == _unlike(turned, NAMES)[::-1]
+    assert "loss" in _unlike(table, NAMES)[7]

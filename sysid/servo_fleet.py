@@ -1,0 +1,96 @@
+"""Fit servo models to the recordings of many robots at once, as `sysid.fleet` calibrates them.
+
+One recording is one robot and becomes one model folder. Models that were fitted to the same bytes
+in the same way are kept; a recording that cannot be used does not stop the others.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from common.errors import InputError
+from common.files import sha256
+from servo_models.servo_file import load_servo_model
+from sysid.fleet import Fleet, robots_in, run_fleet
+from sysid.recording import load
+from sysid.servo_fit import Split, fit_servo, save_fit
+
+QUANTITIES = {
+    "free_run_mrad": "rmse_free_run_rad",
+    "held_mrad": "rmse_held_rad",
+    "linear_mrad": "linear_rmse_rad",
+    "delayed_pd_mrad": "delayed_pd_rmse_rad",
+    "persistence_mrad": "persistence_rmse_rad",
+}
+"""What the table has of each joint, by its name in the model's contract: errors on unseen data."""
+
+
+@dataclass(frozen=True)
+class ServoSettings:
+    """How every recording is fitted; fields as the parameters of `sysid.servo_fit.fit_servo`."""
+
+    arch: str = "mlp"
+    preset: str = "default"
+    split: Split | None = None
+    readings: str = "auto"
+    seed: int = 0
+
+
+def fit_servo_fleet(
+    root: Path,
+    out: Path,
+    settings: ServoSettings,
+    jobs: int = 1,
+    cluster: str | None = None,
+    force: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Fleet:
+    """Fit a servo model to every recording in `root`; a folder per robot in `out`, and the table.
+
+    Parameters and errors as for `sysid.fleet.calibrate_fleet`.
+    """
+    targets = {path: out / name for path, name in robots_in(root).items()}
+    fleet = run_fleet(
+        targets,
+        lambda target, path: _is_of(target, path, settings),
+        partial(_fitted, settings=settings),
+        jobs, cluster, force, progress,
+    )  # fmt: skip
+    rows = []
+    for folder in (t for t in targets.values() if t.exists()):
+        for joint, known in load_servo_model(folder).contract.joints.items():
+            errors = {name: known.scores.get(key) for name, key in QUANTITIES.items()}
+            rows.append(
+                {"robot": folder.name, "joint": joint}
+                | {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
+            )
+    fleet.tabulate(rows, tuple(QUANTITIES), out)
+    return fleet
+
+
+def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
+    """Whether a model was fitted to these bytes in this way."""
+    try:
+        made = load_servo_model(target).contract
+    except InputError:
+        return False
+    return (
+        [r.sha256 for r in made.recordings] == [sha256(path)]
+        and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
+        and (settings.split is None or settings.split.name == made.split)
+    )
+
+
+def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
+    """Fit one robot's model, on one core."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded, in a new process
+    recording = load(path)
+    fit = fit_servo(
+        [recording], recording.joints, settings.arch, settings.preset, settings.split,
+        settings.readings, settings.seed,
+    )  # fmt: skip
+    save_fit(target, fit, [recording], settings.seed, force=True)
