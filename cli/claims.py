@@ -214,16 +214,19 @@ def _report(
     """The report as HTML."""
     from common.page import Column, Picture, Section, Table, render
 
-    claims = tuple({**asdict(c), "bounds": _bounds(c)} for c in found)
+    claims = tuple(
+        {**asdict(c), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
+        for c in found
+    )
     columns = (
         Column("", lambda row: row["id"], "key"),
         *(
             Column(heading, lambda row, key=key: row[key], "prose")
             for heading, key in (
-                ("claim", "claim"), ("paper", "paper"), ("here", "ours"), ("interval", "bounds"),
-                ("verdict", "verdict"), ("how", "how"),
+                ("claim", "claim"), ("paper", "paper"), ("here", "here"), ("how", "how"),
             )
         ),
+        Column("verdict", lambda row: row["verdict"], "words"),
     )  # fmt: skip
     kinds, rows = _table_one(evidence)
     one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
