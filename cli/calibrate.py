@@ -22,7 +22,13 @@ from sysid.calibration_file import (
 )
 from sysid.report_data import calibrate_json
 
-_SHOWN = {"lag_ms": 1, "delay_ms": 1, "stiffness_per_s2": 0, "speed_rad_s": 2, "loss": 2}
+_SHOWN = {
+    "lag_ms": ("lag ms", 1),
+    "delay_ms": ("dead time ms", 1),
+    "stiffness_per_s2": ("stiffness 1/s²", 0),
+    "speed_rad_s": ("speed rad/s", 2),
+    "loss": ("loss", 2),
+}
 
 
 @dataclass(frozen=True)
@@ -87,30 +93,19 @@ class Calibrate:
 
     def _fleet(self, root: Path, started: float) -> None:
         """Many robots, one after the other or side by side."""
-        from sysid.fleet import TABLE, Settings, calibrate_fleet, recordings_in
+        from sysid.fleet import Settings, calibrate_fleet, robots_in
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
         out = self.out or root.with_name(f"{root.resolve().name}_calibrated")
         settings = Settings(self.seed, self.stall_torque, self._source())
-        with terminal.progress("calibrating", len(recordings_in(root))) as advance:
+        with terminal.progress("calibrating", len(robots_in(root))) as advance:
             fleet = calibrate_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance
             )
-        elapsed = time.perf_counter() - started
-        if self.json:
-            terminal.print_json(fleet.summary(out, elapsed))
-            return
-        known = fleet.table.query("problem == ''")
-        shown = terminal.table(
-            "Fleet: median and middle 90 % of the robots", "joint", "robots", "lag ms",
-            "dead time ms", "stiffness 1/s²", "speed rad/s", "loss",
-        )  # fmt: skip
-        for joint, rows in known.groupby("joint", sort=False):
-            cells = [terminal.spread(rows[key], digits) for key, digits in _SHOWN.items()]
-            shown.add_row(str(joint), str(len(rows)), *cells)
-        terminal.out.print(shown)
-        terminal.fleet_end(fleet, out / TABLE, elapsed, "a calibration")
+        terminal.print_fleet(
+            fleet, out, time.perf_counter() - started, self.json, "a calibration", _SHOWN
+        )
 
     def _print(
         self,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cli import terminal
-from cli.policy_choice import policy_at
+from cli.policy_choice import policy_at, run_folder
 from cli.terminal import err, out, print_json
 from common.errors import InputError
 from common.files import refuse_overwrite, write_text
@@ -46,8 +46,7 @@ def write_claims(options: Analyze, tries: Tries) -> None:
     robot = servo_claims.gather(recordings, options.seed, say)
     evidence = []
     for (name, policy, trial), path in zip(tries, options.policies, strict=True):
-        folder = path.parent if path.name.startswith("policy_") else path
-        evidence.append(gather(name, policy, trial, folder, say))
+        evidence.append(gather(name, policy, trial, run_folder(path), say))
     stacks = _stacks(options, say)
     found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
     pictures = _draw(options.out, evidence, robot, options.force)

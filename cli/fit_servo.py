@@ -18,6 +18,13 @@ from servo_models.servo_file import CONTRACT
 if TYPE_CHECKING:
     from sysid.servo_fit import Split
 
+_SHOWN = {
+    "free_run_mrad": ("free run mrad", 1),
+    "linear_mrad": ("linear mrad", 1),
+    "delayed_pd_mrad": ("delayed PD mrad", 1),
+    "persistence_mrad": ("stays put mrad", 1),
+}
+
 
 @dataclass(frozen=True)
 class FitServo:
@@ -97,9 +104,9 @@ class FitServo:
             soft_wrap=True,
         )
 
-    def _fleet(self, root: Path, split: Split | None) -> None:
+    def _fleet(self, root: Path, split: Split) -> None:
         """Many robots, one after the other or side by side."""
-        from sysid.fleet import TABLE, recordings_in
+        from sysid.fleet import robots_in
         from sysid.servo_fleet import ServoSettings, fit_servo_fleet
 
         if self.joints != "all":
@@ -107,28 +114,16 @@ class FitServo:
         started = time.perf_counter()
         out = self.out or root.with_name(f"{root.resolve().name}_servos")
         settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
-        with terminal.progress(f"fitting {self.arch}", len(recordings_in(root))) as advance:
+        with terminal.progress(f"fitting {self.arch}", len(robots_in(root))) as advance:
             fleet = fit_servo_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance
             )
-        elapsed = time.perf_counter() - started
-        if self.json:
-            terminal.print_json(fleet.summary(out, elapsed))
-            return
-        known = fleet.table.query("problem == ''")
-        shown = terminal.table(
-            "Fleet: median and middle 90 % of the robots, RMS error in mrad", "joint", "robots",
-            "free run", "linear", "delayed PD", "stays put",
-        )  # fmt: skip
-        keys = ("free_run_mrad", "linear_mrad", "delayed_pd_mrad", "persistence_mrad")
-        for joint, rows in known.groupby("joint", sort=False):
-            cells = [terminal.spread(rows[key], 1) for key in keys]
-            shown.add_row(str(joint), str(len(rows)), *cells)
-        terminal.out.print(shown)
-        terminal.fleet_end(fleet, out / TABLE, elapsed, "a servo model")
+        terminal.print_fleet(
+            fleet, out, time.perf_counter() - started, self.json, "a servo model", _SHOWN
+        )
 
-    def _split(self) -> Split | None:
-        from sysid.servo_fit import Split
+    def _split(self) -> Split:
+        from sysid.servo_fit import EACH_GROUP_IN_TURN, Split
 
         loops, times = (self.train_loops, self.test_loops), (self.train_before, self.test_after)
         ways = [any(loops), times != (None, None), self.leave_one_frequency_out]
@@ -152,7 +147,7 @@ class FitServo:
                 lambda number, elapsed, group: np.isin(number, test),
             )
         if times == (None, None):
-            return None
+            return EACH_GROUP_IN_TURN
         if self.train_before is None or self.test_after is None:
             raise InputError("--train-before and --test-after go together, such as 2 and 2.")
         before, after = self.train_before, self.test_after

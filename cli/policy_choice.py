@@ -30,6 +30,12 @@ def is_policy(folder: Path) -> bool:
     return False
 
 
+def run_folder(path: Path) -> Path:
+    """The run that a policy is in (`policy_best`, `policy_last`), else the folder itself."""
+    path = path.resolve()
+    return path.parent if path.name.startswith("policy_") else path
+
+
 def policy_at(path: Path) -> tuple[Policy, Run | None]:
     """The policy in a policy folder, or the best (else the last) of a run, and the run.
 

@@ -15,7 +15,7 @@ import tyro
 from rich.table import Table
 
 from cli import terminal
-from cli.policy_choice import policy_at, simulator
+from cli.policy_choice import policy_at, run_folder, simulator
 from cli.terminal import err, need_positive, out, print_json
 from cli.user_errors import run_program
 from common.errors import InputError
@@ -130,13 +130,8 @@ def _tries(paths: Sequence[Path], options: Analyze) -> Tries:
         trial = Trial(
             task, servos, options.command, options.robots, options.seconds, options.seed
         )  # fmt: skip
-        tries.append((_name(path), policy, trial))
+        tries.append((run_folder(path).name, policy, trial))
     return tries
-
-
-def _name(path: Path) -> str:
-    """Short and distinct: the run's name, without `policy_best`."""
-    return path.parent.name if path.name.startswith("policy_") else path.name
 
 
 def _gait(tries: Tries, rng: np.random.Generator) -> Found:
@@ -310,7 +305,7 @@ def _walked(folder: Path, options: Analyze) -> Path:
 
     policy, run = policy_at(folder)
     actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
-    path = options.out / f"{_name(folder)}-walk.csv"
+    path = options.out / f"{run_folder(folder).name}-walk.csv"
     about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
     with RecordingWriter(path, about | {"policy": str(folder)}, options.force) as rows:
         outcome, _ = walk_once(

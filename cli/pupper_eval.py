@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import tyro
 
 from cli import terminal
-from cli.policy_choice import policy_at, simulator
+from cli.policy_choice import policy_at, run_folder, simulator
 from cli.terminal import err, number, out, print_json
 from cli.user_errors import run_program
 from common.errors import InputError
@@ -98,10 +98,10 @@ def _run(options: Eval) -> None:
         from common.page import write_page
         from policies.walking_report import walking_sections
 
-        name = options.policy.resolve().name
-        folder = options.policy.parent if name.startswith("policy_") else options.policy
+        folder = run_folder(options.policy)
         sections = walking_sections(policy, run, folder, found)
-        title = f"Walking report: {folder.resolve().name}"
+        title = f"Walking report: {folder.name}"
+        name = options.policy.resolve().name
         write_page(page, title, f"{name}, seed {options.seed}", sections, options.force)
     if options.json:
         print_json(found | ({"report": str(page)} if page else {}))

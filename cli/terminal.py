@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,9 +97,31 @@ def spread(values: Any, digits: int) -> str:
     return "{} ({} … {})".format(*(number(x, digits) for x in values.quantile([0.5, 0.05, 0.95])))
 
 
-def fleet_end(fleet: Fleet, table_path: Path, elapsed_s: float, what: str) -> None:
-    """Which servos of a fleet are unlike the others, which recordings failed, where it all is."""
-    for _, row in fleet.table.query("problem == '' and unlike != ''").iterrows():
+def print_fleet(
+    fleet: Fleet,
+    folder: Path,
+    elapsed_s: float,
+    as_json: bool,
+    what: str,
+    columns: Mapping[str, tuple[str, int]],
+) -> None:
+    """A fleet's joints, servos unlike the others, recordings that failed, where it all is.
+
+    `what` is made of each robot; `columns` has, by column of the fleet's table, title and digits.
+    """
+    from sysid.fleet import TABLE
+
+    if as_json:
+        print_json(fleet.summary(folder, elapsed_s))
+        return
+    titles = [title for title, _ in columns.values()]
+    shown = table("Fleet: median and middle 90 % of the robots", "joint", "robots", *titles)
+    known = fleet.table.query("problem == ''")
+    for joint, rows in known.groupby("joint", sort=False):
+        cells = [spread(rows[key], digits) for key, (_, digits) in columns.items()]
+        shown.add_row(str(joint), str(len(rows)), *cells)
+    out.print(shown)
+    for _, row in known.query("unlike != ''").iterrows():
         out.print(
             f"{row['robot']} {row['joint']} is unlike its sisters: "
             f"{', '.join(str(row['unlike']).split(';'))}.",
@@ -109,7 +131,7 @@ def fleet_end(fleet: Fleet, table_path: Path, elapsed_s: float, what: str) -> No
         warn([f"{name} was left out: {problem}"])
     err.print(
         f"{len(fleet.made)} made, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
-        f"{elapsed_s:.0f} s. Wrote {table_path} and {what} per robot beside it.",
+        f"{elapsed_s:.0f} s. Wrote {folder / TABLE} and {what} per robot beside it.",
         soft_wrap=True,
     )
 

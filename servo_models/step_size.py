@@ -2,8 +2,8 @@
 
 In a step MuJoCo, like most engines, turns the set-point and brakes the joint with what will be true
 at the step's end. A stepped servo therefore answers sooner than the same servo in continuous time,
-by about a step: a calibration found with steps of 2 ms and simulated with 5 ms would be 3 ms too
-quick. `delay_at_step` is the delay with which another step gives the same lag.
+by about a step: a calibration found with steps of 2 ms and simulated with 5 ms would be 2 to 3 ms
+too quick. `delay_at_step` is the delay with which another step gives the same lag.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 `run_fleet` does the same for whatever else is made of a robot's recording (`sysid.servo_fleet`).
 
-    fleet = calibrate_fleet(paths, Path("fleet"), Settings(seed=0), jobs=2)
+    fleet = calibrate_fleet(Path("robots"), Path("fleet"), Settings(seed=0), jobs=2)
     fleet.table                   # one row per robot and joint
 
 One recording is one robot. Each becomes a calibration file of its own, written when it is done, so
@@ -107,8 +107,8 @@ class Fleet:
         }  # fmt: skip
 
 
-def recordings_in(folder: Path) -> list[Path]:
-    """Recordings in a folder and the folders in it, without the tables that lie beside them.
+def robots_in(root: Path) -> dict[Path, str]:
+    """Recordings in a folder and the folders in it, and what their robots are called.
 
     Raises
     ------
@@ -117,16 +117,17 @@ def recordings_in(folder: Path) -> list[Path]:
     """
     found = sorted(
         path
-        for path in folder.rglob("*.csv")
+        for path in root.rglob("*.csv")
         if not path.name.endswith(".truth.csv") and path.name != TABLE
     )
     if not found:
-        raise InputError(f"{folder} holds no recording (.csv). Give the folder of your sweeps.")
-    names = [_name(path, folder) for path in found]
+        raise InputError(f"{root} holds no recording (.csv). Give the folder of your sweeps.")
+    # a robot is called as its file, after its folder where there are folders
+    names = ["_".join(path.relative_to(root).with_suffix("").parts) for path in found]
     twice = {n for n in names if names.count(n) > 1}
     if twice:
-        raise InputError(f"{folder}: two recordings would be called {min(twice)}. Rename one.")
-    return found
+        raise InputError(f"{root}: two recordings would be called {min(twice)}. Rename one.")
+    return dict(zip(found, names, strict=True))
 
 
 def calibrate_fleet(
@@ -230,22 +231,6 @@ def run_fleet(
             if progress:
                 progress(name)
     return fleet
-
-
-def robots_in(root: Path) -> dict[Path, str]:
-    """Every recording in a folder, and what its robot is called.
-
-    Raises
-    ------
-    InputError
-        As `recordings_in`.
-    """
-    return {path: _name(path, root) for path in recordings_in(root)}
-
-
-def _name(path: Path, root: Path) -> str:
-    """A robot's name: its file's, with its folder's where there are folders."""
-    return "_".join(path.relative_to(root).with_suffix("").parts)
 
 
 def _called(target: Path) -> str:

@@ -207,6 +207,30 @@ def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:
     return track[whole] + fraction * (track[whole + 1] - track[whole])
 
 
+@dataclass(frozen=True)
+class _Space:
+    """A rung's fitted coordinates: their bounds and prior, arrays of shape (parameters,)."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rung: Rung) -> _Space:
+        par = rung.parameters
+        low, high, centre = (
+            np.array([float(p.encode(getattr(p, name))) for p in par])
+            for name in ("low", "high", "nominal")
+        )
+        return cls(low, high, centre, np.array([p.prior_sd**-2.0 for p in par]))
+
+    def cost(self, r: NDArray, points: NDArray) -> NDArray[np.float64]:
+        """Soft-L1 of residuals in units of the noise, and prior; sums over the last axes."""
+        prior = 0.5 * np.sum(self.precision * (points - self.centre) ** 2, axis=-1)
+        return np.sum(np.sqrt(1 + r**2) - 1, axis=-1) + prior
+
+
 def fit(
     rung: Rung,
     problems: Sequence[Problem],
@@ -231,12 +255,8 @@ def fit(
     -------
     list of Fit, one per problem
     """
-    par = rung.parameters
-    k = len(par)
-    low = np.array([float(p.encode(p.low)) for p in par])
-    high = np.array([float(p.encode(p.high)) for p in par])
-    centre = np.array([float(p.encode(p.nominal)) for p in par])
-    precision = np.array([p.prior_sd**-2.0 for p in par])
+    par, space = rung.parameters, _Space.of(rung)
+    k, low, high = len(par), space.low, space.high
     scale = np.where([p.logarithmic for p in par], 1.0, 0.01)
     z = np.array([[float(p.encode(v)) for p, v in zip(par, row, strict=True)] for row in starts])
     free = np.ones((len(problems), k), bool)
@@ -259,11 +279,10 @@ def fit(
             constant = np.full((r.shape[1], 1), 1.0 / problems[i].noise_rad)
             jacobian = np.hstack([slopes, constant]) * free[i]
             weight = 1.0 / np.sqrt(1.0 + r[0] ** 2)
-            away = points[n] - centre
-            cost = np.sum(np.sqrt(1 + r[0] ** 2) - 1) + 0.5 * np.sum(precision * away**2)
-            costs.append(cost)
-            gradients.append(jacobian.T @ (weight * r[0]) + precision * away * free[i])
-            curvatures.append((jacobian.T * weight) @ jacobian + np.diag(precision * free[i]))
+            pull = space.precision * (points[n] - space.centre) * free[i]
+            costs.append(space.cost(r[0], points[n]))
+            gradients.append(jacobian.T @ (weight * r[0]) + pull)
+            curvatures.append((jacobian.T * weight) @ jacobian + np.diag(space.precision * free[i]))
         return np.array(costs), np.array(gradients), np.array(curvatures)
 
     everyone = np.arange(len(problems))
@@ -324,22 +343,18 @@ def evolve(
     rng : numpy.random.Generator
     generations : int
     """
-    par = rung.parameters
-    low = np.array([float(p.encode(p.low)) for p in par])
-    high = np.array([float(p.encode(p.high)) for p in par])
-    centre = np.array([float(p.encode(p.nominal)) for p in par])
-    precision = np.array([p.prior_sd**-2.0 for p in par])
+    par, space = rung.parameters, _Space.of(rung)
 
     def cost(points: NDArray) -> NDArray:  # (parameters, candidates)
         r = _residuals(rung, [problem], points.T[None])[0] / problem.noise_rad
-        prior = 0.5 * np.sum(precision * (points.T - centre) ** 2, axis=1)
-        return np.sum(np.sqrt(1 + r**2) - 1, axis=1) + prior
+        return space.cost(r, points.T)
 
     population: Any = np.clip(  # SciPy's annotations know names of methods only
-        np.stack([p.encode(column) for p, column in zip(par, starts.T, strict=True)], 1), low, high
-    )
+        np.stack([p.encode(column) for p, column in zip(par, starts.T, strict=True)], 1),
+        space.low, space.high,
+    )  # fmt: skip
     found = differential_evolution(
-        cost, list(zip(low, high, strict=True)), init=population, rng=rng,
+        cost, list(zip(space.low, space.high, strict=True)), init=population, rng=rng,
         maxiter=generations, mutation=(0.4, 0.9), recombination=0.9, tol=0.0, polish=False,
         vectorized=True, updating="deferred",
     )  # fmt: skip

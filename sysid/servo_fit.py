@@ -62,6 +62,9 @@ class Split:
     test: Part | None = None
 
 
+EACH_GROUP_IN_TURN = Split("each group left out in turn")
+
+
 @dataclass(frozen=True)
 class Scored:
     """One model on the test part.
@@ -167,7 +170,7 @@ def fit_servo(
     joints: Sequence[str],
     arch: str = "mlp",
     preset: str = "default",
-    split: Split | None = None,
+    split: Split = EACH_GROUP_IN_TURN,
     mode: str = "auto",
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
@@ -181,8 +184,7 @@ def fit_servo(
     arch : {"fir", "mlp", "lstm", "delayed-pd", "sindy"}
     preset : {"default", "paper"}
         `paper` trains an MLP or LSTM as published: shown its last position, one step ahead.
-    split : Split, optional
-        By default every group is left out in turn.
+    split : Split
     mode : {"auto", "fresh", "all"}
         Which readings count, see `sysid.servo_data`.
     seed : int
@@ -197,7 +199,6 @@ def fit_servo(
     if preset == "paper" and arch not in ("mlp", "lstm"):
         raise InputError(f"--preset paper has an mlp and an lstm; there is no published {arch}.")
     data = servo_data(recordings, joints, mode)
-    split = split or Split("each group left out in turn")
     notes: list[str] = []
     whole = split.train or everything
     data, note = grouped(data, whole)

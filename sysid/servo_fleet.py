@@ -6,8 +6,7 @@ in the same way are kept; a recording that cannot be used does not stop the othe
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,8 @@ from common.files import sha256
 from servo_models.servo_file import load_servo_model
 from sysid.fleet import Fleet, robots_in, run_fleet
 from sysid.recording import load
-from sysid.servo_fit import Split, fit_servo, save_fit
+from sysid.servo_data import servo_data
+from sysid.servo_fit import EACH_GROUP_IN_TURN, Split, fit_servo, save_fit
 
 QUANTITIES = {
     "free_run_mrad": "rmse_free_run_rad",
@@ -35,7 +35,7 @@ class ServoSettings:
 
     arch: str = "mlp"
     preset: str = "default"
-    split: Split | None = None
+    split: Split = EACH_GROUP_IN_TURN
     readings: str = "auto"
     seed: int = 0
 
@@ -81,13 +81,18 @@ def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
     return (
         [r.sha256 for r in made.recordings] == [sha256(path)]
         and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
-        and (settings.split is None or settings.split.name == made.split)
+        and made.split == settings.split.name
+        and made.readings_counted == _modes(path, made.joints, settings.readings)
     )
 
 
+def _modes(path: Path, joints: Iterable[str], readings: str) -> dict[str, str]:
+    """Which readings of a recording count, by joint."""
+    return servo_data([load(path)], list(joints), readings).modes
+
+
 def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
-    """Fit one robot's model, on one core."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded, in a new process
+    """Fit one robot's model."""
     recording = load(path)
     fit = fit_servo(
         [recording], recording.joints, settings.arch, settings.preset, settings.split,

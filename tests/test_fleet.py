@@ -31,15 +31,21 @@ def sweeps(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_folder_becomes_a_calibration_per_robot_and_one_table(sweeps, tmp_path, capsys):
-    out = tmp_path / "fleet"
-    code, said, err = run(capsys, "calibrate", sweeps, "--jobs", "2", "--out", out, "--json")
-    assert code == 0, err
+def two_made_and_one_failed(said: str, out: Path) -> pd.DataFrame:
+    """What `--json` said of `sweeps` and what the table has of them, which it returns."""
     found = json.loads(said)
     assert sorted(found["made"]) == ["r1", "r2"] and found["failed"] == ["torn"]
     table = pd.read_csv(out / "fleet.csv")
     assert table["robot"].to_list() == ["r1", "r2", "torn"]
     assert "column" in table["problem"].iloc[2]
+    return table
+
+
+def test_a_folder_becomes_a_calibration_per_robot_and_one_table(sweeps, tmp_path, capsys):
+    out = tmp_path / "fleet"
+    code, said, err = run(capsys, "calibrate", sweeps, "--jobs", "2", "--out", out, "--json")
+    assert code == 0, err
+    table = two_made_and_one_failed(said, out)
     own = load_calibration(out / "r2.yaml").joint("LF_hip").actuator
     assert table["delay_ms"].iloc[1] == pytest.approx(1e3 * own.delay_s.value)
 
@@ -57,11 +63,7 @@ def test_a_folder_becomes_a_servo_model_per_robot_and_one_table(sweeps, tmp_path
     arguments = ("fit-servo", sweeps, "--arch", "fir", "--out", out)
     code, said, err = run(capsys, *arguments, "--json")
     assert code == 0, err
-    found = json.loads(said)
-    assert sorted(found["made"]) == ["r1", "r2"] and found["failed"] == ["torn"]
-    table = pd.read_csv(out / "fleet.csv")
-    assert table["robot"].to_list() == ["r1", "r2", "torn"]
-    assert "column" in table["problem"].iloc[2]
+    table = two_made_and_one_failed(said, out)
     known = load_servo_model(out / "r2").contract.joints["LF_hip"].scores["rmse_free_run_rad"]
     assert table["free_run_mrad"].iloc[1] == pytest.approx(1e3 * known)
     assert 0 < known < 1e-3 * table["persistence_mrad"].iloc[1]
@@ -69,6 +71,14 @@ def test_a_folder_becomes_a_servo_model_per_robot_and_one_table(sweeps, tmp_path
     code, said, err = run(capsys, *arguments)
     assert code == 0 and "2 kept" in err and "torn was left out" in err
     assert "--force" in refused(capsys, cli.pupper_sysid, *arguments, "--seed", "3")
+    # another split or other readings are another model, too; what auto took stays
+    loops = ("--train-before", "1", "--test-after", "1")
+    assert "--force" in refused(capsys, cli.pupper_sysid, *arguments, *loops)
+    counted = load_servo_model(out / "r1").contract.readings_counted["LF_hip"]
+    code, _, err = run(capsys, *arguments, "--readings", counted)
+    assert code == 0 and "2 kept" in err
+    other = "all" if counted == "fresh" else "fresh"
+    assert "--force" in refused(capsys, cli.pupper_sysid, *arguments, "--readings", other)
 
 
 def test_one_robot_alone_and_in_a_fleet_get_the_same_numbers(sweeps, tmp_path, capsys):

@@ -322,8 +322,7 @@ def test_it_walks_behind_the_robots_proxy_in_real_time(path):
         bus.close()
     assert trunk.upright > 0.98 and trunk.position_m[0] > 0.4
     read = [s for s in samples if s]
-    # in real time a busy host leaves some unanswered
-    assert len(read) > 0.5 * len(samples)
+    assert len(read) > 0.9 * len(samples)
     assert max(abs(s.rate_rad_s).max() for s in read) > 0.3
 
 
