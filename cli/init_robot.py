@@ -36,7 +36,7 @@ class InitRobot:
         """Read the model, write the map, show what to do next."""
         from sim.robot_map import joint_map_of
 
-        found = joint_map_of(self.model, self.servo)
+        found, left_out = joint_map_of(self.model, self.servo)
         target = self.out or Path(f"{self.model.stem}.joints.yaml")
         found.save(target, self.force)
         servos = found.per_servo()
@@ -47,12 +47,20 @@ class InitRobot:
             f"--amplitude {amplitude:g}"
             for amplitude, names in plan
         ]
+        if left_out:
+            terminal.warn(
+                [
+                    f"left out, for no actuator of {self.model} drives them: {', '.join(left_out)}."
+                    " If they have servos, give them actuators there, or take all actuators out."
+                ]
+            )
         if self.json:
             terminal.print_json(
                 {
                     "joint_map": str(target),
                     "joints": list(found.joint_names),
                     "ids": list(found.ids),
+                    "left_out": left_out,
                     "room_rad": dict(zip(found.joint_names, map(float, room), strict=True)),
                     "sweeps": sweeps,
                 }
@@ -68,8 +76,13 @@ class InitRobot:
             )  # fmt: skip
         terminal.out.print(table)
         terminal.out.print(
-            "Ids, centres and signs are guesses. Correct them with the robot connected:\n"
-            f"  pupper-sysid calibrate-joints --joint-map {target} --bus feetech:/dev/ttyUSB0\n"
+            "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
+            "servos limp, move one joint after the other by hand to its positive side and watch\n"
+            f"  pupper-sysid monitor --joint-map {target} --bus feetech:/dev/ttyUSB0\n"
+            f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
+            "Then measure centres, ranges and scale:\n"
+            f"  pupper-sysid calibrate-joints --joint-map {target} --out {target} --force "
+            "--bus feetech:/dev/ttyUSB0\n"
             "Sweep, first without the robot, then with --bus feetech:/dev/ttyUSB0:\n"
             + "".join(f"  {line}\n" for line in sweeps)
             + "Then doctor, delay, calibrate, fit-servo and export, as for any recording.",

@@ -42,6 +42,7 @@ _LARGEST_REPLY = 64
 _MOST_STALE = 16
 _SAME_READINGS = 3
 _TORQUE_TRIES = 5
+_ANY_COUNT = 512
 
 Answer = TypeVar("Answer")
 
@@ -61,7 +62,7 @@ class Esp32Bus:
     BusError
         If the socket is not there or another program owns it.
     InputError
-        If the map is for raw counts or lacks a servo.
+        If the map is for raw counts or another encoder, or lacks a servo.
     """
 
     name = "esp32"
@@ -73,6 +74,12 @@ class Esp32Bus:
             raise InputError(
                 f"the joint map {self._map.file.name} holds raw counts, and the proxy speaks "
                 "calibrated ones. Make a map with `pupper-sysid calibrate-joints --bus esp32`."
+            )
+        if self._map.file.counts != datagrams.HIGHEST_COUNT + 1:
+            raise InputError(
+                f"the joint map {self._map.file.name} is for servos of {self._map.file.counts} "
+                f"counts; the proxy's have {datagrams.HIGHEST_COUNT + 1}. Choose another map, such "
+                "as mini_pupper_2."
             )
         if sorted(self._map.ids) != list(range(1, datagrams.SERVOS + 1)):
             raise InputError(
@@ -87,7 +94,7 @@ class Esp32Bus:
         self._power: datagrams.Power | None = None
         self._power_s = -np.inf
         self._on = np.ones(datagrams.SERVOS, bool)
-        self._goal = np.full(datagrams.SERVOS, 512)
+        self._goal = np.full(datagrams.SERVOS, datagrams.NO_COUNT)  # which cannot be sent
         self.joint_names = self._map.joint_names
         self.limits = self._map.position_limits()
         self.metadata: dict[str, Any] = {
@@ -159,11 +166,13 @@ class Esp32Bus:
         return None
 
     def torque(self, on: bool) -> bool:
-        """Hold the present pose, or let all servos go limp."""
-        if on:
-            present = self._settled_counts()
-            known = present > 0
-            self._goal[known] = present[known]
+        """Hold the present pose, or let all servos go limp.
+
+        While a servo does not say where it is, nothing is sent: all goals go out together, and its
+        own would be a guess.
+        """
+        if on and not self._hold_present():
+            return False
         self._on[:] = on
         for _ in range(_TORQUE_TRIES):
             if self._send_goals():
@@ -183,6 +192,18 @@ class Esp32Bus:
             os.close(self._owner)
             self._owner = None
 
+    def _hold_present(self) -> bool:
+        """Make the present counts the goals; False if not all became known in time."""
+        present = np.full(datagrams.SERVOS, datagrams.NO_COUNT)
+        for _ in range(_TORQUE_TRIES):
+            counts = self._settled_counts()
+            present = np.where(counts > 0, counts, present)
+            if (present > 0).all():
+                self._goal = present
+                return True
+            time.sleep(_RECONNECT_S)
+        return False
+
     def _settled_counts(self) -> NDArray[np.int64]:
         """Counts by id on which two successive answers agree."""
         last = None
@@ -200,7 +221,9 @@ class Esp32Bus:
         return settled
 
     def _send_goals(self) -> bool:
-        request = datagrams.set_position(self._on, self._goal)
+        # what stands beside a torque byte of 0 goes to no servo, but must be a count
+        goal = np.where(self._on | (self._goal > 0), self._goal, _ANY_COUNT)
+        request = datagrams.set_position(self._on, goal)
         acknowledged = self._exchange(request) == datagrams.ACKNOWLEDGED
         if not acknowledged:
             self._disconnect()
@@ -265,9 +288,16 @@ def _own(path: Path) -> int:
         raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
     lock = path.with_name(path.name + ".lock")
     try:
-        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)
+        try:
+            # reading is enough to lock it, so that one which root has left keeps nobody out
+            descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            descriptor = os.open(lock, os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
     except OSError as error:
-        raise BusError(f"{lock} cannot be opened: {error.strerror}.") from error
+        advice = ""
+        if lock.exists():
+            advice = f" Run this as its owner, or, while nobody drives the robot, `sudo rm {lock}`."
+        raise BusError(f"{lock} cannot be opened: {error.strerror}.{advice}") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

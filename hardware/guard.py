@@ -29,6 +29,7 @@ _PARK_PERIOD_S = 0.02
 _LONGEST_TICK_S = 0.06  # a pause does not save up for a jump
 _REST_S = 0.1  # longer since the last goal than any tick: the goal has been at rest
 _TORQUE_OFF_TRIES = 10
+_STALE_S = 0.1  # as old as what some buses say anyway
 _FIND_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
 
 
@@ -77,6 +78,7 @@ class GuardedBus:
         self._stopped_for_safety = self._left_on = False
         self._found: Angles | None = None
         self._present = np.full(len(bus.joint_names), np.nan)
+        self._present_s = np.full(len(bus.joint_names), -np.inf)
         self._sent: Angles | None = None
         self._sent_s = -np.inf
         self._velocity = np.zeros(len(bus.joint_names))
@@ -104,6 +106,7 @@ class GuardedBus:
         sample = self.bus.read()
         here = np.isfinite(sample.position_rad)
         self._present = np.where(here, sample.position_rad, self._present)
+        self._present_s[here] = self.bus.now()
         self.report.missing += int((~here).sum())
         if self._on:
             self._alive()
@@ -120,14 +123,14 @@ class GuardedBus:
         Raises
         ------
         SafetyStop
-            If the first goal is far from where the robot is.
+            If the first goal is far from where the robot is, or the robot outside its limits.
         """
         goal = np.asarray(position_rad, float)
         allowed = self.limits.clip(goal)
         self.report.clipped += int(np.any(allowed != goal))
         now = self.bus.now()
         if self._sent is None:
-            self._refuse_far(goal)
+            self._refuse_far(allowed)
             self._velocity[:] = 0.0
         else:
             allowed = self._bounded(allowed, now - self._sent_s)
@@ -146,25 +149,29 @@ class GuardedBus:
         Raises
         ------
         BusError
-            If it has not, or if a servo did not confirm that it is on.
+            If it has not, or if a servo did not confirm that it is on; all are let go then.
         """
-        if on:
-            self._find()
-        self._on = on
-        done = self.bus.torque(on)
-        if on and not done:
-            self.bus.torque(False)
-            self._on = False
-            raise BusError(f"{self.name}: not every servo confirmed that its torque is on.")
         if not on:
-            self._sent = None
+            self._let_go()
+            return not self._left_on
+        if not self._on:
+            # a limp robot may have been moved by hand since it was read
+            self._present[self.bus.now() - self._present_s > _STALE_S] = np.nan
+            self._found = None
+        self._find()
         if self._watchdog and self._found is not None:
-            if on:
-                self._watchdog.arm(self.joint_names, self._found)
-            else:
-                self._watchdog.disarm()
+            # before the first servo is on: who is killed from here on leaves some that are
+            self._watchdog.arm(self.joint_names, self._found)
+        self._on = True
+        if not self.bus.torque(True):
+            self._let_go()
+            raise BusError(
+                f"{self.name}: not every servo confirmed that its torque is on, and so all were "
+                "told to go limp. Check cables and power, then try again."
+            )
+        self._alive()
         self._watch.forget(self.bus.now())
-        return done
+        return True
 
     def take_over(self) -> None:
         """The torque is on, and whoever switched it on is gone: from here on it is ours.
@@ -200,8 +207,6 @@ class GuardedBus:
         """
         if not self._on:
             return
-        if self._watchdog and self._stopped_for_safety:
-            self._watchdog.only_limp()
         try:
             pose = self._found if pose_rad is None else pose_rad
             if pose is not None and not self._stopped_for_safety:
@@ -209,20 +214,7 @@ class GuardedBus:
         except BusError:
             pass
         finally:
-            self._on = False
-            self._sent = None
-            off = False
-            for _ in range(_TORQUE_OFF_TRIES):
-                try:
-                    off = self.bus.torque(False)
-                except BusError:
-                    pass
-                if off:
-                    break
-                self.bus.sleep_until(self.bus.now() + 0.02)
-            self._left_on = not off
-            if self._watchdog and off:
-                self._watchdog.disarm()
+            self._let_go()
 
     def close(self) -> None:
         """Park if that has not been done, and release the bus.
@@ -239,9 +231,37 @@ class GuardedBus:
             elif self._watchdog:
                 self._watchdog.close()
 
-    def _alive(self) -> None:
+    def _let_go(self) -> None:
+        """Torque off, asked for several times; the watchdog goes on if that does not help."""
+        self._on, self._sent = False, None
+        self._left_on = True  # until a servo says otherwise, whatever ends the tries
         if self._watchdog:
-            self._watchdog.beat()
+            self._watchdog.only_limp()
+        interrupted = None
+        for _ in range(_TORQUE_OFF_TRIES):
+            try:
+                if self.bus.torque(False):
+                    self._left_on = False
+                    break
+                self._alive()  # a line in trouble takes its time
+            except KeyboardInterrupt as pressed:
+                interrupted = pressed
+            except Exception:  # of whatever kind: the robot is still on
+                pass
+            self.bus.sleep_until(self.bus.now() + _PARK_PERIOD_S)
+        if self._watchdog and not self._left_on:
+            self._watchdog.disarm()
+        if interrupted:
+            raise interrupted
+
+    def _alive(self) -> None:
+        """Tell the watchdog that someone is in control."""
+        if self._watchdog:
+            try:
+                self._watchdog.beat()
+            except SafetyStop:
+                self._stopped_for_safety = True
+                raise
 
     def _find(self) -> None:
         """Where the robot is, before anything is sent to it."""
@@ -294,18 +314,25 @@ class GuardedBus:
         slower = np.where(held, here + self._velocity * dt, wanted)
         return self.limits.clip(self.limits.from_servo_angles(slower))
 
-    def _refuse_far(self, goal: Angles) -> None:
-        away = np.abs(goal - self._present)
+    def _refuse_far(self, allowed: Angles) -> None:
+        """Refuse a first goal, within the limits, that would make a joint jump."""
+        away = np.abs(allowed - self._present)
         if not np.isfinite(self._present).all():
             self._stopped_for_safety = True
             raise SafetyStop(f"{self.name}: no first command, for {self._silent()} is not known.")
         far = int(np.argmax(away))
         if away[far] > self.guard.first_command_rad:
             self._stopped_for_safety = True
+            name, here = self.joint_names[far], self._present[far]
+            outside = abs(here - self.limits.clip(self._present)[far])
+            if outside > self.guard.first_command_rad:
+                raise SafetyStop(
+                    f"{name} was found at {here:.2f} rad, {outside:.2f} rad outside its limits, "
+                    "and would jump to them. Move it by hand to where it may be, then start again."
+                )
             raise SafetyStop(
-                f"the first command would send {self.joint_names[far]} "
-                f"{away[far]:.2f} rad away at once (it is at {self._present[far]:.2f} rad). "
-                "Begin from where the robot is."
+                f"the first command would send {name} {away[far]:.2f} rad away at once (it is at "
+                f"{here:.2f} rad). Begin from where the robot is."
             )
 
     def _silent(self) -> str:

@@ -20,6 +20,7 @@ from hardware.feetech_registers import error_words
 Angles = NDArray[np.float64]
 
 _LOOK_EVERY_S = 0.1
+_SAME_RAD = 1e-6  # far below any encoder's count: what sums and differences of angles leave of zero
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ class Watch:
 
     def __init__(self, bus: ServoBus, limits: GuardLimits):
         self._names, self._limits = bus.joint_names, limits
+        # where a push rod turns a calf, its joint's angle changes with a thigh though its own servo
+        # does not: servos are judged by what they turn by themselves
+        self._servo_angles = bus.limits.servo_angles
         band: Any = limits.voltage_v or bus.metadata.get("voltage_band_v")
         self._band = tuple(band) if band else None
         self._keep_s = max(limits.frozen_after_s, limits.load_for_s, limits.astray_after_s) + 0.2
@@ -81,7 +85,7 @@ class Watch:
 
     def commanded(self, now_s: float, goal: Angles) -> None:
         """Remember a goal."""
-        self._goals.append((now_s, goal))
+        self._goals.append((now_s, self._servo_angles(goal)))
 
     def look(self, sample: BusSample, sent: Angles | None) -> None:
         """Judge a reading and what came before it."""
@@ -89,8 +93,8 @@ class Watch:
         here = np.isfinite(sample.position_rad)
         self._last_here_s[here] = now
         self._silence(now)
-        self._faults(sample, now)
-        self._readings.append((now, sample.position_rad))
+        self._faults(sample, here, now)
+        self._readings.append((now, self._servo_angles(sample.position_rad)))
         if sample.load is not None:
             self._loads.append((now, sample.load))
         if now < self._next_s:
@@ -118,38 +122,44 @@ class Watch:
                 "SCS series that stops answering needs its power switched off and on."
             )
 
-    def _faults(self, sample: BusSample, now: float) -> None:
+    def _faults(self, sample: BusSample, here: NDArray[np.bool_], now: float) -> None:
         if sample.voltage_v is not None and self._band:
             low, high = self._band
             bad = (sample.voltage_v < low) | (sample.voltage_v > high)
-            k = self._lasting("voltage", bad, now)
+            k = self._lasting("voltage", bad, np.isfinite(sample.voltage_v), now)
             if k is not None:
                 raise SafetyStop(
                     f"{self._names[k]}: the supply is {sample.voltage_v[k]:.1f} V, outside "
                     f"{low:.1f} to {high:.1f} V. Charge the battery or check the supply."
                 )
         if sample.temperature_c is not None:
-            k = self._lasting("heat", sample.temperature_c > self._limits.temperature_c, now)
+            bad = sample.temperature_c > self._limits.temperature_c
+            k = self._lasting("heat", bad, np.isfinite(sample.temperature_c), now)
             if k is not None:
                 raise SafetyStop(
                     f"{self._names[k]} is at {sample.temperature_c[k]:.0f} °C. Let it cool down, "
                     "then use a smaller --amplitude or fewer --freqs."
                 )
         if sample.status is not None:
-            k = self._lasting("status", sample.status != 0, now)
+            k = self._lasting("status", sample.status != 0, here, now)
             if k is not None:
                 raise SafetyStop(
                     f"{self._names[k]} reports an error: {error_words(int(sample.status[k]))}. "
                     "Relieve it, and switch its power off and on if the error stays."
                 )
 
-    def _lasting(self, what: str, bad: NDArray[np.bool_], now: float) -> int | None:
-        """Index of a joint that has been `bad` for long enough."""
+    def _lasting(
+        self, what: str, bad: NDArray[np.bool_], known: NDArray[np.bool_], now: float
+    ) -> int | None:
+        """Index of a joint that is `bad` and has been for long enough.
+
+        Only a reading that says so makes a joint well again: one that did not come says nothing.
+        """
         since = self._fault_since_s[what]
-        since[~bad] = np.inf
+        since[known & ~bad] = np.inf
         since[bad] = np.minimum(since[bad], now)
-        worst = int(np.argmin(since))
-        return worst if now - since[worst] >= self._limits.fault_for_s else None
+        lasting = np.flatnonzero(bad & (now - since >= self._limits.fault_for_s))
+        return int(lasting[0]) if len(lasting) else None
 
     def _frozen(self, now: float) -> None:
         """Goals moved, long enough ago, and not one reading changed."""
@@ -160,11 +170,9 @@ class Watch:
         if len(told) < 2 or len(read) < 10 or now - self._readings[0][0] < window:
             return
         moved = np.ptp(told, axis=0) >= self._limits.frozen_command_rad
-        with np.errstate(invalid="ignore"):
-            same = np.nanmax(read, axis=0, initial=-np.inf) == np.nanmin(
-                read, axis=0, initial=np.inf
-            )
-        frozen = np.flatnonzero(moved & same)
+        spread = np.nanmax(read, axis=0, initial=-np.inf) - np.nanmin(read, axis=0, initial=np.inf)
+        # a servo that was never read has a spread of minus infinity
+        frozen = np.flatnonzero(moved & (spread >= 0) & (spread < _SAME_RAD))
         if len(frozen):
             k = int(frozen[0])
             raise SafetyStop(
@@ -178,12 +186,13 @@ class Watch:
         since = now - self._limits.astray_after_s
         if not self._goals or self._goals[0][0] > since:
             return
-        told = np.array([x for t, x in self._goals if t >= since] or [sent])
+        goal = self._servo_angles(sent)
+        told = np.array([x for t, x in self._goals if t >= since] or [goal])
         read = np.array([x for t, x in self._readings if t >= now - 0.3])
         resting = np.ptp(told, axis=0) < 0.02
         some = np.isfinite(read).any(axis=0)
         away = np.zeros(len(self._names))
-        away[some] = np.nanmedian(read[:, some], axis=0) - sent[some]
+        away[some] = np.nanmedian(read[:, some], axis=0) - goal[some]
         astray = np.flatnonzero(resting & (np.abs(away) > self._limits.astray_rad))
         if len(astray):
             k = int(astray[0])

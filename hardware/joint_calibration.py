@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import InputError
+from common.joints import JOINT_NAMES
 from hardware.joint_map import JointMap, JointMapFile, joint_map_from
 
 MARGIN = 0.02
@@ -128,11 +129,16 @@ class Travel:
 
 
 def middle_pose_in_words(file: JointMapFile, joints: tuple[str, ...]) -> str:
-    """The pose in which the servos of `joints` stand at their neutral, a line per kind of joint."""
+    """The pose in which the servos of `joints` stand at their neutral.
+
+    A line per kind of joint of the Mini Pupper; another robot's joints one by one, by their angle.
+    """
     degrees = {n: round(np.degrees(file.joints[n].neutral_rad)) for n in joints}
-    lines = []
+    lines = [f"  {n}: {d} degrees" for n, d in degrees.items() if n not in JOINT_NAMES]
+    if lines:
+        lines.append("Angles are those of the robot's model: its MJCF or URDF says where zero is.")
     for kind, (positive, negative) in _SIDES.items():
-        mine = {n: d for n, d in degrees.items() if n.endswith(kind)}
+        mine = {n: d for n, d in degrees.items() if n in JOINT_NAMES and n.endswith(kind)}
         for angle in sorted(set(mine.values())):
             same = [n for n, d in mine.items() if d == angle]
             who = f"every {kind}" if len(same) == len(mine) else ", ".join(same)
@@ -282,8 +288,8 @@ def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
 def doubts(new: JointMap, joints: Mapping[str, int]) -> list[str]:
     """What a person should look at again before trusting the offsets and limits of `joints`."""
     sentences, far = [], []
-    file, bounds = new.file, new.per_servo().position_limits()
-    for k, joint in enumerate(new.joint_names):
+    file = new.file
+    for joint in new.joint_names:
         if joint not in joints:
             continue
         entry = file.joints[joint]
@@ -296,11 +302,6 @@ def doubts(new: JointMap, joints: Mapping[str, int]) -> list[str]:
             sentences.append(
                 f"{joint}: its middle (count {zero}) lies outside its limits {low} to {high}. "
                 "Either the pose was not the middle one or it was not moved through its range."
-            )
-        elif bounds.low_rad[k] >= bounds.high_rad[k]:
-            sentences.append(
-                f"{joint}: its limits in counts and its limits_rad have no angle in common. Check "
-                "the pose, and the sign in the joint map."
             )
     if far:
         sentences.append(

@@ -115,6 +115,19 @@ class JointMapFile(BaseModel):
             low, high = entry.limits_counts
             if low < 0 or high > self.counts - 1:
                 raise ValueError(f"{joint}: limits_counts {[low, high]} leave 0..{self.counts - 1}")
+            # a push rod's servo counts thigh + calf: any one thigh may have room for it
+            if self.linkage != "none" and joint.endswith("_calf"):
+                continue
+            first, last = sorted(
+                entry.neutral_rad
+                + entry.sign * (x - self.counts / 2 - entry.offset_counts) / entry.counts_per_rad
+                for x in entry.limits_counts
+            )
+            if max(first, entry.limits_rad[0]) >= min(last, entry.limits_rad[1]):
+                raise ValueError(
+                    f"{joint}: its limits in counts and its limits_rad have no angle in common. "
+                    "Check the pose, and the sign in the joint map"
+                )
         return self
 
 
@@ -169,14 +182,15 @@ class JointMap:
         """Where a joint stands before it is swept, shape (joints,) [rad].
 
         The Mini Pupper's standing pose; of another robot the servos' neutral, or as near to it as
-        leaves `REST_ROOM_RAD` to both limits.
+        leaves `REST_ROOM_RAD` to both limits. A joint that has a Mini Pupper's name, and limits in
+        which that pose has not half of this room, is another robot's.
         """
         limits = self.per_servo().position_limits()
         room = np.minimum(REST_ROOM_RAD, (limits.high_rad - limits.low_rad) / 2)
         pose = np.clip(self.zero_rad(), limits.low_rad + room, limits.high_rad - room)
-        return np.array(
-            [DEFAULT_POSE.get(n, x) for n, x in zip(self.joint_names, pose, strict=True)]
-        )
+        standing = np.array([DEFAULT_POSE.get(n, np.nan) for n in self.joint_names])
+        free = np.minimum(standing - limits.low_rad, limits.high_rad - standing)
+        return np.where(free >= REST_ROOM_RAD / 2, standing, pose)
 
     def counts_per_rad(self) -> NDArray[np.float64]:
         """Counts per radian, shape (joints,)."""

@@ -4,7 +4,8 @@ Neither the robot's proxy nor a servo notices that its host has died: the last g
 ever, with full torque. So whoever drives a robot starts a `Watchdog` and calls `beat` often. When
 the pipe between the two ends without a goodbye, or when the beat stops for a second, the watchdog
 ends what is left of the driver, opens the bus itself, stops the joints, takes them back to the
-pose the robot was found in, and switches the torque off.
+pose the robot was found in, and switches the torque off. If the watchdog itself dies, the next beat
+stops the driver.
 
     python -m hardware.watchdog          (started by `Watchdog`, never by hand)
 """
@@ -27,15 +28,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import BusError, PupperError
+from common.errors import BusError, PupperError, SafetyStop
 from hardware.joint_map import JointMap, joint_map_from
 
 if TYPE_CHECKING:
-    from hardware.bus import ServoBus
     from hardware.connect import BusAddress
 
 HANG_S = 1.0
 """Without a beat for so long, the driver counts as hung."""
+SWITCH_ON_S = 5.0
+"""So long it may take to switch the torque on, servo by servo on a line in trouble."""
 PARK_WITHIN_S = 0.5
 """The way back takes at most this long, so that all is over within a second."""
 
@@ -73,7 +75,8 @@ class Watchdog:
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         # a session of its own: Ctrl-C at the terminal is for the driver
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "hardware.watchdog"], stdin=subprocess.PIPE,
+            # -P: a file in the user's folder, such as json.py, must not stand in for a module
+            [sys.executable, "-P", "-m", "hardware.watchdog"], stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, start_new_session=True, env=os.environ | {"PYTHONPATH": path},
         )  # fmt: skip
         self._beaten = 0.0
@@ -88,7 +91,10 @@ class Watchdog:
             )
 
     def arm(self, joints: Sequence[str], pose_rad: NDArray[np.float64]) -> None:
-        """The torque of `joints` is on: from now on beats are expected, and this is home."""
+        """The torque of `joints` is about to go on: from now on beats are expected; this is home.
+
+        Said before the first servo is on, so that a driver that is killed meanwhile is followed.
+        """
         self._say({"arm": dict(zip(joints, map(float, pose_rad), strict=True))})
 
     def disarm(self) -> None:
@@ -96,10 +102,22 @@ class Watchdog:
         self._say({"disarm": True})
 
     def beat(self) -> None:
-        """Someone is in control; cheap enough for every tick."""
+        """Someone is in control; cheap enough for every tick.
+
+        Raises
+        ------
+        SafetyStop
+            If the watchdog process has ended.
+        """
         now = time.monotonic()
         if now - self._beaten > _BEAT_S:
             self._beaten = now
+            if self._process.poll() is not None:
+                raise SafetyStop(
+                    "the watchdog process has ended, and without it nobody would park the robot if "
+                    "this one died. Look for who ends processes here (the system's log names a "
+                    "lack of memory), then start again."
+                )
             self._say({"beat": True})
 
     def only_limp(self) -> None:
@@ -144,7 +162,7 @@ def main() -> None:
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     pipe, heard, pose, only_limp = sys.stdin.fileno(), b"", None, False
-    last = time.monotonic()
+    last, patience_s = time.monotonic(), HANG_S
     while True:
         ready, _, _ = select.select([pipe], [], [], 0.1)
         if ready:
@@ -155,6 +173,7 @@ def main() -> None:
                 message = json.loads(line)
                 if "bye" in message:
                     return
+                patience_s = SWITCH_ON_S if "arm" in message else HANG_S
                 if "arm" in message:
                     pose, only_limp = message["arm"], False
                 if "disarm" in message:
@@ -162,7 +181,7 @@ def main() -> None:
                 only_limp |= "limp" in message
             if not data:
                 break
-        elif pose is not None and time.monotonic() - last > HANG_S:
+        elif pose is not None and time.monotonic() - last > patience_s:
             with contextlib.suppress(OSError):
                 os.kill(orders["driver"], signal.SIGKILL)
             break
@@ -174,18 +193,25 @@ def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = F
     """Open the bus that the driver has left, and park the robot, or let it go where it is.
 
     All joints are taken home together if they answer soon, and those that do not are left behind:
-    they get further chances of their own.
+    they get further chances of their own. Where a joint's angle takes two servos (joint
+    coordinates), a servo that does not answer costs the others their way home: all go limp.
     """
+    from hardware.connect import BusAddress, open_bus
     from hardware.guard import GuardedBus, GuardLimits
 
+    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
     joint_map = joint_map_from(orders["map"], "the joint map") if orders["map"] else None
-    if joint_map is not None and orders["coordinates"] == "servo":
-        joint_map = joint_map.per_servo()
+    servo_map = joint_map.per_servo() if joint_map else None
+    if orders["coordinates"] == "servo":
+        joint_map = servo_map
     left, start = list(pose_rad), time.monotonic()
     while left and time.monotonic() - start < _GIVE_UP_S:
-        patient = time.monotonic() - start < _OPEN_WITHIN_S
         try:
-            bus = _opened(orders, joint_map, left, patient)
+            answering = left
+            if time.monotonic() - start > _OPEN_WITHIN_S:
+                answering = _answering(address, servo_map, left)
+                only_limp |= joint_map is not servo_map and len(answering) < len(left)
+            bus = open_bus(address, servo_map if only_limp else joint_map, answering)
         except PupperError:
             # the driver's lock goes with its last thread, which can take a moment
             time.sleep(0.02)
@@ -205,20 +231,16 @@ def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = F
         left = [name for name in left if name not in guard.joint_names]
 
 
-def _opened(
-    orders: dict[str, Any], joint_map: JointMap | None, joints: list[str], all_of_them: bool
-) -> ServoBus:
-    """The bus of `joints`, or of those that answer."""
-    from hardware.connect import BusAddress, open_bus
+def _answering(address: BusAddress, servo_map: JointMap | None, joints: list[str]) -> list[str]:
+    """Those of `joints` whose servos are there."""
+    from hardware.connect import open_bus
 
-    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
-    if not all_of_them:
-        there = open_bus(address, joint_map)
-        there.close()
-        joints = [name for name in joints if name in there.joint_names]
-        if not joints:
-            raise BusError("None of the joints answers.")
-    return open_bus(address, joint_map, joints)
+    there = open_bus(address, servo_map)
+    there.close()
+    found = [name for name in joints if name in there.joint_names]
+    if not found:
+        raise BusError("None of the joints answers.")
+    return found
 
 
 if __name__ == "__main__":

@@ -104,7 +104,14 @@ class FeetechPty:
         self.emulator.faults.ended.append(("unplugged", self.now()))
 
     def _baud(self) -> int | None:
-        """Rate that the host has set; None if it is one that has no name."""
+        """Rate that the host has set; None if the terminal does not say.
+
+        A terminal cannot tell rates without a name from each other: such a one is the servos' if
+        theirs has no name either, and else 0, at which nobody listens.
+        """
         with contextlib.suppress(termios.error):
-            return _SPEEDS.get(termios.tcgetattr(self._host)[4])
+            named = _SPEEDS.get(termios.tcgetattr(self._host)[4])
+            if named is not None:
+                return named
+            return 0 if self.emulator.baud in _SPEEDS.values() else self.emulator.baud
         return None

@@ -1,11 +1,13 @@
 """A joint map for any robot with hobby servos, from its MJCF (or URDF).
 
-    joint_map = joint_map_of(Path("arm.xml"), "sts3215")
+    joint_map, left_out = joint_map_of(Path("arm.xml"), "sts3215")
 
-Each hinge that an actuator drives becomes a joint with a servo; without actuators, each hinge. Ids
-run from 1 in the file's order, a servo's centre is taken to stand where the joint is at zero (or in
-the middle of its range, if zero is outside), and the direction of the counts is the joint's. Those
-three are guesses for `pupper-sysid calibrate-joints`, or a person with a screwdriver, to correct.
+Each hinge that an actuator drives, by itself or through a tendon, becomes a joint with a servo;
+in a model without actuators, each hinge. Ids run from 1 in the file's order, a servo's centre is
+taken to stand where the joint is at zero (or in the middle of its range, if zero is outside), and
+the direction of the counts is the joint's. Those three are guesses: `pupper-sysid calibrate-joints`
+measures the centres; ids and signs are for whoever watches `pupper-sysid monitor` while moving a
+joint by hand to correct.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ _LARGEST_BYTES = 50_000_000
 _MOST_SERVOS = 253
 
 
-def joint_map_of(path: Path, servo: str) -> JointMap:
-    """A joint map of the robot described in `path`.
+def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
+    """A joint map of the robot described in `path`, and the hinges that no actuator drives.
 
     Parameters
     ----------
@@ -40,18 +42,20 @@ def joint_map_of(path: Path, servo: str) -> JointMap:
     Raises
     ------
     InputError
-        If MuJoCo cannot read the file, or it has no hinge that a servo could turn.
+        If MuJoCo cannot read the file, or it has no hinge that a servo turns.
     """
     model = _model(path)
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    driven = {
-        int(model.actuator_trnid[a, 0])
-        for a in range(model.nu)
-        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-    }
-    joints = [j for j in hinges if j in driven] or hinges
-    if not joints:
+    if not hinges:
         raise InputError(f"{path} has no hinge joint: there is nothing for a servo to turn.")
+    driven = _driven(model) if model.nu else set(hinges)
+    joints = [j for j in hinges if j in driven]
+    left_out = [model.joint(j).name or "one without a name" for j in hinges if j not in driven]
+    if not joints:
+        raise InputError(
+            f"{path}: its actuators drive none of its hinges ({', '.join(left_out)}). Give each "
+            "hinge that has a servo an actuator there, or take all actuators out to use every one."
+        )
     if len(joints) > _MOST_SERVOS:
         raise InputError(f"{path} has {len(joints)} hinges; a bus has at most {_MOST_SERVOS} ids.")
     names = [model.joint(j).name for j in joints]
@@ -68,7 +72,22 @@ def joint_map_of(path: Path, servo: str) -> JointMap:
             for k, (j, name) in enumerate(zip(joints, names, strict=True))
         },
     }  # fmt: skip
-    return joint_map_from(data, str(path))
+    return joint_map_from(data, str(path)), left_out
+
+
+def _driven(model) -> set[int]:
+    """Joints that an actuator drives."""
+    found: set[int] = set()
+    trn = mujoco.mjtTrn
+    for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
+        if kind == trn.mjTRN_JOINT or kind == trn.mjTRN_JOINTINPARENT:
+            found.add(int(target))
+        elif kind == trn.mjTRN_TENDON:
+            first = model.tendon_adr[target]
+            for wrap in range(first, first + model.tendon_num[target]):
+                if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:
+                    found.add(int(model.wrap_objid[wrap]))
+    return found
 
 
 def _model(path: Path):

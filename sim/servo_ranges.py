@@ -155,7 +155,7 @@ def _lender(name: str, calibration: Calibration) -> str:
     leg, kind = name.split("_")
     return min(
         calibration.joint_names,
-        key=lambda j: (j != name, j.split("_")[1] != kind, j.split("_")[0] != leg),
+        key=lambda j: (j != name, j.partition("_")[2] != kind, j.partition("_")[0] != leg),
     )
 
 

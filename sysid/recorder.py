@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import InputError
+from common.errors import InputError, SafetyStop
 from hardware.bus import BusSample, ServoBus
 from hardware.guard import GuardedBus, guarded
 from hardware.loop import FixedRateLoop
@@ -79,7 +79,8 @@ def record(
     InputError
         If the plan names a joint the bus has not, or the file exists.
     BusError
-        If the bus gives no reading of where the robot is; `SafetyStop` if the guard ended it.
+        If the bus gives no reading of where the robot is; `SafetyStop` if the guard ended it, or
+        the loop missed too many deadlines: the robot is limp then, where it was.
     KeyboardInterrupt
         On Ctrl-C, after the robot was parked; the file has no footer then.
     """
@@ -144,6 +145,9 @@ class _Session:
                     rows += self._trial(number, trial, writer, done)
                     done += trial.duration_s
                     self._move_to_start()
+            except SafetyStop:
+                bus.limp()  # the loop's own stop too, of which the guard does not know
+                raise
             finally:
                 bus.park()  # before the disk may take its time
             writer.close(

@@ -1,5 +1,6 @@
 """The robot's proxy: layouts of its datagrams, its emulator's quirks, and a bus that bears both."""
 
+import os
 import socket
 import tempfile
 import time
@@ -218,6 +219,33 @@ def test_torque_on_holds_where_the_servos_are_and_off_lets_all_go(path, patient)
     assert np.frombuffer(on[14:], "<u2").tolist() == list(range(501, 513))
 
 
+def test_an_unanswered_question_does_not_make_the_servos_jump_when_they_go_on(path, patient):
+    lost: list[bytes | None] = [None]
+
+    def answer(request: bytes) -> bytes | None:
+        return lost.pop() if request[1] == 2 and lost else answers(request)
+
+    proxy = ScriptedProxy(answer)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        assert bus.torque(True)
+        bus.close()
+    on = next(r for r in proxy.requests if r[1] == 1)
+    assert np.frombuffer(on[14:], "<u2").tolist() == list(range(501, 513))
+
+
+def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
+    def without_the_last(request: bytes) -> bytes:
+        return counts_reply([*range(501, 512), 0]) if request[1] == 2 else answers(request)
+
+    proxy = ScriptedProxy(without_the_last)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        assert not bus.torque(True)
+        bus.close()
+    assert all(r[1] != 1 for r in proxy.requests)
+
+
 def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
     hung = False
     proxy = ScriptedProxy(lambda request: None if hung else answers(request))
@@ -282,16 +310,41 @@ def test_a_second_owner_is_refused_until_the_first_lets_go(path, patient):
         Esp32Bus(path).close()
 
 
+@pytest.mark.parametrize("readable", [True, False])
+def test_a_lock_that_another_user_left_keeps_nobody_out_if_it_can_be_read(
+    path, monkeypatch, readable
+):
+    lock = path.with_name("s.lock")
+    lock.touch()
+    opened = os.open
+
+    def as_another_user(name, flags, *mode):
+        if not readable or flags & (os.O_RDWR | os.O_CREAT):
+            raise PermissionError(13, "Permission denied")
+        return opened(name, flags, *mode)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", as_another_user)
+        if readable:
+            os.close(esp32_bus._own(path))
+        else:
+            with pytest.raises(BusError, match=f"as its owner, or, .* `sudo rm {lock}`"):
+                esp32_bus._own(path)
+
+
 def test_a_missing_socket_gives_a_sentence_and_keeps_no_lock(path, patient):
     for _ in range(2):
         with pytest.raises(BusError, match="nobody answers there. On the robot, check"):
             Esp32Bus(path)
 
 
-def test_a_map_of_raw_counts_or_of_fewer_servos_is_refused(path):
+def test_a_map_of_raw_counts_of_another_encoder_or_of_fewer_servos_is_refused(path):
     with pytest.raises(InputError, match="holds raw counts, and the proxy speaks calibrated ones"):
         Esp32Bus(path, load_joint_map("mini_pupper_2_direct"))
     data = load_joint_map("mini_pupper_2").file.model_dump(by_alias=True)
+    fine = load_joint_map("sts3215").file.model_dump(by_alias=True) | {"frame": "proxy"}
+    with pytest.raises(InputError, match="is for servos of 4096 counts; the proxy's have 1024"):
+        Esp32Bus(path, joint_map_from(fine, "mine"))
     data["joints"]["RB_hip"]["id"] = 13
     with pytest.raises(InputError, match="the proxy drives the servos 1 to 12 together"):
         Esp32Bus(path, joint_map_from(data, "mine"))

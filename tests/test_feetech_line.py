@@ -371,6 +371,17 @@ def test_a_500000_baud_scs_line_is_found_without_naming_the_rate(monkeypatch):
         bus.close()
 
 
+@pytest.mark.parametrize(
+    ("baud", "rate", "hears"),
+    [(57_600, 250_000, False), (57_600, 57_600, True), (250_000, 250_000, True)],
+)
+def test_emulated_servos_hear_a_rate_without_a_name_only_if_theirs_has_none(baud, rate, hears):
+    with on_a_port(still_servos(baud=baud)) as server:
+        line = FeetechLine(server.device, rate)
+        assert (line.ping(1) is not None) is hears
+        line.close()
+
+
 def test_nobody_on_the_line_gives_a_sentence(monkeypatch):
     monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.003)
     with (

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from common.errors import BusError, SafetyStop
 from hardware.bus import BusSample, Sent
 from hardware.guard import GuardedBus, GuardLimits, guarded
 from hardware.limits import Coupling, PositionLimits
+from hardware.watchdog import Watchdog
 
 PERIOD = 0.02
 TWO = ("LF_thigh", "LF_calf")
@@ -62,6 +66,33 @@ class PlainBus:
 
     def close(self):
         self.log.append("close")
+
+
+class Told(Watchdog):
+    """A watchdog that writes what it is told into the bus's log."""
+
+    def __init__(self, bus: PlainBus):
+        self.log = bus.log
+
+    def _say(self, message):
+        self.log += [f"watchdog {word}" for word in message]
+
+    def beat(self):
+        pass
+
+    def close(self):
+        self._say({"bye": True})
+
+    def leave_limp(self):
+        self._say({"leave": True})
+
+
+def linked(bus: PlainBus) -> PlainBus:
+    """The same servos, the second of which turns its joint by a push rod, as on the Mini Pupper."""
+    one = np.array([0])
+    rod = Coupling(one + 1, one, 1, np.array([-3.0]), np.array([3.0]))
+    bus.limits = PositionLimits(np.full(2, -2.0), np.full(2, 2.0), rod)
+    return bus
 
 
 def ready(bus: PlainBus, limits: GuardLimits | None = None) -> GuardedBus:
@@ -140,6 +171,30 @@ def test_a_first_command_far_from_the_robot_is_refused_and_nothing_is_sent():
     assert bus.written == []
 
 
+def test_a_robot_found_outside_its_limits_is_not_made_to_jump_into_them():
+    bus = PlainBus(high=1.0)
+    bus.goal = np.array([1.8, 0.0])
+    guard = GuardedBus(bus)
+    guard.torque(True)
+    with pytest.raises(SafetyStop, match=r"LF_thigh was found at 1\.80 rad, 0\.80 rad outside"):
+        guard.write(np.array([1.8, 0.0]))
+    guard.close()
+    assert bus.written == [] and bus.log[-2:] == ["torque False", "close"]
+
+
+def test_a_robot_that_was_moved_by_hand_while_limp_is_found_anew():
+    bus = PlainBus()
+    guard = ready(bus)
+    guard.park()
+    bus.goal = by_hand = np.array([-0.9, 0.0])
+    guard.sleep_until(guard.now() + 1.0)
+    guard.torque(True)
+    guard.write(by_hand)
+    drive(guard, 0.5, lambda t: np.array([-0.5, 0.0]))
+    guard.park()
+    np.testing.assert_allclose(bus.goal, by_hand, atol=0.002)
+
+
 def test_the_torque_stays_off_while_a_joint_does_not_say_where_it_is():
     bus = PlainBus()
     bus.silent = np.array([False, True])
@@ -181,6 +236,52 @@ def test_who_takes_over_goes_home_although_a_servo_does_not_confirm():
     assert bus.log[-1] == "torque False"
 
 
+def test_the_watchdog_stands_by_before_the_first_servo_is_on():
+    bus = PlainBus()
+    GuardedBus(bus, watchdog=Told(bus)).torque(True)
+    assert bus.log == ["watchdog arm", "torque True"]
+
+
+def test_servos_that_did_not_all_go_on_are_told_to_go_limp_until_they_are():
+    bus = PlainBus()
+    told, answers = bus.torque, [False, False, False, True]
+    bus.torque = lambda on: told(on) and answers.pop(0)
+    with pytest.raises(BusError, match="confirm"):
+        GuardedBus(bus, watchdog=Told(bus)).torque(True)
+    off = ["torque False"] * 3
+    assert bus.log == ["watchdog arm", "torque True", "watchdog limp", *off, "watchdog disarm"]
+
+
+def test_servos_that_do_not_confirm_that_they_are_limp_are_left_to_the_watchdog():
+    bus = PlainBus()
+    guard = GuardedBus(bus, watchdog=Told(bus))
+    guard.torque(True)
+    bus.torque = lambda on: False
+    assert not guard.torque(False)
+    guard.close()
+    assert bus.log == ["watchdog arm", "torque True", "watchdog limp", "close", "watchdog leave"]
+
+
+@pytest.mark.parametrize("trouble", [KeyboardInterrupt(), ValueError("counts"), OSError("gone")])
+def test_torque_off_is_asked_for_again_whatever_comes_between(trouble):
+    bus = PlainBus()
+    guard = GuardedBus(bus, watchdog=Told(bus))
+    guard.torque(True)
+    told, troubles = bus.torque, [trouble]
+
+    def troubled(on):
+        if troubles:
+            raise troubles.pop()
+        return told(on)
+
+    bus.torque = troubled
+    pressed = isinstance(trouble, KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt) if pressed else nullcontext():
+        guard.park()
+    guard.close()
+    assert bus.log[-4:] == ["torque False", "watchdog disarm", "close", "watchdog bye"]
+
+
 def test_a_healthy_robot_is_left_alone_for_a_minute():
     guard = ready(PlainBus())
     drive(guard, 60.0, swing)
@@ -219,6 +320,60 @@ def test_a_joint_that_is_held_away_from_its_goal_stops_the_robot():
     bus.blocked = True
     with pytest.raises(SafetyStop, match=r"LF_thigh is held at 0\.50 rad and stays"):
         drive(guard, 3.0, lambda t: np.array([0.5, 0.0]))
+
+
+def test_a_stuck_calf_servo_is_seen_though_the_angle_of_its_joint_changes_with_the_thigh():
+    bus = linked(PlainBus())
+    guard = ready(bus)
+    read = bus.read
+
+    def stuck():
+        sample = read()
+        # a joint's angle is what its servo stands at less the thigh
+        sample.position_rad[1] = 0.3 - sample.position_rad[0]
+        return sample
+
+    bus.read = stuck
+    with pytest.raises(SafetyStop, match=r"LF_calf was told to move .* did not change once"):
+        drive(guard, 3.0, lambda t: np.full(2, 0.2 * np.sin(2 * np.pi * t)))
+
+
+def test_a_calf_servo_away_from_its_goal_is_not_hidden_by_a_thigh_that_is_away_too():
+    bus = linked(PlainBus())
+    guard = ready(bus)
+    read = bus.read
+    # each joint is 0.2 rad away, and so the calf's servo 0.4
+    bus.read = lambda: replace(read(), position_rad=np.full(2, 0.2))
+    with pytest.raises(SafetyStop, match=r"LF_calf is held at 0\.00 rad and stays 0\.40 rad away"):
+        drive(guard, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("trouble", "says"),
+    [
+        ({"heat": 70.0}, "70 °C"),
+        ({"volts": 3.9}, r"3\.9 V"),
+        ({"status": np.array([0, 32])}, "LF_calf reports an error: overload"),
+    ],
+)
+def test_a_reading_lost_now_and_then_does_not_hide_trouble_that_lasts(trouble, says):
+    bus = PlainBus()
+    guard = ready(bus)
+    for name, value in trouble.items():
+        setattr(bus, name, value)
+    read, none = bus.read, np.full(2, np.nan)
+
+    def every_fifth_lost():
+        sample = read()
+        if bus.ticks % 5:
+            return sample
+        return replace(
+            sample, position_rad=none, voltage_v=none, temperature_c=none, status=np.zeros(2, int)
+        )
+
+    bus.read = every_fifth_lost
+    with pytest.raises(SafetyStop, match=says):
+        drive(guard, 2.0, swing)
 
 
 @pytest.mark.parametrize(
@@ -280,12 +435,7 @@ def test_speed_is_bounded_where_the_servo_turns_not_where_the_joint_bends():
     """The calf's servo turns by thigh + calf: a calf that folds as its thigh rises stands still."""
 
     def moved(goal: np.ndarray) -> np.ndarray:
-        bus = PlainBus()
-        one = np.array([0])
-        bus.limits = PositionLimits(
-            np.full(2, -2.0), np.full(2, 2.0),
-            Coupling(one + 1, one, 1, np.array([-3.0]), np.array([3.0])),
-        )  # fmt: skip
+        bus = linked(PlainBus())
         guard = GuardedBus(bus, GuardLimits(speed_rad_s=8.0, acceleration_rad_s2=1e6))
         guard.read()
         guard.torque(True)

@@ -8,7 +8,7 @@ import pytest
 from common.errors import InputError
 from common.joints import JOINT_NAMES
 from hardware import joint_calibration as jc
-from hardware.joint_map import load_joint_map
+from hardware.joint_map import joint_map_from, load_joint_map
 
 DATE = "2026-11-21"
 PRESET = load_joint_map("mini_pupper_2")
@@ -146,6 +146,22 @@ def test_a_middle_outside_the_travel_and_a_far_horn_are_doubted():
     assert "LF_hip +100 (33°):" in far
     assert "its middle (count 612) lies outside its limits 300 to 600" in outside
     assert jc.doubts(PRESET, {"LF_hip": 0}) == []
+
+
+def test_a_travel_on_the_wrong_side_of_the_middle_makes_no_map():
+    # 612 - 300 counts are 1.78 rad, and a left hip ends at 0.425
+    measured = jc.Measured({"LF_hip": 100}, {"LF_hip": (100, 300)})
+    with pytest.raises(InputError, match="LF_hip: its limits in counts and its limits_rad have no"):
+        jc.calibrated(PRESET.file, measured, DATE)
+
+
+def test_the_middle_pose_of_another_robot_is_told_joint_by_joint_in_degrees():
+    data = PRESET.file.model_dump(by_alias=True) | {"linkage": "none"}
+    given = data["joints"]
+    data["joints"] = {"elbow": given["LF_thigh"], "left_hip": given["LF_hip"]}
+    words = jc.middle_pose_in_words(joint_map_from(data, "arm").file, ("elbow", "left_hip"))
+    assert "elbow: 45 degrees\n" in words and "left_hip: 0 degrees\n" in words
+    assert "the robot's model" in words and "straight down" not in words
 
 
 @pytest.mark.parametrize("preset", ["mini_pupper_2", "sts3215"])

@@ -251,6 +251,21 @@ def test_the_zero_of_a_map_is_the_angle_of_its_centre_counts(pupper):
     assert pupper.zero_rad() == pytest.approx(np.tile([0.0, QUARTER, -2 * QUARTER], 4))
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_mini_pupper_rests_as_it_stands(preset):
+    assert load_joint_map(preset).rest_pose() == pytest.approx(standing())
+
+
+def test_another_robot_with_the_same_names_rests_within_its_own_limits():
+    def other(data: dict) -> None:
+        data["linkage"] = "none"
+        for entry in data["joints"].values():
+            entry |= {"neutral_rad": 0.0, "limits_counts": (402, 622), "limits_rad": (-0.7, 0.7)}
+
+    # ±110 counts are ±0.63 rad: neither 0.785 nor -1.57 is one of its angles
+    assert joint_map_from(edited(other), "mine").rest_pose() == pytest.approx(np.zeros(12))
+
+
 # ---- files ----
 
 
@@ -272,6 +287,7 @@ def put(joint: str, **fields):
         (put("LF_hip", id=5), r"LF_thigh and LF_hip have the same id 5"),
         (put("LF_hip", limits_counts=(608, 438)), r"LF_hip: limits_counts is \[608, 438\]: the"),
         (put("LF_hip", limits_rad=(0.5, 0.5)), r"LF_hip: limits_rad is \[0.5, 0.5\]: the first"),
+        (put("LF_hip", offset_counts=300), r"LF_hip: its limits in counts and its limits_rad have"),
         (put("LF_hip", limits_counts=(438, 1024)), r"LF_hip: limits_counts \[438, 1024\] leave 0"),
         (put("LF_hip", neutral_rad=np.nan), r"joints.LF_hip.neutral_rad: input should be a finite"),
         (put("LF_hip", limits_rad=(-np.inf, 1.0)), r"joints.LF_hip.limits_rad\[0\]: input should"),

@@ -13,13 +13,17 @@ from servo_servers import on_a_port
 from test_simulator_export import in_free_air
 
 import cli.pupper_sysid
+from common.joints import JOINT_NAMES
 from hardware.feetech_registers import STS3215
 from hardware.joint_map import load_joint_map
 from servo_models.calibration import load_calibration
 from servo_models.servo_file import load_servo_model
 from sim.emulated_robot import RobotSpec, draw_robot
 from sim.feetech_emulator import FeetechEmulator
+from sim.mini_pupper import robot_xml
+from sim.robot_map import joint_map_of
 from sim.servo_bench import ServoBench
+from sim.servo_ranges import servo_ranges
 from sysid.recording import load
 
 ARM = """<mujoco><worldbody>
@@ -58,6 +62,31 @@ def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys)
     # 10° before its lower end, a gripper at zero has no room to swing
     assert pose["gripper"] == pytest.approx(np.radians(-10) + 0.4, abs=2e-3)
     assert pose["elbow"] == 0.0 and min(found["room_rad"].values()) > 0.39
+
+
+def test_what_is_guessed_is_said_with_what_corrects_it(capsys):
+    code, out, _ = run(capsys, "init-robot", "arm.xml")
+    said = " ".join(out.split())
+    assert code == 0 and "Ids and signs are for you to check" in said
+    # ids first: a centre is measured for the servo that has the joint's id
+    assert 0 < said.find("monitor --joint-map arm.joints.yaml") < said.find("calibrate-joints")
+
+
+def test_hinges_driven_through_tendons_and_in_the_parent_s_frame_are_taken_and_others_named(capsys):
+    driven = """</worldbody><tendon><fixed name="t"><joint joint="elbow" coef="1"/></fixed></tendon>
+    <actuator><position joint="base_yaw"/><position jointinparent="shoulder"/>
+    <position tendon="t"/></actuator>"""
+    Path("driven.xml").write_text(ARM.replace("</worldbody>", driven))
+    code, out, err = run(capsys, "init-robot", "driven.xml", "--json")
+    assert code == 0 and json.loads(out)["joints"] == ["base_yaw", "shoulder", "elbow"]
+    assert json.loads(out)["left_out"] == ["wrist_pitch", "wrist_roll", "gripper"]
+    assert "left out" in err and "wrist_pitch, wrist_roll, gripper" in " ".join(err.split())
+
+
+def test_the_mini_pupper_s_own_model_has_its_twelve_joints():
+    Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
+    layout, left_out = joint_map_of(Path("pupper.xml"), "scs0009")
+    assert layout.joint_names == JOINT_NAMES and left_out == []
 
 
 def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys):
@@ -111,10 +140,14 @@ def test_one_servo_on_a_bench_is_swept_over_a_serial_line_and_calibrated(capsys)
 def test_what_is_no_robot_is_refused_in_a_sentence(capsys):
     Path("broken.xml").write_text("<mujoco><worldbody><body></worldbody></mujoco>")
     Path("fixed.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    slide = '<actuator><position joint="lift"/></actuator></mujoco>'
+    lift = '<body><joint name="lift" type="slide"/><geom size=".02"/></body></worldbody>'
+    Path("lift.xml").write_text(ARM.replace("</worldbody>", lift).replace("</mujoco>", slide))
     Path("odd.xml").write_text(ARM.replace("base_yaw", "base yaw!"))
     program = cli.pupper_sysid
     assert "MuJoCo's viewer" in refused(capsys, program, "init-robot", "broken.xml")
     assert "no hinge joint" in refused(capsys, program, "init-robot", "fixed.xml")
+    assert "drive none of its hinges" in refused(capsys, program, "init-robot", "lift.xml")
     assert "letters, digits" in refused(capsys, program, "init-robot", "odd.xml")
     assert "is no file" in refused(capsys, program, "init-robot", "nowhere.xml")
     code, _, _ = run(capsys, "init-robot", "arm.xml")

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from common.errors import BusError, FileExistsRefusal, InputError
+from common.errors import BusError, FileExistsRefusal, InputError, SafetyStop
 from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.bus import BusSample, Sent
 from hardware.limits import PositionLimits
@@ -154,6 +154,15 @@ def test_an_interrupted_recording_keeps_its_rows_and_switches_the_torque_off(tmp
     assert len(recording.table) == 60
     if isinstance(raises, KeyboardInterrupt):
         np.testing.assert_allclose(bus.written[-1][1], POSE, atol=1e-12)
+
+
+def test_a_sweep_that_nobody_controls_goes_limp_where_it_is(tmp_path):
+    at = round(REST_S / PERIOD + 0.5) + 20
+    bus = ScriptedBus(POSE, fail_at=at, raises=SafetyStop("the loop missed 10 deadlines in a row"))
+    with pytest.raises(SafetyStop):
+        record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=PERIOD)
+    assert len(bus.written) == at, "it was driven on after the stop"
+    assert bus.calls[-2:] == ["torque False", "close"]
 
 
 def test_nothing_moves_if_the_file_exists_already(tmp_path):

@@ -86,6 +86,11 @@ def test_a_joint_whose_kind_nobody_calibrated_borrows_from_its_own_leg(tmp_path)
     assert ranges.borrowed["RB_calf"] == "RB_thigh"
 
 
+def test_one_servo_on_a_bench_lends_to_all_joints(tmp_path):
+    ranges = ranges_of(tmp_path, calibration(bench=joint_calibration(5.0)))
+    assert ranges.borrowed == dict.fromkeys(JOINT_NAMES, "bench")
+
+
 def test_feedback_comes_with_the_calibration_and_can_be_exchanged(tmp_path):
     held = ranges_of(tmp_path).feedback
     expected = HeldFeedback(0.02685, 0.42, math.pi / 550, -0.1)

@@ -12,12 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from servo_servers import moving_servos, on_a_port, on_a_socket
+from servo_servers import bench_of, moving_servos, on_a_port, on_a_socket, still_servos
 
+from common.errors import SafetyStop
 from common.joints import JOINT_NAMES
-from hardware.connect import open_guarded, parse_address
+from hardware import feetech_line, watchdog
+from hardware.connect import BusAddress, open_guarded, parse_address
 from hardware.guard import GuardedBus
 from hardware.joint_map import load_joint_map
+from hardware.watchdog import Watchdog
 from sim.emulated_robot import draw_robot
 from sim.esp32_emulator import ProxyEmulator
 from sim.servo_bench import ServoBench
@@ -152,6 +155,39 @@ def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
     commands = len(server.emulator.bench.commands)
     time.sleep(0.3)
     assert len(server.emulator.bench.commands) == commands
+
+
+def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monkeypatch):
+    # the servos share this process and a busy machine
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(watchdog, "_GIVE_UP_S", 3.0)
+    layout = load_joint_map("sts3215")
+    there = [i for i in layout.ids if i != 5]  # LF_thigh, on which LF_calf hangs
+    servos = still_servos(ids=there)
+    with on_a_port(servos) as server:
+        orders = {
+            "kind": "feetech", "where": server.device, "baud": 1_000_000,
+            "map": layout.file.model_dump(mode="json", by_alias=True), "coordinates": "joint",
+        }  # fmt: skip
+        watchdog.park(orders, dict.fromkeys(layout.joint_names, 0.0))
+    assert dict(bench_of(servos).torques) == dict.fromkeys(there, False)
+    assert bench_of(servos).goals == []
+
+
+def test_a_driver_without_its_watchdog_does_not_go_on():
+    lost = Watchdog(BusAddress("esp32", "/tmp/none"), None)
+    lost._process.kill()
+    lost._process.wait()
+    with pytest.raises(SafetyStop, match="the watchdog process has ended"):
+        lost.beat()
+    lost.close()
+
+
+def test_files_in_the_users_folder_do_not_stand_in_for_the_watchdogs_modules(tmp_path, monkeypatch):
+    for name in ("json.py", "common.py"):
+        (tmp_path / name).write_text("raise SystemExit\n")
+    monkeypatch.chdir(tmp_path)
+    Watchdog(BusAddress("esp32", "/tmp/none"), None).close()
 
 
 def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp_path):
