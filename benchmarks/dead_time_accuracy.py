@@ -47,7 +47,7 @@ class Result:
 
 def measure(seed: int, tones: str) -> Result:
     """Build, sweep and calibrate one robot."""
-    rng = np.random.default_rng([20261122, seed])
+    rng = np.random.default_rng([20261123, seed])
     spec = random_spec(
         rng, loss=float(rng.uniform(0.0, 0.5)), reading_noise_rad=float(rng.uniform(0.002, 0.012))
     )

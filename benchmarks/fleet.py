@@ -26,7 +26,7 @@ from sysid.excitation import plan
 from sysid.fleet import Settings, calibrate_fleet
 from sysid.recorder import record
 
-JOINT, TONES_HZ, SECONDS = "LF_hip", (2.0, 4.0), 4.0
+JOINT, TONES_HZ, SECONDS = "LF_hip", (2.0, 4.0), 2.0
 
 
 def write_robots(count: int, folder: Path) -> None:

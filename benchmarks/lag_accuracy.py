@@ -69,7 +69,7 @@ def measure(seed: int) -> Result:
         path = Path(folder) / "sweep.csv"
         record(bus, plan("sine", [joint], parse_frequencies("1-10")), path)
         trials = load(path).trials(joint)
-    lattice = find_poll_lattice(trials)
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
     budget = lag_budget(joint, trials, np.random.default_rng(seed), lattice)
 
     tones, clean = [], []

@@ -69,7 +69,7 @@ def true_lag(recording: Recording, server, joint: str, shift: float) -> float:
     """The lag of the true motion, averaged as the estimator averages [s]."""
     time, position = true_motion(server, joint, shift)
     trials = recording.trials(joint)
-    lattice = find_poll_lattice(trials)
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
     tones, clean = [], []
     for trial in trials:
         tone = tone_response(trial, readings(trial, lattice), np.random.default_rng(0), draws=2)

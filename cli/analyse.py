@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from rich.text import Text
 
 from cli import terminal
 from sysid import calibrate as calibration
@@ -50,7 +51,7 @@ class Doctor:
             )  # fmt: skip
         terminal.out.print(shown)
         for name, j in found.joints.items():
-            terminal.out.print(f"\n[bold]{name}[/]: {j.verdict}")
+            terminal.out.print(Text.assemble("\n", (name, "bold"), f": {j.verdict}"))
             for reason in j.reasons:
                 terminal.out.print(f"  - {reason}", soft_wrap=True)
 
@@ -147,7 +148,7 @@ class Bode:
         recordings = terminal.load_all(self.recordings)
         found = {}
         for joint in terminal.pick_joints(recordings, self.joints):
-            trials, _ = calibration.joint_trials(recordings, joint)
+            trials = calibration.joint_trials(recordings, joint)
             rng = calibration.joint_rng(self.seed, joint)
             found[joint] = frequency_response.frequency_response(joint, trials, rng)
         if self.plot:
@@ -160,7 +161,7 @@ class Bode:
             )
             return
         for joint, response in found.items():
-            terminal.out.print(f"[bold]{joint}[/]")
+            terminal.out.print(Text(joint, "bold"))
             terminal.out.print(response.summary(), soft_wrap=True)
         if self.plot:
             terminal.err.print(f"Wrote {self.plot}.")

@@ -97,7 +97,7 @@ class Calibrate:
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
-        out = self.out or root.with_name(f"{root.resolve().name}_calibrated")
+        out = self.out or root.resolve().with_name(f"{root.resolve().name}_calibrated")
         settings = Settings(self.seed, self.stall_torque, self._source())
         with terminal.progress("calibrating", len(robots_in(root))) as advance:
             fleet = calibrate_fleet(

@@ -170,7 +170,7 @@ class Guide:
     def offsets(self) -> dict[str, int]:
         """Step 1: the middle pose; offset of each joint."""
         pose = jc.middle_pose_in_words(self.start.file, self.joints)
-        terminal.err.print(f"\n[bold]Step 1 of 3: the middle pose.[/]\n{pose}")
+        terminal.err.print(Text.assemble(("\nStep 1 of 3: the middle pose.\n", "bold"), pose))
         while True:
             self._keyboard.ask("Hold it still and press Enter.")
             mean, strayed = self._mean()
@@ -195,7 +195,7 @@ class Guide:
 
     def limits(self) -> dict[str, tuple[int, int]]:
         """Step 2: the whole range; limits of the joints that were moved through it."""
-        terminal.err.print("\n[bold]Step 2 of 3: the whole range.[/]")
+        terminal.err.print(Text("\nStep 2 of 3: the whole range.", "bold"))
         travel = jc.Travel(len(self.joints), self._counts)
         while True:
             terminal.err.print(
@@ -207,7 +207,7 @@ class Guide:
             if not refused:
                 break
             for name, why in refused.items():
-                terminal.err.print(f"[yellow]{name}[/] {why}.")
+                terminal.err.print(Text.assemble((name, "yellow"), f" {why}."))
             answer = self._choice(
                 "Enter to go on moving, k to keep the starting map's limits for "
                 f"{'it' if len(refused) == 1 else 'these'}",
@@ -232,8 +232,11 @@ class Guide:
         """Step 3: the scale measured, None if that was skipped, and whether to use it."""
         stated = self.start.file.joints[joint].counts_per_rad
         terminal.err.print(
-            f"\n[bold]Step 3 of 3: the scale.[/]\n{joint} will be moved by {angle_deg:g} degrees, "
-            "in one direction. Measure the angle at the horn, for example with a set square."
+            Text.assemble(
+                ("\nStep 3 of 3: the scale.\n", "bold"),
+                f"{joint} will be moved by {angle_deg:g} degrees, in one direction. Measure the "
+                "angle at the horn, for example with a set square.",
+            )
         )
         which = self.joints.index(joint)
         while True:

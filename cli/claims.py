@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cli import terminal
-from cli.policy_choice import policy_at, run_folder
+from cli.policy_choice import chosen_actuator, policy_at, run_folder
 from cli.terminal import err, out, print_json
 from common.errors import InputError
-from common.files import refuse_overwrite, write_text
+from common.files import refuse_overwrite, sha256, versions, write_text
 
 if TYPE_CHECKING:
     from cli.pupper_analyze import Analyze, Tries
@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from sysid.servo_claims import ServoEvidence
 
 PAGE, REPORT = "claims.md", "claims.html"
+PICTURES = (
+    "sweep.png", "gait-lstm.png", "gait-mlp.png", "orbits.png", "late.png", "ablation.png",
+    "delay.png", "autonomy.png", "terrain.png", "compliance.png", "servos.png",
+)  # fmt: skip
+"""All that may be drawn; which are depends on the evidence."""
 _STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 
@@ -31,16 +36,18 @@ _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 def write_claims(options: Analyze, tries: Tries) -> None:
     """Gather, judge, draw and write."""
     from policies.claims import judge
-    from policies.evidence import gather
+    from policies.evidence import KINDS, gather
     from sysid import servo_claims
 
-    page, report = options.out / PAGE, options.out / REPORT
-    for file in (page, report):
-        refuse_overwrite(file, options.force)
-    names = [name for name, _, _ in tries]
-    twice = {n for n in names if names.count(n) > 1}
-    if twice:
-        raise InputError(f"Two policies are called {min(twice)}; rename a folder to tell them.")
+    page, report = options.folder / PAGE, options.folder / REPORT
+    for name in (PAGE, REPORT, *PICTURES):  # before hours of work, not after them
+        refuse_overwrite(options.folder / name, options.force)
+    for name, policy, _ in tries:
+        if policy.contract.kind not in KINDS:
+            raise InputError(
+                f"{name} is of the kind {policy.contract.kind}, about which nothing was published, "
+                f"so no claim would count it. Leave it out; claims are about {', '.join(KINDS)}."
+            )
     recordings = terminal.load_all(options.recordings) if options.recordings else []
     say = _say
     robot = servo_claims.gather(recordings, options.seed, say)
@@ -49,15 +56,16 @@ def write_claims(options: Analyze, tries: Tries) -> None:
         evidence.append(gather(name, policy, trial, run_folder(path), say))
     stacks = _stacks(options, say)
     found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
-    pictures = _draw(options.out, evidence, robot, options.force)
-    text = _page(found, evidence, pictures, options)
+    pictures = _draw(options.folder, evidence, robot, options.force)
+    inputs = _inputs(options, tries)
+    text = _page(found, evidence, pictures, inputs, options)
     write_text(page, text, options.force)
-    write_text(report, _report(found, evidence, pictures, options), options.force)
+    write_text(report, _report(found, evidence, pictures, inputs, options), options.force)
     if options.json:
         print_json(
             {
                 "claims": [asdict(c) for c in found], "page": str(page), "report": str(report),
-                "pictures": list(pictures),
+                "pictures": list(pictures), "inputs_sha256": inputs, "versions": versions(*_MORE),
             }
         )  # fmt: skip
         return
@@ -82,7 +90,7 @@ def _stacks(options: Analyze, say: Any) -> list[dict[str, Any]]:
     from policies.stacks import STACKS
 
     policy, run = policy_at(options.policies[0])
-    actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
+    actuator = chosen_actuator(options.policies[0], policy, run, options.actuator)
     closed = STACKS["closed-loop"]
     # the same smoothing in both: only what the policy is shown differs
     predicted = replace(closed, observer="servo-model")
@@ -184,8 +192,9 @@ def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
 
 
 def _page(
-    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str], options: Analyze
-) -> str:
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str],
+    inputs: dict[str, str], options: Analyze,
+) -> str:  # fmt: skip
     """The report as Markdown."""
     lines = [
         f"# {_TITLE}", "", _tally(found), "", "Made by", "", "```", _command(options), "```", "",
@@ -204,12 +213,15 @@ def _page(
     lines += ["", "## Pictures", ""]
     for name, caption in pictures.items():
         lines += [f"![{caption}]({name})", "", caption, ""]
-    return "\n".join(lines)
+    lines += [f"## {_MADE}", "", f"{_versions()}.", "", "| input | SHA-256 |", "|---|---|"]
+    lines += [f"| {name} | `{digest}` |" for name, digest in inputs.items()]
+    return "\n".join([*lines, ""])
 
 
 def _report(
-    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str], options: Analyze
-) -> str:
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str],
+    inputs: dict[str, str], options: Analyze,
+) -> str:  # fmt: skip
     """The report as HTML."""
     from common.page import Column, Picture, Section, Table, render
 
@@ -247,16 +259,24 @@ def _report(
             Section(
                 "pictures", "Pictures",
                 figures=[
-                    Picture(Path(name).stem, caption, (options.out / name).read_bytes())
+                    Picture(Path(name).stem, caption, (options.folder / name).read_bytes())
                     for name, caption in pictures.items()
                 ],
             ),
-            Section("made", "Where this comes from", [f"Made by: {_command(options)}"]),
+            Section(
+                "made", _MADE, [f"Made by: {_command(options)}", f"{_versions()}."],
+                tables=[Table("inputs", "What it was made from", (
+                    Column("input", lambda row: row["input"], "words"),
+                    Column("SHA-256", lambda row: row["digest"], "prose"),
+                ), tuple({"input": k, "digest": v} for k, v in inputs.items()))],
+            ),
         ],
     )  # fmt: skip
 
 
 _TITLE, _TABLE_ONE = "The published claims, one by one", "Table I, regenerated"
+_MADE = "Where this comes from"
+_MORE = ("torch", "pandas")  # packages that shape these numbers beside the usual ones
 _ABOUT = (
     "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
     "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
@@ -280,7 +300,27 @@ def _command(options: Analyze) -> str:
     for flag in ("actuator", "feedback"):
         if getattr(options, flag):
             parts += [f"--{flag}", str(getattr(options, flag))]
-    return " ".join([*parts, "--robots", str(options.robots), "--out", str(options.out)])
+    parts += ["--command", *(f"{c:g}" for c in options.command)]
+    for flag in ("robots", "seconds", "seed"):
+        parts += [f"--{flag}", f"{getattr(options, flag):g}"]
+    return " ".join([*parts, "--out", str(options.folder)])
+
+
+def _versions() -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions(*_MORE).items())
+
+
+def _inputs(options: Analyze, tries: Tries) -> dict[str, str]:
+    """SHA-256 of everything the page rests on, by name."""
+    from servo_models.servo_file import WEIGHTS
+
+    found = {f"policy {name}": policy.contract.weights_sha256 for name, policy, _ in tries}
+    servos = {Path(trial.servos.source) for _, _, trial in tries}
+    if options.servo:
+        servos.add(options.servo)
+    files = [p / WEIGHTS if p.is_dir() else p for p in sorted(servos)]
+    files += options.recordings
+    return found | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
 
 
 def _bounds(claim: Claim) -> str:

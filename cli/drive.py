@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from cli import terminal
 from common.errors import InputError
@@ -111,6 +112,6 @@ def _table(tick: Tick, age_s: np.ndarray) -> Table:
             joint, terminal.number(tick.sent[i], 3),
             terminal.number(float(tick.reading.position_rad[i]), 3), terminal.ms(age_s[i], 0),
             terminal.number(tick.senses.load[i], 2),
-            f"[red]{room:.2f}[/]" if room < 0.02 else terminal.number(room, 2),
+            Text(f"{room:.2f}", "red") if room < 0.02 else terminal.number(room, 2),
         )  # fmt: skip
     return shown

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import tyro
+from rich.text import Text
 
 from cli import terminal
 from common.errors import InputError
@@ -112,7 +113,7 @@ class FitServo:
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
         started = time.perf_counter()
-        out = self.out or root.with_name(f"{root.resolve().name}_servos")
+        out = self.out or root.resolve().with_name(f"{root.resolve().name}_servos")
         settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
         with terminal.progress(f"fitting {self.arch}", len(robots_in(root))) as advance:
             fleet = fit_servo_fleet(
@@ -182,7 +183,7 @@ class FitServo:
             "and the model were fitted to the same readings and scored on the same unseen ones.",
             soft_wrap=True,
         )
-        terminal.out.print(f"\n[bold]{found['verdict']}[/]", soft_wrap=True)
+        terminal.out.print(Text(f"\n{found['verdict']}", "bold"), soft_wrap=True)
 
 
 def _free_folder() -> Path:

@@ -9,6 +9,8 @@ import termios
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from rich.text import Text
+
 from cli import terminal
 from common.errors import InputError
 
@@ -25,7 +27,7 @@ class Keyboard:
 
     def ask(self, question: str) -> str:
         """What a person answers to a question, in small letters."""
-        terminal.err.print(f"[bold]{question}[/]")
+        terminal.err.print(Text(question, "bold"))
         self.forget()
         while (line := self.line()) is None:
             select.select([self._input], [], [])

@@ -195,7 +195,7 @@ class Watched:
                 self._age(k, row["age_s" if self.answers_now else "unchanged_s"]),
                 terminal.number(load, 0),
                 terminal.number(row["voltage_v"], 1), terminal.number(row["temperature_c"], 0),
-                errors if row["answers"] else "[red]silent[/]",
+                errors if row["answers"] else Text("silent", "red"),
             )  # fmt: skip
         if self.answers_now:
             said = "age: since the last good answer. goal: what stands in the servo."

@@ -1,4 +1,4 @@
-"""What `pupper-play` and `pupper-eval` share: which policy is meant, and in which simulator."""
+"""What programs that run policies share: which policy is meant, with which servos, and where."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 
 from cli.terminal import err, warn
 from common.errors import InputError
+from common.files import sha256
 from policies.run_file import RUN_FILE, Run, load_run
-from sim.servo_ranges import ServoRanges, check_actuator, servo_ranges
+from servo_models.calibration import PRESETS
+from sim.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 from sim.walking_config import Walking
 
 if TYPE_CHECKING:
@@ -65,10 +67,59 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
     )
 
 
+def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str | None, bool]:
+    """What the policy at `path` was trained with, and whether it is that to the last bit.
+
+    A file is looked for from here, then from the policy's folder and those above it: a run keeps
+    the name that it was given where it began. Of several, the one with the contract's hash is
+    meant. None if there is none.
+    """
+    name = run.actuator if run else policy.contract.actuator
+    if name in (*PRESETS, IDEAL):
+        return name, True
+    wanted, found = policy.contract.actuator_sha256, _near(name, path)
+    same = [f for f in found if wanted is None or (f.is_file() and sha256(f) == wanted)]
+    return (str((same or found)[0]) if found else None), bool(same)
+
+
+def chosen_actuator(path: Path, policy: Policy, run: Run | None, told: str | None) -> str:
+    """What to run the policy at `path` with: what --actuator says, else what it was trained with.
+
+    Raises
+    ------
+    InputError
+        If there is no such thing.
+    """
+    if told is not None:
+        check_actuator(told)
+        return told
+    found, same = trained_actuator(path, policy, run)
+    if found is None:
+        file, name = (RUN_FILE, run.actuator) if run else (_CONTRACT, policy.contract.actuator)
+        raise InputError(
+            f"{file} of {path} names the actuator {name}, which is not here. Give --actuator: a "
+            f"calibration, or one of {', '.join((*PRESETS, IDEAL))}."
+        )
+    if not same:
+        warn(
+            [
+                f"{found} is not the file with which {path} was trained: it was changed, or only "
+                "has the same name. Give the right one with --actuator, or this one, to mean it."
+            ]
+        )
+    return found
+
+
+def _near(name: str, path: Path) -> list[Path]:
+    """What has this name, seen from here, from `path` or from a folder above that."""
+    folder = path.resolve()
+    return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
+
+
 def simulator(
-    policy: Policy, run: Run | None, actuator: str | None, feedback: str | None
+    path: Path, policy: Policy, run: Run | None, actuator: str | None, feedback: str | None
 ) -> tuple[Walking, ServoRanges]:
-    """Task and servos to run a policy in: its own, unless told otherwise."""
+    """Task and servos to run the policy at `path` in: its own, unless told otherwise."""
     from policies.policy_file import refuse_other_observation
 
     contract = policy.contract
@@ -80,9 +131,12 @@ def simulator(
     task = replace(
         task, observation=replace(task.observation, base_velocity=contract.base_velocity)
     )
-    chosen = actuator or (run.actuator if run else None) or contract.actuator
-    check_actuator(chosen)
-    servos = servo_ranges(chosen, feedback or (run.feedback if run else contract.feedback))
+    chosen = chosen_actuator(path, policy, run, actuator)
+    if feedback is None:
+        feedback = run.feedback if run else contract.feedback
+        if feedback not in ("held", "ideal"):
+            feedback = str(next(iter(_near(feedback, path)), feedback))
+    servos = servo_ranges(chosen, feedback)
     if servos.borrowed:
         kinds = sorted(set(servos.borrowed.values()))
         warn(

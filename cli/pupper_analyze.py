@@ -15,7 +15,7 @@ import tyro
 from rich.table import Table
 
 from cli import terminal
-from cli.policy_choice import policy_at, run_folder, simulator
+from cli.policy_choice import chosen_actuator, policy_at, run_folder, simulator
 from cli.terminal import err, need_positive, out, print_json
 from cli.user_errors import run_program
 from common.errors import InputError
@@ -29,6 +29,8 @@ autonomy: does the rhythm go on with inputs frozen, after a push, at another con
 terrain, compliance: where it stays up, and whether it goes where it is told.
 servo: published PD, fitted PD, LSTM and MLP on a recording (or on a walk of an emulated robot).
 claims: all published claims beside what is found here, as a page with pictures.
+
+Example: pupper-analyze gait runs/<name> --command 0.15 0 0
 """
 
 Tries = list[tuple[str, Any, Any]]
@@ -72,14 +74,20 @@ class Analyze:
     servo: Path | None = None
     """For `claims`: servo model of the emulated robot of --seed, to compare its stack with the
     closed loop."""
-    out: Path = Path("analysis")
-    """Folder for the pictures."""
+    out: Path | None = None
+    """Folder for the pictures; by default `analysis`, and `analysis/claims` for `claims`, which has
+    pictures of the same names."""
     seed: int = 0
     """Of servos, friction, start and noise."""
     json: bool = False
     """Print one JSON object."""
     force: bool = False
     """Replace existing pictures."""
+
+    @property
+    def folder(self) -> Path:
+        """Where to write."""
+        return self.out or Path("analysis", *(["claims"] if self.what == "claims" else []))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -103,7 +111,7 @@ def _run(options: Analyze) -> None:
 
         write_claims(options, _tries(options.policies, options))
         return
-    picture = options.out / f"{options.what}.png"
+    picture = options.folder / f"{options.what}.png"
     refuse_overwrite(picture, options.force)
     if options.what == "servo":
         found, figure, table = _servo(options)
@@ -123,14 +131,21 @@ def _tries(paths: Sequence[Path], options: Analyze) -> Tries:
     """Policies by their short names, and how each is tried."""
     from policies.robustness import Trial
 
+    names = [run_folder(path).name for path in paths]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise InputError(
+            f"Two policies are called {twice}, after their run's folder, and results go by these "
+            "names: give one of them, or rename a folder."
+        )
     tries: Tries = []
-    for path in paths:
+    for name, path in zip(names, paths, strict=True):
         policy, run = policy_at(path)
-        task, servos = simulator(policy, run, options.actuator, options.feedback)
+        task, servos = simulator(path, policy, run, options.actuator, options.feedback)
         trial = Trial(
             task, servos, options.command, options.robots, options.seconds, options.seed
         )  # fmt: skip
-        tries.append((run_folder(path).name, policy, trial))
+        tries.append((name, policy, trial))
     return tries
 
 
@@ -145,8 +160,8 @@ def _gait(tries: Tries, rng: np.random.Generator) -> Found:
     found, figure = {}, None
     for name, policy, trial in tries:
         walked = trial.walk(policy)
-        figure = figure or gait_figure(walked)
         gait = describe(walked, rng)
+        figure = figure or gait_figure(walked)
         found[name] = asdict(gait)
         table.add_row(
             name, _interval(gait.frequency_hz, 2), _interval(gait.action_r2, 2),
@@ -160,6 +175,8 @@ def _gait(tries: Tries, rng: np.random.Generator) -> Found:
 def _attractor(tries: Tries, rng: np.random.Generator) -> Found:
     from policies.analysis_figures import orbit_figure
     from policies.evidence import DELAYS_MS
+    from policies.gait import SETTLE_S
+    from policies.rhythm import SHORTEST_S
     from policies.robustness import orbits
 
     table = terminal.table(
@@ -179,6 +196,11 @@ def _attractor(tries: Tries, rng: np.random.Generator) -> Found:
                 *(terminal.number(c, 2) for c in seen["closure"]),
                 *(terminal.number(a, 2) for a in seen["area_ratio"][1:]),
             )  # fmt: skip
+    if not drawn:
+        raise InputError(
+            f"No robot walked for {SETTLE_S + SHORTEST_S:g} s and moved: there is no orbit to look "
+            "at. Give a policy that walks, or more --seconds."
+        )
     return {"delays_ms": DELAYS_MS, "orbits": found}, orbit_figure(drawn, DELAYS_MS), table
 
 
@@ -304,8 +326,8 @@ def _walked(folder: Path, options: Analyze) -> Path:
     from sysid.recording import RecordingWriter
 
     policy, run = policy_at(folder)
-    actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
-    path = options.out / f"{run_folder(folder).name}-walk.csv"
+    actuator = chosen_actuator(folder, policy, run, options.actuator)
+    path = options.folder / f"{run_folder(folder).name}-walk.csv"
     about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
     with RecordingWriter(path, about | {"policy": str(folder)}, options.force) as rows:
         outcome, _ = walk_once(

@@ -17,7 +17,7 @@ import tyro
 
 from cli import terminal
 from cli.buses import chosen_map
-from cli.policy_choice import policy_at
+from cli.policy_choice import chosen_actuator, policy_at, trained_actuator
 from cli.sweep import EMULATED, Sweep
 from cli.terminal import err, need_positive, out, print_json, warn
 from cli.user_errors import end_politely, run_program
@@ -29,7 +29,6 @@ from hardware.imu import Imu
 from hardware.joint_map import JointMap, load_joint_map
 from hardware.loop import real_time_priority
 from policies.stacks import STACKS, ObserverKind, Stack, StackName, suited
-from sim.servo_ranges import check_actuator
 from sysid.recording import RecordingWriter
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
@@ -37,6 +36,8 @@ DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same
 The robot stands up, is measured at rest for a second, walks, and sits down. Ctrl-C ends it there,
 a fault leaves it limp. Every input and output is in walks/<name>/walk.csv, which --replay repeats
 bit for bit; walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
+
+Example: pupper-deploy runs/<name> --command 0.15 0 0 --seconds 20
 """
 
 PLAYBACK_LOOPS, PLAYBACK_HZ = 3, 50.0
@@ -60,8 +61,8 @@ class Deploy:
     servo: Path | None = None
     """Servo model's folder, for `lstm-servo`."""
     actuator: str | None = None
-    """Calibration for `mlp-observer`, and of the comparison before the start; by default the one
-    the policy was trained with."""
+    """Calibration of this robot, for `mlp-observer`, and to be compared with the one the policy was
+    trained with before the start; by default that one."""
     observer: ObserverKind | None = None
     """Instead of the stack's."""
     lowpass_hz: float | None = None
@@ -126,10 +127,25 @@ def _run(options: Deploy) -> None:
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
     with ExitStack() as open_things:
         bus, imu, joint_map, truth = _open(options, open_things)
-        actuator = options.actuator or (run.actuator if run else policy.contract.actuator)
-        check_actuator(actuator)
-        parts = assemble(policy, stack, joint_map, actuator, options.servo)
-        _say_match(parts.match)
+        actuator = chosen_actuator(options.policy, policy, run, options.actuator)
+        trained, known = trained_actuator(options.policy, policy, run)
+        parts = assemble(
+            policy, stack, joint_map, actuator, options.servo, trained if known else None
+        )
+        if stack.observer == "readings" and options.actuator is None:
+            err.print(
+                "The policy is shown the servos' own readings. Whether they move as in its "
+                "training can be told with a calibration of this robot: --actuator."
+            )
+        elif not known:
+            warn(
+                [
+                    "the actuator with which the policy was trained is not here, so whether the "
+                    "observer moves like it was not checked."
+                ]
+            )
+        else:
+            _say_match(parts.match)
         header = parts.header | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
             "bus": {"name": bus.name} | bus.metadata,

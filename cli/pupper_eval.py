@@ -23,6 +23,8 @@ from sim.terrain import Terrain
 DESCRIPTION = """How well a policy walks: falls, tracking errors, by direction, ground and delay.
 
 Errors are mean absolute errors of the instantaneous velocity over whole episodes.
+
+Example: pupper-eval runs/<name> --extra-delay-ms 0 40 80 --report report
 """
 
 
@@ -63,6 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _run(options: Eval) -> None:
     if options.episodes < 1:
         raise InputError(f"--episodes is {options.episodes}; it must be at least 1.")
+    for extra in options.extra_delay_ms:
+        if not 0 <= extra < float("inf"):
+            raise InputError(
+                f"--extra-delay-ms is {extra:g}; a servo cannot answer before its own delay: give "
+                "0 or more."
+            )
     page = options.report / "walking.html" if options.report else None
     if page:
         refuse_overwrite(page, options.force)  # before the work, not after it
@@ -72,14 +80,14 @@ def _run(options: Eval) -> None:
 
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
-    task, servos = simulator(policy, run, options.actuator, options.feedback)
+    task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
     flat = replace(task, terrain="flat")
     stages = 8 + len(options.terrain) + len(options.extra_delay_ms)
     with terminal.progress("walking", stages) as advance:
         found = evaluate(
             policy, flat, servos, options.episodes, options.seed, options.threads, advance
         )
-        found["feedback"] = options.feedback or (run.feedback if run else "held")
+        found["feedback"] = options.feedback or policy.contract.feedback
         found["by_terrain"] = []
         for ground in options.terrain:
             advance(ground)

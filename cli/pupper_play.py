@@ -25,8 +25,10 @@ from common.errors import InputError
 from common.files import refuse_overwrite
 from sim.terrain import Terrain
 
-DESCRIPTION = "Watch a policy walk in the simulator it was trained in."
-_FRAMES_PER_S = 50
+DESCRIPTION = """Watch a policy walk in the simulator it was trained in.
+
+Example: pupper-play runs/<name> --command 0.15 0 0 --video walk.mp4
+"""
 _SIZE = (480, 640)
 
 
@@ -75,7 +77,7 @@ def _run(options: Play) -> None:
 
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
-    task, servos = simulator(policy, run, options.actuator, options.feedback)
+    task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)
@@ -149,9 +151,11 @@ class _Screen:
         try:
             imageio: Any = importlib.import_module("imageio.v2")
             self._path.parent.mkdir(parents=True, exist_ok=True)
+            # a picture per action: at the policy's own rate the video runs as fast as the robot
             self._writer = imageio.get_writer(
-                self._path, fps=_FRAMES_PER_S, codec="libx264", macro_block_size=None
-            )
+                self._path, fps=1 / self._env.config.control_step_s, codec="libx264",
+                macro_block_size=None,
+            )  # fmt: skip
         except (ImportError, ValueError, RuntimeError) as error:  # no imageio, or no ffmpeg
             raise InputError(
                 "Writing video needs the package imageio: pip install 'pupper-sysid[video]'."

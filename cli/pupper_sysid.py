@@ -26,7 +26,7 @@ from cli.report import Report
 from cli.scan import Scan
 from cli.sindy import Sindy
 from cli.sweep import Sweep
-from cli.user_errors import end_politely, user_errors
+from cli.user_errors import end_politely, need_seed, user_errors
 
 Command = (
     Annotated[InitRobot, tyro.conf.subcommand("init-robot")]
@@ -63,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=rest or ["--help"],
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
+        need_seed(command)
         end_politely()
         command.run()
 

@@ -70,7 +70,7 @@ class Report:
                 advance(recording.name)
             for joint, result in results.items():
                 if result.budget.by_frequency:
-                    trials = calibration.joint_trials(recordings, joint)[0]
+                    trials = calibration.joint_trials(recordings, joint)
                     rng = calibration.joint_rng(seed, joint)
                     responses[joint] = frequency_response(joint, trials, rng, result.budget.lattice)
                 advance(joint)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from rich.text import Text
 
 from cli import terminal
 from sysid.sindy import EquationResult, identify, to_json
@@ -43,7 +44,7 @@ class Sindy:
 
     def _print(self, results: dict[str, EquationResult], elapsed: float) -> None:
         for name, r in results.items():
-            terminal.out.print(f"[bold]{name}[/]: {r.equation}", soft_wrap=True)
+            terminal.out.print(Text.assemble((name, "bold"), f": {r.equation}"), soft_wrap=True)
             for line in r.explanation():
                 terminal.out.print(f"  - {line}", soft_wrap=True)
             terminal.out.print()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from common.errors import InputError
 from common.joints import select_joints
@@ -24,8 +25,9 @@ from sysid.recording import Recording, load, newest_recording
 if TYPE_CHECKING:
     from sysid.fleet import Fleet
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+# no markup: names of files and joints may have brackets; `Text` where something is to stand out
+out = Console(highlight=False, markup=False)
+err = Console(stderr=True, highlight=False, markup=False)
 
 
 def load_all(paths: Sequence[Path]) -> list[Recording]:
@@ -68,7 +70,7 @@ def _finite(value: Any) -> Any:
 def warn(sentences) -> None:
     """Sentences the user should read, on stderr."""
     for sentence in sentences:
-        err.print(f"[yellow]warning:[/] {sentence}")
+        err.print(Text.assemble(("warning: ", "yellow"), sentence))
 
 
 def table(title: str, *columns: str) -> Table:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import tyro
+from rich.text import Text
 
 from cli.terminal import err, out
 from common.errors import InputError, PupperError
@@ -39,12 +40,19 @@ def run_program(
     """Parse a program's arguments into `options` and do its `work`; ends the process on errors."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, program) as rest:
-        work(
-            tyro.cli(
-                options, args=rest, description=description, prog=program,
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
+        parsed = tyro.cli(
+            options, args=rest, description=description, prog=program,
+            config=(tyro.conf.FlagCreatePairsOff,),
         )  # fmt: skip
+        need_seed(parsed)
+        work(parsed)
+
+
+def need_seed(options: object) -> None:
+    """Refuse a negative `--seed`, which no generator takes."""
+    seed = getattr(options, "seed", 0)
+    if seed < 0:
+        raise InputError(f"--seed is {seed}; it must be a whole number from 0 on.")
 
 
 def end_politely() -> None:
@@ -72,7 +80,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     except PupperError as error:
         if debug:
             raise
-        err.print(f"[red]error:[/] {error}", soft_wrap=True)
+        _tell(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         err.print("Stopped.")
@@ -83,12 +91,15 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     except Exception as error:
         if debug:
             raise
-        err.print(
-            f"[red]error:[/] {type(error).__name__}: {error}. This is a defect of {program}; "
-            "run again with --debug and report what it prints.",
-            soft_wrap=True,
+        _tell(
+            f"{type(error).__name__}: {error}. This is a defect of {program}; run again with "
+            "--debug and report what it prints."
         )
         sys.exit(1)
+
+
+def _tell(error: str) -> None:
+    err.print(Text.assemble(("error: ", "red"), error), soft_wrap=True)
 
 
 def _tell_version(program: str) -> None:

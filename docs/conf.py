@@ -43,9 +43,17 @@ def _help(module: str, *words: str) -> str:
 
 
 def subcommands(module: str) -> list[str]:
-    """Names of a program's commands; empty if it has none."""
-    command = getattr(import_module(f"cli.{module}"), "Command", None)
-    return [get_args(one)[1].name for one in get_args(command)] if command else []
+    """Names of a program's commands, those of a command's own as two words; empty without any."""
+    return _names(getattr(import_module(f"cli.{module}"), "Command", None))
+
+
+def _names(command: object, *before: str) -> list[str]:
+    found = []
+    for one in get_args(command):
+        inner, how = get_args(one)
+        words = (*before, how.name)
+        found += [" ".join(words), *_names(inner, *words)]
+    return found
 
 
 def reference() -> str:
@@ -60,7 +68,8 @@ def reference() -> str:
         program = module.replace("_", "-")
         lines += [f"## {program}", "", "```text", _help(module), "```", ""]
         for name in subcommands(module):
-            lines += [f"### {program} {name}", "", "```text", _help(module, name), "```", ""]
+            shown = _help(module, *name.split())
+            lines += [f"### {program} {name}", "", "```text", shown, "```", ""]
     return "\n".join(lines)
 
 

@@ -27,7 +27,8 @@ def delay_figure(curves: Mapping[str, Rows]) -> Figure:
     names = {"survival": "share still up", "frequency_hz": "gait [Hz]", "amplitude_rad": "rad"}
     figure, axes = axes_column(len(names), 2.2 * len(names))
     for (name, title), one in zip(names.items(), axes, strict=True):
-        for (policy, rows), colour in zip(curves.items(), JOINT_COLOURS, strict=False):
+        for k, (policy, rows) in enumerate(curves.items()):
+            colour = JOINT_COLOURS[k % len(JOINT_COLOURS)]
             for mode, line in _MODES.items():
                 chosen = [r for r in rows if r["mode"] == mode and np.isfinite(r[name])]
                 if chosen:
@@ -37,7 +38,8 @@ def delay_figure(curves: Mapping[str, Rows]) -> Figure:
                     )  # fmt: skip
         one.set_ylabel(title)
     axes[-1].set_xlabel("more delay [ms]")
-    axes[1].legend(fontsize=7)
+    if axes[1].lines:  # without a gait there is none to name
+        axes[1].legend(fontsize=7)
     return figure
 
 
@@ -78,22 +80,28 @@ def orbit_figure(orbits: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms
 
 
 @styled
-def gait_figure(rollout: Rollout, robot: int = 0) -> Figure:
-    """Stance bars of the four feet, LF thigh's angle, and its action, over two seconds."""
+def gait_figure(rollout: Rollout) -> Figure:
+    """Stance bars of the four feet, LF thigh's angle, and its action, over two seconds.
+
+    Of the first robot that is up so long, others' thighs behind; empty if none is.
+    """
     start = round(SETTLE_S / rollout.step_s)
     stop = start + round(_SHOWN_S / rollout.step_s)
     time = np.arange(stop - start) * rollout.step_s
+    up = np.flatnonzero(rollout.alive[stop - 1]) if len(rollout.alive) >= stop else []
     figure, (feet, thigh, action) = axes_column(3, 6.0)
     for i, leg in enumerate(LEGS):
-        for begin, length in intervals(rollout.contact[start:stop, robot, i], rollout.step_s):
-            feet.barh(3 - i, length, left=begin, color=INK, height=0.6)
+        for robot in up[:1]:
+            for begin, length in intervals(rollout.contact[start:stop, robot, i], rollout.step_s):
+                feet.barh(3 - i, length, left=begin, color=INK, height=0.6)
         feet.text(-0.02, 3 - i, leg, ha="right", va="center", transform=feet.get_yaxis_transform())
     feet.set(yticks=[], xlim=(0, time[-1]), title="feet on the ground")
-    for i in range(min(rollout.joint_position.shape[1], 7)):
-        bold = {"lw": 1.6, "color": RED} if i == robot else {"lw": 0.5, "color": "#bbbbbb"}
-        thigh.plot(time, rollout.joint_position[start:stop, i, _THIGH], **bold)
+    for k, robot in enumerate(up[:7]):
+        bold = {"lw": 1.6, "color": RED} if k == 0 else {"lw": 0.5, "color": "#bbbbbb"}
+        thigh.plot(time, rollout.joint_position[start:stop, robot, _THIGH], **bold)
     thigh.set(ylabel="LF thigh [rad]", xlim=(0, time[-1]))
-    action.plot(time, rollout.action_rad[start:stop, robot, _THIGH], color=GREEN)
+    for robot in up[:1]:
+        action.plot(time, rollout.action_rad[start:stop, robot, _THIGH], color=GREEN)
     action.set(ylabel="its action [rad]", xlabel="time [s]", xlim=(0, time[-1]))
     return figure
 
@@ -128,7 +136,7 @@ def autonomy_figure(tests: Mapping[str, Mapping[str, Rows]]) -> Figure:
         rows = found["frozen"]
         places = np.arange(len(rows)) + 0.8 * k / count
         bars.barh(places, [r["share"] for r in rows], 0.8 / count, color=colour, label=policy)
-        for row, mark in zip(found["push"], ("x", "o"), strict=True):
+        for row, mark in zip(found["push"], ("x", "o"), strict=False):  # none if nobody walked
             shifts.plot(
                 row["phases"], row["shifts"], mark, ms=3, color=colour, ls="",
                 label=f"{policy}, {row['push_m_s']:g} m/s",
@@ -143,7 +151,8 @@ def autonomy_figure(tests: Mapping[str, Mapping[str, Rows]]) -> Figure:
     shifts.set(xlabel="phase at the push [cycles]", ylabel="shift [cycles]", ylim=(-0.52, 0.52))
     rates.set(xlabel="control rate [Hz]", ylabel="gait [Hz]", ylim=(0, None))
     for axes in (bars, shifts, rates):
-        axes.legend(fontsize=6.5)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=6.5)
     return figure
 
 
@@ -176,5 +185,6 @@ def compliance_figure(tables: Mapping[str, Rows]) -> Figure:
                 one.plot(-path[:, 1], path[:, 0], color=colour, lw=1.2, label=row["direction"])
         one.set_aspect("equal")
         one.set(title=policy, xlabel="to the right [m]", ylabel="forward [m]")
-    axes[0].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    if axes[0].lines:
+        axes[0].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure

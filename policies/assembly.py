@@ -29,7 +29,7 @@ class Assembly:
     ----------
     controller : Controller
     match : Match
-        The observer against the actuator the policy was trained with.
+        What the observer will say of this robot against the actuator the policy was trained with.
     header : dict
         What a log must say so that the same can be put together again.
     """
@@ -40,7 +40,12 @@ class Assembly:
 
 
 def assemble(
-    policy: Policy, stack: Stack, joint_map: JointMap, actuator: str, servo: Path | None
+    policy: Policy,
+    stack: Stack,
+    joint_map: JointMap,
+    actuator: str,
+    servo: Path | None,
+    trained: str | None = None,
 ) -> Assembly:
     """Put a controller together.
 
@@ -51,9 +56,11 @@ def assemble(
     joint_map : JointMap
         Of the bus, in joint coordinates.
     actuator : str
-        Calibration or preset with which the policy was trained.
+        Calibration or preset of the robot at hand, which a simulated PD moves like.
     servo : Path or None
         A learned servo model's folder.
+    trained : str, optional
+        Calibration or preset with which the policy was trained, if not with `actuator`.
 
     Raises
     ------
@@ -74,7 +81,11 @@ def assemble(
         stack.observer, period, contract.velocity_steps, parameters,
         (limits.low_rad, limits.high_rad), model,
     )  # fmt: skip
-    match = compare(observer, parameters, period)
+    if trained is None or trained == actuator:
+        match = compare(observer, parameters, period)
+    else:
+        of_training = DelayedPDParameters(**servo_ranges(trained).value)
+        match = compare(observer, of_training, period, parameters)
     controller = Controller(policy, stack, observer, joint_map, _stall_torque(servos))
     header = {
         "policy_sha256": contract.weights_sha256, "stack": asdict(stack),

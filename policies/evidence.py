@@ -20,6 +20,7 @@ from policies.policy_file import Policy
 from policies.rhythm import Estimate, mean_of
 from policies.robustness import Trial, ablation, delay_curve, frozen, orbits, scales, terrain
 from policies.rollouts import Rollout
+from policies.run_file import RUN_FILE, load_run
 
 KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
 """The architectures compared, and how they are called."""
@@ -40,6 +41,10 @@ class PolicyEvidence:
     trained: dict[str, float]
     """Last updates of its training: `reward` per second, `std`, `updates`, `steps_per_s`; empty if
     not known."""
+    curriculum: bool | None
+    """Whether it was trained with a curriculum; None if not known."""
+    ground: str | None
+    """Kind of ground it was trained on; None if not known."""
     walk: Rollout
     gait: GaitReport | None
     """None if no robot walked long enough."""
@@ -69,7 +74,7 @@ def gather(
     policy : Policy
     trial : Trial
     run_folder : Path or None
-        Where its training's curve is.
+        Where its training's curve and settings are.
     say : callable
         Told what is about to be done.
     """
@@ -84,9 +89,11 @@ def gather(
         gait = describe(walk, rng)
     except InputError:
         gait = None
+    task = load_run(run_folder).task if run_folder and (run_folder / RUN_FILE).is_file() else None
     return PolicyEvidence(
-        name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s), walk, gait,
-        step("orbits", lambda: orbits(policy, trial, DELAYS_MS)) if gait else {},
+        name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s),
+        task.curriculum.on if task else None, task.terrain if task else None, walk, gait,
+        step("orbits", lambda: orbits(policy, trial, DELAYS_MS)),
         step("delay", lambda: delay_curve(policy, trial, _EXTRA_DELAYS_MS)),
         step("ablation", lambda: ablation(policy, trial, ("all joints",))),
         step("frozen inputs", lambda: frozen(policy, trial)),
@@ -99,9 +106,14 @@ def gather(
 
 
 def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyEvidence], float]):
-    """Mean over the policies of a kind, with the interval over them (NaN for one policy)."""
-    values = [value(e) for e in evidence if e.kind == kind]
-    return mean_of(np.array(values, float)) if values else Estimate(*[float("nan")] * 3)
+    """Mean over the policies of a kind, with the interval over them (NaN for one policy).
+
+    Those without a number (NaN) are left out; one infinite number is an infinite mean.
+    """
+    values = np.array([value(e) for e in evidence if e.kind == kind], float)
+    if np.isposinf(values).any():
+        return Estimate(float("inf"), float("nan"), float("nan"))
+    return mean_of(values)
 
 
 def of_kinds(
@@ -112,13 +124,20 @@ def of_kinds(
     Raises
     ------
     NotTestable
-        If there is none of one of the kinds `needed`.
+        If there is no policy of one of the kinds `needed` (of any), or no number for it.
     """
-    found = {k: over(evidence, k, value) for k in KINDS}
-    found = {k: v for k, v in found.items() if np.isfinite(v.value)}
-    if not found or not set(needed) <= set(found):
+    given = [k for k in KINDS if any(e.kind == k for e in evidence)]
+    if not given or not set(needed) <= set(given):
         wanted = " and of the ".join(KINDS[k] for k in needed or ("lstm",))
         raise NotTestable(f"Give a run of the {wanted}.")
+    found = {k: over(evidence, k, value) for k in given}
+    found = {k: v for k, v in found.items() if not np.isnan(v.value)}
+    without = [KINDS[k] for k in needed or given if k not in found]
+    if without and (needed or not found):
+        raise NotTestable(
+            f"Of the {' and of the '.join(without)} that was given there is no number for it: no "
+            "robot stayed up and moved for long enough."
+        )
     return found
 
 
@@ -138,7 +157,10 @@ def of_kind(evidence: Sequence[PolicyEvidence], kind: str) -> list[PolicyEvidenc
 
 def several(found: dict[str, Estimate], digits: int) -> str:
     """The values by architecture, in words."""
-    return ", ".join(f"{KINDS[k]} {v.value:,.{digits}f}" for k, v in found.items())
+    return ", ".join(
+        f"{KINDS[k]} " + (f"{v.value:,.{digits}f}" if np.isfinite(v.value) else "∞")
+        for k, v in found.items()
+    )
 
 
 def bounds(found: dict[str, Estimate]) -> Interval:

@@ -32,7 +32,10 @@ class Architecture:
     """Whether the critic sees the truth beside the observation."""
 
     def __post_init__(self):
-        if min(*self.hidden, *self.critic_hidden, self.memory, 1) < 1:
+        for name in ("hidden", "critic_hidden"):
+            if not getattr(self, name):
+                raise InputError(f"architecture.{name} is empty; give the units of each layer.")
+        if min(*self.hidden, *self.critic_hidden, self.memory) < 1:
             raise InputError("A layer of the architecture has no units; each needs at least 1.")
 
 
@@ -69,7 +72,8 @@ class Hyperparameters:
     normalise: bool = True
     """Whether observations are normalised by their running mean and deviation."""
     mixed_precision: bool = False
-    """bfloat16 in the update; worth it where the processor has it (avx512_bf16, amx, GPUs)."""
+    """Whether updates are computed in bfloat16; worth it where the processor has it (avx512_bf16,
+    amx)."""
 
     def __post_init__(self):
         for name in ("steps_per_environment", "epochs", "minibatches"):
@@ -89,3 +93,10 @@ class Imitation:
     """Parts of the data per pass."""
     learning_rate: float = 1e-3
     """Of Adam, at the start; it falls to a tenth."""
+
+    def __post_init__(self):
+        for name, least in (("iterations", 0), ("epochs", 1), ("minibatches", 1)):
+            if getattr(self, name) < least:
+                raise InputError(
+                    f"imitation.{name} is {getattr(self, name)}; it must be at least {least}."
+                )

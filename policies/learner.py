@@ -4,7 +4,8 @@
 - A checkpoint holds everything that a run needs to go on as if it had never stopped: networks,
   optimiser, learning rate, random numbers, recurrent state, environments with their delay lines,
   the last observation and the counters. It is written atomically and read with `weights_only`.
-- Several processes exchange gradients through gloo on CPUs and nccl on GPUs.
+- Several processes exchange gradients through gloo: all of it runs on processors, as the physics
+  does, whatever else the machine has.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from tensordict import TensorDict
 
 from common.errors import InputError
 from common.files import write_bytes
+from policies.file_version import refuse_other_version
 from policies.hyperparameters import Architecture, Hyperparameters
 from policies.networks import build
 from policies.vec_env import WalkingVecEnv
@@ -50,7 +52,7 @@ class TerminalPPO(PPO):
         """Record one step; `extras` as `WalkingVecEnv.step` gives them."""
         late = extras["terminal_ids"]
         if len(late):
-            reached = self.critic(extras["terminal_observations"].to(self.device)).detach()
+            reached = self.critic(extras["terminal_observations"]).detach()
             rewards = rewards.clone()
             rewards[late] += self.gamma * reached[:, 0]
         super().process_env_step(obs, rewards, dones, {})
@@ -72,14 +74,8 @@ class Ranks:
             return cls()
         found = cls(int(os.environ["RANK"]), size, int(os.environ.get("LOCAL_RANK", "0")))
         if not torch.distributed.is_initialized():
-            backend = "nccl" if torch.cuda.is_available() else "gloo"
-            torch.distributed.init_process_group(backend, rank=found.rank, world_size=size)
+            torch.distributed.init_process_group("gloo", rank=found.rank, world_size=size)
         return found
-
-    @property
-    def device(self) -> str:
-        """Where this process computes."""
-        return f"cuda:{self.local_rank}" if torch.cuda.is_available() else "cpu"
 
     def same(self, text: str) -> str:
         """The first process's `text`, in all."""
@@ -99,7 +95,7 @@ class Ranks:
     def _reduced(self, here: float, operation: str) -> float:
         if self.size == 1:
             return here
-        found = torch.tensor(here, dtype=torch.float64, device=self.device)
+        found = torch.tensor(here, dtype=torch.float64)
         torch.distributed.all_reduce(found, getattr(torch.distributed.ReduceOp, operation))
         return float(found)
 
@@ -131,7 +127,6 @@ class Learner:
     ):
         self.env, self.architecture, self.hyper = env, architecture, hyper
         self.ranks = ranks or Ranks()
-        device = self.ranks.device
         # the networks of all ranks start alike; what they sample later must differ
         torch.manual_seed(seed)
         # as if begun at different times: not all episodes shall end in the same update
@@ -146,7 +141,7 @@ class Learner:
             )
         storage = RolloutStorage(
             "rl", env.num_envs, hyper.steps_per_environment, self.observations,
-            [env.num_actions], device,
+            [env.num_actions],
         )  # fmt: skip
         group = None
         if self.ranks.size > 1:
@@ -159,7 +154,7 @@ class Learner:
             num_mini_batches=hyper.minibatches, clip_param=hyper.clip, gamma=hyper.discount,
             lam=hyper.gae_lambda, value_loss_coef=hyper.value_weight, entropy_coef=hyper.entropy,
             learning_rate=hyper.learning_rate, max_grad_norm=hyper.gradient_norm,
-            desired_kl=hyper.desired_kl, use_mixed_precision=hyper.mixed_precision, device=device,
+            desired_kl=hyper.desired_kl, use_mixed_precision=hyper.mixed_precision,
             multi_gpu_cfg=group,
         )  # fmt: skip
         if group:
@@ -277,9 +272,7 @@ class Learner:
         self.env.restore(state)
         hidden = content["hidden"]
         self.actor.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
-        self.observations = TensorDict(content["observations"], batch_size=[self.env.num_envs]).to(
-            self.ranks.device
-        )
+        self.observations = TensorDict(content["observations"], batch_size=[self.env.num_envs])
         torch.set_rng_state(content["torch_rng"])
         return content["more"]
 
@@ -302,11 +295,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
         raise InputError(f"{path} is not a checkpoint of pupper-train.")
-    if content.get("schema_version") != CHECKPOINT_VERSION:
-        raise InputError(
-            f"{path} has schema version {content.get('schema_version')}; this version reads "
-            f"{CHECKPOINT_VERSION}."
-        )
+    refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)
     missing = [part for part in _PARTS if part not in content]
     if missing:
         raise InputError(f"{path} has no {missing[0]}. Resume from another checkpoint of the run.")

@@ -182,21 +182,31 @@ class Match:
         return "all joints" if alike else JOINT_NAMES[j]
 
 
-_ADVICE = "Use an observer with the parameters that the policy was trained with."
+_ADVICE = (
+    "Use an observer with the parameters that the policy was trained with, or train one with this "
+    "robot's calibration."
+)
 
 
-def compare(observer: Observer, actuator: DelayedPDParameters, period_s: float) -> Match:
+def compare(
+    observer: Observer,
+    actuator: DelayedPDParameters,
+    period_s: float,
+    robot: DelayedPDParameters | None = None,
+) -> Match:
     """Compare an observer with the actuator a policy was trained with.
 
     Parameters
     ----------
     observer : Observer
-        Left in some state: reset it before use. One that needs readings is given those of the
-        trained actuator.
+        Left in some state: reset it before use. One that needs readings is given those of
+        `robot`.
     actuator : DelayedPDParameters
         Scalars or arrays of 12: the middle of what training drew from.
     period_s : float
         Control period of the controller [s].
+    robot : DelayedPDParameters, optional
+        Of the robot at hand; by default it is one of the training's.
 
     Raises
     ------
@@ -214,7 +224,10 @@ def compare(observer: Observer, actuator: DelayedPDParameters, period_s: float) 
     targets = _sines(FREQUENCIES_HZ, AMPLITUDE_RAD, period_s)
     nothing = np.full_like(targets, np.nan)
     moved = _drive(SyntheticPD(actuator, period_s), targets, nothing, period_s)
-    seen = _drive(observer, targets, moved, period_s)
+    readings = moved
+    if robot is not None:
+        readings = _drive(SyntheticPD(robot, period_s), targets, nothing, period_s)
+    seen = _drive(observer, targets, readings, period_s)
     told, trained = (_phasors(x, FREQUENCIES_HZ, period_s) / AMPLITUDE_RAD for x in (seen, moved))
     return Match(FREQUENCIES_HZ.copy(), told, trained)
 

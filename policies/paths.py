@@ -32,10 +32,11 @@ def compliance(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     -------
     list of dict
         `direction`, `command`, `survival`; as (value, low, high) over robots: `share` (speed along
-        the command over the speed asked for), `drift` (across the command, metres per metre, to
+        the command over the speed asked for; 0 of a robot that fell), and over those that stayed
+        up: `drift` (across the command, metres per metre, to
         the left of it positive; NaN for turns), `arc_rad_m` (change of heading per metre; NaN for
         turns), `wander_m` (distance that the trunk's mean place moves per turn; NaN for straight
-        ones); and `path`, places [m] of the first robot, shape (steps, 2).
+        ones); and `path`, places [m] of the first robot that stayed up, shape (steps, 2).
     """
     found = []
     for name, command in DIRECTIONS.items():
@@ -54,11 +55,14 @@ def _measured(walked: Rollout) -> dict[str, Any]:
     start = round(SETTLE_S / walked.step_s)
     robots = np.flatnonzero(walked.alive[-1])
     command = np.array(walked.command)
-    if len(walked.position) <= start + 1 or not len(robots):
+    everyone = np.zeros(walked.alive.shape[1])
+    if not len(robots) or len(walked.position) <= start + 1:
         nothing = mean_of(np.zeros(0))
-        return dict.fromkeys(("share", "drift", "arc_rad_m", "wander_m"), nothing) | {
-            "path": np.zeros((0, 2))
-        }
+        return {
+            # one that is not up goes nowhere; of one that is, nothing is known yet
+            "share": nothing if len(robots) else mean_of(everyone),
+            "drift": nothing, "arc_rad_m": nothing, "wander_m": nothing, "path": np.zeros((0, 2)),
+        }  # fmt: skip
     place = _from_start(walked.position[start:, robots])
     seconds = walked.step_s * (len(place) - 1)
     asked = float(np.linalg.norm(command))
@@ -77,7 +81,8 @@ def _measured(walked: Rollout) -> dict[str, Any]:
         metres = np.where(went > _SHORTEST_M, went, np.nan)
         drift, arc = place[-1, :, :2] @ across / metres, place[-1, :, 2] / metres
         wander = np.full(len(robots), np.nan)
-    measures = {"share": share, "drift": drift, "arc_rad_m": arc, "wander_m": wander}
+    everyone[robots] = share
+    measures = {"share": everyone, "drift": drift, "arc_rad_m": arc, "wander_m": wander}
     return {k: mean_of(v) for k, v in measures.items()} | {"path": place[:, 0, :2]}
 
 

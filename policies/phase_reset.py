@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from policies.gait import SETTLE_S
 from policies.policy_file import Policy
-from policies.rhythm import sine_frequency
-from policies.robustness import Trial, outcome
+from policies.rhythm import mean_of, sine_frequency
+from policies.robustness import Trial, outcome, still
 from policies.rollouts import Disturb, Rollout
 from sim.walking_env import PupperEnv
 
@@ -44,19 +44,19 @@ def push_response(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     list of dict
         `push_m_s`, `survival`, `shift_early`, `shift_late` (mean size of the phase shift [cycles],
         1–3 s and 3–5 s after the push), `kept` (slope of the late shifts on the early ones: 1 is
-        kept, 0 comes back) and `phases`, `shifts` (of each robot and push, cycles).
+        kept, 0 comes back) and `phases`, `shifts` (of each robot and push, cycles). Empty if no
+        robot walks to the end.
     """
     trial = replace(trial, seconds=_PUSH_S + _LATE_S[1] + 1.0)
     plain = trial.walk(policy)
     step_s = plain.step_s
-    steady = plain.alive[-1]
-    if not steady.any():
-        return []
     begin = round(_PUSH_S / step_s)
-    robots = np.flatnonzero(steady).tolist()
-    rates = {
-        i: sine_frequency(plain.action_rad[round(SETTLE_S / step_s) :, i], step_s) for i in robots
-    }
+    settled = plain.action_rad[round(SETTLE_S / step_s) :]
+    up = np.flatnonzero(plain.alive[-1]).tolist()
+    robots = [i for i in up if not still(settled[:, i])]
+    if not robots:
+        return []
+    rates = {i: sine_frequency(settled[:, i], step_s) for i in robots}
     period = 1 / float(np.median(list(rates.values())))
     found: list[dict[str, Any]] = []
     for speed in (NUDGE_M_S, PUSH_M_S):
@@ -64,7 +64,7 @@ def push_response(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
         for k in range(_PUSHES):
             at = begin + round(k * period / _PUSHES / step_s)
             pushed = trial.walk(policy, None, _pusher(at, speed))
-            survived.append(pushed.alive[-1][steady].mean())
+            survived.append(pushed.alive[-1][robots].mean())
             both = [i for i in robots if pushed.alive[-1, i]]
             shifts += [
                 [_shift(plain, pushed, at, w, i, rates[i]) for w in (_EARLY_S, _LATE_S)]
@@ -74,7 +74,8 @@ def push_response(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
         early, late = np.array(shifts).reshape(-1, 2).T
         found.append(
             {"push_m_s": speed, "survival": float(np.mean(survived)),
-             "shift_early": float(np.abs(early).mean()), "shift_late": float(np.abs(late).mean()),
+             "shift_early": mean_of(np.abs(early)).value,
+             "shift_late": mean_of(np.abs(late)).value,
              "kept": float(early @ late / (early @ early)) if early.any() else float("nan"),
              "phases": phases, "shifts": late.tolist()}
         )  # fmt: skip
@@ -137,6 +138,7 @@ def _shift(
 ) -> float:
     """Phase of the pushed walk ahead of the other's [cycles], -0.5 to 0.5."""
     begin, end = (at + round(s / plain.step_s) for s in window_s)
+    end = min(end, len(plain.action))  # the last pushes of a slow gait come late
     carrier = _carrier(rate, begin, end, plain.step_s)
     before, after = (r.action_rad[begin:end, robot] for r in (plain, pushed))
     one, other = (carrier @ (x - x.mean(axis=0)) for x in (before, after))

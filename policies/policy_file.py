@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,6 +26,7 @@ from safetensors.torch import save as save_tensors
 from common.errors import InputError
 from common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
 from common.joints import DEFAULT_POSE, JOINT_NAMES
+from policies.file_version import refuse_other_version
 from policies.policy_network import ACTIONS, PolicyNetwork
 from sim.walking_env import OBSERVATION, VELOCITY_STEPS
 
@@ -103,12 +105,6 @@ class Policy:
         history = self.contract.action_history
         self._past = np.repeat(np.asarray(action, np.float32)[:, None], history, axis=1)
 
-    def reset_rows(self, rows: np.ndarray, action: np.ndarray) -> None:
-        """Start anew for some robots."""
-        for part in self._state:
-            part[:, torch.as_tensor(rows)] = 0.0
-        self._past[rows] = np.asarray(action, np.float32)[:, None]
-
     def for_one(self) -> Policy:
         """A copy with a state of its own that acts for one robot: same bits in half the time."""
         own = copy(self)
@@ -171,6 +167,7 @@ def load_policy(folder: Path) -> Policy:
             raise InputError(f"{folder} holds no policy: there is no {file.name} in it.")
         if file.stat().st_size > _MOST_BYTES:
             raise InputError(f"{file} is too large to be part of a policy.")
+    _refuse_other_version(path)
     try:
         contract = Contract.model_validate_json(path.read_bytes())
     except ValidationError as error:
@@ -193,6 +190,14 @@ def load_policy(folder: Path) -> Policy:
         ) from error
     refuse_bad(network, str(folder))
     return Policy(network, contract)
+
+
+def _refuse_other_version(path: Path) -> None:
+    """A newer contract would only be said to have a wrong number in it."""
+    with suppress(OSError, ValueError, RecursionError):  # damaged: the contract's own check says so
+        found = json.loads(path.read_bytes())
+        version = found.get("schema_version") if isinstance(found, dict) else VERSION
+        refuse_other_version(path, version, VERSION)
 
 
 def refuse_other_observation(contract: Contract) -> None:

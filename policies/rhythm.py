@@ -117,9 +117,10 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
     if not y.any():
         raise InputError("Nothing moves in this signal: it has no frequency.")
     coarse, within = _peak(y, step_s), 0.5 / (len(y) * step_s)
+    low, high = max(coarse - within, _SLOWEST_HZ), min(coarse + within, 0.25 / step_s)
     found: Any = minimize_scalar(
         lambda f: -sine_fit_r2(y, step_s, f).sum(),
-        bounds=(coarse - within, coarse + within), method="bounded", options={"xatol": 1e-7},
+        bounds=(low, high), method="bounded", options={"xatol": 1e-7},
     )  # fmt: skip
     return float(found.x)
 

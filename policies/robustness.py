@@ -16,12 +16,13 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from common.errors import InputError
 from policies import perturbations
 from policies.attractor import closure, collapse, principal_components
 from policies.gait import SETTLE_S, amplitude, correlation, jitter, steady
 from policies.perturbations import JOINTS
 from policies.policy_file import Policy
-from policies.rhythm import frequency
+from policies.rhythm import frequency, mean_of
 from policies.rollouts import Change, Disturb, Rollout, collect, replay
 from sim.servo_ranges import ServoRanges
 from sim.terrain import Terrain
@@ -97,7 +98,7 @@ def outcome(rollout: Rollout) -> dict[str, float]:
             jitter(action),
         )
         for i, now in steady(rollout).items()
-        if not _still(action := rollout.action_rad[now, i])
+        if not still(action := rollout.action_rad[now, i])
     ]
     means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [float("nan")] * 3
     return found | dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True))
@@ -151,15 +152,20 @@ def ablation(
     list of dict
         `channel`, `kind` (`noise`, `zero`, `hold`), `level` (share, 0, ms), `sigma`,
         `correlation` (replay, with the actions of the whole observation), `survival` and the rest
-        of `outcome` (closed loop).
+        of `outcome` (closed loop). All of it NaN for noise if no robot walked long enough to size
+        it by.
     """
     rng = np.random.default_rng(trial.seed)
     plain = trial.walk(policy)
-    settled = round(SETTLE_S / plain.step_s)
+    walked = steady(plain)
+    nothing = dict.fromkeys(outcome(plain), float("nan"))
     found: list[dict[str, Any]] = []
     for name in channels:
         part = CHANNELS[name]
-        spread = plain.observation[settled:, :, part].std(axis=(0, 1))
+        spread = np.full(part.stop - part.start, np.nan)
+        if walked:
+            shown = [plain.observation[now, i, part] for i, now in walked.items()]
+            spread = np.concatenate(shown).std(axis=0)
         sigma = float(spread.mean()) if name != "all joints" else float("nan")
         cases: list[tuple[str, float, float, Callable[[], Change]]] = [
             ("noise", share, share * sigma, partial(perturbations.noisy, part, share * spread, rng))
@@ -171,13 +177,13 @@ def ablation(
             for ms in HOLD_MS
         ]
         for kind, level, size, change in cases:
-            walked = outcome(trial.walk(policy, change()))
+            row = {"channel": name, "kind": kind, "level": level, "sigma": size}
+            if kind == "noise" and not walked:
+                found.append(row | {"correlation": float("nan")} | nothing)
+                continue
+            closed_loop = outcome(trial.walk(policy, change()))
             actions, _ = replay(policy, perturbations.applied(change(), plain.observation))
-            agreement = _agreement(plain.action[settled:], actions[settled:])
-            found.append(
-                {"channel": name, "kind": kind, "level": level, "sigma": size,
-                 "correlation": agreement} | walked
-            )  # fmt: skip
+            found.append(row | {"correlation": _agreement(plain, actions)} | closed_loop)
     return found
 
 
@@ -222,12 +228,13 @@ def frozen(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        `test`, `frequency_hz`, `amplitude_rad`, `share` (of the amplitude before) and `rhythmic`.
+        `test`, `frequency_hz`, `amplitude_rad`, `jitter_rad` and `share` (of the amplitude with
+        nothing frozen); NaN if no robot walked long enough, or moved.
     """
     plain = trial.walk(policy)
     start = round(SETTLE_S / plain.step_s)
     own = _LAST_ACTION
-    before = float(np.mean(amplitude(plain.action_rad[start:, 0])[0]))
+    before = _gait_of_actions(plain, plain.action)["amplitude_rad"]
     found: list[dict[str, Any]] = []
     tests = {
         "nothing frozen": (None, False),
@@ -238,7 +245,8 @@ def frozen(policy: Policy, trial: Trial) -> list[dict[str, Any]]:
     for name, (part, feeds_back) in tests.items():
         actions = _driven(policy, plain, part, feeds_back, start)
         gait = _gait_of_actions(plain, actions)
-        found.append({"test": name, "share": gait["amplitude_rad"] / max(before, 1e-9)} | gait)
+        share = gait["amplitude_rad"] / before if before > _STILL_RAD else float("nan")
+        found.append({"test": name, "share": share} | gait)
     return found
 
 
@@ -248,19 +256,22 @@ def orbits(policy: Policy, trial: Trial, delays_ms: Sequence[float]) -> dict[str
     Returns
     -------
     dict of str to dict
-        For `actions` [rad] and `hidden`: `states` and `orbits` (of one robot, per delay; arrays of
-        shape (steps, k)), `explained` and
-        `explained_3` (shares of variance), `participation_ratio`, `closure` and `area_ratio`
-        (to no delay) per delay.
+        For `actions` [rad] and `hidden`: `states` and `orbits` (of the first robot that walked long
+        enough, per delay; arrays of shape (steps, k)), `explained` and `explained_3` (shares of
+        variance), `participation_ratio`, `closure` and `area_ratio` (to no delay) per delay, NaN
+        where it stands still. Empty if no robot walked long enough and moved.
     """
     plain = trial.walk(policy)
-    start = round(SETTLE_S / plain.step_s)
+    moving = {i: now for i, now in steady(plain).items() if not still(plain.action_rad[now, i])}
+    if not moving:
+        return {}
+    robot, now = next(iter(moving.items()))
     acted, minds = [], []
     for delay in delays_ms:
         change = perturbations.delayed(JOINTS, round(delay / 1e3 / plain.step_s))
         actions, hidden = replay(policy, perturbations.applied(change, plain.observation))
-        acted.append(plain.action_scale * actions[start:, 0].astype(float))
-        minds.append(hidden[start:, 0].astype(float))
+        acted.append(plain.action_scale * actions[now, robot].astype(float))
+        minds.append(hidden[now, robot].astype(float))
     rate = _rate(acted[0], plain.step_s)
     found = {}
     for name, conditions in (("actions", acted), ("hidden", minds)):
@@ -272,8 +283,8 @@ def orbits(policy: Policy, trial: Trial, delays_ms: Sequence[float]) -> dict[str
             "explained": axes.explained.tolist(),
             "explained_3": float(axes.explained[:3].sum()),
             "participation_ratio": float(axes.participation_ratio),
-            "closure": [closure(path, plain.step_s, rate) for path in paths],
-            "area_ratio": [collapse(path[:, :2], paths[0][:, :2]).area for path in paths],
+            "closure": [_or_nan(closure, path, plain.step_s, rate) for path in paths],
+            "area_ratio": [_or_nan(_area, path[:, :2], paths[0][:, :2]) for path in paths],
         }
     return found
 
@@ -284,7 +295,7 @@ def _driven(
     """Actions of a policy that is shown a recording with a part frozen from `start` on.
 
     With `own_action` its last action is what it really did last, else what the recording (or the
-    frozen part) says.
+    frozen part) says. A recording that ends before has nothing to freeze.
     """
     player = copy(policy)
     seen = plain.observation
@@ -302,33 +313,60 @@ def _driven(
 
 
 def _gait_of_actions(plain: Rollout, actions: NDArray[np.floating]) -> dict[str, float]:
-    """Frequency, amplitude and jitter of replayed actions, means over robots, once settled."""
-    radians = plain.action_scale * actions[round(SETTLE_S / plain.step_s) :].astype(float)
-    robots = range(radians.shape[1])
+    """Frequency, amplitude and jitter of replayed actions, once settled.
+
+    Means over the robots whose recording is of a walk, up to their fall; NaN if there is none (for
+    the frequency: none that moves in the replay).
+    """
+    radians = plain.action_scale * actions.astype(float)
+    walked = [radians[now, i] for i, now in steady(plain).items()]
     return {
-        "frequency_hz": float(np.mean([_rate(radians[:, i], plain.step_s) for i in robots])),
-        "amplitude_rad": float(np.mean([amplitude(radians[:, i])[0] for i in robots])),
-        "jitter_rad": float(np.mean([jitter(radians[:, i]) for i in robots])),
+        "frequency_hz": _mean([_rate(x, plain.step_s) for x in walked]),
+        "amplitude_rad": _mean([float(amplitude(x)[0].mean()) for x in walked]),
+        "jitter_rad": _mean([jitter(x) for x in walked]),
     }
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Mean of the numbers among them, NaN if there are none."""
+    return mean_of(np.array(values, float)).value
+
+
+def _area(path: Array, reference: Array) -> float:
+    return collapse(path, reference).area
+
+
+def _or_nan(measure: Callable[..., float], *given: Any) -> float:
+    """A measure of an orbit; NaN where it has none, because nothing moves any more."""
+    try:
+        return measure(*given)
+    except InputError:
+        return float("nan")
 
 
 def _steps(ms: float, step_s: float) -> int:
     return max(round(ms / 1e3 / step_s), 1)
 
 
-def _still(signal: Array) -> bool:
+def still(signal: Array) -> bool:
     """Whether no joint moves, wherever each of them stands."""
     return bool(signal.std(axis=0).max() < _STILL_RAD)
 
 
 def _rate(signal: Array, step_s: float) -> float:
     """Frequency of a signal; NaN if it stands still."""
-    if _still(signal):
+    if still(signal):
         return float("nan")
     return frequency(signal, step_s).value
 
 
-def _agreement(whole: NDArray[np.floating], altered: NDArray[np.floating]) -> float:
-    """Gait correlation: mean over robots of Pearson's r, which is the mean over joints."""
-    robots = range(whole.shape[1])
-    return float(np.mean([correlation(whole[:, i], altered[:, i], _MOST_LAG).r for i in robots]))
+def _agreement(plain: Rollout, altered: NDArray[np.floating]) -> float:
+    """Gait correlation of replayed actions with the walk's: mean over robots of that over joints.
+
+    Of robots that walked long enough, and moved; NaN if there is none.
+    """
+    walked = {i: now for i, now in steady(plain).items() if not still(plain.action_rad[now, i])}
+    return _mean(
+        [correlation(plain.action[now, i], altered[now, i], _MOST_LAG).r
+         for i, now in walked.items()]
+    )  # fmt: skip

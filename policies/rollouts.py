@@ -209,7 +209,7 @@ def _observed(policy: Policy) -> Iterator[tuple[Policy, list[NDArray[np.float32]
 
     handle = _listen(policy.network, keep)
     try:
-        # a policy replaces its state and never writes into it, but for `reset_rows`
+        # a policy replaces its state and never writes into it
         yield copy(policy), hidden
     finally:
         handle.remove()

@@ -16,12 +16,15 @@ import yaml
 
 from common.errors import InputError
 from common.files import sha256, versions, write_text
+from policies.file_version import refuse_other_version
 from policies.hyperparameters import Architecture, Hyperparameters, Imitation, Kind
-from sim.walking_config import PRESETS, Walking
+from sim.walking_config import PRESETS, Observation, Walking
 
 RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 1
 RUN_FILE = "run.yaml"
+_DROPPED: dict[type, set[str]] = {Observation: {"privileged_critic"}}
+"""Settings that changed nothing; older files have them."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,11 @@ class Run:
     seed: int = 0
     """Of everything that is drawn."""
 
+    def __post_init__(self):
+        for name in ("threads", "seed"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
+
 
 def preset(name: Literal["fast", "paper", "release"], kind: Kind) -> Run:
     """Complete settings for one kind of policy.
@@ -56,17 +64,14 @@ def preset(name: Literal["fast", "paper", "release"], kind: Kind) -> Run:
     `fast` suits a few cores; `paper` and `release` follow the published sizes.
     """
     task = PRESETS[name]
-    privileged = task.observation.privileged_critic
     if name == "fast":
         # without a memory, reading the gait's phase off one action takes a wide network
         hidden = (512, 256, 128) if kind in ("mlp", "mlp-actions") else (128, 64)
         memory = 64
-        return Run(
-            architecture=Architecture(kind, hidden, memory, (256, 128, 64), privileged), task=task
-        )
+        return Run(architecture=Architecture(kind, hidden, memory, (256, 128, 64)), task=task)
     wide = (512, 256, 128)
     return Run(
-        architecture=Architecture(kind, wide, 128, wide, privileged), task=task,
+        architecture=Architecture(kind, wide, 128, wide, privileged_critic=False), task=task,
         learner=Hyperparameters(
             epochs=5, learning_rate=1e-3, value_weight=1.0, initial_std=1.0, normalise=False,
             entropy=0.0025 if kind == "mlp" else 0.005,
@@ -122,11 +127,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not readable YAML.") from error
     if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
-    if found.get("schema_version") != RUN_VERSION:
-        raise InputError(
-            f"{path} has schema version {found.get('schema_version')}; this version reads "
-            f"{RUN_VERSION}."
-        )
+    refuse_other_version(path, found.get("schema_version"), RUN_VERSION)
     return found
 
 
@@ -134,6 +135,7 @@ def _from_dict(kind: type, given: Any, where: str) -> Any:
     """A frozen dataclass from plain data, checked against its own types."""
     if not isinstance(given, dict):
         raise InputError(f"{where}: expected settings by name.")
+    given = {k: v for k, v in given.items() if k not in _DROPPED.get(kind, ())}
     default, types = kind(), get_type_hints(kind)
     unknown = [name for name in given if name not in types]
     if unknown:
@@ -175,12 +177,22 @@ def save_run(folder: Path, run: Run) -> None:
     InputError
         If the folder holds a run already.
     """
+    refuse_taken(folder)
+    _write(folder / RUN_FILE, run)
+
+
+def refuse_taken(folder: Path) -> None:
+    """Raise if the folder holds a run already.
+
+    Raises
+    ------
+    InputError
+    """
     if (folder / RUN_FILE).exists():
         raise InputError(
             f"{folder} holds a run already. Resume it with --resume {folder}, or give another "
             "--name."
         )
-    _write(folder / RUN_FILE, run)
 
 
 def _write(path: Path, run: Run) -> None:

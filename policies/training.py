@@ -26,7 +26,7 @@ from policies.curves import CurveWriter, EpisodeMeans
 from policies.imitation import imitate
 from policies.learner import Learner, Ranks
 from policies.policy_export import write_policy
-from policies.run_file import Run, resume_run, save_run
+from policies.run_file import Run, refuse_taken, resume_run, save_run
 from policies.vec_env import WalkingVecEnv
 from sim.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from sim.walking_env import PupperEnv
@@ -69,8 +69,8 @@ def make_learner(run: Run, ranks: Ranks) -> Learner:
     keep_freed_memory()
     env = make_env(run, ranks)
     return Learner(
-        WalkingVecEnv(env, action_history(run, env.servos), ranks.device), run.architecture,
-        run.learner, run.seed, ranks,
+        WalkingVecEnv(env, action_history(run, env.servos)), run.architecture, run.learner,
+        run.seed, ranks,
     )  # fmt: skip
 
 
@@ -138,14 +138,24 @@ class _Session:
         }  # fmt: skip
         if resumed:
             self.counters = self.learner.load(folder / _rank_file(LAST, self.ranks))
-        elif self.ranks.rank == 0:
-            save_run(folder, run)
+        else:
+            self._begin()
         self.done_before = {
             "imitation": self.counters["imitated"], "ppo": self.learner.iteration,
         }  # fmt: skip
         self.writer = CurveWriter(folder, self.done_before) if self.ranks.rank == 0 else None
         self.started = time.monotonic() - self.counters["elapsed_s"]
         self.phase_began = self.started
+
+    def _begin(self) -> None:
+        """A first checkpoint, then the settings: from then on a run that dies can be resumed."""
+        if self.ranks.rank == 0:
+            refuse_taken(self.folder)
+        self.ranks.any(False)  # before that is known, nobody writes
+        self.save(LAST)
+        self.ranks.any(False)  # all have one before there is a run to resume
+        if self.ranks.rank == 0:
+            save_run(self.folder, self.run)
 
     def learn_first_gait(self, asked: Callable[[], bool]) -> None:
         """Rounds of imitation that are still to do."""

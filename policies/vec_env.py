@@ -25,13 +25,12 @@ class WalkingVecEnv:
     env : PupperEnv
     action_history : int
         How many past actions the group `actions` holds; 0 leaves the group out.
-    device : str
     """
 
     num_actions = 12
 
-    def __init__(self, env: PupperEnv, action_history: int = 0, device: str = "cpu"):
-        self.env, self.device = env, device
+    def __init__(self, env: PupperEnv, action_history: int = 0):
+        self.env = env
         self.num_envs = env.environments
         self.max_episode_length = env.config.episode_steps
         self.cfg: dict[str, Any] = {}
@@ -76,8 +75,8 @@ class WalkingVecEnv:
             )
         return (
             self._groups(found.observation, found.privileged, self._past),
-            torch.from_numpy(found.reward.astype(np.float32)).to(self.device),
-            torch.from_numpy(found.done).to(self.device),
+            torch.from_numpy(found.reward.astype(np.float32)),
+            torch.from_numpy(found.done),
             extras,
         )
 
@@ -97,4 +96,4 @@ class WalkingVecEnv:
             groups["actions"] = past.reshape(len(past), -1).astype(np.float32)
         return TensorDict(
             {k: torch.from_numpy(v) for k, v in groups.items()}, batch_size=[len(observation)]
-        ).to(self.device)
+        )

@@ -21,6 +21,7 @@ from common.errors import InputError
 from common.files import SyncedText, versions
 from common.joints import JOINT_NAMES
 from policies.controller import Controller, Decision, Senses
+from policies.file_version import refuse_other_version
 from policies.filters import Rest
 from sim.walking_env import OBSERVATION_SIZE
 
@@ -143,11 +144,7 @@ def read_walk(path: Path) -> Walk:
             header[key] = json.loads(value)
         except ValueError as error:
             raise InputError(f"{path}: its header's {key} is not JSON: {error}.") from error
-    if header.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"{path} has schema_version {header.get('schema_version')}; this version reads "
-            f"{SCHEMA_VERSION}."
-        )
+    refuse_other_version(path, header.get("schema_version"), SCHEMA_VERSION)
     rows = [row for row in csv.reader(line for line in lines if not line.startswith("#"))]
     if not rows or tuple(rows[0]) != COLUMNS:
         raise InputError(f"{path}: its columns are not those of a walk. Was it edited?")

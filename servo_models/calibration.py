@@ -158,7 +158,7 @@ class Calibration(Part):
         Returns
         -------
         DelayedPD
-            Its batch has shape (joints,), in the order of `joint_names`, however they were named.
+            Its batch has shape (joints,), in the order asked for.
 
         Raises
         ------
@@ -166,8 +166,7 @@ class Calibration(Part):
             If this calibration does not have one of the joints.
         """
         wanted = self.joint_names if joints is None else tuple(joints)
-        parts = {name: self.joint(name).actuator for name in wanted}
-        actuators = [parts[name] for name in self.joint_names if name in parts]
+        actuators = [self.joint(name).actuator for name in wanted]
         if not actuators:
             raise InputError("No joint was named. Name at least one.")
 

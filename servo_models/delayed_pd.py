@@ -177,6 +177,7 @@ def integrate(
     values: dict[str, NDArray],
     time_step_s: float,
     out: NDArray[np.float64] | None = None,
+    implicit: bool = True,
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:
     """Step the servo through commands that have already been delayed: the inner loop of fitting.
 
@@ -190,6 +191,8 @@ def integrate(
     time_step_s : float
     out : ndarray, optional
         Where the positions go; may be `delayed` itself.
+    implicit : bool
+        Brake with the velocity at the step's end, as MuJoCo does, instead of the present one.
 
     Returns
     -------
@@ -211,7 +214,7 @@ def integrate(
     low_effort, low_friction, stop = -effort, -friction, -FRICTION_IMPEDANCE
     slew = flat(values["velocity_limit"] * h)
     low_slew = -slew
-    inverse = h / (1.0 + h * kd)
+    inverse = h / (1.0 + h * kd) if implicit else h
     position, velocity, setpoint = (flat(x).copy() for x in state)
     force, wanted, change = (np.empty_like(position) for _ in range(3))
     # numpy.clip costs five times minimum + maximum on small arrays, hence the pairs below

@@ -2,7 +2,7 @@
 
 The bus polls each servo once per `poll_period_s`. A poll fails with probability `loss` and then
 leaves the previous value in place. The host reads whatever is there. So a reading is the position
-at the last successful poll, rounded to `quantum_rad`, plus `offset_rad`; its age is between zero
+at the last successful poll, plus `offset_rad`, rounded to `quantum_rad`; its age is between zero
 and many periods, on average `mean_age_s = poll_period_s * (1/2 + loss / (1 - loss))`.
 """
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common.errors import InputError
 
@@ -51,29 +50,3 @@ class HeldFeedback:
     def mean_age_s(self) -> float:
         """Mean age of a reading at a random instant [s]."""
         return self.poll_period_s * (0.5 + self.loss / (1.0 - self.loss))
-
-    def poll_times(
-        self, start_s: float, stop_s: float, phase_s: float, rng: np.random.Generator
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Poll instants in [start_s, stop_s) and whether each succeeded.
-
-        Parameters
-        ----------
-        phase_s : float
-            One poll instant of the lattice.
-        rng : numpy.random.Generator
-            Decides which polls fail.
-        """
-        if self.poll_period_s == 0:
-            raise InputError("HeldFeedback: poll_period_s is 0, so there are no poll instants.")
-        first = np.ceil((start_s - phase_s) / self.poll_period_s)
-        last = np.ceil((stop_s - phase_s) / self.poll_period_s)
-        times = phase_s + self.poll_period_s * np.arange(first, last)
-        return times, rng.random(len(times)) >= self.loss
-
-    def quantise(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`position_rad` as the encoder reports it [rad]."""
-        reported = np.asarray(position_rad, float) + self.offset_rad
-        if self.quantum_rad == 0:
-            return reported
-        return np.round(reported / self.quantum_rad) * self.quantum_rad

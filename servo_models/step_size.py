@@ -3,25 +3,49 @@
 In a step MuJoCo, like most engines, turns the set-point and brakes the joint with what will be true
 at the step's end. A stepped servo therefore answers sooner than the same servo in continuous time,
 by about a step: a calibration found with steps of 2 ms and simulated with 5 ms would be 2 to 3 ms
-too quick. `delay_at_step` is the delay with which another step gives the same lag.
+too quick. A simulator whose set-points have no speed limit answers sooner, too, and one that
+computes the PD before its step later. `delay_at_step` is the delay with which another `Engine`, or
+another step, gives the same lag.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import InputError
-from servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
+from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, integrate
 
 _TONES_HZ, _AMPLITUDE_RAD = (1.0, 2.0, 4.0), 0.2  # a walk's speeds, below most servos' limits
 _LOOP_S = 0.0193  # no multiple of a step: a delay puts commands anywhere in one
 _WARM_UP_S, _LENGTH_S = 1.0, 3.0
 
 
-def lag_in_steps_of(parameters: DelayedPDParameters, time_step_s: float) -> NDArray[np.float64]:
+@dataclass(frozen=True)
+class Engine:
+    """How a simulator runs a PD servo.
+
+    Attributes
+    ----------
+    slews : bool
+        Whether it limits the speed of the set-point.
+    implicit : bool
+        Whether it brakes with the velocity at the step's end, or computes the PD before its step.
+    """
+
+    slews: bool = True
+    implicit: bool = True
+
+
+MUJOCO = Engine()
+"""MuJoCo's `<pid>`, with which calibrations are found."""
+
+
+def lag_in_steps_of(
+    parameters: DelayedPDParameters, time_step_s: float, engine: Engine = MUJOCO
+) -> NDArray[np.float64]:
     """Mean lag behind slow tones [s] of servos stepped so, without their delay.
 
     Parameters
@@ -29,6 +53,7 @@ def lag_in_steps_of(parameters: DelayedPDParameters, time_step_s: float) -> NDAr
     parameters : DelayedPDParameters
         Numbers, or arrays of shape (servos,).
     time_step_s : float
+    engine : Engine
 
     Returns
     -------
@@ -44,22 +69,20 @@ def lag_in_steps_of(parameters: DelayedPDParameters, time_step_s: float) -> NDAr
     turn = 2 * np.pi * np.array(_TONES_HZ)
     # commands in stairs, as control loops give them: on each stair the set-point runs at its limit;
     # a step gets the mean of the command over it
-    told = _LOOP_S * np.arange(round(_LENGTH_S / _LOOP_S) + 2)
-    stairs = _AMPLITUDE_RAD * np.sin(told[:-1, None] * turn)
+    stair = _LOOP_S * np.arange(round(_LENGTH_S / _LOOP_S) + 2)
+    stairs = _AMPLITUDE_RAD * np.sin(stair[:-1, None] * turn)
     area = np.concatenate([np.zeros((1, len(turn))), np.cumsum(stairs * _LOOP_S, axis=0)])
-    commands = np.stack([np.diff(np.interp(edge, told, a)) for a in area.T], axis=1) / time_step_s
-    tall = replace(
-        parameters,
-        **{
-            name: np.atleast_1d(getattr(parameters, name))[:, None]
-            for name in ("stiffness", "damping", "friction_loss", "armature", "effort_limit",
-                         "velocity_limit")
-        },
-        delay_s=0.0,
-    )  # fmt: skip
-    servo = DelayedPD(tall, time_step_s)
-    servo.reset(np.zeros((len(np.atleast_1d(parameters.stiffness)), len(turn))))
-    moved = servo.rollout(commands[:, None])
+    commands = np.stack([np.diff(np.interp(edge, stair, a)) for a in area.T], axis=1) / time_step_s
+    values = {
+        f.name: np.atleast_1d(np.asarray(getattr(parameters, f.name), float))[:, None]
+        for f in fields(parameters)
+    }
+    if not engine.slews:
+        values["velocity_limit"] = np.full_like(values["velocity_limit"], np.inf)
+    batch = (len(values["stiffness"]), len(turn))
+    still = (np.zeros(batch), np.zeros(batch), np.zeros(batch))
+    told = np.broadcast_to(commands[:, None], (count, *batch))
+    moved, _ = integrate(told, still, values, time_step_s, implicit=engine.implicit)
     late = edge[1:] > _WARM_UP_S
     lags = []
     for n, w in enumerate(turn):
@@ -77,7 +100,10 @@ def lag_in_steps_of(parameters: DelayedPDParameters, time_step_s: float) -> NDAr
 
 
 def delay_at_step(
-    parameters: DelayedPDParameters, time_step_s: float, fitted_step_s: float = TIME_STEP_S
+    parameters: DelayedPDParameters,
+    time_step_s: float,
+    fitted_step_s: float = TIME_STEP_S,
+    engine: Engine = MUJOCO,
 ) -> NDArray[np.float64]:
     """Delay [s] with which servos in steps of `time_step_s` lag as they do in `fitted_step_s`.
 
@@ -86,6 +112,8 @@ def delay_at_step(
     parameters : DelayedPDParameters
         Numbers, or arrays of shape (servos,); found in steps of `fitted_step_s`.
     time_step_s, fitted_step_s : float
+    engine : Engine
+        What takes the steps of `time_step_s`.
 
     Returns
     -------
@@ -98,7 +126,10 @@ def delay_at_step(
         If the servo is not stable at this step.
     """
     delay = np.atleast_1d(parameters.delay_s)
-    if time_step_s == fitted_step_s:
+    if time_step_s == fitted_step_s and engine == MUJOCO:
         return delay
-    quicker = lag_in_steps_of(parameters, fitted_step_s) - lag_in_steps_of(parameters, time_step_s)
-    return delay + quicker
+    fitted, there = (
+        lag_in_steps_of(parameters, step, using)
+        for step, using in ((fitted_step_s, MUJOCO), (time_step_s, engine))
+    )
+    return delay + fitted - there

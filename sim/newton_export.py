@@ -23,6 +23,7 @@ from common.files import refuse_overwrite, write_bytes, write_text
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Actuator
 from sim.simulator_export import (
+    EXPLICIT_PD,
     FEEDBACK_KEYS,
     Delay,
     delays_at_step,
@@ -35,20 +36,26 @@ MODULE = "newton_actuators.py"
 _OPSET, _IR_VERSION = 17, 8
 
 _CODE = '''
-def add_actuators(builder, dofs):
-    """Add all servos to a `newton.ModelBuilder`; `dofs` is the index of each joint's degree.
+def add_actuators(builder):
+    """Add all servos to a `newton.ModelBuilder` that has one robot; call it before replicating.
 
-    Position targets are what the servos are told. The joints' own drives are switched off.
+    Joints are found by name, the last part of their labels. Position targets (`joint_target_q`)
+    are what the servos are told. The joints' own drives are switched off.
     """
     folder = Path(__file__).resolve().parent
+    labels = [label.split("/")[-1] for label in builder.joint_label]
     for name, servo in SERVOS.items():
-        dof = dofs[name]
+        if labels.count(name) != 1:
+            raise ValueError(f"{labels.count(name)} joints are called {name}; it must be one.")
+        joint = labels.index(name)
+        dof = builder.joint_qd_start[joint]
         builder.joint_armature[dof] = servo["armature"]
         builder.joint_friction[dof] = servo["friction_loss"]
         builder.joint_target_ke[dof] = builder.joint_target_kd[dof] = 0.0
         builder.add_actuator(
             DriveNeuralMLP,
             index=dof,
+            pos_index=builder.joint_q_start[joint],  # a free base has 7 positions and 6 degrees
             model_path=str(folder / servo["model"]),
             delay_steps=servo["delay_steps"],
             clamping=[(ClampingMaxEffort, {"max_effort": servo["effort_limit"]})],
@@ -67,7 +74,7 @@ def export_newton(
         If a file exists and `force` is not given, the step is no sensible one, or the package for
         ONNX is not installed.
     """
-    delays = delays_at_step(calibration, physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s, EXPLICIT_PD)
     for name in (*(f"{joint}.onnx" for joint in calibration.joint_names), MODULE):
         refuse_overwrite(folder / name, force)
     for name, joint in calibration.joints.items():

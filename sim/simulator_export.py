@@ -27,13 +27,14 @@ from common.files import versions
 from servo_models.calibration import Calibration
 from servo_models.calibration_parts import Actuator, Quantity, unit_of
 from servo_models.delayed_pd import whole_steps
-from servo_models.step_size import delay_at_step
+from servo_models.step_size import MUJOCO, Engine, delay_at_step
 from sim.servo_mjcf import INTEGRATOR, actuator_attributes, attributes, joint_attributes
 
 SCHEMA = "pupper-actuators"
 SCHEMA_VERSION = 1
 ENDINGS = {"mjcf": ".xml", "isaaclab": "_isaaclab.py", "mjlab": "_mjlab.py", "json": ".json"}
 _LONGEST_STEP_S = 0.1
+EXPLICIT_PD, MJLAB_PD = Engine(slews=False, implicit=False), Engine(slews=False)
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
 _TORQUES = (
     "stiffness_nm_per_rad", "damping_nm_s_per_rad", "friction_loss_nm", "armature_kg_m2",
@@ -122,7 +123,7 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
     InputError
         If the step is not a sensible one.
     """
-    delays = delays_at_step(calibration, physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s, EXPLICIT_PD)
     groups = []
     for name, joint in calibration.joints.items():
         a = joint.actuator
@@ -152,8 +153,8 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave both "
         "friction lines out with it.",
         "Not carried over: the limit on the set-point's speed (velocity_limit is only told to "
-        "Isaac Lab, no PD of its uses it), parts of a step, and that the PD here is computed once "
-        "per physics step without the joint's next velocity: keep steps at 5 ms or less.",
+        "Isaac Lab, no PD of its uses it) but for the lag it makes, and parts of a step. The PD "
+        "here is computed once per physics step, before it: keep steps at 5 ms or less.",
         _NOT_CARRIED,
     )
     return _module(
@@ -172,7 +173,7 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
     InputError
         If the step is not a sensible one.
     """
-    delays = delays_at_step(calibration, physics_step_s)
+    delays = delays_at_step(calibration, physics_step_s, MJLAB_PD)
     groups, bounds = [], []
     for name, joint in calibration.joints.items():
         a = joint.actuator
@@ -274,8 +275,10 @@ class Delay:
         return whole_steps(self.low_s, self.high_s, physics_step_s)
 
 
-def delays_at_step(calibration: Calibration, physics_step_s: float) -> dict[str, Delay]:
-    """Each joint's delay for another physics step than the calibration's (`step_size`).
+def delays_at_step(
+    calibration: Calibration, physics_step_s: float, engine: Engine = MUJOCO
+) -> dict[str, Delay]:
+    """Each joint's delay for another physics step or engine than the calibration's (`step_size`).
 
     Raises
     ------
@@ -286,7 +289,7 @@ def delays_at_step(calibration: Calibration, physics_step_s: float) -> dict[str,
     found = {}
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s)
+        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s, engine)
         more = float(fitting) - a.delay_s.value
         numbers = (max(t + more, 0.0) for t in (a.delay_s.value, *a.delay_interval_s))
         found[name] = Delay(*numbers)
@@ -302,11 +305,12 @@ def step_note(
         for name, joint in calibration.joints.items()
     ]
     steps = {1e3 * joint.actuator.physics_step_s for joint in calibration.joints.values()}
-    if steps != {1e3 * physics_step_s}:
+    if np.any(added):
         yield (
-            f"Measured delays are for steps of {' or '.join(f'{s:g}' for s in sorted(steps))} ms; "
-            f"a longer step answers sooner, so {np.mean(added):+.1f} ms (mean of the joints) are "
-            "in the ones here."
+            f"Measured delays are for steps of {' or '.join(f'{s:g}' for s in sorted(steps))} ms "
+            f"in MuJoCo with set-points of limited speed; steps of {1e3 * physics_step_s:g} ms "
+            f"here give another lag, so {np.mean(added):+.1f} ms (mean of the joints) are in the "
+            "delays below."
         )
 
 

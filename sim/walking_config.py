@@ -6,6 +6,7 @@ published task (observation with the true speed of the trunk, wide commands, pub
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -33,17 +34,19 @@ class Commands:
     every_s: float = 5.0
     """Mean time between two commands (exponential)."""
 
+    def __post_init__(self):
+        for name in ("forward_m_s", "sideways_m_s", "yaw_rad_s"):
+            _check_range("commands", name, getattr(self, name))
+
 
 @dataclass(frozen=True)
 class Observation:
     """What the policy sees: 60 numbers in the order of `sim.walking_env.OBSERVATION`."""
 
     noise: bool = True
-    """Add the published uniform noise."""
+    """Whether the published uniform noise is added."""
     base_velocity: Literal["zero", "true"] = "zero"
     """The trunk's speed, which this robot cannot measure: zeros, or (as published) the truth."""
-    privileged_critic: bool = True
-    """Let the critic, which stays in the simulator, see the truth beside the observation."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +74,20 @@ class Randomisation:
     on_the_move: float = 0.5
     """Share of episodes that start in the pose of a trot, at a random phase."""
 
+    def __post_init__(self):
+        for name, least in (
+            ("friction", 0.0), ("payload_kg", -math.inf), ("torque_scale", 0.0),
+            ("push_every_s", 0.0),
+        ):  # fmt: skip
+            _check_range("randomisation", name, getattr(self, name), least)
+
 
 @dataclass(frozen=True)
 class Curriculum:
     """Grow from easy to full: delay, penalties, action scale and commands, in equal stages."""
 
     on: bool = False
-    """Whether to."""
+    """Whether the task grows; otherwise it is full from the start."""
     stages: int = 4
     """How many stages, the last one full."""
     stage_steps: int = 2400
@@ -142,9 +152,19 @@ class Walking:
         return round(self.episode_s / self.control_step_s)
 
 
+def _check_range(part: str, name: str, ends: tuple[float, float], least: float = -math.inf) -> None:
+    """Refuse a range that cannot be drawn from."""
+    low, high = ends
+    if not (least <= low <= high and math.isfinite(high - low)):
+        above = f" from {least:g} on" if math.isfinite(least) else ""
+        raise InputError(
+            f"{part}.{name} is {low:g} to {high:g}; give the lower end, then the upper one{above}."
+        )
+
+
 _PUBLISHED = Walking(
     commands=Commands((-0.35, 0.35), (-0.35, 0.35), (-0.30, 0.30), 0.25, 0.0, 10.0),
-    observation=Observation(base_velocity="true", privileged_critic=False),
+    observation=Observation(base_velocity="true"),
     randomisation=Randomisation(torque_scale=(1.0, 1.0), push_m_s=0.5, on_the_move=0.0),
     rewards=RELEASE,
 )

@@ -99,22 +99,9 @@ class DeadTime:
 
 
 @dataclass(frozen=True)
-class Truncation:
-    """How a bus cuts commands to counts: size of one [rad], direction, an angle that is whole.
-
-    The defaults leave commands as they are.
-    """
-
-    quantum_rad: float = 0.0
-    rounding: str | None = None
-    zero_rad: float | None = None
-
-
-@dataclass(frozen=True)
 class _Task:
     joint: str
     trials: tuple[Trial, ...]
-    truncation: Truncation
     seed: int
     presets: dict[str, DelayedPDParameters]
 
@@ -192,9 +179,8 @@ def _each_joint(
     chosen = in_order(j for r in recordings for j in r.joints if joints is None or j in joints)
     tasks = []
     for joint in chosen:
-        trials, truncation = joint_trials(recordings, joint)
         own = {name: table[joint] for name, table in (presets or {}).items() if joint in table}
-        tasks.append(_Task(joint, trials, truncation, seed, own))
+        tasks.append(_Task(joint, joint_trials(recordings, joint), seed, own))
     found: dict[str, Any] = {}
     if workers <= 1 or len(tasks) <= 1:
         for task in tasks:
@@ -211,25 +197,10 @@ def _each_joint(
     return {joint: found[joint] for joint in chosen}
 
 
-def joint_trials(
-    recordings: Sequence[Recording], joint: str
-) -> tuple[tuple[Trial, ...], Truncation]:
-    """All trials of `joint`, renumbered, and how the bus truncated its commands."""
-    trials: list[Trial] = []
-    truncation = Truncation()
-    for recording in recordings:
-        if joint not in recording.joints:
-            continue
-        bus = recording.metadata.get("bus") or {}
-        quantum = bus.get("command_quantum_rad") or 0.0
-        truncation = Truncation(
-            float((quantum.get(joint) or 0.0) if isinstance(quantum, dict) else quantum),
-            (bus.get("command_rounding") or {}).get(joint),
-            (bus.get("count_zero_rad") or {}).get(joint),
-        )
-        for trial in recording.trials(joint):
-            trials.append(replace(trial, number=len(trials)))
-    return tuple(trials), truncation
+def joint_trials(recordings: Sequence[Recording], joint: str) -> tuple[Trial, ...]:
+    """All trials of `joint`, renumbered."""
+    trials = [trial for recording in recordings for trial in recording.trials(joint)]
+    return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
 
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:
@@ -255,13 +226,9 @@ class PreparedJoint:
 
 def _prepare(task: _Task) -> PreparedJoint:
     rng = joint_rng(task.seed, task.joint)
-    lattice = find_poll_lattice(task.trials)
+    lattice = find_poll_lattice(task.trials, rng.spawn(1)[0])
     budget = lag_budget(task.joint, task.trials, rng, lattice)
-    cut = task.truncation
-    data = tuple(
-        prepare(t, readings(t, lattice), cut.quantum_rad, cut.rounding, cut.zero_rad)
-        for t in task.trials
-    )
+    data = tuple(prepare(t, readings(t, lattice)) for t in task.trials)
     data = tuple(d for d in data if len(d.sample_step))
     step = quantum(task.trials)
     # fits of a noise-free servo still meet rounding: a third of a count

@@ -53,7 +53,7 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
             f"{path} is no file of commands: it needs rows with the columns time_s and {wanted}; "
             f"it has {len(table)} rows of {', '.join(map(str, table.columns[:8]))}."
         )
-    used = ["time_s", *(columns[j] for j in moving)]
+    used = ["time_s", *(columns[j] for j in moving), *(["loop"] if "loop" in table else [])]
     numbers = np.stack(
         [np.asarray(pd.to_numeric(table[c], errors="coerce"), float) for c in used], axis=-1
     )
@@ -64,12 +64,13 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
             f"{path}: column {used[column]}, data row {row + 1} is no number; "
             "every command and time must be one."
         )
+    numbers, loops = numbers[:, : len(moving) + 1], numbers[:, len(moving) + 1 :]
     largest = float(np.abs(numbers[:, 1:]).max())
     if largest > _LARGEST_RAD:
         raise InputError(
             f"{path}: a command of {largest:g} is beyond a full turn; angles must be in radians."
         )
-    loops = table["loop"].to_numpy() if "loop" in table else np.zeros(len(table))
+    loops = loops[:, 0] if loops.size else np.zeros(len(table))
     first = numbers[0, 1:]
     trials = []
     for loop in pd.unique(loops):

@@ -20,7 +20,8 @@ against the command as it was held. Intervals are from a bootstrap over periods.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ LEVEL = 0.90
 
 LONGEST_LAG_S = 0.5
 
+_BLOCK_S = 0.5  # of the bootstrap where there are no periods
+_ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
 _FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
 
@@ -52,6 +55,10 @@ class Interval:
         """The interval that holds the middle 90 % of `draws`."""
         low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         return cls(float(value), float(low), float(high))
+
+    def widened(self, by: float) -> Interval:
+        """The interval if all of it may be off by as much as `by`, to either side."""
+        return Interval(self.value, self.low - by, self.high + by)
 
 
 @dataclass(frozen=True)
@@ -126,7 +133,7 @@ def lag_budget(
     InputError
         If nothing moves, or there are too few fresh readings to say anything.
     """
-    lattice = lattice or find_poll_lattice(trials)
+    lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     read = [readings(t, lattice) for t in trials]
     if sum(len(r.rows) for r in read) < 16:
         raise InputError(
@@ -159,15 +166,21 @@ def lag_budget(
             f"{joint}: no tones in this recording, so the lag is one time shift over everything it "
             "did. Record a sweep for a lag per frequency."
         )
+    by_frequency = tuple(map(_at_frequency, tones, _servo_lags(tones)))
     if lattice.kind == "unresolved":
+        # all readings may be as old as a read that was answered at once, or one loop older
+        loop = float(np.median(np.concatenate([np.diff(t.read_time_s) for t in trials])))
+        fresh, lag = fresh.widened(loop / 2), lag.widened(loop / 2)
+        by_frequency = tuple(replace(f, lag=f.lag.widened(loop / 2)) for f in by_frequency)
         warnings.append(
             f"{joint}: readings are held, but their poll period could not be found; fresh readings "
-            "are dated to the middle between two reads. A longer sweep would settle it."
+            "are dated to the middle between two reads, which may put all lags off by half a loop "
+            f"({1e3 * loop / 2:.0f} ms). A longer sweep would settle it."
         )
     return LagBudget(
         joint, naive, fresh, lag,
         naive.value - fresh.value, fresh.value - lag.value,
-        tuple(map(_at_frequency, tones, _servo_lags(tones))),
+        by_frequency,
         _estimators(trials, read, tones, lag.value),
         lattice,
         float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else float("nan"),
@@ -235,7 +248,9 @@ def tone_lags(response: NDArray, frequency_hz: NDArray) -> NDArray[np.float64]:
 
 def _common_lag(response: NDArray, frequency: NDArray) -> float:
     """The lag on which all phases agree best."""
-    spacing = np.diff(np.unique(np.round(frequency, 3)))
+    spacing = np.diff(np.unique(frequency))
+    # two trials of one tone differ by what their fits are off, and say nothing more
+    spacing = spacing[spacing > _ONE_TONE_HZ]
     # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
     repeat = 1.0 / (spacing.min() if len(spacing) else frequency[0])
     lags = np.arange(0.0, min(LONGEST_LAG_S, 0.95 * repeat), 2e-4)
@@ -292,20 +307,21 @@ def _shift_sums(trial: Trial, read: Readings, kind: str, lags: NDArray) -> NDArr
         time, position = trial.send_time_s[rows], trial.position_rad[rows]
     else:
         time, position = read.time_s, read.position_rad
-    past = time[:, None] - lags
-    if kind == "fresh_held":
-        row = np.searchsorted(trial.send_time_s, past, side="right") - 1
-        command = np.where(
-            row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)]
-        )
-    else:
-        command = np.interp(past, trial.send_time_s, trial.command_rad)
-    y = np.broadcast_to(position[:, None], command.shape)
-    products = np.stack([np.ones_like(y), y, command, y * y, y * command, command * command], 1)
-    block = np.floor((time - time[0]) / 0.5).astype(int) if len(time) else np.zeros(0, int)
-    _, block = np.unique(block, return_inverse=True)
-    sums = np.zeros((block.max() + 1 if len(block) else 0, 6, len(lags)))
-    np.add.at(sums, block, products)
+    block = np.floor((time - time[:1]) / _BLOCK_S)
+    edges = [0, *(np.flatnonzero(np.diff(block)) + 1), len(time)] if len(time) else []
+    sums = np.empty((max(len(edges) - 1, 0), 6, len(lags)))
+    # a block at a time: all lags of all rows would be gigabytes for a long walk
+    for n, (first, last) in enumerate(pairwise(edges)):
+        y, past = position[first:last], time[first:last, None] - lags
+        if kind == "fresh_held":
+            row = np.searchsorted(trial.send_time_s, past, side="right") - 1
+            c = np.where(row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)])
+        else:
+            c = np.interp(past, trial.send_time_s, trial.command_rad)
+        one = np.ones(len(lags))
+        sums[n] = (
+            len(y) * one, y.sum() * one, c.sum(axis=0), (y @ y) * one, y @ c, (c * c).sum(axis=0),
+        )  # fmt: skip
     return sums
 
 

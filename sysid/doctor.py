@@ -120,7 +120,7 @@ def examine(recording: Recording, rng: np.random.Generator | int = 0) -> Examina
     found = {}
     for joint in recording.joints:
         own = joint_rng(rng, joint) if isinstance(rng, int) else rng
-        found[joint] = _examine_joint(joint, joint_trials([recording], joint)[0], limit, own)
+        found[joint] = _examine_joint(joint, joint_trials([recording], joint), limit, own)
     return Examination(recording.name, recording.warnings, found)
 
 

@@ -83,6 +83,10 @@ class Fleet:
     failed: list[str] = field(default_factory=list)
     problems: dict[str, str] = field(default_factory=dict)
 
+    def usable(self, targets: Iterable[Path]) -> list[Path]:
+        """Those of `targets` that stand for their recordings; a failed robot's may be older."""
+        return [t for t in targets if _called(t) in {*self.kept, *self.made}]
+
     def tabulate(
         self, rows: Sequence[dict[str, Any]], quantities: Sequence[str], out: Path
     ) -> None:
@@ -170,10 +174,10 @@ def calibrate_fleet(
         jobs, cluster, force, progress,
     )  # fmt: skip
     rows = []
-    for path in (t for t in targets.values() if t.exists()):
+    for path in fleet.usable(targets.values()):
         calibration: Calibration = load_calibration(path)
         rows += [
-            {"robot": path.stem, "joint": name}
+            {"robot": _called(path), "joint": name}
             | {key: value(joint) for key, value in QUANTITIES.items()}
             for name, joint in calibration.joints.items()
         ]

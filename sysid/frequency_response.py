@@ -178,7 +178,7 @@ def frequency_response(
     InputError
         If the recording has neither tones nor a multisine.
     """
-    lattice = lattice or find_poll_lattice(trials)
+    lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     tones: list[ToneResponse] = []
     for trial in trials:
         reading = readings(trial, lattice)

@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from servo_models.delayed_pd import TIME_STEP_S
 from sysid.delay import LEVEL, Interval
@@ -40,6 +40,11 @@ from sysid.output_error import (
 PREFERRED = "delayed_pd"
 """The rung that simulators and training run."""
 
+STEPPING_SD_S = 0.5 * TIME_STEP_S
+"""How far off a dead time is, however many the readings, because the servo itself does not move in
+the model's steps: standard deviation over random emulated servos, which are stepped twice as finely
+(`benchmarks/dead_time_accuracy.py`)."""
+
 _MOST_FOLDS = 6
 _CANDIDATES = 512
 _SHORT, _FINAL = 8, 20  # iterations: enough to rank the starts, enough to converge
@@ -53,11 +58,11 @@ def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ..
     Returns
     -------
     dict of float to tuple of bool
-        By frequency [Hz] (by trial number for a trial without a tone): which trials remain. Of
+        By frequency [Hz] (a trial without a tone by -1 minus its number): which trials remain. Of
         many frequencies some are picked, evenly; empty if there is only one.
     """
     labels = [
-        round(d.frequency_hz, 2) if d.frequency_hz > 0 else float(n) for n, d in enumerate(data)
+        round(d.frequency_hz, 2) if d.frequency_hz > 0 else -1.0 - n for n, d in enumerate(data)
     ]
     names = sorted(set(labels))
     if len(names) < 2:
@@ -242,9 +247,9 @@ def dead_time_profile(
         best = min(*fit(model, [everything], lowest.values[None], 25), best, key=lambda f: f.cost)
     cost = np.array([f.cost for f in fits]) - min(best.cost, lowest.cost)
     low, high = _crossings(delays, cost, best.values[0], threshold)
-    centre, grain = float(best.values[0]), 0.5 * TIME_STEP_S  # no finer than the physics step
+    centre, grain = float(best.values[0]), norm.ppf(0.5 + LEVEL / 2) * STEPPING_SD_S
     ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
-    return Interval(centre, float(ends[0]), float(ends[1])), best
+    return Interval(centre, max(float(ends[0]), 0.0), float(ends[1])), best
 
 
 def _crossings(

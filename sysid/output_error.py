@@ -67,28 +67,10 @@ _WHOLE_COUNT = {
 }
 
 
-def prepare(
-    trial: Trial,
-    reading: Readings,
-    command_quantum_rad: float = 0.0,
-    rounding: str | None = None,
-    zero_rad: float | None = None,
-) -> TrialData:
-    """Put one trial on the physics clock.
-
-    Parameters
-    ----------
-    trial : Trial
-    reading : Readings
-    command_quantum_rad : float
-        Size of one count of the command; 0 if commands are not made whole counts.
-    rounding : {"up", "down", "nearest"}, optional
-        Where making the count whole moves the angle; None leaves the command as it is.
-    zero_rad : float, optional
-        An angle that is a whole count; by default the rest position.
-    """
+def prepare(trial: Trial, reading: Readings) -> TrialData:
+    """Put one trial on the physics clock."""
     rest, start = trial.initial_command_rad, trial.send_time_s[0]
-    command = whole_counts(trial, command_quantum_rad, rounding, zero_rad) - rest
+    command = whole_counts(trial) - rest
     stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
     steps = int(np.ceil(stop / TIME_STEP_S)) + 2
     edges = TIME_STEP_S * np.arange(steps + 1)
@@ -108,15 +90,14 @@ def prepare(
     )  # fmt: skip
 
 
-def whole_counts(
-    trial: Trial, quantum_rad: float, rounding: str | None, zero_rad: float | None
-) -> NDArray[np.float64]:
-    """Commands as the bus sends them [rad]; parameters as for `prepare`."""
-    if quantum_rad <= 0 or rounding not in _WHOLE_COUNT:
+def whole_counts(trial: Trial) -> NDArray[np.float64]:
+    """Commands as the bus sent them [rad]."""
+    cut = trial.truncation
+    if cut.quantum_rad <= 0 or cut.rounding not in _WHOLE_COUNT:
         return trial.command_rad
-    zero = trial.initial_command_rad if zero_rad is None else zero_rad
-    count = (trial.command_rad - zero) / quantum_rad
-    return _WHOLE_COUNT[rounding](count) * quantum_rad + zero
+    zero = trial.initial_command_rad if cut.zero_rad is None else cut.zero_rad
+    count = (trial.command_rad - zero) / cut.quantum_rad
+    return _WHOLE_COUNT[cut.rounding](count) * cut.quantum_rad + zero
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ _STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e
 _LONGEST_S = 0.12
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 _ALL_FRESH = 0.97
+_SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class PollLattice:
     loss, loss_sd : float
         Probability that a poll fails, and its standard error; NaN without a lattice.
     z_score : float
-        Score against shuffled rows, in their standard deviations; NaN if it was not computed.
+        Score against shuffled rows, in their standard deviations; NaN if there was no search.
     hit_rate : float
         Share of changed rows with a lattice instant between the previous read and this one.
     fresh_fraction : float
@@ -143,7 +144,7 @@ def quantum(trials: Sequence[Trial]) -> float:
 
 
 def find_poll_lattice(
-    trials: Sequence[Trial], rng: np.random.Generator | None = None, shuffles: int = 12
+    trials: Sequence[Trial], rng: np.random.Generator, shuffles: int = 12
 ) -> PollLattice:
     """Period, loss and phases of the poll behind one joint's readings.
 
@@ -151,9 +152,8 @@ def find_poll_lattice(
     ----------
     trials : sequence of Trial
         All of one joint.
-    rng : numpy.random.Generator, optional
-        Shuffles the gaps between changes for the z-score; without it there is none, and the
-        hit rate alone decides.
+    rng : numpy.random.Generator
+        Shuffles the gaps between changes: a lattice must explain them better than that.
     shuffles : int
 
     Returns
@@ -180,12 +180,8 @@ def find_poll_lattice(
     grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * BLUR_S / _STRETCH_S))
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
     period, score = best_period(informative, grid)
-    z_score = float("nan")
-    if rng is not None:
-        null = [
-            best_period([shuffled(s, rng) for s in informative], grid)[1] for _ in range(shuffles)
-        ]
-        z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
+    null = [best_period([shuffled(s, rng) for s in informative], grid)[1] for _ in range(shuffles)]
+    z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
 
     phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
     loss, _ = _loss(trials, phases)
@@ -202,7 +198,7 @@ def find_poll_lattice(
     hits = [contains(s, p) for s, p in zip(stretches, phases, strict=True)]
     hit_rate = float(np.mean(np.concatenate(hits)))
     loss, loss_sd = _loss(trials, phases)
-    found = hit_rate >= 0.9 and not z_score < 4.0
+    found = hit_rate >= 0.9 and z_score >= _SIGNIFICANT
     return PollLattice(
         "lattice" if found else "unresolved",
         period if found else float("nan"),

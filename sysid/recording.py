@@ -40,6 +40,25 @@ _ADVICE = "; what is there can be continued with `pupper-sysid sweep --resume`"
 
 
 @dataclass(frozen=True)
+class Truncation:
+    """How a bus cuts commands to counts; the defaults leave them as they are.
+
+    Attributes
+    ----------
+    quantum_rad : float
+        Size of one count.
+    rounding : {"up", "down", "nearest"}, optional
+        Where making the count whole moves the angle.
+    zero_rad : float, optional
+        An angle that is a whole count; by default the rest position.
+    """
+
+    quantum_rad: float = 0.0
+    rounding: str | None = None
+    zero_rad: float | None = None
+
+
+@dataclass(frozen=True)
 class Trial:
     """One joint over one stretch of time; arrays are over its rows, in time order.
 
@@ -59,6 +78,8 @@ class Trial:
         Command in force before the first row.
     direct : bool
         Whether the servo itself answered each read, so that no reading can be an old one.
+    truncation : Truncation
+        How the bus cut the commands.
     """
 
     joint: str
@@ -71,6 +92,7 @@ class Trial:
     position_count: NDArray[np.int64] | None
     initial_command_rad: float
     direct: bool = False
+    truncation: Truncation = Truncation()
 
 
 @dataclass(frozen=True)
@@ -117,8 +139,9 @@ class Recording:
     @cached_property
     def _trials(self) -> dict[str, list[Trial]]:
         rest = self.metadata.get("start_pose_rad") or {}
-        bus = self.metadata.get("bus")
-        direct = isinstance(bus, dict) and bus.get("kind") == "feetech"
+        bus = self.metadata.get("bus") or {}
+        direct = bus.get("kind") == "feetech"
+        quantum = bus.get("command_quantum_rad") or 0.0
         found: dict[str, list[Trial]] = {}
         for _, rows in self.table.groupby(["joint", "trial"], sort=True):
             columns = {c: rows[c].to_numpy() for c in rows.columns}
@@ -136,6 +159,13 @@ class Recording:
                     None if count is None else np.nan_to_num(count, nan=-1).astype(np.int64),
                     float(rest.get(joint, columns["command_rad"][0])),
                     direct,
+                    Truncation(
+                        float(
+                            (quantum.get(joint) or 0.0) if isinstance(quantum, dict) else quantum
+                        ),
+                        (bus.get("command_rounding") or {}).get(joint),
+                        (bus.get("count_zero_rad") or {}).get(joint),
+                    ),
                 )
             )
         return found
@@ -158,11 +188,11 @@ def load(path: Path) -> Recording:
             f"{path} is the truth that belongs to {path.name.removesuffix('.truth.csv')}.csv, "
             "not a recording; give that one."
         )
-    text = read_text(path)
-    parsed = parse(path, text)
+    data = read_bytes(path)
+    parsed = parse(path, as_text(path, data))
     table, metadata, warnings = convert(path, parsed)
     table, more = check(path, table)
-    digest = hashlib.sha256(text.encode()).hexdigest()
+    digest = hashlib.sha256(data).hexdigest()
     found = [*parsed.warnings, *warnings, *more]
     return Recording(table, metadata, path.stem, path, digest, tuple(found))
 
@@ -184,7 +214,8 @@ def newest_recording(folder: Path = FOLDER) -> Path:
     return max(found, key=lambda p: p.stat().st_mtime)
 
 
-def read_text(path: Path) -> str:
+def read_bytes(path: Path) -> bytes:
+    """What is in the file, if it can be a recording at all."""
     largest = 500e6
     try:
         if path.stat().st_size > largest:
@@ -196,6 +227,11 @@ def read_text(path: Path) -> str:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     if not data.strip():
         raise InputError(f"{path} is empty: the recording never started. Record it again.")
+    return data
+
+
+def as_text(path: Path, data: bytes) -> str:
+    """The file's text, without a byte order mark."""
     try:
         if b"\0" in data:
             raise ValueError
@@ -244,7 +280,7 @@ class RecordingWriter:
         InputError
             If the file cannot be read or written.
         """
-        text = read_text(path)
+        text = as_text(path, read_bytes(path))
         whole = text[: text.rfind("\n") + 1]
         lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
         made = cls.__new__(cls)

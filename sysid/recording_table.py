@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import difflib
-import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +15,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from common.errors import InputError
 from common.joints import strange_joint
+from sysid.recording import TITLE
 
 _LEAST_ROWS = 20
+_SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
 _TEXT_COLUMNS = ("joint", "signal")
 
@@ -66,6 +67,11 @@ def parse(path: Path, text: str) -> Parsed:
     if not rows:
         raise InputError(f"{path} has no rows: the recording never started. Record it again.")
     columns = [c.strip() for c in next(csv.reader([rows[0][1]]))]
+    if len(columns) == 1 and ";" in columns[0]:
+        raise InputError(
+            f"{path}, line {rows[0][0]}: cells are separated by semicolons. Save it with commas "
+            "between cells and points in numbers."
+        )
     if len(set(columns)) != len(columns):
         raise InputError(f"{path}, line {rows[0][0]}: a column name stands twice. Rename one.")
     ours = "send_time_s" in columns
@@ -76,7 +82,8 @@ def parse(path: Path, text: str) -> Parsed:
             f"trial {trial} was interrupted and recorded again; the second one is used."
         )
         body = [(n, line) for n, line in body if not first <= n <= last]
-    cells = list(csv.reader(io.StringIO("\n".join(line for _, line in body))))
+    # line by line: a stray quote must not swallow the lines behind it
+    cells = [_cells(path, n, line) for n, line in body]
     numbers = [n for n, _ in body]
     # killed in the middle of a line: the last one has no end, or too few cells
     cut = bool(cells) and (len(cells[-1]) < len(columns) or (ours and not text.endswith("\n")))
@@ -90,7 +97,7 @@ def parse(path: Path, text: str) -> Parsed:
                 "columns; command and position must have the same number of values. Mend or "
                 "remove the line."
             )
-    if ours and "completed" not in metadata:
+    if lines[0].startswith(TITLE) and "completed" not in metadata:
         warnings.append("it was not recorded to its end; what is there is used.")
     if not cells:
         raise InputError(f"{path} has column names but no rows. Record it again.")
@@ -132,6 +139,7 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     if again.any():
         warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
         table = table.loc[~again]
+    short: list[tuple[str, float]] = []
     for _, rows in table.groupby(["joint", "trial"], sort=False):
         joint, trial = rows["joint"].iloc[0], rows["trial"].iloc[0]
         for column in ("send_time_s", "read_time_s"):
@@ -142,14 +150,24 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
                     f"after {rows[column].iloc[back[0]]:.4f} s. Sort the rows, or give each pass "
                     "its own trial number."
                 )
-        if len(rows) < _LEAST_ROWS:
+        tones = rows["frequency_hz"].dropna().unique()
+        if len(tones) > 1:
+            raise InputError(
+                f"{path}, column frequency_hz: trial {trial:g} of {joint} has {tones[0]:g} and "
+                f"{tones[1]:g} Hz. Give each frequency its own trial number."
+            )
+        if len(rows) < _SHORTEST_TRIAL:
+            short.append((joint, trial))
+            warnings.append(f"trial {trial:g} of {joint} is too short to use and was left out.")
+        elif len(rows) < _LEAST_ROWS:
             warnings.append(f"trial {trial:g} of {joint} has only {len(rows)} rows.")
-    if len(table) < _LEAST_ROWS:
+    usable = ~pd.MultiIndex.from_frame(table[["joint", "trial"]]).isin(short)
+    if usable.sum() < _LEAST_ROWS:
         raise InputError(
             f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed to say "
             "anything. Record for longer."
         )
-    return table.reset_index(drop=True), warnings
+    return table.loc[usable].reset_index(drop=True), warnings
 
 
 def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
@@ -175,7 +193,7 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
         try:
             metadata[key.strip()] = json.loads(value)
         except (ValueError, RecursionError):
-            if lines[0].startswith("# pupper-sysid recording") and n < len(lines):
+            if lines[0].startswith(TITLE) and n < len(lines):
                 raise InputError(
                     f"{path}, line {n}: the value of '{key}' is not JSON. Mend or remove the line."
                 ) from None
@@ -191,6 +209,15 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
             "this one reads up to 1. Upgrade."
         )
     return metadata
+
+
+def _cells(path: Path, number: int, line: str) -> list[str]:
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error:
+        raise InputError(
+            f"{path}, line {number}: a quotation mark is not closed. Mend or remove the line."
+        ) from None
 
 
 def _cancelled(

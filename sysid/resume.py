@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import InputError
 from sysid.excitation import Plan
-from sysid.recording import TITLE, read_text
+from sysid.recording import TITLE, as_text, read_bytes
 from sysid.recording_table import header, parse
 
 _LEAST_PAUSE_S = 0.5
@@ -78,7 +78,7 @@ def header_of(path: Path) -> dict[str, Any]:
     InputError
         If it is no recording of ours, was finished, or does not say what was planned.
     """
-    text = read_text(path)
+    text = as_text(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is no recording of pupper-sysid; only those can be continued.")
     metadata = header(path, text.splitlines())
@@ -103,7 +103,7 @@ def header_of(path: Path) -> dict[str, Any]:
 
 def footer(path: Path) -> dict[str, Any]:
     """What a finished recording says of how it went; empty if it was not finished."""
-    return header(path, read_text(path).splitlines()).get("completed", {})
+    return header(path, as_text(path, read_bytes(path)).splitlines()).get("completed", {})
 
 
 def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
@@ -115,7 +115,7 @@ def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
         If the recording cannot be read, or was made with another plan.
     """
     written_at = path.stat().st_mtime
-    text = read_text(path)
+    text = as_text(path, read_bytes(path))
     planned = header(path, text.splitlines()).get("excitation")
     if planned != json.loads(json.dumps(dict(plan.description))):
         raise InputError(

@@ -80,7 +80,7 @@ def compare(
     InputError
         If a model cannot be read, or is for another rate or other joints.
     """
-    data = merged_groups(servo_data(recordings, joints, mode))
+    data = merged_groups(servo_data(recordings, joints, mode, seed))
     found: dict[str, ServoModel] = {}
     bands, notes = {}, []
     inputs = {r.sha256: r.name for r in recordings}

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import InputError
-from sysid.calibrate import Truncation, joint_trials
+from sysid.calibrate import joint_rng, joint_trials
 from sysid.output_error import TrialData, prepare, whole_counts
 from sysid.poll_lattice import Readings, find_poll_lattice, fresh_rows, readings
 from sysid.recording import Recording, Trial
@@ -42,8 +42,6 @@ class Run:
     ----------
     trial : Trial
         All rows, merged.
-    truncation : Truncation
-        How the bus cut the commands.
     readings : Readings
         Those that count, over `fresh` entries.
     tick, position_rad : ndarray, shape (fresh,)
@@ -58,7 +56,6 @@ class Run:
     """
 
     trial: Trial
-    truncation: Truncation
     readings: Readings
     tick: NDArray[np.float64]
     position_rad: NDArray[np.float64]
@@ -88,8 +85,7 @@ class Run:
     @property
     def truncated_rad(self) -> NDArray[np.float64]:
         """Commands as the bus sent them, in whole counts [rad]."""
-        cut = self.truncation
-        return whole_counts(self.trial, cut.quantum_rad, cut.rounding, cut.zero_rad)
+        return whole_counts(self.trial)
 
     def trial_data(self, used: NDArray[np.bool_]) -> TrialData:
         """The run on the clock of physics, with only the readings of `used`, shape (fresh,)."""
@@ -97,8 +93,7 @@ class Run:
         kept = replace(
             r, rows=r.rows[used], time_s=r.time_s[used], position_rad=r.position_rad[used]
         )
-        cut = self.truncation
-        return prepare(self.trial, kept, cut.quantum_rad, cut.rounding, cut.zero_rad)
+        return prepare(self.trial, kept)
 
 
 @dataclass(frozen=True)
@@ -125,7 +120,7 @@ class ServoData:
 
 
 def servo_data(
-    recordings: Sequence[Recording], joints: Sequence[str], mode: str = "auto"
+    recordings: Sequence[Recording], joints: Sequence[str], mode: str = "auto", seed: int = 0
 ) -> ServoData:
     """Arrange recordings for fitting or scoring servo models.
 
@@ -135,6 +130,8 @@ def servo_data(
     joints : sequence of str
     mode : {"auto", "fresh", "all"}
         Which readings count; `auto` decides per joint, see the module's text.
+    seed : int
+        Of the search for the poll.
 
     Raises
     ------
@@ -146,7 +143,7 @@ def servo_data(
     runs: dict[str, tuple[Run, ...]] = {}
     modes: dict[str, str] = {}
     for joint in joints:
-        found, modes[joint] = _joint_runs(recordings, joint, mode, period, labels)
+        found, modes[joint] = _joint_runs(recordings, joint, mode, period, labels, seed)
         if not sum(len(r.tick) for r in found):
             raise InputError(f"{joint}: no reading ever changed; there is nothing to learn from.")
         runs[joint] = tuple(found)
@@ -202,12 +199,17 @@ def _common_period(recordings: Sequence[Recording]) -> float:
 
 
 def _joint_runs(
-    recordings: Sequence[Recording], joint: str, mode: str, period: float, labels: dict[str, int]
+    recordings: Sequence[Recording],
+    joint: str,
+    mode: str,
+    period: float,
+    labels: dict[str, int],
+    seed: int,
 ) -> tuple[list[Run], str]:
-    trials, _ = joint_trials(recordings, joint)
+    trials = joint_trials(recordings, joint)
     if not trials:
         raise InputError(f"{joint} was not recorded. Leave it out with --joints.")
-    lattice = find_poll_lattice(trials)
+    lattice = find_poll_lattice(trials, joint_rng(seed, joint))
     if mode == "auto":
         held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION
         mode = "fresh" if held and not all(t.direct for t in trials) else "all"
@@ -215,7 +217,6 @@ def _joint_runs(
     runs = []
     for recording in recordings:
         own = recording.trials(joint)
-        _, truncation = joint_trials([recording], joint)
         known = joint in (recording.metadata.get("start_pose_rad") or {})
         prefix = f"{recording.name}, " if len(recordings) > 1 else ""
         parts = []
@@ -229,7 +230,7 @@ def _joint_runs(
                 rest = float(first[0]) if len(first) else trial.initial_command_rad
                 trial = replace(trial, initial_command_rad=rest)
             parts += _without_pauses(trial, counted, group, period)
-        runs += [_run(p, truncation, period) for p in _joined(parts, period)]
+        runs += [_run(p, period) for p in _joined(parts, period)]
     return runs, mode
 
 
@@ -285,7 +286,7 @@ def _joined(parts: list[_Part], period: float) -> list[list[_Part]]:
     return joined
 
 
-def _run(parts: list[_Part], truncation: Truncation, period: float) -> Run:
+def _run(parts: list[_Part], period: float) -> Run:
     trials = [p[0] for p in parts]
     sizes = [len(t.send_time_s) for t in trials]
     merged = replace(
@@ -311,7 +312,7 @@ def _run(parts: list[_Part], truncation: Truncation, period: float) -> Run:
 
     held = np.where(r.held_time_s >= edges[0], r.held_time_s, np.nan)
     return Run(
-        merged, truncation, r, to_tick(r.time_s), r.position_rad,
+        merged, r, to_tick(r.time_s), r.position_rad,
         to_tick(merged.read_time_s), to_tick(held),
         np.repeat([t.number for t in trials], sizes), np.repeat([p[2] for p in parts], sizes),
         merged.send_time_s - np.repeat([p[3] for p in parts], sizes),

@@ -9,7 +9,7 @@ the same part and scored on the same readings, and so is "it stays where it was"
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from common.errors import InputError
 from common.files import versions
+from common.joints import DEFAULT_POSE
 from servo_models.calibration import utc_now
 from servo_models.interface import ServoModel
 from servo_models.recurrent_network import RecurrentNetwork
@@ -109,6 +110,8 @@ class ServoFit:
         Share of the test readings inside the 90 % band.
     difference : (float, float, float)
         Model less linear model, mean RMS [rad], and its 90 % interval.
+    interrupted : bool
+        Whether Ctrl-C ended the training; the best so far was kept.
     """
 
     arch: str
@@ -127,6 +130,7 @@ class ServoFit:
     readings: dict[str, int]
     notes: tuple[str, ...]
     tracks: scores.Tracks
+    interrupted: bool
 
     @property
     def feedback(self) -> bool:
@@ -198,13 +202,18 @@ def fit_servo(
     """
     if preset == "paper" and arch not in ("mlp", "lstm"):
         raise InputError(f"--preset paper has an mlp and an lstm; there is no published {arch}.")
-    data = servo_data(recordings, joints, mode)
+    if preset == "paper" and (other := [j for j in joints if j not in DEFAULT_POSE]):
+        raise InputError(
+            f"--preset paper is for the joints of a Mini Pupper; {other[0]} is none. Leave it out."
+        )
+    data = servo_data(recordings, joints, mode, seed)
     notes: list[str] = []
     whole = split.train or everything
     data, note = grouped(data, whole)
     notes += [note] if note else []
     data = merged_groups(data)
     if split.test is None:
+        data = _with_two_groups(data, whole)
         folds = [(without(g), only(g)) for g in range(len(data.groups))]
     else:
         folds = [(whole, split.test)]
@@ -223,7 +232,8 @@ def fit_servo(
         say("DelayedPD", 0.0)
         found = _physics("delayed-pd", data, folds, seed)
         physics = [delayed_pd_model(v, data.period_s) for v in found]
-    notes += ours.notes
+    if ours.interrupted:
+        notes.append("Training was stopped early; the best so far was kept.")
     few = ours.weights_per_joint
     if few and few > min(readings.values()):
         notes.append(
@@ -244,8 +254,35 @@ def fit_servo(
         scores.persistence(data, test), scores.repeatability(data, test), bands,
         _coverage(scored[arch].errors, bands),
         (scored[arch].mean - scored["linear"].mean, low, high), readings, tuple(notes),
-        scores.tracks(ours.model, data),
+        scores.tracks(ours.model, data), ours.interrupted,
     )  # fmt: skip
+
+
+def _with_two_groups(data: ServoData, part: Part) -> ServoData:
+    """The data without groups that nobody has readings of, such as a tone cut short.
+
+    Raises
+    ------
+    InputError
+        If a joint has readings in one group only, so that nothing of it can be held out.
+    """
+    present = {
+        j: {int(g) for r in data.runs[j] for g in r.group[r.readings.rows][chosen(r, part)]} - {-1}
+        for j in data.joints
+    }
+    for joint, own in present.items():
+        if len(own) < 2:
+            seen = ", ".join(data.groups[g] for g in own) or "nothing"
+            raise InputError(
+                f"{joint} has readings of {seen} only, others of more, so it cannot be tested on "
+                "what it has not seen. Leave it out with --joints, record it again, or split by "
+                "time with --train-before and --test-after."
+            )
+    used = sorted(set().union(*present.values()))
+    place = np.full(len(data.groups) + 1, -1)
+    place[used] = np.arange(len(used))
+    runs = {j: tuple(replace(r, group=place[r.group]) for r in own) for j, own in data.runs.items()}
+    return replace(data, runs=runs, groups=tuple(data.groups[g] for g in used))
 
 
 def save_fit(
@@ -353,7 +390,7 @@ class _Fitted:
     choices: dict[str, float]
     held_out: dict[str, scores.Errors] | None
     weights_per_joint: int
-    notes: list[str]
+    interrupted: bool = False
 
 
 def _fit(
@@ -373,7 +410,7 @@ def _fit(
         parts = folds if same else [(whole, whole), *folds]
         values = _physics(arch, data, parts, seed)
         models: list[ServoModel] = [build(v, data.period_s) for v in values]
-        return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0, [])
+        return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0)
     if preset == "paper":
         found = [
             fit_published(arch, data, part, seed, lambda share: say(f"{arch} as published", share))
@@ -382,9 +419,7 @@ def _fit(
         size = sum(
             v[0].size for k, v in found[-1].parameters.items() if "weight" in k or "bias" in k
         )
-        return _Fitted(
-            found[-1], found[-1].parameters, list(found[: len(folds)]), {}, None, size, []
-        )
+        return _Fitted(found[-1], found[-1].parameters, list(found[: len(folds)]), {}, None, size)
     fit = fit_network(
         arch, data.joints, data.period_s, ready, seed, nested=split.test is None,
         progress=lambda done, steps: say(arch, done / steps),
@@ -393,7 +428,6 @@ def _fit(
         scores.errors(m, scores.tracks(m, data), data, _both(whole, only(g)))
         for g, m in fit.held_out.items()
     ]
-    notes = ["Training was stopped early; the best so far was kept."] if fit.interrupted else []
     size = sum(
         v[0].size
         for k, v in fit.model.parameters.items()
@@ -401,7 +435,7 @@ def _fit(
     )
     return _Fitted(
         fit.model, fit.model.parameters, _fold_models(fit, folds, split), fit.choices,
-        scores.pooled(held) if held else None, size if arch != "fir" else 0, notes,
+        scores.pooled(held) if held else None, size if arch != "fir" else 0, fit.interrupted,
     )  # fmt: skip
 
 

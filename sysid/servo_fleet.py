@@ -61,7 +61,7 @@ def fit_servo_fleet(
         jobs, cluster, force, progress,
     )  # fmt: skip
     rows = []
-    for folder in (t for t in targets.values() if t.exists()):
+    for folder in fleet.usable(targets.values()):
         for joint, known in load_servo_model(folder).contract.joints.items():
             errors = {name: known.scores.get(key) for name, key in QUANTITIES.items()}
             rows.append(
@@ -82,13 +82,13 @@ def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
         [r.sha256 for r in made.recordings] == [sha256(path)]
         and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
         and made.split == settings.split.name
-        and made.readings_counted == _modes(path, made.joints, settings.readings)
+        and made.readings_counted == _modes(path, made.joints, settings)
     )
 
 
-def _modes(path: Path, joints: Iterable[str], readings: str) -> dict[str, str]:
+def _modes(path: Path, joints: Iterable[str], settings: ServoSettings) -> dict[str, str]:
     """Which readings of a recording count, by joint."""
-    return servo_data([load(path)], list(joints), readings).modes
+    return servo_data([load(path)], list(joints), settings.readings, settings.seed).modes
 
 
 def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
@@ -98,4 +98,6 @@ def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
         [recording], recording.joints, settings.arch, settings.preset, settings.split,
         settings.readings, settings.seed,
     )  # fmt: skip
+    if fit.interrupted:  # one robot alone keeps what it has; a fleet makes it again
+        raise KeyboardInterrupt
     save_fit(target, fit, [recording], settings.seed, force=True)

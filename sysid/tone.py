@@ -17,6 +17,7 @@ from sysid.poll_lattice import Readings
 from sysid.recording import Trial
 
 HARMONICS = (1, 3)
+_ALIASED = 30.0  # condition number beyond which a harmonic looks like the tone or the offset
 _SETTLE_S = 0.2  # after the tone is at full amplitude: several times the servo's slowest pole
 
 
@@ -104,6 +105,8 @@ def tone_response(
     fresh = (reading.time_s >= start) & (reading.time_s <= stop)
     if rows.sum() < 8 or fresh.sum() < 8:
         return None
+    if np.linalg.cond(_design(send[rows], frequency)) > _ALIASED:  # two rows per period
+        return None
 
     def phasors(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
         return _fit(time, value, frequency, start, rng, draws)
@@ -131,11 +134,13 @@ def fit_phasor(time_s: NDArray, value: NDArray, frequency_hz: float) -> complex:
 
 
 def _design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:
+    """Offset, tone and, where the sampling lets it be seen, its third harmonic."""
     angle = 2 * np.pi * frequency_hz * time_s
     columns = [np.ones_like(time_s)]
     for n in HARMONICS:
         columns += [np.cos(n * angle), np.sin(n * angle)]
-    return np.stack(columns, axis=1)
+    design = np.stack(columns, axis=1)
+    return design if np.linalg.cond(design) < _ALIASED else design[:, :3]
 
 
 def _fit(

@@ -7,12 +7,12 @@ import pytest
 from synthetic import LOOP_S, tone_trials
 
 from servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
-from sysid.calibrate import Truncation, _calibrate_joint, _Task, calibrate
+from sysid.calibrate import _calibrate_joint, _dead_time, _Task, calibrate
 from sysid.calibration_file import preset_parameters, to_calibration
 from sysid.ladder import LADDER, rung
 from sysid.output_error import Problem, fit, positions, prepare
 from sysid.poll_lattice import find_poll_lattice, readings
-from sysid.recording import load
+from sysid.recording import Truncation, load
 
 TRUE = DelayedPDParameters(
     stiffness=12000.0, damping=100.0, friction_loss=150.0, armature=1.0, effort_limit=450.0,
@@ -39,7 +39,7 @@ def servo_trials(rng, frequencies=(1.0, 2.0, 3.0, 4.0)):
 @pytest.fixture(scope="module")
 def result():
     trials = servo_trials(np.random.default_rng(1))
-    return _calibrate_joint(_Task("LF_hip", trials, Truncation(), 0, {}))
+    return _calibrate_joint(_Task("LF_hip", trials, 0, {}))
 
 
 def test_delayed_pd_is_recovered_from_lossy_readings(result):
@@ -56,6 +56,12 @@ def test_the_truth_is_inside_the_dead_time_interval(result):
     assert result.dead_time.low <= 0.025 <= result.dead_time.high
     low, high = result.delay_steps
     assert low <= 12.5 <= high and high - low <= 8
+
+
+def test_the_interval_of_a_fast_servo_ends_at_zero():
+    trials = tone_trials(0.002, np.random.default_rng(2), (1.0, 3.0), period_s=0.0)
+    found = _dead_time(_Task("LF_hip", tuple(trials), 0, {})).dead_time
+    assert found.low == 0.0 < found.high
 
 
 def test_the_fit_is_as_good_as_the_readings_allow(result):
@@ -91,22 +97,20 @@ def test_ratios_are_identified_and_torques_only_by_the_anchor(result, tmp_path):
 def test_a_speed_limit_that_was_never_reached_is_not_claimed():
     rng = np.random.default_rng(2)
     slow = servo_trials(rng, (0.5, 1.0, 1.5))  # 2.8 rad/s at most
-    found = _calibrate_joint(_Task("LF_hip", slow, Truncation(), 0, {}))
+    found = _calibrate_joint(_Task("LF_hip", slow, 0, {}))
     assert "velocity_limit_rad_s" in found.rungs["delayed_pd"].undecided
     assert any("speed limit was not excited" in w for w in found.warnings)
 
 
 def test_results_repeat_under_a_seed():
     trials = servo_trials(np.random.default_rng(3), (1.0, 3.0))
-    first, again = (
-        _calibrate_joint(_Task("LF_hip", trials, Truncation(), 5, {})) for _ in range(2)
-    )
+    first, again = (_calibrate_joint(_Task("LF_hip", trials, 5, {})) for _ in range(2))
     assert first.rungs == again.rungs and first.dead_time == again.dead_time
 
 
 def test_the_fit_simulates_what_delayed_pd_simulates():
     trial = servo_trials(np.random.default_rng(4), (2.0,))[0]
-    data = prepare(trial, readings(trial, find_poll_lattice([trial])))
+    data = prepare(trial, readings(trial, find_poll_lattice([trial], np.random.default_rng(0))))
     values = np.array([0.0273, 12000.0, 100.0, 150.0, 450.0, 6.5, 0.0])
     track = positions(rung("delayed_pd"), [(values[None], [data])])[0][1:, 0, 0]
     model = DelayedPD(replace(TRUE, delay_s=0.0273))
@@ -115,8 +119,9 @@ def test_the_fit_simulates_what_delayed_pd_simulates():
 
 def test_commands_are_averaged_over_physics_steps_and_truncated_by_count():
     trial = tone_trials(0.04, np.random.default_rng(5), (1.0,))[0]
-    data = prepare(trial, readings(trial, find_poll_lattice([trial])), 0.0057, "up")
-    plain = prepare(trial, readings(trial, find_poll_lattice([trial])))
+    read = readings(trial, find_poll_lattice([trial], np.random.default_rng(0)))
+    data = prepare(replace(trial, truncation=Truncation(0.0057, "up")), read)
+    plain = prepare(trial, read)
     inside = slice(100, 1500)
     difference = data.command[inside] - plain.command[inside]
     assert difference.min() >= -1e-9 and difference.max() <= 0.0057 + 1e-9
@@ -127,7 +132,7 @@ def test_commands_are_averaged_over_physics_steps_and_truncated_by_count():
 
 def test_a_frozen_parameter_stays_where_it_was_put():
     trials = servo_trials(np.random.default_rng(6), (1.0, 2.0))
-    lattice = find_poll_lattice(trials)
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
     data = tuple(prepare(t, readings(t, lattice)) for t in trials)
     model = rung("sopdt")
     start = np.array([[p.nominal for p in model.parameters]])

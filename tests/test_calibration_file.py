@@ -76,12 +76,12 @@ def test_numpy_numbers_are_stored_as_plain_numbers(tmp_path):
     assert type(number.value) is float and type(number.low) is float
 
 
-def test_joints_are_in_the_one_joint_order_and_models_are_vectorised_over_them():
+def test_joints_are_in_the_one_joint_order_and_models_in_the_one_asked_for():
     both = calibration(LF_thigh=joint_calibration(12.0), LF_hip=joint_calibration(11.0))
     assert both.joint_names == ("LF_hip", "LF_thigh")
     model = both.delayed_pd(["LF_thigh", "LF_hip"], time_step_s=0.001)
     assert model.time_step_s == 0.001
-    np.testing.assert_array_equal(model.parameters.stiffness, [11.0, 12.0])
+    np.testing.assert_array_equal(model.parameters.stiffness, [12.0, 11.0])
     assert both.delayed_pd(["LF_thigh"]).batch == (1,)
 
 

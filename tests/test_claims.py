@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from test_paths import walked
 import cli.claims
 import cli.pupper_analyze
 from cli.sweep import Sweep
+from common.claims import Claim
+from common.files import sha256
 from policies.claims import judge
 from policies.evidence import DELAYS_MS, PolicyEvidence
 from policies.phase_reset import NUDGE_M_S, PUSH_M_S
@@ -51,7 +54,7 @@ def evidence(kind: str, name: str | None = None) -> PolicyEvidence:
     directions = ("forward", "backward", "left", "right", "turn left", "turn right")
     return PolicyEvidence(
         name or kind, kind, {"reward": 7.0, "std": 0.01, "updates": 60.0, "steps_per_s": 1000.0},
-        walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
+        False, "flat", walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
         {"actions": orbit, "hidden": orbit},
         [
             gait | {"extra_delay_ms": d, "mode": m}
@@ -79,8 +82,12 @@ def evidence(kind: str, name: str | None = None) -> PolicyEvidence:
     )  # fmt: skip
 
 
+def claims(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, Claim]:
+    return {c.id: c for c in judge(policies, played or {}, stacks)}
+
+
 def verdicts(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, str]:
-    return {c.id: c.verdict for c in judge(policies, played or {}, stacks)}
+    return {i: c.verdict for i, c in claims(*policies, played=played, stacks=stacks).items()}
 
 
 BOTH = (evidence("mlp"), evidence("lstm"))
@@ -118,6 +125,14 @@ def test_an_oscillator_in_the_cell_would_be_one_and_a_loop_through_the_action_is
     assert verdicts(mlp, replace(lstm, frozen=driven))["X1"] == "does not hold here"
 
 
+def test_an_lstm_that_does_not_walk_is_no_oscillator_to_judge():
+    mlp, lstm = BOTH
+    still = [r | {"share": float("nan")} for r in lstm.frozen]
+    assert verdicts(mlp, replace(lstm, frozen=still, push=[]))["X1"] == "not testable here"
+    # nobody stayed up to be pushed: what is frozen in replay decides
+    assert verdicts(mlp, replace(lstm, push=[]))["X1"] == "holds partly"
+
+
 def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
     mlp, lstm = BOTH
     assert verdicts(mlp, lstm)["G2"] == "holds" and verdicts(mlp, lstm)["G3"] == (
@@ -126,6 +141,73 @@ def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
     wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in mlp.delay]
     assert verdicts(replace(mlp, delay=wild), lstm)["G3"] == "holds"
     assert verdicts(mlp, replace(lstm, delay=wild))["G2"] == "does not hold here"
+
+
+def test_two_policies_that_each_keep_a_rate_of_their_own_are_not_erratic():
+    slow, quick = ([r | {"frequency_hz": hz} for r in BOTH[0].delay] for hz in (2.5, 2.9))
+    four = [
+        replace(p, name=f"{p.kind}-{i}", delay=delay)
+        for p in BOTH for i, delay in enumerate((slow, quick))
+    ]  # fmt: skip
+    found = verdicts(*four)
+    assert found["G2"] == "holds" and found["G3"] == "does not hold here"
+    wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in slow]
+    one_wild = [replace(p, delay=wild) if p.name.endswith("-1") else p for p in four]
+    assert verdicts(*one_wild)["G2"] == verdicts(*one_wild)["G3"] == "holds partly"
+
+
+def test_a_policy_without_a_rhythm_is_neither_constant_nor_erratic():
+    mlp, lstm = BOTH
+    still = [r | {"frequency_hz": float("nan")} for r in mlp.delay]
+    found = claims(replace(mlp, delay=still), replace(lstm, delay=still))
+    for id_ in ("G2", "G3"):
+        assert found[id_].verdict == "not testable here" and "no rhythm" in found[id_].how
+
+
+def test_noise_that_is_never_worse_than_zeros_contradicts():
+    mlp, lstm = BOTH
+    robust = [r | {"correlation": 0.95 if r["kind"] == "noise" else 0.7} for r in mlp.ablation]
+    found = claims(mlp, replace(lstm, ablation=robust))["B2"]
+    assert found.verdict == "does not hold here" and "LSTM ∞" in found.ours
+    # one of two is not left out of the mean
+    found = claims(mlp, lstm, replace(lstm, name="b", ablation=robust))["B2"]
+    assert "LSTM ∞" in found.ours
+
+
+def test_policies_that_were_given_but_have_no_number_are_not_asked_for():
+    mlp, lstm = BOTH
+    lost = [r | {"correlation": float("nan")} for r in lstm.ablation]
+    how = claims(mlp, replace(lstm, ablation=lost))["B2"].how
+    assert "Of the LSTM that was given there is no number" in how and "Give a run" not in how
+    fallen = [
+        r | ({"frequency_hz": float("nan"), "survival": 0.0} if r["rate_hz"] < 50 else {})
+        for r in mlp.rate
+    ]
+    found = claims(replace(mlp, rate=fallen), replace(lstm, rate=fallen))["D1"]
+    assert found.verdict == "does not hold here" and "MLP 0, LSTM 0 %" in found.ours
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_direction_in_which_nothing_is_known_hides_nowhere(place):
+    mlp, lstm = BOTH
+    rows = [dict(r) for r in lstm.compliance]
+    rows[place]["share"] = known(0.0)
+    assert verdicts(mlp, replace(lstm, compliance=rows))["C1"] == "does not hold here"
+    rows[place]["share"] = known(float("nan"))
+    assert "LSTM" not in claims(mlp, replace(lstm, compliance=rows))["C1"].ours
+
+
+@pytest.mark.parametrize(
+    ("id_", "trained"),
+    [
+        ("T3", {"curriculum": True}), ("T3", {"curriculum": None}), ("B3", {"ground": "rough"}),
+        ("B3", {"ground": None}),
+    ],
+)  # fmt: skip
+def test_how_a_policy_was_trained_is_looked_at_not_taken_for_granted(id_, trained):
+    mlp, lstm = BOTH
+    assert verdicts(mlp, lstm)[id_] != "not testable here"
+    assert verdicts(replace(mlp, **trained), lstm)[id_] == "not testable here"
 
 
 @pytest.mark.parametrize(
@@ -146,6 +228,17 @@ def test_servos_that_make_a_saw_tooth_rounder_are_seen_in_the_sine_fit():
     smooth = np.sin(2 * np.pi * 2.8 * time)
     found = {c.id: c for c in judge(BOTH, {"LF_thigh": (time, saw, smooth)}, [])}
     assert found["G1"].verdict == "holds partly" and "2.80 Hz" in found["G1"].ours
+
+
+def test_drift_is_not_judged_as_a_gait():
+    rng = np.random.default_rng(0)
+    time = 0.04 * np.arange(300)
+    walk = np.cumsum(rng.standard_normal((2, 300)), axis=1)
+    found = claims(*BOTH, played={"LF_thigh": (time, walk[0], walk[1])})["G1"]
+    assert found.verdict == "not testable here" and "of noise" in found.how
+    unread = np.full(300, np.nan)
+    found = claims(*BOTH, played={"LF_thigh": (time, walk[0], unread)})["G1"]
+    assert found.verdict == "not testable here" and "nothing was read" in found.how
 
 
 def test_intervals_are_over_policies_of_a_kind():
@@ -172,6 +265,10 @@ def test_four_ways_on_the_sample_playback_score_unseen_readings_only():
     }  # fmt: skip
     assert claims["S1"].verdict in ("holds", "does not hold here") and "mrad" in claims["S1"].ours
     assert claims["A1"].verdict == "not testable here"
+    # commands that were never repeated do not say how well the robot repeats itself
+    once = replace(found, repeatability={"LF_thigh": float("nan")})
+    for c in servo_claims.judge(servo_claims.ServoEvidence(servos=once, played=recording)):
+        assert c.id != "S4" or c.verdict == "not testable here"
 
 
 def test_a_sweep_says_how_much_of_the_lag_is_stale_feedback(tmp_path):
@@ -201,8 +298,16 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     for claim in found["claims"]:
         assert f"| {claim['id']} |" in page
     for picture in found["pictures"]:
-        assert f"({picture})" in page and (tmp_path / "analysis" / picture).stat().st_size > 5000
+        assert f"({picture})" in page
+        # not where `pupper-analyze ablation` draws its own
+        assert (tmp_path / "analysis/claims" / picture).stat().st_size > 5000
     assert "Table I" in page
+    assert "--command 0.15 0 0 --robots 16 --seconds 10 --seed 0" in page
+    contract = json.loads((policies[0] / "contract.json").read_text())
+    for digest in (contract["weights_sha256"], sha256(SAMPLES / "calibrated.yaml")):
+        assert digest in page
+    assert f"mujoco {version('mujoco')}" in page
+    assert set(found["pictures"]) <= set(cli.claims.PICTURES)
     report = Path(found["report"]).read_text()
     assert "Table I" in report and report.count("data:image/png") == len(found["pictures"])
     assert all(claim["id"] in report for claim in found["claims"])
@@ -215,3 +320,18 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
         capsys, cli.pupper_analyze, "claims", policies[0], policies[0], *arguments[3:], "--out", "b"
     )
     assert "rename" in twice
+    Path("c").mkdir()
+    Path("c/ablation.png").touch()
+    taken = refused(capsys, cli.pupper_analyze, *arguments, "--out", "c")
+    assert "ablation.png exists already" in taken
+
+
+def test_a_kind_of_policy_about_which_nothing_was_published_is_refused(capsys, tmp_path):
+    contract = tmp_path / "more/contract.json"
+    shutil.copytree(SAMPLES / "policies/mlp", contract.parent)
+    contract.write_text(contract.read_text().replace('"kind": "mlp"', '"kind": "mlp-actions"'))
+    said = refused(
+        capsys, cli.pupper_analyze, "claims", contract.parent, "--actuator",
+        SAMPLES / "calibrated.yaml", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert "of the kind mlp-actions" in said

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from command_line import refused, run_program
 
 import cli.pupper_analyze
 import cli.pupper_deploy
+import cli.pupper_eval
+import cli.pupper_play
 from policies.walk_log import read_walk
 from sysid.recording import load
 
@@ -74,6 +78,49 @@ def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(cap
     assert "hip 3.00 2.80 0.98 -276.31" in err and err.count("thigh ") == 6
 
 
+@pytest.fixture
+def late(here) -> Path:
+    """The calibration of a robot whose servos answer 60 ms later."""
+    found = yaml.safe_load(CALIBRATION.read_text())
+    for joint in found["joints"].values():
+        for end in ("value", "low", "high"):
+            joint["actuator"]["delay_s"][end] += 0.06
+        for end in ("delay_steps_min", "delay_steps_max"):
+            joint["actuator"][end] += 30
+    Path("late.yaml").write_text(yaml.safe_dump(found))
+    return Path("late.yaml")
+
+
+@pytest.mark.parametrize("stack", ["closed-loop", "mlp-observer"])
+def test_a_robot_unlike_the_one_of_the_training_is_told_before_the_start(capsys, late, stack):
+    code, _, err = run_program(
+        capsys, cli.pupper_deploy, POLICY, "--actuator", late, "--stack", stack, "--seconds", 0.1,
+        "--name", "late",
+    )  # fmt: skip
+    assert code == 0 and "60 ms later than the trained actuator" in err
+
+
+def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys, late):
+    alone = Path("alone")
+    shutil.copytree(POLICY, alone)
+    late.rename("calibrated.yaml")
+    run_file = alone / "run.yaml"
+    run_file.write_text(run_file.read_text().replace("data/samples/calibrated", "calibrated"))
+    code, _, err = run_program(
+        capsys, cli.pupper_deploy, alone, "--stack", "mlp-observer", "--seconds", 0.1,
+        "--name", "swapped",
+    )  # fmt: skip
+    assert code == 0 and "calibrated.yaml is not the file with which alone was trained" in err
+    assert "was not checked" in err and "moves like the trained" not in err
+
+
+def test_the_shipped_policies_are_tried_from_any_folder(capsys, here):
+    code, _, err = run_program(
+        capsys, cli.pupper_deploy, POLICY, "--seconds", 0.1, "--name", "walk"
+    )
+    assert code == 0 and "warning" not in err and "the servos' own readings" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -88,6 +135,7 @@ def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(cap
         ((POLICY, "--actuator", CALIBRATION, "--keyboard"), "terminal"),
         ((POLICY, "--replay", "nowhere.csv"), "cannot be read"),
         ((POLICY, "--seconds", "-1"), "--seconds"),
+        ((POLICY, "--seed", "-1"), "--seed is -1"),
     ],
 )
 def test_bad_input_is_answered_in_a_sentence(capsys, here, arguments, says):
@@ -135,6 +183,31 @@ def test_orbits_close(capsys, here):
 def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what):
     rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
     assert len(rows) == 6 and all(0 <= r["survival"] <= 1 for r in rows)
+
+
+def test_two_policies_of_one_name_are_not_merged(capsys, here):
+    run = here / "runs/A"
+    for name in ("policy_best", "policy_last"):
+        shutil.copytree(POLICY, run / name)
+    both = (run / "policy_best", run / "policy_last")
+    said = refused(capsys, cli.pupper_analyze, "gait", *both, "--actuator", CALIBRATION)
+    assert "Two policies are called A" in said
+
+
+def test_a_walk_too_short_for_a_gait_or_an_orbit_is_told_so(capsys, here):
+    for what, says in (("gait", "No robot walked for 7 s"), ("attractor", "there is no orbit")):
+        arguments = (what, POLICY, "--robots", 1, "--seconds", 3)
+        assert says in refused(capsys, cli.pupper_analyze, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("module", "program"),
+    [(cli.pupper_deploy, "deploy"), (cli.pupper_analyze, "analyze"), (cli.pupper_eval, "eval"),
+     (cli.pupper_play, "play")],
+)  # fmt: skip
+def test_help_shows_an_example(capsys, module, program):
+    code, out, _ = run_program(capsys, module, "--help")
+    assert code == 0 and f"Example: pupper-{program} " in " ".join(out.split())
 
 
 def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):

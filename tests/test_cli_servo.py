@@ -13,6 +13,7 @@ from command_line import run
 
 import sysid.network_fit
 from servo_models.servo_file import load_servo_model
+from sysid.recording import load
 from sysid.servo_training import Recipe
 
 SAMPLE = Path(__file__).parents[1] / "data" / "samples"
@@ -168,3 +169,25 @@ def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(cap
     assert code == 2 and "neither a servo model" in err
     code, _, err = run(capsys, "compare", "log.csv")
     assert code == 2 and "--models" in err
+
+
+def cut_sweep(path: Path, trial: int, rows: int) -> Path:
+    """The sample sweep as it is if it was interrupted so many rows into a trial."""
+    lines = (SAMPLE / "sweep.csv").read_text().splitlines()
+    first = next(n for n, line in enumerate(lines) if f",{trial},LF_" in line)
+    path.write_text("\n".join([*lines[: first + rows], ""]))
+    return path
+
+
+def test_a_sweep_that_was_interrupted_is_used_up_to_there(capsys, tmp_path):
+    tones = {int(n) for n in load(SAMPLE / "sweep.csv").table.query("joint == 'LF_hip'")["trial"]}
+    torn = cut_sweep(tmp_path / "torn.csv", max(tones), 8)
+    code, _, err = run(capsys, "fit-servo", torn, "--arch", "fir")
+    assert code == 0, err
+    assert load_servo_model(tmp_path / "servo").contract.split == "each group left out in turn"
+    # of the next joint there is one tone: nothing to test on
+    torn = cut_sweep(tmp_path / "later.csv", max(tones) + 2, 1)
+    code, _, err = run(capsys, "fit-servo", torn, "--arch", "fir")
+    assert code == 2 and "LF_thigh" in err and "--joints" in err
+    code, _, err = run(capsys, "delay", torn)
+    assert code == 0, err

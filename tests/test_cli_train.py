@@ -114,6 +114,13 @@ def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here, arguments, 
         (("--architecture.hidden", "0"), "at least 1"),
         (("--task.control-step-s", "0.003"), "whole multiple"),
         (("--policy", "lstm", "--environments", "1"), "1 environments cannot be split"),
+        (("--threads", "-1"), "threads is -1; it must be 0 or more"),
+        (("--seed", "-1"), "seed is -1; it must be 0 or more"),
+        (("--imitation.minibatches", "0"), "imitation.minibatches is 0"),
+        (("--architecture.hidden", "--seed", "1"), "architecture.hidden is empty"),
+        (("--task.randomisation.friction", "1", "0.3"), "randomisation.friction is 1 to 0.3"),
+        (("--task.randomisation.friction", "-1", "0.3"), "from 0 on"),
+        (("--task.commands.yaw-rad-s", "0.5", "-0.5"), "commands.yaw_rad_s is 0.5 to -0.5"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(capsys, here, arguments, words):
@@ -220,6 +227,26 @@ def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, traine
     assert "walking.html exists already" in refused(capsys, cli.pupper_eval, *arguments)
 
 
+@pytest.mark.parametrize("extra", ["-40", "nan"])
+def test_servos_cannot_be_made_quicker_than_they_are(capsys, trained, extra):
+    said = refused(capsys, cli.pupper_eval, trained, "--extra-delay-ms", "0", extra)
+    assert f"--extra-delay-ms is {extra}" in said
+
+
+def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
+    capsys, trained, tmp_path
+):
+    alone = tmp_path / "alone"
+    shutil.copytree(trained / "policy_last", alone)
+    contract = alone / "contract.json"
+    contract.write_text(contract.read_text().replace('"feedback": "held"', '"feedback": "ideal"'))
+    code, out, _ = run(
+        capsys, cli.pupper_eval, alone, "--json", "--episodes", "1", "--actuator", CALIBRATION,
+        "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+    )  # fmt: skip
+    assert code == 0 and json.loads(out)["feedback"] == "ideal"
+
+
 def test_no_episodes_are_refused(capsys, trained):
     said = refused(capsys, cli.pupper_eval, trained, "--episodes", "0")
     assert "--episodes is 0; it must be at least 1" in said
@@ -274,6 +301,39 @@ def test_where_nothing_can_be_drawn_the_walk_goes_on_without_a_video(
     assert code == 0 and "asked 0.15 m/s" in out
     assert "No frames can be drawn here (RuntimeError: no EGL display)" in err
     assert not (here / "walk.mp4").exists()
+
+
+def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, here, monkeypatch):
+    import mujoco
+
+    imageio = pytest.importorskip("imageio.v2")
+
+    class Screen:
+        def __init__(self, *_): ...
+        def update_scene(self, *_, **__): ...
+        def render(self): ...
+
+    told = {}
+
+    class Film:
+        def __init__(self, path, **how):
+            told.update(how)
+
+        def append_data(self, picture):
+            told["pictures"] = told.get("pictures", 0) + 1
+
+        def close(self): ...
+
+    settings = trained / "run.yaml"
+    slow = settings.read_text().replace("control_step_s: 0.02", "control_step_s: 0.04")
+    shutil.copytree(trained, here / "slow")
+    (here / "slow/run.yaml").write_text(slow)
+    monkeypatch.setattr(mujoco, "Renderer", Screen)
+    monkeypatch.setattr(imageio, "get_writer", Film)
+    arguments = ("--seconds", "0.4", "--video", here / "walk.mp4")
+    code, _, err = run(capsys, cli.pupper_play, here / "slow", *arguments)
+    assert code == 0, err
+    assert told["fps"] == pytest.approx(25) and told["pictures"] == 10
 
 
 def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):

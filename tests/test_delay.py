@@ -1,5 +1,7 @@
 """The lag, its budget and the poll lattice, on signals whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic import LOOP_S, held_trial, tone_trials
@@ -7,6 +9,8 @@ from synthetic import LOOP_S, held_trial, tone_trials
 from common.errors import InputError
 from sysid.delay import lag_budget, tone_lags
 from sysid.poll_lattice import find_poll_lattice, fresh_rows, quantum, readings
+from sysid.recording import Trial
+from sysid.tone import tone_response
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3, 0.5])
@@ -73,10 +77,46 @@ def test_no_lattice_is_claimed_where_readings_change_at_random():
     assert find_poll_lattice(trials, np.random.default_rng(0)).kind == "unresolved"
 
 
+@pytest.mark.parametrize("share", [0.05, 0.1])
+def test_reads_that_are_answered_at_once_and_sometimes_lost_make_no_poll(share):
+    rng = np.random.default_rng(11)
+    trials = []
+    for trial in tone_trials(0.04, rng, period_s=0.0, quantum_rad=0.001):
+        position = trial.position_rad.copy()
+        for k in np.flatnonzero(rng.random(len(position)) < share):
+            position[k] = position[k - 1] if k else position[k]
+        trials.append(replace(trial, position_rad=position))
+    b = lag_budget("LF_hip", trials, rng)
+    assert b.lattice.kind != "lattice"
+    assert b.lag.low < 0.04 < b.lag.high
+    for f in b.by_frequency:
+        assert f.lag.low < 0.04 < f.lag.high
+
+
+@pytest.mark.parametrize("rows_per_period", [3, 4, 6])
+def test_a_harmonic_that_the_rows_cannot_tell_from_the_tone_is_left_out(rows_per_period):
+    rng = np.random.default_rng(12)
+    time = np.arange(0.0, 6.0, 1 / 30)
+    f = 30 / rows_per_period
+    command = 0.3 * np.sin(2 * np.pi * f * time + 0.4)
+    position = 0.3 * np.sin(2 * np.pi * f * (time - 0.02) + 0.4)
+    trial = Trial("LF_hip", 0, f, time, time, command, position, None, 0.0)
+    tone = tone_response(trial, readings(trial, find_poll_lattice([trial], rng)), rng)
+    assert tone is not None
+    late = -np.angle(tone.fresh / tone.command_rows) / (2 * np.pi * f)
+    assert late == pytest.approx(0.02, abs=1e-4)
+
+
+def test_two_trials_of_one_fast_tone_do_not_move_the_lag_by_a_period():
+    frequency = np.array([3.0, 3.004, 3.009])
+    response = np.exp(-2j * np.pi * frequency * 0.05 + 0.05j * np.array([1, -1, 1]))
+    assert tone_lags(response, frequency) == pytest.approx([0.05] * 3, abs=5e-3)
+
+
 def test_readings_that_are_never_held_are_dated_to_the_read():
     rng = np.random.default_rng(5)
     trials = tone_trials(0.04, rng, period_s=0.0, quantum_rad=0.0001)
-    lattice = find_poll_lattice(trials)
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
     assert lattice.kind == "every read"
     np.testing.assert_array_equal(readings(trials[0], lattice).time_s, trials[0].read_time_s)
     assert lag_budget("LF_hip", trials, rng).feedback_age_s == pytest.approx(0.0, abs=1e-3)
@@ -85,7 +125,7 @@ def test_readings_that_are_never_held_are_dated_to_the_read():
 def test_fresh_readings_are_dated_to_the_poll_that_made_them():
     rng = np.random.default_rng(6)
     trials = tone_trials(0.04, rng, loss=0.2, quantum_rad=0.001)
-    read = readings(trials[3], find_poll_lattice(trials))
+    read = readings(trials[3], find_poll_lattice(trials, np.random.default_rng(0)))
     # identifiable data: at 4 Hz the reading tells the time at which the true motion had it
     late = 0.04 + LOOP_S / 2
     amplitude = 0.3 * np.sinc(4 * LOOP_S)

@@ -55,6 +55,12 @@ def test_the_pages_build_without_a_warning_and_name_every_command(tmp_path):
         assert name in commands
 
 
+def test_a_commands_own_commands_are_on_the_page_of_all_commands():
+    known = docs_conf.subcommands("pupper_sysid")
+    assert {"emulate", "emulate esp32", "emulate feetech", "sweep"} <= set(known)
+    assert docs_conf.subcommands("pupper_play") == []
+
+
 def test_pages_name_commands_and_options_that_exist():
     """Also those that need a robot, and so cannot be run here."""
     for path in [*DOCS.rglob("*.md"), ROOT / "README.md"]:

@@ -16,6 +16,7 @@ from servo_models.calibration import load_calibration
 from servo_models.servo_file import load_servo_model
 from sysid import fleet
 from sysid.fleet import QUANTITIES, UNLIKE, _unlike
+from sysid.servo_fleet import ServoSettings, fit_servo_fleet
 
 NAMES = tuple(QUANTITIES)
 SWEEP = ("sweep", "--freqs", "2,4", "--joints", "LF_hip", "--duration", "2")
@@ -79,6 +80,27 @@ def test_a_folder_becomes_a_servo_model_per_robot_and_one_table(sweeps, tmp_path
     assert code == 0 and "2 kept" in err
     other = "all" if counted == "fresh" else "fresh"
     assert "--force" in refused(capsys, cli.pupper_sysid, *arguments, "--readings", other)
+
+
+def test_a_robot_that_fails_now_is_not_shown_with_what_it_was_before(sweeps, tmp_path):
+    root, out = tmp_path / "robots", tmp_path / "out"
+    root.mkdir()
+    shutil.copy(sweeps / "r1.csv", root)
+    fleet.calibrate_fleet(root, out, fleet.Settings())
+    (root / "r1.csv").write_text("time,what\n1,2\n")
+    again = fleet.calibrate_fleet(root, out, fleet.Settings(), force=True)
+    assert again.failed == ["r1"] and again.table["robot"].to_list() == ["r1"]
+    assert again.table["problem"].iloc[0]
+
+
+def test_an_interrupted_training_is_not_kept_for_a_finished_one(sweeps, tmp_path, monkeypatch):
+    def stop(*arguments, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torch.optim.Adam.step", stop)
+    with pytest.raises(KeyboardInterrupt):
+        fit_servo_fleet(sweeps, tmp_path / "out", ServoSettings())
+    assert not (tmp_path / "out" / "r1").exists()
 
 
 def test_one_robot_alone_and_in_a_fleet_get_the_same_numbers(sweeps, tmp_path, capsys):

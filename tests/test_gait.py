@@ -325,3 +325,11 @@ def test_robots_that_stand_have_no_frequency_and_no_rhythm():
 def test_a_rollout_in_which_nobody_walked_for_long_is_not_described():
     with pytest.raises(InputError, match=r"No robot walked for 7 s: the longest was up for 6\.0 s"):
         describe(rollout([3.2, 3.3], fell_at={0: 6.0, 1: 3.0}), np.random.default_rng(0))
+
+
+def test_the_search_for_a_sine_keeps_to_its_band():
+    """Drift has its best sine below 0.5 Hz, which is no gait."""
+    drift = np.linspace(0.0, 1.0, 500)[:, None] ** 2
+    assert sine_frequency(drift, STEP_S) >= 0.5
+    fast = np.sin(2 * np.pi * 12.6 * STEP_S * np.arange(500))[:, None]
+    assert sine_frequency(fast, STEP_S) <= 12.5

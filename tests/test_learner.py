@@ -163,6 +163,15 @@ def test_a_loaded_learner_goes_on_exactly_as_the_one_that_was_saved(tmp_path, ki
         assert torch.equal(a, b)
 
 
+def test_it_learns_on_the_processor_though_the_machine_has_a_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    learner = make_learner(tiny_run(), Ranks())
+    learner.rollout()
+    learner.update()
+    devices = {p.device.type for p in learner.actor.parameters()}
+    assert devices == {learner.observations["policy"].device.type} == {"cpu"}
+
+
 def test_what_was_learned_can_be_taken_back():
     learner = make_learner(tiny_run(), Ranks())
     learner.rollout()
@@ -278,7 +287,7 @@ def test_what_is_no_checkpoint_or_of_another_version_or_incomplete_is_refused(tm
     good = torch.load(path, weights_only=True)
     for change, words in [
         ({"schema": "something else"}, "not a checkpoint"),
-        ({"schema_version": CHECKPOINT_VERSION + 1}, f"reads {CHECKPOINT_VERSION}"),
+        ({"schema_version": CHECKPOINT_VERSION + 1}, f"reads {CHECKPOINT_VERSION}). Upgrade"),
     ]:
         torch.save(good | change, path)
         assert words in refusal(path)

@@ -104,6 +104,13 @@ def test_readings_of_the_actuator_itself_fit():
     assert match.worst_gain_ratio == pytest.approx(1)
 
 
+def test_readings_are_those_of_the_robot_not_of_the_training():
+    late = replace(TRAINED, delay_s=0.024 + 2 * P)
+    match = compare(HeldEncoder(P, 4), TRAINED, P, late)
+    assert not match.fits and "40 ms later than the trained actuator" in match.sentence()
+    assert compare(HeldEncoder(P, 4), TRAINED, P, TRAINED).fits
+
+
 def test_the_papers_observer_does_not_fit_and_the_sentence_names_its_resonance():
     match = compare(SyntheticPD.paper(P), TRAINED, P)
     assert not match.fits

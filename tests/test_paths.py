@@ -63,6 +63,17 @@ def test_a_turn_on_the_spot_wanders_nowhere():
     assert np.isnan(found["drift"].value)
 
 
+def test_a_robot_that_fell_went_nowhere_and_says_nothing_of_drift():
+    rollout = walked((0.2, 0.0, 0.0), 0.2, 0.0, -0.06, robots=2)
+    rollout.alive[150:, 0] = False
+    found = _measured(rollout)
+    assert found["share"].value == pytest.approx(0.5, rel=0.01)
+    assert found["arc_rad_m"].value == pytest.approx(-0.3, rel=0.03)
+    rollout.alive[150:] = False
+    nobody = _measured(rollout)
+    assert nobody["share"].value == 0.0 and np.isnan(nobody["drift"].value)
+
+
 def waves(hz: float, ahead: float, steps: int) -> np.ndarray:
     """Actions of a trot, `ahead` of the plain one by so many cycles."""
     phase = hz * STEP * np.arange(steps)[:, None] + ahead
@@ -76,6 +87,15 @@ def test_the_shift_between_two_walks_is_that_of_their_phases(ahead):
         walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(3.1, a, steps)) for a in (0.0, ahead)
     )
     assert _shift(plain, pushed, 200, (1.0, 3.0), 0, 3.1) == pytest.approx(ahead, abs=0.01)
+
+
+def test_the_last_push_of_a_slow_gait_is_judged_by_what_there_is():
+    steps = round(10.0 / STEP)
+    plain, pushed = (
+        walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(0.6, a, steps)) for a in (0.0, 0.1)
+    )
+    # pushed after 5.5 s, its window would end after 10.5 s
+    assert _shift(plain, pushed, 275, (3.0, 5.0), 0, 0.6) == pytest.approx(0.1, abs=0.05)
 
 
 def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):

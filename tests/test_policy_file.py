@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 
-from cli.policy_choice import policy_at, simulator
+from cli.policy_choice import chosen_actuator, policy_at, simulator, trained_actuator
 from common.errors import FileExistsRefusal, InputError
 from common.files import sha256
 from common.joints import JOINT_NAMES
@@ -71,7 +71,7 @@ def test_a_policy_that_was_written_is_read_back_bit_for_bit(tmp_path, kind):
     assert contract.actuator_sha256 == sha256(Path(CALIBRATION))
 
 
-def test_a_policy_keeps_a_memory_per_robot_and_forgets_by_rows(tmp_path):
+def test_a_policy_keeps_a_memory_and_forgets_it_at_a_reset(tmp_path):
     write(tmp_path, "lstm")
     policy, fresh = load_policy(tmp_path), load_policy(tmp_path)
     start = np.zeros((2, 12))
@@ -80,10 +80,10 @@ def test_a_policy_keeps_a_memory_per_robot_and_forgets_by_rows(tmp_path):
     seen = np.random.default_rng(0).normal(size=(6, 2, 60))
     for row in seen[:5]:
         policy.act(row)
-    policy.reset_rows(np.array([1]), start[:1])
-    old, new = policy.act(seen[5]), fresh.act(seen[5])
-    np.testing.assert_allclose(old[1], new[1], atol=1e-6)
-    assert np.abs(old[0] - new[0]).max() > 1e-3
+    assert np.abs(policy.act(seen[5]) - fresh.act(seen[5])).max() > 1e-3
+    for one in (policy, fresh):
+        one.reset(start)
+    np.testing.assert_array_equal(policy.act(seen[5]), fresh.act(seen[5]))
 
 
 def test_a_policy_with_past_actions_remembers_its_own(tmp_path):
@@ -120,7 +120,8 @@ def test_weights_that_were_tampered_with_are_refused(tmp_path):
     ("change", "words"),
     [
         ({"schema": "pupper-servo"}, "schema"),
-        ({"schema_version": 2}, "schema_version"),
+        ({"schema_version": 2}, "Upgrade pupper-sysid"),
+        ({"schema_version": 0}, "schema_version"),
         ({"kind": "perceptron"}, "kind"),
         ({"hidden": []}, "does not fit"),
         ({"hidden": [32, 17]}, "does not fit"),
@@ -221,10 +222,33 @@ def test_the_gate_refuses_actions_that_overflow():
 )
 def test_a_policy_that_expects_another_observation_is_not_run(tmp_path, change):
     write(tmp_path)
-    simulator(load_policy(tmp_path), None, CALIBRATION, None)
+    simulator(tmp_path, load_policy(tmp_path), None, CALIBRATION, None)
     rewrite_contract(tmp_path, **change)
     with pytest.raises(InputError, match="observation is not the one"):
-        simulator(load_policy(tmp_path), None, CALIBRATION, None)
+        simulator(tmp_path, load_policy(tmp_path), None, CALIBRATION, None)
+
+
+def test_the_actuator_of_the_training_is_found_beside_a_policy_and_known_by_its_hash(
+    tmp_path, monkeypatch, capsys
+):
+    folder, elsewhere = tmp_path / "mine/policies/one", tmp_path / "elsewhere"
+    write(folder)
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    policy = load_policy(folder)
+    with pytest.raises(InputError, match=r"names the actuator calibrated\.yaml, which is not here"):
+        chosen_actuator(folder, policy, None, None)
+    original = Path(CALIBRATION).read_text()
+    Path("calibrated.yaml").write_text(original + "# of another robot\n")
+    assert trained_actuator(folder, policy, None) == ("calibrated.yaml", False)
+    assert chosen_actuator(folder, policy, None, None) == "calibrated.yaml"
+    assert "not the file with which" in " ".join(capsys.readouterr().err.split())
+    (tmp_path / "mine/calibrated.yaml").write_text(original)
+    found = str(tmp_path / "mine/calibrated.yaml")
+    assert trained_actuator(folder, policy, None) == (found, True)
+    assert chosen_actuator(folder, policy, None, "paper") == "paper"
+    assert simulator(folder, policy, None, None, None)[1].source == found
+    assert "not the file with which" not in " ".join(capsys.readouterr().err.split())
 
 
 def test_what_is_neither_run_nor_policy_is_refused(tmp_path):

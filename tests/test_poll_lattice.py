@@ -22,7 +22,10 @@ def test_a_servo_that_sticks_is_not_mistaken_for_a_bus_that_holds():
 
     assert len(fresh_rows(trial(False))) < 200
     asked = trial(True)
-    lattice, rows = find_poll_lattice([asked]), np.delete(np.arange(300), 40)
+    lattice, rows = (
+        find_poll_lattice([asked], np.random.default_rng(0)),
+        np.delete(np.arange(300), 40),
+    )
     assert lattice.kind == "every read" and fresh_rows(asked).tolist() == rows.tolist()
     # each at the time it was read, not somewhere between two reads
     assert np.allclose(readings(asked, lattice).time_s, asked.read_time_s[rows])

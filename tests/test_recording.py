@@ -1,5 +1,6 @@
 """Recordings: what is written is read back, and what cannot be used is refused in a sentence."""
 
+import json
 import threading
 from pathlib import Path
 
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 
 from common.errors import FileExistsRefusal, InputError
-from sysid.recording import RecordingWriter, load, newest_recording
+from common.files import sha256
+from sysid.recording import RecordingWriter, Truncation, load, newest_recording
 
 HEADER = "send_time_s,read_time_s,trial,joint,frequency_hz,command_rad,position_rad"
 
@@ -105,6 +107,10 @@ BAD = {
     "degrees": (changed(8, "position_rad", "45.0"), HEADER, "looks like degrees"),
     "another length": ([*rows()[:10], "0.5,0.5,0", *rows()[11:]], HEADER, "same number of values"),
     "unknown joint": (rows(joint="LF_hipp"), HEADER, "did you mean LF_hip"),
+    "a stray quote": (changed(3, "position_rad", '"0.1'), HEADER, "line 7"),
+    "semicolons": (
+        [r.replace(",", ";") for r in rows()], HEADER.replace(",", ";"), "separated by semicolons"),
+    "tones in a trial": (changed(30, "frequency_hz", "2.0"), HEADER, "its own trial number"),
     "column twice": (rows(), HEADER.replace("read_time_s", "send_time_s"), "stands twice"),
 }
 # fmt: on
@@ -148,6 +154,29 @@ def test_the_truth_beside_a_recording_is_not_taken_for_one(tmp_path):
         load(tmp_path / "a.truth.csv")
     with pytest.raises(InputError, match="pupper-sysid sweep"):
         newest_recording(tmp_path)
+
+
+def test_a_trial_that_had_hardly_begun_is_left_out(tmp_path):
+    last = "2.0,2.0005,1,LF_hip,2.0,0.0,0.0"
+    recording = load(write(tmp_path, [*rows(), last]))
+    assert len(recording.trials("LF_hip")) == 1
+    assert any("trial 1 of LF_hip is too short" in w for w in recording.warnings)
+
+
+def test_the_hash_is_that_of_the_bytes_whatever_wrote_them(tmp_path):
+    path = write(tmp_path, rows(), top=())
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())  # as spreadsheets save UTF-8
+    recording = load(path)
+    assert recording.sha256 == sha256(path)
+    # a table that this program did not write has no end to miss
+    assert recording.warnings == ()
+
+
+def test_each_trial_knows_how_its_bus_cut_commands(tmp_path):
+    bus = {"command_quantum_rad": {"LF_hip": 0.0057}, "command_rounding": {"LF_hip": "up"}}
+    top = ("# pupper-sysid recording", f"# bus: {json.dumps(bus)}")
+    (cut,) = load(write(tmp_path, rows(), top=top)).trials("LF_hip")
+    assert cut.truncation == Truncation(0.0057, "up")
 
 
 def test_missing_files_are_named(tmp_path):

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from policies import analysis_figures as figures
 from policies import perturbations
 from policies.perturbations import JOINTS
-from policies.robustness import _rate, ablation, delay_curve
+from policies.phase_reset import push_response
+from policies.robustness import Trial, _rate, ablation, delay_curve, frozen, orbits
+from policies.rollouts import Rollout
+from sim.servo_ranges import servo_ranges
+from sim.walking_config import Walking
 from sim.walking_env import OBSERVATION_PARTS as PARTS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -89,3 +95,86 @@ def test_joints_that_stand_apart_but_do_not_move_have_no_frequency():
     assert np.isnan(_rate(still, 0.02))
     swing = still + 0.1 * np.sin(2 * np.pi * 3.0 * 0.02 * np.arange(400))[:, None]
     assert _rate(swing, 0.02) == pytest.approx(3.0, abs=0.01)
+
+
+# ------------------------------------------------------------------ policies that do not walk
+
+
+def recorded(rollout: Rollout) -> Trial:
+    """A trial whose walks are all this one."""
+
+    class Recorded(Trial):
+        def walk(self, policy, change=None, disturb=None):
+            return rollout
+
+    return Recorded(Walking(), servo_ranges("ideal"), robots=rollout.alive.shape[1])
+
+
+def fallen(rollout: Rollout, robots: list[int], after_s: float) -> Rollout:
+    """The same walk, but these robots fell; what is recorded of them then is noise."""
+    alive, seen = rollout.alive.copy(), rollout.observation.copy()
+    at = round(after_s / rollout.step_s)
+    alive[at:, robots] = False
+    noise = np.random.default_rng(0).standard_normal(seen[at:, robots].shape)
+    seen[at:, robots] = 5 * noise
+    end = len(alive) if alive[-1].any() else at + 1  # a rollout ends when nobody is up
+    parts = {
+        f.name: getattr(rollout, f.name)[:end] for f in fields(rollout)
+        if isinstance(getattr(rollout, f.name), np.ndarray)
+    }  # fmt: skip
+    return replace(rollout, **parts | {"alive": alive[:end], "observation": seen[:end]})
+
+
+def test_replay_is_of_the_robots_that_walked_and_only_while_they_did(walker):
+    policy, trial = walker
+    plain = trial.walk(policy)
+    half = recorded(fallen(plain, [0], 3.0))
+    alone = recorded(replace_robots(plain, [1]))
+    for measure in (
+        lambda t: frozen(policy, t), lambda t: delay_curve(policy, t, (80,))[:1],
+        lambda t: orbits(policy, t, (0.0, 160.0))["actions"]["closure"],
+    ):  # fmt: skip
+        for one, other in zip(measure(half), measure(alone), strict=True):
+            assert one == pytest.approx(other, nan_ok=True, abs=1e-4)
+
+
+def replace_robots(rollout: Rollout, robots: list[int]) -> Rollout:
+    """The same walk of some of its robots."""
+    parts = {
+        f.name: getattr(rollout, f.name)[:, robots] for f in fields(rollout)
+        if isinstance(getattr(rollout, f.name), np.ndarray)
+    }  # fmt: skip
+    return replace(rollout, **parts)
+
+
+@pytest.mark.parametrize("after_s", [0.5, 3.0])
+def test_where_all_fell_there_are_no_numbers_and_no_crash(walker, after_s):
+    policy, trial = walker
+    gone = recorded(fallen(trial.walk(policy), [0, 1], after_s))
+    assert all(np.isnan(r["share"]) for r in frozen(policy, gone))
+    assert all(np.isnan(r["frequency_hz"]) for r in delay_curve(policy, gone, (0, 80)))
+    assert orbits(policy, gone, (0.0, 160.0)) == {} and push_response(policy, gone) == []
+    rows = ablation(policy, gone, ("last_action",))
+    assert all(np.isnan(r["correlation"]) for r in rows)
+    figures.ablation_figure({"fell": rows})
+    figures.gait_figure(gone.walk(policy))
+    figures.autonomy_figure(
+        {"fell": {"frozen": frozen(policy, gone), "push": [],
+                  "rate": [{"rate_hz": 50.0, "frequency_hz": float("nan")}]}}
+    )  # fmt: skip
+
+
+def test_a_policy_that_stands_has_no_orbit_and_no_phase(walker):
+    policy, trial = walker
+    plain = trial.walk(policy)
+    standing = recorded(replace(plain, action=np.zeros_like(plain.action)))
+    assert orbits(policy, standing, (0.0, 160.0)) == {} and push_response(policy, standing) == []
+    assert all(np.isnan(r["share"]) for r in frozen(policy, standing))
+    assert all(np.isnan(r["correlation"]) for r in ablation(policy, standing, ("last_action",)))
+
+
+def test_an_eighth_policy_is_drawn_as_well():
+    row = {"mode": "fixed", "extra_delay_ms": 0, "survival": 1.0, "frequency_hz": 3.0,
+           "amplitude_rad": 0.1}  # fmt: skip
+    figure = figures.delay_figure({f"policy {k}": [row] for k in range(9)})
+    assert [len(axes.lines) for axes in figure.axes] == [9, 9, 9]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import json
+import re
+import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +20,12 @@ import cli.pupper_sysid
 from servo_models.calibration import load_calibration
 from servo_models.delayed_pd import TIME_STEP_S
 from servo_models.held_feedback import HeldFeedback
-from sim.servo_mjcf import mujoco, rest_at
+from sim import simulator_export
+from sim.newton_export import export_newton
+from sim.servo_mjcf import INTEGRATOR, mujoco, rest_at
 from sim.simulator_export import (
+    EXPLICIT_PD,
+    MJLAB_PD,
     SIMULATORS,
     delays_at_step,
     to_isaaclab,
@@ -87,13 +94,13 @@ def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(c
         np.testing.assert_allclose(theirs, ours, atol=1e-6)
 
 
-def lags_s(calibration, step_s: float, frequency_hz: float = 3.0) -> np.ndarray:
-    """Lag of every exported servo behind a tone that a loop of 50 Hz commands."""
-    model = in_free_air(to_mjcf(calibration, step_s), calibration.joint_names)
+def lags_s(calibration, step_s: float, changed: Callable[[str], str] = str) -> np.ndarray:
+    """Lag of every exported servo behind a tone of 3 Hz that a loop of 50 Hz commands."""
+    model = in_free_air(changed(to_mjcf(calibration, step_s)), calibration.joint_names)
     data = mujoco.MjData(model)
     rest_at(model, data, [0.0] * model.nu)
     at = step_s * np.arange(round(3.0 / step_s))
-    turn, moved = 2 * np.pi * frequency_hz, []
+    turn, moved = 2 * np.pi * 3.0, []
     for now in at:
         data.ctrl[:] = 0.15 * np.sin(turn * 0.02 * np.floor(now / 0.02 + 1e-9))
         mujoco.mj_step(model, data)
@@ -113,6 +120,21 @@ def test_an_export_for_longer_steps_lags_as_long_as_the_calibration_says(calibra
     more = delays_at_step(calibration, 0.005)
     for name, joint in calibration.joints.items():
         assert 0.0015 < more[name].value_s - joint.actuator.delay_s.value < 0.004
+
+
+@pytest.mark.parametrize("engine", [EXPLICIT_PD, MJLAB_PD])
+def test_simulators_without_limited_set_points_get_the_lag_that_these_make(
+    calibration, engine, monkeypatch
+):
+    expected = lags_s(calibration, TIME_STEP_S)
+    monkeypatch.setattr(simulator_export, "delays_at_step", lambda *of: delays_at_step(*of, engine))
+
+    def as_they_do(text: str) -> str:
+        text = re.sub(r' slewmax="[^"]*"', "", text)
+        return text if engine.implicit else text.replace(INTEGRATOR, "Euler")
+
+    there = lags_s(calibration, 0.005, as_they_do)
+    np.testing.assert_allclose(there, expected, atol=1e-3)
 
 
 def _held(trial, at: np.ndarray) -> np.ndarray:
@@ -157,10 +179,8 @@ class _Recorder:
 def executed(text: str, package: str, name: str, recorder: _Recorder, monkeypatch) -> dict:
     parts = package.split(".")
     for k in range(len(parts)):
-        monkeypatch.setitem(
-            __import__("sys").modules, ".".join(parts[: k + 1]), types.ModuleType(parts[k])
-        )
-    setattr(__import__("sys").modules[package], name, recorder)
+        monkeypatch.setitem(sys.modules, ".".join(parts[: k + 1]), types.ModuleType(parts[k]))
+    setattr(sys.modules[package], name, recorder)
     space: dict[str, Any] = {}
     exec(compile(text, "exported.py", "exec"), space)
     return space
@@ -173,7 +193,7 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     text = to_isaaclab(calibration, 0.005)
     space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
     assert list(space["ACTUATORS"]) == list(calibration.joint_names)
-    delays = delays_at_step(calibration, 0.005)
+    delays = delays_at_step(calibration, 0.005, EXPLICIT_PD)
     for name, made in space["ACTUATORS"].items():
         own = calibration.joint(name).actuator
         assert made["joint_names_expr"] == [name]
@@ -190,7 +210,7 @@ def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibr
     text = to_mjlab(calibration, 0.005)
     space = executed(text, "mjlab.actuator", "BuiltinPositionActuatorCfg", recorder, monkeypatch)
     assert len(space["ACTUATORS"]) == 3
-    delays = delays_at_step(calibration, 0.005)
+    delays = delays_at_step(calibration, 0.005, MJLAB_PD)
     for made, (name, joint) in zip(space["ACTUATORS"], calibration.joints.items(), strict=True):
         assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value_s / 0.005)
         assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
@@ -269,7 +289,33 @@ def test_newton_networks_give_the_effort_of_the_pd(calibration, tmp_path, capsys
     assert effort.shape == (1, 1) and effort[0, 0] == pytest.approx(expected, rel=1e-6)
     contract = json.loads({p.key: p.value for p in model.metadata_props}["metadata"])
     assert contract["input_order"] == "pos_vel" and contract["sample_dt_s"] == 0.005
-    ast.parse((folder / "newton_actuators.py").read_text())
+
+
+def test_the_newton_module_finds_joints_by_name_behind_a_free_base(
+    calibration, tmp_path, monkeypatch
+):
+    pytest.importorskip("onnx")
+    export_newton(calibration, 0.005, tmp_path)
+    names = types.ModuleType("newton.actuators")
+    names.ClampingMaxEffort, names.DriveNeuralMLP = "clamp", "mlp"  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "newton", types.ModuleType("newton"))
+    monkeypatch.setitem(sys.modules, "newton.actuators", names)
+    space = {"__file__": str(tmp_path / "newton_actuators.py")}
+    exec((tmp_path / "newton_actuators.py").read_text(), space)
+    labels = ["robot/base_freejoint", *(f"robot/base/{n}" for n in calibration.joint_names)]
+    added: list[dict[str, Any]] = []
+    builder = types.SimpleNamespace(
+        joint_label=labels, joint_qd_start=[0, 6, 7, 8], joint_q_start=[0, 7, 8, 9],
+        joint_armature=[0.0] * 9, joint_friction=[0.0] * 9, joint_target_ke=[1.0] * 9,
+        joint_target_kd=[1.0] * 9, add_actuator=lambda drive, **given: added.append(given),
+    )  # fmt: skip
+    space["add_actuators"](builder)  # type: ignore[operator]
+    assert [(a["index"], a["pos_index"]) for a in added] == [(6, 7), (7, 8), (8, 9)]
+    own = calibration.joint("LF_hip").actuator
+    assert builder.joint_armature[6] == own.armature_kg_m2.value
+    builder.joint_label = labels[:2]
+    with pytest.raises(ValueError, match="joints are called"):
+        space["add_actuators"](builder)  # type: ignore[operator]
 
 
 def test_exports_are_written_by_name_and_never_over_something(capsys, tmp_path, monkeypatch):

@@ -176,6 +176,15 @@ def test_a_power_cut_in_a_long_imitation_does_not_lose_all_of_it(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_a_run_that_dies_in_its_first_round_can_be_resumed(tmp_path, uninterrupted, kind):
+    with pytest.raises(PowerCut):
+        train(tmp_path, tiny_run(kind), cut_power_after("imitation", 1))
+    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 0
+    train(tmp_path, None)
+    assert different(uninterrupted(kind), read_checkpoint(tmp_path / LAST)) == []
+
+
 def test_resuming_a_finished_run_changes_nothing(tmp_path):
     train(tmp_path, tiny_run())
     before = read_checkpoint(tmp_path / LAST)
@@ -392,6 +401,23 @@ def test_a_damaged_run_file_is_refused_and_nothing_in_it_is_run(tmp_path, monkey
     assert not (tmp_path / "made").exists()
 
 
+def test_a_setting_that_older_files_have_and_that_changed_nothing_is_passed_over(tmp_path):
+    old = with_settings(tmp_path, "task", "observation", "privileged_critic", False)
+    assert load_run(old) == tiny_run()
+
+
+@pytest.mark.parametrize(("name", "sees"), [("fast", True), ("paper", False), ("release", False)])
+def test_whether_the_critic_sees_the_truth_is_the_architectures_alone(name, sees):
+    assert preset(name, "mlp").architecture.privileged_critic is sees
+    assert not hasattr(preset(name, "mlp").task.observation, "privileged_critic")
+
+
+def test_a_newer_run_file_is_told_to_need_an_upgrade(tmp_path):
+    (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 2\nsettings: {}")
+    with pytest.raises(InputError, match="newer version.*Upgrade pupper-sysid"):
+        load_run(tmp_path)
+
+
 def test_settings_that_are_missing_take_their_defaults(tmp_path):
     (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 1\nsettings: {seed: 5}")
     assert plain(load_run(tmp_path)) == plain(replace(tiny_run().__class__(), seed=5))
@@ -404,6 +430,8 @@ def test_settings_that_are_missing_take_their_defaults(tmp_path):
         lambda: Hyperparameters(steps_per_environment=0),
         lambda: Architecture(memory=0),
         lambda: Architecture(critic_hidden=(8, -1)),
+        lambda: Imitation(minibatches=0),
+        lambda: Imitation(epochs=0),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(make):

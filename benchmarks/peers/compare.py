@@ -149,7 +149,7 @@ def off_truth(track: NDArray, case: Case) -> float:
 
 def peer_trials(case: Case, data: tuple[TrialData, ...], retimed: bool) -> list[PeerTrial]:
     """The joint's trials as a peer gets them; `retimed`: fresh readings at the times we found."""
-    trials, _ = joint_trials([case.recording], case.joint)
+    trials = joint_trials([case.recording], case.joint)
     given = []
     for trial, one in zip(trials, data, strict=True):
         start, seen = trial.send_time_s[0], np.isfinite(trial.position_rad)

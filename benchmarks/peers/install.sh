@@ -1,10 +1,13 @@
 #!/bin/sh
 # Environments for compare.py: one for the peers that run on this Python, one for BAM, which asks
 # for Python 3.12 (give another with PYTHON312=...). PyTorch and hardware drivers are left out.
+# One more for check_exports.py: Newton, which runs its export.
 set -eu
 cd "$(dirname "$0")"
 python3 -m venv .venv
 .venv/bin/pip install --quiet "mujoco[sysid]==4.0.0" "cmaes==0.13.1" "control==0.10.2" "scipy==1.17.1"
 "${PYTHON312:-python3.12}" -m venv .venv-bam
 .venv-bam/bin/pip install --quiet "better-actuator-models==1.0.2" "optuna==5.0.0" "cmaes==0.13.1" wandb
+python3 -m venv .venv-newton
+.venv-newton/bin/pip install --quiet "newton==1.8.0" "mujoco~=3.17.0" "mujoco-warp~=3.17.0" onnx warp-nn
 echo "Ready: .venv/bin/python benchmarks/peers/compare.py"
