@@ -33,6 +33,7 @@ from hardware.joint_map import JointMap, joint_map_from
 
 if TYPE_CHECKING:
     from hardware.connect import BusAddress
+    from hardware.guard import GuardedBus
 
 HANG_S = 1.0
 """Without a beat for so long, the driver counts as hung."""
@@ -218,17 +219,21 @@ def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = F
             continue
         guard = GuardedBus(bus, GuardLimits(park_within_s=PARK_WITHIN_S))
         try:
-            if only_limp:
-                if guard.torque(False):
-                    left = [name for name in left if name not in guard.joint_names]
-                continue
-            guard.take_over()
-            guard.park(np.array([pose_rad[name] for name in guard.joint_names]))
-        except PupperError:
-            guard.limp()
+            if not only_limp:
+                _take_home(guard, pose_rad)
+            if guard.torque(False):  # who does not confirm is not done with
+                left = [name for name in left if name not in guard.joint_names]
         finally:
             guard.close()
-        left = [name for name in left if name not in guard.joint_names]
+
+
+def _take_home(guard: GuardedBus, pose_rad: dict[str, float]) -> None:
+    """Park the joints of this bus where they were found, or let them go if that cannot be."""
+    try:
+        guard.take_over()
+        guard.park(np.array([pose_rad[name] for name in guard.joint_names]))
+    except PupperError:
+        guard.limp()
 
 
 def _answering(address: BusAddress, servo_map: JointMap | None, joints: list[str]) -> list[str]:

@@ -15,12 +15,13 @@ import pytest
 from servo_servers import bench_of, moving_servos, on_a_port, on_a_socket, still_servos
 
 from common.errors import SafetyStop
-from common.joints import JOINT_NAMES
-from hardware import feetech_line, watchdog
+from common.joints import DEFAULT_POSE, JOINT_NAMES
+from hardware import connect, feetech_line, watchdog
 from hardware.connect import BusAddress, open_guarded, parse_address
 from hardware.guard import GuardedBus
 from hardware.joint_map import load_joint_map
 from hardware.watchdog import Watchdog
+from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import draw_robot
 from sim.esp32_emulator import ProxyEmulator
 from sim.servo_bench import ServoBench
@@ -172,6 +173,21 @@ def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monke
         watchdog.park(orders, dict.fromkeys(layout.joint_names, 0.0))
     assert dict(bench_of(servos).torques) == dict.fromkeys(there, False)
     assert bench_of(servos).goals == []
+
+
+def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monkeypatch):
+    asked: list[bool] = []
+
+    class Deaf(EmulatedBus):
+        def torque(self, on: bool) -> bool:
+            asked.append(on)
+            return super().torque(on) and (on or len(asked) > 45)
+
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(connect, "open_bus", lambda *of: Deaf(draw_robot(rng), rng))
+    orders = {"kind": "esp32", "where": "", "baud": None, "map": None, "coordinates": "servo"}
+    watchdog.park(orders, DEFAULT_POSE)
+    assert len(asked) > 45 and not asked[-1]
 
 
 def test_a_driver_without_its_watchdog_does_not_go_on():
