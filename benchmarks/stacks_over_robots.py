@@ -1,8 +1,8 @@
 """Closed loop on stale encoders against a servo model's prediction, over robots.
 
-    .venv/bin/python benchmarks/stacks_over_robots.py --robots 6
+    .venv/bin/python benchmarks/stacks_over_robots.py --robots 4
 
-Every emulated robot has servos of its own and a servo model of its own, fitted to 40 s of its own
+Every emulated robot has servos of its own and a servo model of its own, fitted to 30 s of its own
 walk. The shipped LSTM then walks it in three directions, once shown the readings, once shown what
 the servo model predicts, both smoothed alike. Errors are compared robot by robot.
 """
@@ -23,12 +23,12 @@ from policies.policy_file import load_policy
 from policies.stack_trials import Walker, compare_stacks, walk_once
 from policies.stacks import STACKS
 from sysid.recording import RecordingWriter, load
-from sysid.servo_fit import fit_servo, save_fit
+from sysid.servo_fit import Split, fit_servo, save_fit
 
 POLICY, ACTUATOR = Path("data/samples/policies/lstm"), "data/samples/calibrated.yaml"
 COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 ERRORS = {"mae_vx_m_s": "forward m/s", "mae_vy_m_s": "sideways m/s", "mae_yaw_rad_s": "turn rad/s"}
-_LEARN_S = 40.0
+_LEARN_S = 30.0
 
 
 def servo_model(policy, seed: int, folder: Path) -> Path:
@@ -36,17 +36,24 @@ def servo_model(policy, seed: int, folder: Path) -> Path:
     path, out = folder / f"walk{seed}.csv", folder / f"servo{seed}"
     about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
     with RecordingWriter(path, about) as rows:
-        walk_once(policy, STACKS["closed-loop"], COMMANDS[0], _LEARN_S, seed, ACTUATOR, rows=rows)
+        walk_once(
+            policy, STACKS["closed-loop"], COMMANDS[0], _LEARN_S + 5, seed, ACTUATOR, rows=rows
+        )
         rows.close({})
     recording = load(path)
-    save_fit(out, fit_servo([recording], recording.joints), [recording], 0)
+    split = Split(
+        f"trained on the first {_LEARN_S:g} s, tested on the rest",
+        lambda number, elapsed, group: elapsed < _LEARN_S,
+        lambda number, elapsed, group: elapsed >= _LEARN_S,
+    )
+    save_fit(out, fit_servo([recording], recording.joints, split=split), [recording], 0)
     return out
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", type=int, default=6)
+    parser.add_argument("--robots", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=10.0)
     options = parser.parse_args()
     torch.set_num_threads(1)
