@@ -5,8 +5,8 @@
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with what `tests/test_simulator_export.py`
 holds the exports against. mjlab's delay buffer is run with the exported settings, and with the ones
-that its documentation suggests. Where `install.sh` has been run, Newton runs its export: a tone
-through servos behind a floating base, against our own simulation.
+that its documentation suggests. Where `install.sh` has been run, Newton and mjlab run their exports:
+a tone through servos behind a floating base, against our own simulation.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from servo_models.calibration import load_calibration
+from servo_models.calibration import Calibration, load_calibration
 from servo_models.delayed_pd import TIME_STEP_S
 from sim.newton_export import export_newton
-from sim.simulator_export import EXPLICIT_PD, delays_at_step
+from sim.simulator_export import EXPLICIT_PD, MJLAB_PD, delays_at_step, to_mjlab
 from sysid.tone import fit_phasor
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-NEWTON = HERE / ".venv-newton/bin/python"
 CALIBRATED = str(ROOT / "data/samples/calibrated.yaml")
-NEWTON_STEP_S, TONE_HZ = 0.005, 3.0
+STEP_S, TONE_HZ = 0.005, 3.0
+ENGINES = {"newton": EXPLICIT_PD, "mjlab": MJLAB_PD}
 
 _CLASSES = {
     "isaaclab": ("actuators/", ("ActuatorBaseCfg", "IdealPDActuatorCfg", "DelayedPDActuatorCfg")),
@@ -95,40 +96,61 @@ def delivered(root: Path, **settings) -> list[int]:
     return given
 
 
-def tone_in_newton(folder: Path) -> None:
-    """Print gain and lag of a tone in Newton and in our own simulation."""
+def tone(step_s: float) -> tuple[NDArray, NDArray]:
+    """Times of steps, and what a loop of 50 Hz commands of a tone in each."""
+    at = step_s * np.arange(round(3.0 / step_s))
+    return at, 0.15 * np.sin(2 * np.pi * TONE_HZ * 0.02 * np.floor(at / 0.02 + 1e-9))
+
+
+def phasors(at: NDArray, moved: NDArray) -> list[complex]:
+    """Of each joint's steady motion, shape (steps, joints)."""
+    late = at > 1.0
+    return [fit_phasor(at[late], m, TONE_HZ) for m in moved[late].T]
+
+
+def ran(simulator: str, calibration: Calibration, folder: Path) -> list[complex]:
+    """What a simulator makes of the tone with its export."""
+    at, commands = tone(STEP_S)
+    exported = folder / f"{simulator}_export"
+    if simulator == "newton":
+        export_newton(calibration, STEP_S, exported)
+    else:
+        exported.write_text(to_mjlab(calibration, STEP_S))
+    each = np.repeat(commands[:, None], len(calibration.joint_names), axis=1)
+    np.savez(folder / "commands.npz", command=each, step_s=STEP_S)
+    subprocess.run(
+        [HERE / f".venv-{simulator}/bin/python", HERE / f"in_{simulator}.py", exported,
+         "commands.npz", "out.npz"],
+        cwd=folder, check=True, capture_output=True,
+    )  # fmt: skip
+    return phasors(at + STEP_S, np.load(folder / "out.npz")["position"])
+
+
+def print_tones(folder: Path) -> None:
+    """Print gain and lag of the tone in each simulator that is installed, and in our own."""
     calibration = load_calibration(CALIBRATED)
-    found = []
-    for step_s in (NEWTON_STEP_S, TIME_STEP_S):
-        at = step_s * np.arange(round(3.0 / step_s))
-        tone = 0.15 * np.sin(2 * np.pi * TONE_HZ * 0.02 * np.floor(at / 0.02 + 1e-9))
-        command = np.repeat(tone[:, None], len(calibration.joint_names), axis=1)
-        if step_s == TIME_STEP_S:
-            servo = calibration.delayed_pd()
-            servo.reset(np.zeros(command.shape[1]))
-            moved = servo.rollout(command)
-        else:
-            export_newton(calibration, step_s, folder / "export")
-            np.savez(folder / "commands.npz", command=command, step_s=step_s)
-            subprocess.run(
-                [NEWTON, HERE / "in_newton.py", "export", "commands.npz", "out.npz"],
-                cwd=folder, check=True, capture_output=True,
-            )  # fmt: skip
-            moved = np.load(folder / "out.npz")["position"]
-        late = at > 1.0
-        found.append([fit_phasor(at[late] + step_s, m, TONE_HZ) for m in moved[late].T])
-    delays = delays_at_step(calibration, NEWTON_STEP_S, EXPLICIT_PD)
+    at, commands = tone(TIME_STEP_S)
+    servo = calibration.delayed_pd()
+    servo.reset(np.zeros(len(calibration.joint_names)))
+    told = np.repeat(commands[:, None], servo.batch[0], axis=1)
+    ours = phasors(at + TIME_STEP_S, servo.rollout(told))
     print(
-        f"\n| {TONE_HZ:g} Hz, steps of {1e3 * NEWTON_STEP_S:g} ms | amplitude in Newton | ours "
-        "| lag ms in Newton | ours | delay rounded to steps by |\n|---|---|---|---|---|---|"
+        f"\n| {TONE_HZ:g} Hz, steps of {1e3 * STEP_S:g} ms | joint | amplitude | ours | lag ms "
+        "| ours | delay rounded to steps by |\n|---|---|---|---|---|---|---|"
     )
-    for name, there, here in zip(calibration.joint_names, *found, strict=True):
-        turn = 2 * np.pi * TONE_HZ
-        lags = [1e3 * (-np.angle(1j * p) % (2 * np.pi)) / turn for p in (there, here)]
-        exact = delays[name].value_s
-        rounded = 1e3 * (NEWTON_STEP_S * round(exact / NEWTON_STEP_S) - exact)
-        print(f"| {name} | {abs(there):.4f} | {abs(here):.4f} | {lags[0]:.1f} | {lags[1]:.1f} | "
-              f"{rounded:+.1f} |")  # fmt: skip
+    for simulator, engine in ENGINES.items():
+        if not (HERE / f".venv-{simulator}").exists():
+            continue
+        delays = delays_at_step(calibration, STEP_S, engine)
+        theirs = ran(simulator, calibration, folder)
+        for name, there, here in zip(calibration.joint_names, theirs, ours, strict=True):
+            turn, exact = 2 * np.pi * TONE_HZ, delays[name].value_s
+            lags = [1e3 * (-np.angle(1j * p) % (2 * np.pi)) / turn for p in (there, here)]
+            rounded = 1e3 * (STEP_S * round(exact / STEP_S) - exact)
+            print(
+                f"| {simulator} | {name} | {abs(there):.4f} | {abs(here):.4f} | {lags[0]:.1f} "
+                f"| {lags[1]:.1f} | {rounded:+.1f} |"
+            )
 
 
 def main() -> None:
@@ -162,8 +184,7 @@ def main() -> None:
         ):
             ages = [k - g for k, g in enumerate(delivered(folder / "mjlab", **settings))][20:30]
             print(f"| {', '.join(f'{k}={v}' for k, v in settings.items())} | {ages} |")
-        if NEWTON.exists():
-            tone_in_newton(folder)
+        print_tones(folder)
     sys.exit(1 if bad else 0)
 
 

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Environments for compare.py: one for the peers that run on this Python, one for BAM, which asks
 # for Python 3.12 (give another with PYTHON312=...). PyTorch and hardware drivers are left out.
-# One more for check_exports.py: Newton, which runs its export.
+# Two more for check_exports.py: Newton and mjlab, which run their exports.
 set -eu
 cd "$(dirname "$0")"
 python3 -m venv .venv
@@ -10,4 +10,6 @@ python3 -m venv .venv
 .venv-bam/bin/pip install --quiet "better-actuator-models==1.0.2" "optuna==5.0.0" "cmaes==0.13.1" wandb
 python3 -m venv .venv-newton
 .venv-newton/bin/pip install --quiet "newton==1.8.0" "mujoco~=3.17.0" "mujoco-warp~=3.17.0" onnx warp-nn
+python3 -m venv .venv-mjlab
+.venv-mjlab/bin/pip install --quiet "torch==2.13.0" && .venv-mjlab/bin/pip install --quiet "mjlab==1.6.0"
 echo "Ready: .venv/bin/python benchmarks/peers/compare.py"
