@@ -5,8 +5,8 @@
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with what `tests/test_simulator_export.py`
 holds the exports against. mjlab's delay buffer is run with the exported settings, and with the ones
-that its documentation suggests. Where `install.sh` has been run, Newton and mjlab run their exports:
-a tone through servos behind a floating base, against our own simulation.
+that its documentation suggests. Where `install.sh` has been run, Newton and mjlab run their
+exports: a tone through servos behind a floating base, against our own simulation.
 """
 
 from __future__ import annotations
