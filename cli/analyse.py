@@ -164,4 +164,4 @@ class Bode:
             terminal.out.print(Text(joint, "bold"))
             terminal.out.print(response.summary(), soft_wrap=True)
         if self.plot:
-            terminal.err.print(f"Wrote {self.plot}.")
+            terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)

@@ -16,7 +16,7 @@ JOINTS_FILE = Path("joints.yaml")
 def chosen_map(text: str | None) -> JointMap | None:
     """The joint map a user names (a file or a preset), else `joints.yaml` if it is here."""
     if text is None and JOINTS_FILE.exists():
-        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.")
+        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.", soft_wrap=True)
         return load_joint_map(JOINTS_FILE)
     if text is None:
         return None

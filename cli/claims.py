@@ -73,7 +73,7 @@ def write_claims(options: Analyze, tries: Tries) -> None:
     for c in found:
         shown.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
     out.print(shown)
-    err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.")
+    err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.", soft_wrap=True)
 
 
 def _say(what: str) -> None:

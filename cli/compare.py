@@ -79,4 +79,4 @@ class Compare:
             parts = [f"{n} {terminal.ms(made['models'][n]['mean'][key])}" for n in names]
             terminal.out.print(f"Mean, {title}: {', '.join(parts)}", soft_wrap=True)
         terminal.warn(found.notes)
-        terminal.err.print(f"Wrote {self.plot}.")
+        terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)

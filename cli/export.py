@@ -59,7 +59,7 @@ class Export:
         if self.json:
             terminal.print_json({"written": str(target)})
         else:
-            terminal.err.print(f"Wrote {target}.")
+            terminal.err.print(f"Wrote {target}.", soft_wrap=True)
 
     def _policy(self, folder: Path) -> Path:
         if self.to not in ("onnx", "torchscript"):

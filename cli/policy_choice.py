@@ -59,7 +59,7 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
         )
     for name in ("policy_best", "policy_last"):
         if (path / name / CONTRACT).is_file():
-            err.print(f"Taking {path / name}.")
+            err.print(f"Taking {path / name}.", soft_wrap=True)
             return load_policy(path / name), load_run(path)
     raise InputError(
         f"{path} has no policy yet. Train on: pupper-train --resume {path} (the first is written "

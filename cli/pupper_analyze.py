@@ -124,7 +124,7 @@ def _run(options: Analyze) -> None:
         print_json(found | {"picture": str(picture)})
     else:
         out.print(table)
-        err.print(f"Picture: {picture}")
+        err.print(f"Picture: {picture}", soft_wrap=True)
 
 
 def _tries(paths: Sequence[Path], options: Analyze) -> Tries:

@@ -280,7 +280,7 @@ def _walk(
     for key, value in found.items():
         shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)
-    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}")
+    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -182,7 +182,7 @@ class _Screen:
         """Finish the video."""
         if self._writer is not None:
             self._writer.close()
-            err.print(f"Wrote {self._path}.")
+            err.print(f"Wrote {self._path}.", soft_wrap=True)
         if self._viewer is not None:
             self._viewer.close()
 

@@ -109,7 +109,9 @@ def _run(options: Options, given: list[str]) -> None:
     if options.resume is not None and not options.resume.is_dir():
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
     if ranks.rank == 0:
-        err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
+        err.print(
+            f"{'Going on with' if options.resume else 'Training into'} {folder}.", soft_wrap=True
+        )
     with _bar() as watch:
         if options.resume:
             train(folder, None, watch, *_extension(options, given))

@@ -35,7 +35,7 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
     chosen = list(paths)
     if not chosen:
         chosen = [newest_recording()]
-        err.print(f"Taking the newest recording, {chosen[0]}.")
+        err.print(f"Taking the newest recording, {chosen[0]}.", soft_wrap=True)
     recordings = [load(path) for path in chosen]
     for recording in recordings:
         warn(f"{recording.name}: {text}" for text in recording.warnings)
