@@ -38,6 +38,9 @@ _LONGEST_S = 0.12
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 _ALL_FRESH = 0.97
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
+_SHUFFLES = 12
+# each costs as much as the search: where the first few leave no doubt there are no more
+_FEWEST_SHUFFLES, _CLEAR = 4, 20.0
 
 
 @dataclass(frozen=True)
@@ -143,9 +146,7 @@ def quantum(trials: Sequence[Trial]) -> float:
     return refined if np.max(np.abs(steps - counts * refined)) < 0.1 * refined else 0.0
 
 
-def find_poll_lattice(
-    trials: Sequence[Trial], rng: np.random.Generator, shuffles: int = 12
-) -> PollLattice:
+def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> PollLattice:
     """Period, loss and phases of the poll behind one joint's readings.
 
     Parameters
@@ -154,7 +155,6 @@ def find_poll_lattice(
         All of one joint.
     rng : numpy.random.Generator
         Shuffles the gaps between changes: a lattice must explain them better than that.
-    shuffles : int
 
     Returns
     -------
@@ -180,8 +180,14 @@ def find_poll_lattice(
     grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * BLUR_S / _STRETCH_S))
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
     period, score = best_period(informative, grid)
-    null = [best_period([shuffled(s, rng) for s in informative], grid)[1] for _ in range(shuffles)]
-    z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
+    null: list[float] = []
+    z_score = 0.0
+    for _ in range(_SHUFFLES):
+        null.append(best_period([shuffled(s, rng) for s in informative], grid)[1])
+        if len(null) >= _FEWEST_SHUFFLES:
+            z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
+            if not 0 <= z_score <= _CLEAR:
+                break
 
     phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
     loss, _ = _loss(trials, phases)
