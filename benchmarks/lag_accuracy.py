@@ -29,6 +29,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from common.errors import InputError
 from common.joints import JOINT_NAMES
 from sim.emulated_bus import EmulatedBus
 from sim.emulated_robot import EmulatedRobot, draw_robot, random_spec
@@ -57,8 +58,8 @@ class Result:
     kind: str
 
 
-def measure(seed: int) -> Result:
-    """Build, sweep and measure one robot."""
+def measure(seed: int) -> Result | None:
+    """Build, sweep and measure one robot; None if its servo is refused, because it is stuck."""
     rng = np.random.default_rng([20261121, seed])
     # reading noise up to what the recordings of a real robot scatter by, 11 to 14 mrad
     noise = float(rng.uniform(0.001, 0.014))
@@ -70,7 +71,10 @@ def measure(seed: int) -> Result:
         record(bus, plan("sine", [joint], parse_frequencies("1-10")), path)
         trials = load(path).trials(joint)
     lattice = find_poll_lattice(trials, np.random.default_rng(0))
-    budget = lag_budget(joint, trials, np.random.default_rng(seed), lattice)
+    try:
+        budget = lag_budget(joint, trials, np.random.default_rng(seed), lattice)
+    except InputError:
+        return None
 
     tones, clean = [], []
     for trial in trials:
@@ -205,4 +209,5 @@ if __name__ == "__main__":
     given = parser.parse_args()
     with ProcessPoolExecutor(given.workers) as pool:
         found = list(pool.map(measure, range(given.robots), chunksize=4))
-    print(table(found))
+    print(table([r for r in found if r]))
+    print(f"Refused, because the servo has more friction than torque: {found.count(None)}.")

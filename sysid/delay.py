@@ -38,6 +38,7 @@ LONGEST_LAG_S = 0.5
 
 _BLOCK_S = 0.5  # of the bootstrap where there are no periods
 _ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
+_MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
 _FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
 
@@ -145,6 +146,12 @@ def lag_budget(
     tones = [t for t in tones if t is not None]
     warnings: list[str] = []
     if tones:
+        moved = max(abs(t.response) for t in tones)
+        if moved < _MOVES:
+            raise InputError(
+                f"{joint}: it moved by {100 * moved:.0f} % of what it was told at best, so there "
+                "is no lag to measure. Was its torque on, and does it turn freely?"
+            )
         naive = _slope(tones, "naive_rows")
         fresh = _slope(tones, "fresh_rows")
         lag = _slope(tones, "fresh_held")

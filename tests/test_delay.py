@@ -148,6 +148,13 @@ def test_fresh_rows_skip_missing_readings():
     assert not np.isin(fresh_rows(gap), np.arange(10, 20)).any()
 
 
+def test_a_servo_that_is_stuck_has_no_lag():
+    rng = np.random.default_rng(13)
+    stuck = tone_trials(0.04, rng, gain=0.02, quantum_rad=0.0, noise_rad=0.003)
+    with pytest.raises(InputError, match="moved by 2 % of what it was told"):
+        lag_budget("LF_hip", stuck, rng)
+
+
 def test_one_frequency_is_said_to_leave_the_period_open():
     rng = np.random.default_rng(9)
     b = lag_budget("LF_hip", tone_trials(0.04, rng, (2.0,), duration_s=6.0), rng)
