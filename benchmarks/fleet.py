@@ -59,7 +59,7 @@ def main() -> None:
             begun = time.perf_counter()
             fleet = calibrate_fleet(root, Path(name) / f"out{jobs}", Settings(), jobs)
             took = time.perf_counter() - begun
-            odd = fleet.table[fleet.table["unlike"] != ""]
+            odd = fleet.table.query("problem == '' and unlike != ''")
             named = ", ".join(f"{r.robot} ({r.unlike})" for r in odd.itertuples()) or "nobody"
             print(
                 f"| {jobs} | {options.robots} | {took:.0f} | {took / options.robots:.2f} | "
