@@ -161,7 +161,7 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
             warnings.append(f"trial {trial:g} of {joint} is too short to use and was left out.")
         elif len(rows) < _LEAST_ROWS:
             warnings.append(f"trial {trial:g} of {joint} has only {len(rows)} rows.")
-    usable = ~pd.MultiIndex.from_frame(table[["joint", "trial"]]).isin(short)
+    usable = ~pd.MultiIndex.from_arrays([table["joint"], table["trial"]]).isin(short)
     if usable.sum() < _LEAST_ROWS:
         raise InputError(
             f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed to say "
