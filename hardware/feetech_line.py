@@ -292,6 +292,7 @@ def _sdk_port(device: str, baud: int) -> Any:
             self.ser = serial.Serial(
                 self.port_name, cflag_baud, timeout=_POLL_S, write_timeout=0.5, exclusive=True
             )
+            # a help where the adapter's driver has it; an emulated line and some adapters do not
             with contextlib.suppress(ValueError, NotImplementedError, *PORT_ERRORS):
                 self.ser.set_low_latency_mode(True)
             self.is_open = True

@@ -27,7 +27,7 @@ from joblib import Parallel, delayed, parallel_config
 
 from common.errors import InputError, PupperError
 from common.files import sha256, write_text
-from servo_models.calibration import Calibration, load_calibration
+from servo_models.calibration import load_calibration
 from sysid.calibrate import calibrate
 from sysid.calibration_file import STALL_TORQUE_NM, STALL_TORQUE_SOURCE, to_calibration
 from sysid.recording import load
@@ -82,10 +82,6 @@ class Fleet:
     made: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     problems: dict[str, str] = field(default_factory=dict)
-
-    def usable(self, targets: Iterable[Path]) -> list[Path]:
-        """Those of `targets` that stand for their recordings; a failed robot's may be older."""
-        return [t for t in targets if _called(t) in {*self.kept, *self.made}]
 
     def tabulate(
         self, rows: Sequence[dict[str, Any]], quantities: Sequence[str], out: Path
@@ -167,34 +163,28 @@ def calibrate_fleet(
         If there is no recording, or the cluster cannot be reached.
     """
     targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
-    fleet = run_fleet(
-        targets,
-        lambda target, path: _is_of(target, path, settings),
-        partial(_calibrated, settings=settings),
+    return run_fleet(
+        targets, lambda target, path: _is_of(target, path, settings),
+        partial(_calibrated, settings=settings), _numbers, tuple(QUANTITIES), out,
         jobs, cluster, force, progress,
     )  # fmt: skip
-    rows = []
-    for path in fleet.usable(targets.values()):
-        calibration: Calibration = load_calibration(path)
-        rows += [
-            {"robot": _called(path), "joint": name}
-            | {key: value(joint) for key, value in QUANTITIES.items()}
-            for name, joint in calibration.joints.items()
-        ]
-    fleet.tabulate(rows, tuple(QUANTITIES), out)
-    return fleet
 
 
 def run_fleet(
     targets: Mapping[Path, Path],
     is_of: Callable[[Path, Path], bool],
     make: Callable[[Path, Path], None],
+    numbers: Callable[[Path], Mapping[str, dict[str, float]]],
+    quantities: Sequence[str],
+    out: Path,
     jobs: int,
     cluster: str | None,
     force: bool,
     progress: Callable[[str], None] | None,
 ) -> Fleet:
-    """Make what is missing of `targets`, here or on a cluster; problems are told, not raised.
+    """Make what is missing of `targets`, here or on a cluster, and the table of all.
+
+    Problems of single robots are told in it, not raised.
 
     Parameters
     ----------
@@ -204,6 +194,11 @@ def run_fleet(
         `(target, path) -> bool`: whether an existing target was made so from this recording.
     make : callable
         `(path, target) -> None`; must be picklable.
+    numbers : callable
+        By joint of a target: what the table has of it, by `quantities`.
+    quantities : sequence of str
+    out : Path
+        Folder for the table.
     jobs, cluster, force, progress
         As for `calibrate_fleet`.
 
@@ -234,6 +229,17 @@ def run_fleet(
                 fleet.problems[name] = problem
             if progress:
                 progress(name)
+    # a robot that failed may have an older target: its numbers would not be this recording's
+    usable = [t for t in targets.values() if _called(t) in {*fleet.kept, *fleet.made}]
+    fleet.tabulate(
+        [
+            {"robot": _called(target), "joint": joint} | row
+            for target in usable
+            for joint, row in numbers(target).items()
+        ],
+        quantities,
+        out,
+    )
     return fleet
 
 
@@ -254,6 +260,12 @@ def _is_of(target: Path, path: Path, settings: Settings) -> bool:
         and made.seed == settings.seed
         and scales == {settings.stall_torque_nm}
     )
+
+
+def _numbers(target: Path) -> dict[str, dict[str, float]]:
+    """What the table has of each joint of a calibration."""
+    joints = load_calibration(target).joints
+    return {j: {k: value(joint) for k, value in QUANTITIES.items()} for j, joint in joints.items()}
 
 
 def _calibrated(path: Path, target: Path, settings: Settings) -> None:

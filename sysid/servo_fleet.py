@@ -54,22 +54,20 @@ def fit_servo_fleet(
     Parameters and errors as for `sysid.fleet.calibrate_fleet`.
     """
     targets = {path: out / name for path, name in robots_in(root).items()}
-    fleet = run_fleet(
-        targets,
-        lambda target, path: _is_of(target, path, settings),
-        partial(_fitted, settings=settings),
+    return run_fleet(
+        targets, lambda target, path: _is_of(target, path, settings),
+        partial(_fitted, settings=settings), _numbers, tuple(QUANTITIES), out,
         jobs, cluster, force, progress,
     )  # fmt: skip
-    rows = []
-    for folder in fleet.usable(targets.values()):
-        for joint, known in load_servo_model(folder).contract.joints.items():
-            errors = {name: known.scores.get(key) for name, key in QUANTITIES.items()}
-            rows.append(
-                {"robot": folder.name, "joint": joint}
-                | {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
-            )
-    fleet.tabulate(rows, tuple(QUANTITIES), out)
-    return fleet
+
+
+def _numbers(target: Path) -> dict[str, dict[str, float]]:
+    """What the table has of each joint of a model; NaN where it has no such score."""
+    found = {}
+    for joint, known in load_servo_model(target).contract.joints.items():
+        errors = {name: known.scores.get(key) for name, key in QUANTITIES.items()}
+        found[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
+    return found
 
 
 def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
