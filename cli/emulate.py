@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -67,11 +67,11 @@ class Esp32(Common):
         rng = np.random.default_rng(self.seed)
         bench = _bench(self, draw_robot(rng), load_joint_map("mini_pupper_2"), rng)
         emulator = ProxyEmulator(bench, rng, BusFaults.parse(self.faults, rng))
-        server = ProxySocket(emulator, self.socket)
-        _write_truth(self, bench)
-        name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
-        what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
-        _serve(server, f"{what} at {self.socket}.", name, self.walking)
+        with closing(ProxySocket(emulator, self.socket)) as server:
+            _write_truth(self, bench)
+            name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
+            what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
+            _serve(server, f"{what} at {self.socket}.", name, self.walking)
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,11 @@ class Feetech(Common):
             bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
             BusFaults.parse(self.faults, rng), self.echo,
         )  # fmt: skip
-        with _imu_beside(bench, self.imu_socket, rng):
-            server = FeetechPty(emulator, self.link or Path(tempfile.mkdtemp()) / "servos")
+        link = self.link or Path(tempfile.mkdtemp()) / "servos"
+        with (
+            _imu_beside(bench, self.imu_socket, rng),
+            closing(FeetechPty(emulator, link)) as server,
+        ):
             _write_truth(self, bench)
             what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
             what += f"; IMU at {self.imu_socket}." if self.imu_socket else "."
@@ -151,15 +154,14 @@ def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) 
     shown = ServoBench(
         polled, load_joint_map("mini_pupper_2"), rng.spawn(1)[0], keep_log=False, plant=bench.plant
     )
-    server = ProxySocket(ImuProxy(shown, rng.spawn(1)[0]), path)
-    thread = threading.Thread(target=server.serve, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        server.stop()
-        thread.join()
-        server.close()
+    with closing(ProxySocket(ImuProxy(shown, rng.spawn(1)[0]), path)) as server:
+        thread = threading.Thread(target=server.serve, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            server.stop()
+            thread.join()
 
 
 def _write_truth(options: Common, bench: ServoBench) -> None:
@@ -183,11 +185,8 @@ def _serve(
         f"In another terminal:\n{sweep}  pupper-sysid monitor --bus {bus}\nCtrl-C ends it.",
         soft_wrap=True,
     )
-    try:
-        with real_time_priority():  # bytes that come late would look like a slow servo
-            server.serve()
-    finally:
-        server.close()
+    with real_time_priority():  # bytes that come late would look like a slow servo
+        server.serve()
 
 
 def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:

@@ -153,6 +153,21 @@ def test_an_emulator_says_what_to_type_and_ends_on_request(tmp_path, kind):
     assert truth["joints"]["LF_hip"]["actuator"]["delay_s"] > 0
 
 
+@pytest.mark.parametrize("kind", [("feetech", "--link"), ("esp32", "--socket")])
+def test_an_emulator_that_never_gets_to_serve_leaves_no_device(capsys, monkeypatch, kind):
+    Path("t.yaml").write_text("of another robot")
+    code, _, err = run(capsys, "emulate", *kind, "s", "--truth", "t.yaml")
+    assert code == 2 and "t.yaml exists" in err
+    assert list(Path().iterdir()) == [Path("t.yaml")]
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cli.terminal.out.print", interrupted)
+    code, _, err = run(capsys, "emulate", *kind, "s")
+    assert code == 1 and "Stopped." in err and list(Path().iterdir()) == [Path("t.yaml")]
+
+
 def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "cli.pupper_sysid", "emulate", "feetech", "--walking",
