@@ -11,27 +11,18 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from random_robots import sweep_random_robot
 
-from common.joints import JOINT_NAMES
 from servo_models.delayed_pd import TIME_STEP_S
-from servo_models.step_size import delay_at_step
-from sim.emulated_bus import EmulatedBus
-from sim.emulated_robot import draw_robot, random_spec
-from sim.free_air_servo import PHYSICS_STEP_S
 from sysid.calibrate import calibrate
-from sysid.excitation import parse_frequencies, plan
-from sysid.recorder import record
-from sysid.recording import load
 
 
 @dataclass(frozen=True)
@@ -48,19 +39,10 @@ class Result:
 def measure(seed: int, tones: str) -> Result:
     """Build, sweep and calibrate one robot."""
     rng = np.random.default_rng([20261123, seed])
-    spec = random_spec(
-        rng, loss=float(rng.uniform(0.0, 0.5)), reading_noise_rad=float(rng.uniform(0.002, 0.012))
-    )
-    joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
-    robot = draw_robot(rng, spec)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "sweep.csv"
-        record(EmulatedBus(robot, rng), plan("sine", [joint], parse_frequencies(tones)), path)
-        recording = load(path)
-    dead = calibrate([recording], [joint], workers=1)[joint].dead_time
-    servo = robot.servos[JOINT_NAMES.index(joint)].actuator
-    truth = float(delay_at_step(servo, TIME_STEP_S, PHYSICS_STEP_S)[0])
-    return Result(spec.loss, truth, dead.value, dead.low, dead.high)
+    loss, noise = float(rng.uniform(0.0, 0.5)), float(rng.uniform(0.002, 0.012))
+    robot = sweep_random_robot(rng, loss, noise, tones)
+    dead = calibrate([robot.recording], [robot.joint], workers=1)[robot.joint].dead_time
+    return Result(loss, robot.dead_time_s(TIME_STEP_S), dead.value, dead.low, dead.high)
 
 
 def main() -> None:

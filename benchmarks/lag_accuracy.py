@@ -19,27 +19,18 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from random_robots import sweep_random_robot
 
 from common.errors import InputError
-from common.joints import JOINT_NAMES
-from sim.emulated_bus import EmulatedBus
-from sim.emulated_robot import EmulatedRobot, draw_robot, random_spec
-from sim.free_air_servo import FreeAirServo
-from sim.servo_plant import FreeAirServos
 from sysid.delay import lag_budget, tone_lags, tone_weights
-from sysid.excitation import parse_frequencies, plan
-from sysid.poll_lattice import Readings, find_poll_lattice, readings
-from sysid.recorder import record
-from sysid.recording import Trial, load
+from sysid.poll_lattice import find_poll_lattice, readings
 from sysid.tone import tone_response
 
 
@@ -63,16 +54,11 @@ def measure(seed: int) -> Result | None:
     rng = np.random.default_rng([20261121, seed])
     # reading noise up to what the recordings of a real robot scatter by, 11 to 14 mrad
     noise = float(rng.uniform(0.001, 0.014))
-    spec = random_spec(rng, loss=float(rng.uniform(0.0, 0.6)), reading_noise_rad=noise)
-    joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
-    bus = WitnessedBus(draw_robot(rng, spec), rng, joint)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "sweep.csv"
-        record(bus, plan("sine", [joint], parse_frequencies("1-10")), path)
-        trials = load(path).trials(joint)
+    robot = sweep_random_robot(rng, float(rng.uniform(0.0, 0.6)), noise, "1-10")
+    trials = robot.recording.trials(robot.joint)
     lattice = find_poll_lattice(trials, np.random.default_rng(0))
     try:
-        budget = lag_budget(joint, trials, np.random.default_rng(seed), lattice)
+        budget = lag_budget(robot.joint, trials, np.random.default_rng(seed), lattice)
     except InputError:
         return None
 
@@ -82,7 +68,9 @@ def measure(seed: int) -> Result | None:
         if tone is None:
             continue
         tones.append(tone)
-        clean.append(tone_response(trial, bus.motion(trial), np.random.default_rng(0), draws=2))
+        clean.append(
+            tone_response(trial, robot.bus.motion(trial), np.random.default_rng(0), draws=2)
+        )
     frequency = np.array([t.frequency_hz for t in tones])
     lags = tone_lags(np.array([t.response for t in clean]), frequency)
     speed = np.array([abs(t.command_held) for t in tones]) * 2 * np.pi * frequency
@@ -95,65 +83,12 @@ def measure(seed: int) -> Result | None:
     for name in estimates:  # the others measure from rows: give them the command hold
         estimates[name] -= budget.command_hold_s
     return Result(
-        spec.loss, truth, information**-0.5,
+        robot.spec.loss, truth, information**-0.5,
         sum(1 / t.lag_variance_s2 for t in np.array(tones)[used]) ** -0.5,
         budget.lag.low, budget.lag.high,
         estimates | {"hold-aware (default)": budget.lag.value},
-        abs(lattice.period_s - spec.poll_period_s), lattice.kind,
+        abs(lattice.period_s - robot.spec.poll_period_s), lattice.kind,
     )  # fmt: skip
-
-
-class RememberingServo(FreeAirServo):
-    """A servo that can also be asked where it was a little earlier."""
-
-    def __init__(self, *arguments):
-        super().__init__(*arguments)
-        self._past: dict[int, tuple[float, float]] = {}
-
-    def position_at(self, time_s: float) -> float:
-        """True position at `time_s`, however long ago."""
-        step = int(np.ceil(time_s / self._dt - 1e-9))
-        if step < self._step and step in self._past:
-            position, velocity = self._past[step]
-            return position - velocity * (step * self._dt - time_s)
-        now = super().position_at(time_s)
-        self._past[self._step] = (float(self._data.qpos[0]), float(self._data.qvel[0]))
-        return now
-
-
-class WitnessedServos(FreeAirServos):
-    """Servos in free air, one of which remembers."""
-
-    def __init__(self, robot: EmulatedRobot, witnessed: int):
-        super().__init__(robot)
-        rest = robot.joint_map.rest_pose()[witnessed]
-        self._servos[witnessed] = RememberingServo(robot.servos[witnessed].actuator, float(rest))
-
-
-class WitnessedBus(EmulatedBus):
-    """An emulated bus that writes down where one joint is, every millisecond."""
-
-    def __init__(self, robot: EmulatedRobot, rng: np.random.Generator, joint: str):
-        self._witnessed = JOINT_NAMES.index(joint)
-        self._servos = WitnessedServos(robot, self._witnessed)
-        super().__init__(robot, rng, plant=self._servos)
-        self.time: list[float] = []
-        self.position: list[float] = []
-
-    def sleep_until(self, time_s: float) -> None:
-        """Look at the joint on the way."""
-        start = self.time[-1] + 1e-3 if self.time else 0.0
-        super().sleep_until(time_s)
-        for now in np.arange(start, self.now(), 1e-3):
-            self.time.append(float(now))
-            self.position.append(self._servos.angle(self._witnessed, float(now)))
-
-    def motion(self, trial: Trial) -> Readings:
-        """The joint's true motion during `trial`."""
-        time, position = np.array(self.time), np.array(self.position)
-        inside = (time >= trial.send_time_s[0]) & (time <= trial.send_time_s[-1])
-        time, position = time[inside], position[inside]
-        return Readings(np.arange(len(time)), time, position, time, 0.0)
 
 
 def table(results: list[Result]) -> str:

@@ -75,7 +75,8 @@ class FitServo:
     def run(self) -> None:
         """Fit, score, save, print."""
         from sysid.recording import Recording
-        from sysid.servo_fit import ServoFit, fit_servo, save_fit, to_json
+        from sysid.servo_fit import ServoFit, fit_servo
+        from sysid.servo_fit_file import save_fit, to_json
 
         split = self._split()
         if len(self.recordings) == 1 and self.recordings[0].is_dir():

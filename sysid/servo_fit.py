@@ -10,19 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import InputError
-from common.files import versions
 from common.joints import DEFAULT_POSE
-from servo_models.calibration import utc_now
 from servo_models.interface import ServoModel
 from servo_models.recurrent_network import RecurrentNetwork
-from servo_models.servo_file import input_names, save_servo_model
 from sysid import servo_scores as scores
 from sysid.network_fit import Learned, fit_network, past_ticks
 from sysid.physics_fit import (
@@ -160,7 +156,7 @@ class ServoFit:
             said = f"The {name} is worse than the linear model on this data {span}."
         else:
             said = f"The {name} is not better than the linear model on this data {span}."
-        floor = _mean(list(self.repeatability.values()))
+        floor = scores.mean_known(list(self.repeatability.values()))
         if np.isfinite(floor):
             said += (
                 f" The robot repeats itself to {1e3 * floor:.1f} mrad; the model is "
@@ -283,98 +279,6 @@ def _with_two_groups(data: ServoData, part: Part) -> ServoData:
     place[used] = np.arange(len(used))
     runs = {j: tuple(replace(r, group=place[r.group]) for r in own) for j, own in data.runs.items()}
     return replace(data, runs=runs, groups=tuple(data.groups[g] for g in used))
-
-
-def save_fit(
-    folder: Path, fit: ServoFit, recordings: Sequence[Recording], seed: int, force: bool = False
-) -> None:
-    """Save the model with its contract: what it was fitted to, how, and how good it is.
-
-    Raises
-    ------
-    InputError
-        If the folder has a model and `force` is not given, or cannot be written.
-    """
-    found = to_json(fit, 0.0)["joints"]
-    save_servo_model(
-        folder,
-        fit.parameters,
-        {
-            "arch": fit.arch, "preset": fit.preset, "created": utc_now(),
-            "time_step_s": fit.data.period_s,
-            "inputs": input_names(fit.parameters, fit.feedback),
-            "feedback": fit.feedback, "warm_up": fit.warm_up,
-            "joints": {
-                j: {
-                    "scores": {k: _known(v) for k, v in entry.items() if k.endswith("_rad")},
-                    "band_noise_rad": _known(entry["band_noise_rad"]) or 0.0,
-                    "band_timing_s": _known(entry["band_timing_s"]) or 0.0,
-                    "readings": fit.readings[j],
-                }
-                for j, entry in found.items()
-            },
-            "readings_counted": fit.data.modes, "split": fit.split.name,
-            "choices": {k: float(v) for k, v in fit.choices.items()},
-            "recordings": [{"name": r.name, "sha256": r.sha256} for r in recordings],
-            "seed": seed, "versions": versions("torch", "safetensors"),
-            "notes": [fit.verdict, *fit.notes],
-        },
-        force,
-    )  # fmt: skip
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def to_json(fit: ServoFit, elapsed_s: float) -> dict[str, Any]:
-    """Object of `fit-servo --json`."""
-    joints = {j: _joint_json(fit, j) for j in fit.data.joints}
-    keys = [k for k, v in next(iter(joints.values())).items() if isinstance(v, float)]
-    mean = {k: _mean([entry[k] for entry in joints.values()]) for k in keys}
-    ours, linear = fit.scored[fit.arch], fit.scored["linear"]
-    return {
-        "arch": fit.arch,
-        "preset": fit.preset,
-        "elapsed_s": elapsed_s,
-        "split": fit.split.name,
-        "readings_counted": fit.data.modes,
-        "groups": list(fit.data.groups),
-        "time_step_s": fit.data.period_s,
-        "choices": fit.choices,
-        "mean": mean
-        | {
-            "rmse_free_run_interval_rad": list(ours.interval),
-            "linear_interval_rad": list(linear.interval),
-            "difference_to_linear_interval_rad": list(fit.difference[1:]),
-            "coverage_of_90_percent_band": fit.coverage,
-        },
-        "joints": joints,
-        "verdict": fit.verdict,
-        "notes": list(fit.notes),
-    }
-
-
-def _joint_json(fit: ServoFit, joint: str) -> dict[str, float]:
-    own = fit.scored[fit.arch].errors[joint]
-    noise, timing = fit.band[joint]
-    return {
-        "rmse_one_step_rad": scores.rms(own.one_step),
-        "rmse_free_run_rad": scores.rms(own.free_run),
-        "rmse_held_rad": scores.rms(own.held),
-        "rmse_raw_rad": scores.rms(own.raw),
-        "linear_rmse_rad": fit.scored["linear"].free_run(joint),
-        "delayed_pd_rmse_rad": fit.scored["delayed-pd"].free_run(joint),
-        "persistence_rmse_rad": fit.persistence[joint],
-        "repeatability_rad": fit.repeatability[joint],
-        "band_noise_rad": noise,
-        "band_timing_s": timing,
-    }
-
-
-def _mean(values: Sequence[float]) -> float:
-    known = [v for v in values if np.isfinite(v)]
-    return float(np.mean(known)) if known else float("nan")
 
 
 # ------------------------------------------------------------------------------- fitting

@@ -17,7 +17,8 @@ from servo_models.servo_file import load_servo_model
 from sysid.fleet import Fleet, robots_in, run_fleet
 from sysid.recording import load
 from sysid.servo_data import servo_data
-from sysid.servo_fit import EACH_GROUP_IN_TURN, Split, fit_servo, save_fit
+from sysid.servo_fit import EACH_GROUP_IN_TURN, Split, fit_servo
+from sysid.servo_fit_file import save_fit
 
 QUANTITIES = {
     "free_run_mrad": "rmse_free_run_rad",

@@ -126,6 +126,13 @@ def rms(values: ArrayLike) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
+def mean_known(values: ArrayLike) -> float:
+    """Mean of the finite values; NaN if there are none."""
+    values = np.asarray(values, float)
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")
+
+
 def persistence(data: ServoData, part: Part) -> dict[str, float]:
     """RMS [rad] of "it stays where it was last read", per joint."""
     found = {}

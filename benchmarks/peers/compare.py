@@ -18,34 +18,26 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# lag_accuracy's witness is used here, too
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from exchange import STEP_S, dump
 from exchange import Trial as PeerTrial
-from lag_accuracy import WitnessedBus
 from numpy.typing import NDArray
+from random_robots import SweptRobot, sweep_random_robot
 
-from common.joints import JOINT_NAMES
-from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from servo_models.step_size import delay_at_step
-from sim.emulated_robot import draw_robot, random_spec
-from sim.free_air_servo import PHYSICS_STEP_S
+from servo_models.delayed_pd import TIME_STEP_S
 from sysid.calibrate import calibrate, joint_trials
-from sysid.excitation import parse_frequencies, plan
 from sysid.ladder import rung
 from sysid.ladder_fit import leave_one_out_folds
 from sysid.model_scores import rms, score
 from sysid.output_error import TrialData, look_up, positions
-from sysid.recorder import record
 from sysid.recording import Recording, load
 
 HERE = Path(__file__).parent
@@ -72,13 +64,11 @@ class Case:
     recording: Recording
     joint: str
     motion: list[NDArray] | None = None
-    servo: DelayedPDParameters | None = None
+    robot: SweptRobot | None = None
 
     def dead_time_s(self, step_s: float) -> float:
         """The servo's own, as a simulation in such steps has to have it; NaN if unknown."""
-        if self.servo is None:
-            return float("nan")
-        return float(delay_at_step(self.servo, step_s, PHYSICS_STEP_S)[0])
+        return float("nan") if self.robot is None else self.robot.dead_time_s(step_s)
 
 
 @dataclass(frozen=True)
@@ -100,23 +90,15 @@ class Outcome:
 def emulated(seed: int) -> Case:
     """A robot of its own, one of its joints swept at 1, 2, 4 and 8 Hz."""
     rng = np.random.default_rng([20261122, seed])
-    spec = random_spec(
-        rng, loss=float(rng.uniform(0.0, 0.5)), reading_noise_rad=float(rng.uniform(0.002, 0.012))
-    )
-    joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
-    robot = draw_robot(rng, spec)
-    bus = WitnessedBus(robot, rng, joint)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "sweep.csv"
-        record(bus, plan("sine", [joint], parse_frequencies("1,2,4,8")), path)
-        recording = load(path)
+    loss, noise = float(rng.uniform(0.0, 0.5)), float(rng.uniform(0.002, 0.012))
+    robot = sweep_random_robot(rng, loss, noise, "1,2,4,8")
+    bus = robot.bus
     motion = []
-    for trial in recording.trials(joint):
+    for trial in robot.recording.trials(robot.joint):
         steps = int(np.ceil((trial.read_time_s[-1] - trial.send_time_s[0]) / TIME_STEP_S)) + 3
         edges = trial.send_time_s[0] + TIME_STEP_S * np.arange(steps)
         motion.append(np.interp(edges, bus.time, bus.position) - trial.initial_command_rad)
-    servo = robot.servos[JOINT_NAMES.index(joint)].actuator
-    return Case(f"robot {seed}", recording, joint, motion, servo)
+    return Case(f"robot {seed}", robot.recording, robot.joint, motion, robot)
 
 
 def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:

@@ -1,0 +1,104 @@
+"""Random emulated robots, swept as a user would, whose true motion and delay are known."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.joints import JOINT_NAMES
+from servo_models.delayed_pd import DelayedPDParameters
+from servo_models.step_size import delay_at_step
+from sim.emulated_bus import EmulatedBus
+from sim.emulated_robot import EmulatedRobot, RobotSpec, draw_robot, random_spec
+from sim.free_air_servo import PHYSICS_STEP_S, FreeAirServo
+from sim.servo_plant import FreeAirServos
+from sysid.excitation import parse_frequencies, plan
+from sysid.poll_lattice import Readings
+from sysid.recorder import record
+from sysid.recording import Recording, Trial, load
+
+
+@dataclass(frozen=True)
+class SweptRobot:
+    """A robot that was swept, and what it really is."""
+
+    spec: RobotSpec
+    joint: str
+    servo: DelayedPDParameters
+    recording: Recording
+    bus: WitnessedBus
+
+    def dead_time_s(self, step_s: float) -> float:
+        """The joint's own, as a simulation in such steps has to have it."""
+        return float(delay_at_step(self.servo, step_s, PHYSICS_STEP_S)[0])
+
+
+def sweep_random_robot(
+    rng: np.random.Generator, loss: float, reading_noise_rad: float, tones: str
+) -> SweptRobot:
+    """Draw a robot with such readings and sweep one of its joints, chosen by lot."""
+    spec = random_spec(rng, loss=loss, reading_noise_rad=reading_noise_rad)
+    joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
+    robot = draw_robot(rng, spec)
+    bus = WitnessedBus(robot, rng, joint)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sweep.csv"
+        record(bus, plan("sine", [joint], parse_frequencies(tones)), path)
+        recording = load(path)
+    return SweptRobot(spec, joint, robot.servos[JOINT_NAMES.index(joint)].actuator, recording, bus)
+
+
+class RememberingServo(FreeAirServo):
+    """A servo that can also be asked where it was a little earlier."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self._past: dict[int, tuple[float, float]] = {}
+
+    def position_at(self, time_s: float) -> float:
+        """True position at `time_s`, however long ago."""
+        step = int(np.ceil(time_s / self._dt - 1e-9))
+        if step < self._step and step in self._past:
+            position, velocity = self._past[step]
+            return position - velocity * (step * self._dt - time_s)
+        now = super().position_at(time_s)
+        self._past[self._step] = (float(self._data.qpos[0]), float(self._data.qvel[0]))
+        return now
+
+
+class WitnessedServos(FreeAirServos):
+    """Servos in free air, one of which remembers."""
+
+    def __init__(self, robot: EmulatedRobot, witnessed: int):
+        super().__init__(robot)
+        rest = robot.joint_map.rest_pose()[witnessed]
+        self._servos[witnessed] = RememberingServo(robot.servos[witnessed].actuator, float(rest))
+
+
+class WitnessedBus(EmulatedBus):
+    """An emulated bus that writes down where one joint is, every millisecond."""
+
+    def __init__(self, robot: EmulatedRobot, rng: np.random.Generator, joint: str):
+        self._witnessed = JOINT_NAMES.index(joint)
+        self._servos = WitnessedServos(robot, self._witnessed)
+        super().__init__(robot, rng, plant=self._servos)
+        self.time: list[float] = []
+        self.position: list[float] = []
+
+    def sleep_until(self, time_s: float) -> None:
+        """Look at the joint on the way."""
+        start = self.time[-1] + 1e-3 if self.time else 0.0
+        super().sleep_until(time_s)
+        for now in np.arange(start, self.now(), 1e-3):
+            self.time.append(float(now))
+            self.position.append(self._servos.angle(self._witnessed, float(now)))
+
+    def motion(self, trial: Trial) -> Readings:
+        """The joint's true motion during `trial`."""
+        time, position = np.array(self.time), np.array(self.position)
+        inside = (time >= trial.send_time_s[0]) & (time <= trial.send_time_s[-1])
+        time, position = time[inside], position[inside]
+        return Readings(np.arange(len(time)), time, position, time, 0.0)
