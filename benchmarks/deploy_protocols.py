@@ -67,8 +67,8 @@ def robot(kind: str, folder: Path, stop) -> None:
         server.stop()
 
 
-def servo_model(folder: Path) -> Path:
-    """Servo networks of this robot, from walks of it that were recorded before."""
+def servo_model(folder: Path, seed: int) -> Path:
+    """Servo networks of one robot, from walks of it that were recorded before."""
     policy = load_policy(POLICIES / "lstm")
     recordings = []
     for name, command in DIRECTIONS.items():
@@ -76,7 +76,7 @@ def servo_model(folder: Path) -> Path:
         about = {"bus": {"kind": "emulated walking robot", "coordinates": "servo"}}
         with RecordingWriter(path, about) as rows:
             walk_once(
-                policy, STACKS["closed-loop"], command, _RECORD_S, SEED, CALIBRATION, rows=rows
+                policy, STACKS["closed-loop"], command, _RECORD_S, seed, CALIBRATION, rows=rows
             )
             rows.close({})
         recordings.append(path)
@@ -149,7 +149,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
-        servo = options.servo or servo_model(Path(name))
+        servo = options.servo or servo_model(Path(name), SEED)
         print(
             "| protocol | policy, stack | direction | s | fell | forward m/s | sideways m/s | "
             "turn rad/s | misses | step p50 ms | p99 ms | replay | ended |"

@@ -135,7 +135,7 @@ class Bode:
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     plot: Path | None = None
-    """Also draw the Bode plot into this PNG file."""
+    """Also draw the Bode plot into this PNG or SVG file."""
     force: bool = False
     """Replace the plot if it exists."""
     json: bool = False

@@ -1,6 +1,7 @@
 """`pupper-analyze claims`: every published claim beside what is found here, as two pages.
 
 `claims.md` is for a repository, `claims.html` for reading: one file with its pictures inside.
+Beside them lie the pictures as PNG and SVG and the tables as CSV.
 """
 
 from __future__ import annotations
@@ -20,27 +21,32 @@ from common.files import refuse_overwrite, sha256, versions, write_text
 if TYPE_CHECKING:
     from cli.pupper_analyze import Analyze, Tries
     from common.claims import Claim
+    from common.page import Picture, Section
     from policies.evidence import PolicyEvidence
     from sysid.servo_claims import ServoEvidence
 
 PAGE, REPORT = "claims.md", "claims.html"
 PICTURES = (
-    "sweep.png", "gait-lstm.png", "gait-mlp.png", "orbits.png", "late.png", "ablation.png",
-    "delay.png", "autonomy.png", "terrain.png", "compliance.png", "servos.png",
+    "sweep", "gait-lstm", "gait-mlp", "orbits", "late", "ablation", "delay", "autonomy", "terrain",
+    "compliance", "servos",
 )  # fmt: skip
 """All that may be drawn; which are depends on the evidence."""
+TABLES = ("claims", "table_one", "inputs")
 _STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 
 
 def write_claims(options: Analyze, tries: Tries) -> None:
     """Gather, judge, draw and write."""
+    from common.page import write_page
     from policies.claims import judge
     from policies.evidence import KINDS, gather
     from sysid import servo_claims
 
     page, report = options.folder / PAGE, options.folder / REPORT
-    for name in (PAGE, REPORT, *PICTURES):  # before hours of work, not after them
+    figures = [f"figures/{name}{ending}" for name in PICTURES for ending in (".png", ".svg")]
+    tables = [f"tables/{name}.csv" for name in TABLES]
+    for name in (PAGE, REPORT, *figures, *tables):  # before hours of work, not after them
         refuse_overwrite(options.folder / name, options.force)
     for name, policy, _ in tries:
         if policy.contract.kind not in KINDS:
@@ -56,16 +62,20 @@ def write_claims(options: Analyze, tries: Tries) -> None:
         evidence.append(gather(name, policy, trial, run_folder(path), say))
     stacks = _stacks(options, say)
     found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
-    pictures = _draw(options.folder, evidence, robot, options.force)
+    pictures = _draw(evidence, robot)
     inputs = _inputs(options, tries)
     text = _page(found, evidence, pictures, inputs, options)
     write_text(page, text, options.force)
-    write_text(report, _report(found, evidence, pictures, inputs, options), options.force)
+    write_page(
+        report, _TITLE, _tally(found), _sections(found, evidence, pictures, inputs, options),
+        options.force,
+    )  # fmt: skip
     if options.json:
         print_json(
             {
                 "claims": [asdict(c) for c in found], "page": str(page), "report": str(report),
-                "pictures": list(pictures), "inputs_sha256": inputs, "versions": versions(*_MORE),
+                "pictures": [_file(p) for p in pictures], "inputs_sha256": inputs,
+                "versions": versions(*_MORE),
             }
         )  # fmt: skip
         return
@@ -113,77 +123,76 @@ def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.
     return found
 
 
-def _draw(
-    folder: Path, evidence: list[PolicyEvidence], robot: ServoEvidence, force: bool
-) -> dict[str, str]:
-    """The pictures; file name to caption."""
-    from common.figure_style import save
+def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]:
+    """What can be shown of the evidence."""
+    from common.page import Picture
     from policies import analysis_figures as figures
     from policies.evidence import DELAYS_MS
     from sysid.figures import sweep_figure
     from sysid.servo_figures import compare_figure
 
-    made: dict[str, tuple[Any, str]] = {}
+    made: list[Picture] = []
     if robot.sweep is not None:
         joint = robot.sweep.joints[-1]
         trials = [t for t in robot.sweep.trials(joint) if np.isfinite(t.frequency_hz)]
-        made["sweep.png"] = (
-            sweep_figure(trials),
-            "As the paper's figure 2: commands and readings by frequency. Faint ones are old.",
-        )
+        caption = "As the paper's figure 2: commands and readings by frequency. Faint ones are old."
+        made.append(Picture("sweep", caption, sweep_figure(trials)))
     for kind in ("lstm", "mlp"):
         first = next((e for e in evidence if e.kind == kind), None)
         if first:
-            made[f"gait-{kind}.png"] = (
-                figures.gait_figure(first.walk), f"As figure 4: the gait of {first.name}.",
-            )  # fmt: skip
-    moving = [e for e in evidence if e.orbits]
-    shown = _one_per_kind(moving)
+            caption = f"As figure 4: the gait of {first.name}."
+            made.append(Picture(f"gait-{kind}", caption, figures.gait_figure(first.walk)))
+    shown = _one_per_kind([e for e in evidence if e.orbits])
     if shown:
-        made["orbits.png"] = (
-            figures.orbit_figure(
-                {f"{e.name} {k}": v["orbits"] for e in shown for k, v in e.orbits.items()},
-                DELAYS_MS,
+        orbits = {f"{e.name} {k}": v["orbits"] for e in shown for k, v in e.orbits.items()}
+        late = {e.name: e.orbits["actions"]["states"] for e in shown}
+        made += [
+            Picture(
+                "orbits",
+                "As figure 5: orbits of actions and hidden states, joints late by 0, 160, 320 ms.",
+                figures.orbit_figure(orbits, DELAYS_MS),
             ),
-            "As figure 5: orbits of actions and hidden states, joints late by 0, 160, 320 ms.",
-        )
-        made["late.png"] = (
-            figures.delay_trace_figure(
-                {e.name: e.orbits["actions"]["states"] for e in shown}, DELAYS_MS,
-                shown[0].walk.step_s,
+            Picture(
+                "late",
+                "As figure 6: the LF thigh's action in replay with late joints.",
+                figures.delay_trace_figure(late, DELAYS_MS, shown[0].walk.step_s),
             ),
-            "As figure 6: the LF thigh's action in replay with late joints.",
-        )  # fmt: skip
+        ]
     every = _one_per_kind(evidence)
-    made["ablation.png"] = (
-        figures.ablation_figure({e.name: e.ablation for e in every}),
-        "As figure 7a: correlation of actions against noise in all that comes from the joints.",
-    )
-    made["delay.png"] = (
-        figures.delay_figure({e.name: e.delay for e in every}),
-        "Closed loop and replay against more delay, which the paper shows in replay only.",
-    )
-    made["autonomy.png"] = (
-        figures.autonomy_figure(
-            {e.name: {"frozen": e.frozen, "push": e.push, "rate": e.rate} for e in every}
+    own_rhythm = {e.name: {"frozen": e.frozen, "push": e.push, "rate": e.rate} for e in every}
+    made += [
+        Picture(
+            "ablation",
+            "As figure 7a: correlation of actions against noise in all that comes from the joints.",
+            figures.ablation_figure({e.name: e.ablation for e in every}),
         ),
-        "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
-    )
-    made["terrain.png"] = (
-        figures.terrain_figure({e.name: e.terrain for e in every}), "Other ground.",
-    )  # fmt: skip
-    made["compliance.png"] = (
-        figures.compliance_figure({e.name: e.compliance for e in every}),
-        "As figure 7b: where one robot goes in six directions in ten seconds.",
-    )
+        Picture(
+            "delay",
+            "Closed loop and replay against more delay, which the paper shows in replay only.",
+            figures.delay_figure({e.name: e.delay for e in every}),
+        ),
+        Picture(
+            "autonomy",
+            "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
+            figures.autonomy_figure(own_rhythm),
+        ),
+        Picture("terrain", "Other ground.",
+                figures.terrain_figure({e.name: e.terrain for e in every})),
+        Picture(
+            "compliance",
+            "As figure 7b: where one robot goes in six directions in ten seconds.",
+            figures.compliance_figure({e.name: e.compliance for e in every}),
+        ),
+    ]  # fmt: skip
     if robot.servos is not None:
-        made["servos.png"] = (
-            compare_figure(robot.servos),
-            "As the extension's figure: four ways to say where a servo will be, unseen loop.",
-        )
-    for name, (figure, _) in made.items():
-        save(figure, folder / name, force)
-    return {name: caption for name, (_, caption) in made.items()}
+        caption = "As the extension's figure: four ways to say where a servo will be, unseen loop."
+        made.append(Picture("servos", caption, compare_figure(robot.servos)))
+    return made
+
+
+def _file(picture: Picture) -> str:
+    """Where a page finds its picture."""
+    return f"figures/{picture.name}.png"
 
 
 def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
@@ -192,7 +201,7 @@ def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
 
 
 def _page(
-    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str],
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
     inputs: dict[str, str], options: Analyze,
 ) -> str:  # fmt: skip
     """The report as Markdown."""
@@ -211,19 +220,19 @@ def _page(
     lines += ["|---|" + "---|" * len(kinds)]
     lines += [f"| {title} | " + " | ".join(cells) + " |" for title, cells in rows]
     lines += ["", "## Pictures", ""]
-    for name, caption in pictures.items():
-        lines += [f"![{caption}]({name})", "", caption, ""]
+    for picture in pictures:
+        lines += [f"![{picture.caption}]({_file(picture)})", "", picture.caption, ""]
     lines += [f"## {_MADE}", "", f"{_versions()}.", "", "| input | SHA-256 |", "|---|---|"]
     lines += [f"| {name} | `{digest}` |" for name, digest in inputs.items()]
     return "\n".join([*lines, ""])
 
 
-def _report(
-    found: list[Claim], evidence: list[PolicyEvidence], pictures: dict[str, str],
+def _sections(
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
     inputs: dict[str, str], options: Analyze,
-) -> str:  # fmt: skip
-    """The report as HTML."""
-    from common.page import Column, Picture, Section, Table, render
+) -> list[Section]:  # fmt: skip
+    """The same as a page in the style of the other reports."""
+    from common.page import Column, Section, Table
 
     claims = tuple(
         {**asdict(c), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
@@ -242,36 +251,29 @@ def _report(
     kinds, rows = _table_one(evidence)
     one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
     first = Column("", lambda row: row[""], "words")
-    return render(
-        _TITLE,
-        _tally(found),
-        [
-            Section(
-                "claims", "Claims", [_ABOUT],
-                tables=[Table("claims", "What the paper says, and what is found here",
-                              columns, claims)],
-            ),
-            Section(
-                "table", _TABLE_ONE,
-                tables=[Table("table_one", "Architectures, means and 90 % intervals",
-                              (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
-            ),
-            Section(
-                "pictures", "Pictures",
-                figures=[
-                    Picture(Path(name).stem, caption, (options.folder / name).read_bytes())
-                    for name, caption in pictures.items()
-                ],
-            ),
-            Section(
-                "made", _MADE, [f"Made by: {_command(options)}", f"{_versions()}."],
-                tables=[Table("inputs", "What it was made from", (
-                    Column("input", lambda row: row["input"], "words"),
-                    Column("SHA-256", lambda row: row["digest"], "prose"),
-                ), tuple({"input": k, "digest": v} for k, v in inputs.items()))],
-            ),
-        ],
-    )  # fmt: skip
+    return [
+        Section(
+            "claims", "Claims", [_ABOUT],
+            tables=[Table("claims", "What the paper says, and what is found here",
+                          columns, claims)],
+        ),
+        Section(
+            "table", _TABLE_ONE,
+            tables=[Table("table_one", "Architectures, means and 90 % intervals",
+                          (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
+        ),
+        Section(
+            "pictures", "Pictures",
+            figures=pictures,
+        ),
+        Section(
+            "made", _MADE, [f"Made by: {_command(options)}", f"{_versions()}."],
+            tables=[Table("inputs", "What it was made from", (
+                Column("input", lambda row: row["input"], "words"),
+                Column("SHA-256", lambda row: row["digest"], "prose"),
+            ), tuple({"input": k, "digest": v} for k, v in inputs.items()))],
+        ),
+    ]  # fmt: skip
 
 
 _TITLE, _TABLE_ONE = "The published claims, one by one", "Table I, regenerated"

@@ -10,7 +10,6 @@ import tyro
 
 from cli import terminal
 from common.errors import InputError
-from common.files import refuse_overwrite
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Compare:
     """Which readings count: fresh ones at the time they were taken, all rows as logged, or what
     suits the recording."""
     plot: Path = Path("compare.png")
-    """Picture to draw."""
+    """Picture to draw, PNG or SVG."""
     force: bool = False
     """Replace the picture if it exists."""
     json: bool = False
@@ -40,7 +39,7 @@ class Compare:
 
     def run(self) -> None:
         """Compare, print, draw."""
-        from common.figure_style import save
+        from common.figure_style import refuse_picture, save
         from sysid.servo_compare import compare, to_json
         from sysid.servo_figures import compare_figure
 
@@ -48,7 +47,7 @@ class Compare:
             raise InputError(
                 "Nothing to compare: name models, such as `--models servo/ calibrated.yaml`."
             )
-        refuse_overwrite(self.plot, self.force)
+        refuse_picture(self.plot, self.force)
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         found = compare(recordings, joints, self.models, self.readings, self.seed)

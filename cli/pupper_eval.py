@@ -49,8 +49,8 @@ class Eval:
     threads: int = 0
     """Of the physics; 0 for all cores."""
     report: Path | None = None
-    """Folder for all of it as an HTML page, with the run's curves and settings; figures as PNG and
-    tables as CSV beside it."""
+    """Folder for all of it as an HTML page, with the run's curves and settings; beside the page its
+    figures as PNG and SVG, its tables as CSV."""
     force: bool = False
     """Replace a report that exists."""
     json: bool = False

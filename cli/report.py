@@ -19,7 +19,7 @@ from sysid.recording import Recording
 
 @dataclass(frozen=True)
 class Report:
-    """Write one HTML page that opens anywhere, with its figures as PNG and its tables as CSV.
+    """Write one HTML page that opens anywhere, with its figures as PNG and SVG, its tables as CSV.
 
     Example: pupper-sysid report recordings/sweep.csv --out reports/sweep
 
@@ -89,6 +89,7 @@ class Report:
                 {
                     "report": str(written.path),
                     "figures": [str(p) for p in written.figures],
+                    "drawings": [str(p) for p in written.drawings],
                     "tables": [str(p) for p in written.tables],
                 }
             )

@@ -1,4 +1,4 @@
-"""How the report's figures look, and how they become PNG files.
+"""How the report's figures look, and how they become PNG and SVG files.
 
 Figures are narrow, with large letters, so that they can be read on a phone and in print; colours
 are those of Okabe and Ito, which colour-blind readers can tell apart. pyplot's global state is not
@@ -17,10 +17,12 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
 
-from common.files import write_bytes
+from common.errors import InputError
+from common.files import refuse_overwrite, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
@@ -57,6 +59,7 @@ _STYLE: dict[RcKeyType, Any] = {
     "axes.axisbelow": True,
     "figure.facecolor": "white",
     "axes.titlelocation": "left",
+    "svg.hashsalt": "pupper-sysid",  # the same names inside an SVG each time
 }
 
 _P = ParamSpec("_P")
@@ -88,15 +91,38 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def save(figure: Figure, path: Path, force: bool = False) -> None:
-    """Write `figure` to `path` as PNG.
+def svg(figure: Figure) -> bytes:
+    """The figure as an SVG drawing, the same bytes each time."""
+    buffer = io.BytesIO()
+    with rc_context(_STYLE):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def refuse_picture(path: Path, force: bool = False) -> None:
+    """Raise unless a picture can be written to `path`, or `force` was given.
 
     Raises
     ------
     InputError
-        If `path` exists and `force` is not given, or if it cannot be written.
+        If `path` is neither PNG nor SVG, or exists already.
     """
-    write_bytes(path, png(figure), force)
+    if path.suffix.lower() not in (".png", ".svg"):
+        raise InputError(f"{path}: pictures are written as .png or .svg; name it so.")
+    refuse_overwrite(path, force)
+
+
+def save(figure: Figure, path: Path, force: bool = False) -> None:
+    """Write `figure` to `path`, as PNG or SVG by its ending.
+
+    Raises
+    ------
+    InputError
+        As `refuse_picture`, or if it cannot be written.
+    """
+    refuse_picture(path, force)
+    draw = svg if path.suffix.lower() == ".svg" else png
+    write_bytes(path, draw(figure), force)
 
 
 def axes_column(rows: int, height: float) -> tuple[Figure, list[Axes]]:

@@ -1,8 +1,8 @@
 """Reports as one HTML page that opens anywhere: figures inside, no network, no scripts.
 
 A page is a list of `Section` objects, each of words, pictures and tables, set by one template for
-phone, desk and paper, light and dark. `write_page` writes it with its figures as PNG and its tables
-as CSV beside it.
+phone, desk and paper, light and dark. `write_page` writes it with its figures as PNG and SVG and
+its tables as CSV beside it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,18 @@ import base64
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+from matplotlib.figure import Figure
 
+from common.figure_style import png, svg
 from common.files import refuse_overwrite, write_bytes, write_text
 
 Row = dict[str, Any]
@@ -77,13 +82,23 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report, drawn."""
+    """A figure of the report."""
 
     name: str
-    """Of its PNG file, without ending."""
+    """Of its files, without ending."""
     caption: str
     """What to see in it; also its text for those who cannot see it."""
-    png: bytes
+    figure: Figure
+
+    @cached_property
+    def png(self) -> bytes:
+        """As the page shows it."""
+        return png(self.figure)
+
+    @cached_property
+    def svg(self) -> bytes:
+        """To be set in print, or worked on."""
+        return svg(self.figure)
 
     @property
     def base64(self) -> str:
@@ -133,6 +148,7 @@ class WrittenPage:
 
     path: Path
     figures: tuple[Path, ...]
+    drawings: tuple[Path, ...]
     tables: tuple[Path, ...]
 
 
@@ -144,7 +160,8 @@ def write_page(
     Parameters
     ----------
     path : Path
-        Of the page; its folder gets `figures/*.png` and `tables/*.csv`.
+        Of the page; its folder gets `figures/*.png`, the same as `*.svg`, and
+        `tables/*.csv`.
     title, subtitle : str
     sections : sequence of Section
     force : bool
@@ -157,23 +174,23 @@ def write_page(
         one cannot be written.
     """
     html = render(title, subtitle, sections)
-    pictures = {
-        path.parent / "figures" / f"{p.name}.png": p.png for s in sections for p in s.figures
-    }
+    drawn = [(path.parent / "figures" / p.name, p) for s in sections for p in s.figures]
+    pngs = {file.with_name(f"{file.name}.png"): p.png for file, p in drawn}
+    svgs = {file.with_name(f"{file.name}.svg"): p.svg for file, p in drawn}
     csvs = {
         path.parent / "tables" / f"{t.name}.csv": t.to_csv()
         for s in sections
         for t in s.tables
         if t.rows
     }
-    for file in (path, *pictures, *csvs):
+    for file in (path, *pngs, *svgs, *csvs):
         refuse_overwrite(file, force)
-    for file, image in pictures.items():
+    for file, image in (pngs | svgs).items():
         write_bytes(file, image, force)
     for file, text in csvs.items():
         write_text(file, text, force)
     write_text(path, html, force)
-    return WrittenPage(path, tuple(pictures), tuple(csvs))
+    return WrittenPage(path, tuple(pngs), tuple(svgs), tuple(csvs))
 
 
 def render(title: str, subtitle: str, sections: Sequence[Section]) -> str:
@@ -181,8 +198,15 @@ def render(title: str, subtitle: str, sections: Sequence[Section]) -> str:
     environment = Environment(
         loader=PackageLoader("common", "templates"), autoescape=True, undefined=StrictUndefined
     )
+    environment.filters["code"] = _code
     template = environment.get_template("page.html.j2")
     return template.render(title=title, subtitle=subtitle, sections=sections)
+
+
+def _code(text: str) -> Markup:
+    """The text, escaped, with what stands between backticks as code."""
+    quoted = str(escape(text))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", quoted))
 
 
 def _plain(value: Any) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from common.errors import InputError
-from common.figure_style import BLUE, FAINT, GREEN, RED, WIDTH_IN, axes_column, png, styled
+from common.figure_style import BLUE, FAINT, GREEN, RED, WIDTH_IN, axes_column, styled
 from common.files import versions
 from common.page import Column, Picture, Section, Table
 from policies.curves import PROGRESS
@@ -106,7 +106,7 @@ def walking_sections(
                     "errors",
                     "Mean absolute errors by direction, ground and delay; dotted: a robot that "
                     "stands, under random commands. Red: some robots fell.",
-                    png(_errors_figure(rows, still)),
+                    _errors_figure(rows, still),
                 )
             ],
             tables=[Table("walks", "Errors, and what the feet do", columns, tuple(rows))],
@@ -125,7 +125,7 @@ def walking_sections(
                     Picture(
                         "training",
                         "Training, by samples: reward, falls, and the noise of exploration.",
-                        png(_training_figure(curves)),
+                        _training_figure(curves),
                     )
                 ],
             )

@@ -1,7 +1,7 @@
 """The report's figures: each function takes results and returns a matplotlib `Figure`.
 
 They only draw: curves come from `sysid.figure_data`, looks from `common.figure_style`. Every curve
-differs from the others in more than its colour. `save` writes a figure as PNG.
+differs from the others in more than its colour. `save` writes a figure.
 """
 
 from __future__ import annotations

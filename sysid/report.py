@@ -1,8 +1,8 @@
 """Report: everything found about a robot's servos, as one page that opens anywhere.
 
-`write_report` makes a folder with `report.html`, the same figures as PNG and the same tables as CSV
-(`common.page`). Each section is built by one function below, from results that were computed
-elsewhere.
+`write_report` makes a folder with `report.html`, the same figures as PNG and SVG, and the same
+tables as CSV (`common.page`). Each section is built by one function below, from results that were
+computed elsewhere.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def write_report(
     Parameters
     ----------
     folder : Path
-        Made if it is missing; gets `report.html`, `figures/*.png` and `tables/*.csv`.
+        Made if it is missing; gets `report.html`, `figures/*.png`, `figures/*.svg` and
+        `tables/*.csv`.
     recordings : sequence of Recording
         What was computed from.
     results : dict of joint to JointCalibrationResult
@@ -120,7 +121,7 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
         "lag_budget",
         "Lag budget: what passes between the moment a command is sent and the row in which its "
         "motion is read. The black line is the naive lag, which is the sum.",
-        figures.png(figures.lag_budget_figure(results)),
+        figures.lag_budget_figure(results),
     )
     return Section(
         "lag",
@@ -160,7 +161,7 @@ def _overlays(
             f"overlay_{joint}",
             f"{joint}: the grey steps are the readings as the log has them; the dots are the same "
             "readings at the time they were measured, and the model is judged by those.",
-            figures.png(figures.overlay_figure(result, runs[joint])),
+            figures.overlay_figure(result, runs[joint]),
         )
         for joint, result in results.items()
     ]
@@ -186,7 +187,7 @@ def _holds(
         "holds",
         "For how many rows in a row each reading stayed the same while its joint moved. A sensor "
         "that is read afresh each time would have all its runs at 1.",
-        figures.png(figures.hold_histogram_figure(found)),
+        figures.hold_histogram_figure(found),
     )
     return Section("holds", "How long readings are held", figures=[picture])
 
@@ -202,7 +203,7 @@ def _bode(
                 "Frequency response from the held command to the motion, from fresh readings, with "
                 "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too "
                 "low.",
-                figures.png(figures.bode_figure(responses)),
+                figures.bode_figure(responses),
             )
         )
     findings = [
@@ -269,7 +270,7 @@ def _residuals(
             f"residuals_{joint}",
             f"{joint}: above, rows taken at their own time are wrong in proportion to speed, which "
             "is the age of the reading; fresh rows are not. Below, what the model leaves of them.",
-            figures.png(figures.residual_figure(result, runs[joint])),
+            figures.residual_figure(result, runs[joint]),
         )
         for joint, result in results.items()
     ]

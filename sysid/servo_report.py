@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.figure_style import png
 from common.page import Column, Picture, Section, Table
 from sysid import servo_scores as scores
 from sysid.servo_compare import LINEAR, Comparison
@@ -51,7 +50,7 @@ def servo_section(found: Comparison) -> Section:
             f"{joint}: models in free run, commands only. The shaded band is where the first "
             "model expects nine readings in ten, from its errors on data held out of its fit; it "
             "widens with speed, because a polled reading's time is uncertain.",
-            png(compare_figure(found, [joint])),
+            compare_figure(found, [joint]),
         )
         for joint in found.data.joints
     ]
@@ -64,7 +63,7 @@ def servo_section(found: Comparison) -> Section:
             "How much data a servo model needs, measured on the emulated robot under random "
             "commands of 0.5 to 4 Hz (the emulated servo is a DelayedPD, which therefore needs "
             "least). The line marks the readings per joint of this recording.",
-            png(data_curve_figure(curve, own)),
+            data_curve_figure(curve, own),
         )
     )
     return Section(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from dataclasses import replace
@@ -307,7 +308,13 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     for digest in (contract["weights_sha256"], sha256(SAMPLES / "calibrated.yaml")):
         assert digest in page
     assert f"mujoco {version('mujoco')}" in page
-    assert set(found["pictures"]) <= set(cli.claims.PICTURES)
+    assert {Path(p).stem for p in found["pictures"]} <= set(cli.claims.PICTURES)
+    beside = {p.relative_to("analysis/claims") for p in Path("analysis/claims").rglob("*.*")}
+    drawn = {Path(p).with_suffix(ending) for p in found["pictures"] for ending in (".png", ".svg")}
+    tables = {Path(f"tables/{name}.csv") for name in cli.claims.TABLES}
+    assert beside == drawn | tables | {Path("claims.md"), Path("claims.html")}
+    rows = list(csv.DictReader((Path("analysis/claims") / "tables/claims.csv").open()))
+    assert [row["verdict"] for row in rows] == [claim["verdict"] for claim in found["claims"]]
     report = Path(found["report"]).read_text()
     assert "Table I" in report and report.count("data:image/png") == len(found["pictures"])
     assert all(claim["id"] in report for claim in found["claims"])
@@ -320,8 +327,8 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
         capsys, cli.pupper_analyze, "claims", policies[0], policies[0], *arguments[3:], "--out", "b"
     )
     assert "rename" in twice
-    Path("c").mkdir()
-    Path("c/ablation.png").touch()
+    Path("c/figures").mkdir(parents=True)
+    Path("c/figures/ablation.png").touch()
     taken = refused(capsys, cli.pupper_analyze, *arguments, "--out", "c")
     assert "ablation.png exists already" in taken
 

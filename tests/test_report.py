@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from browser import looks_right, needs_chromium
 from matplotlib.text import Text
 
 from common.errors import InputError
+from common.page import Section, render
 from servo_models.delayed_pd import TIME_STEP_S
 from sysid import figures
 from sysid.calibrate import JointCalibrationResult, RungResult
@@ -188,6 +190,13 @@ def test_a_hostile_recording_name_is_shown_not_run(page):
     assert HOSTILE in page.text
 
 
+def test_commands_in_sentences_are_set_as_code_and_escaped():
+    section = Section("a", "A", text=["Add `sweep --kind steps`, not `<b>`."], notes=["A ` alone."])
+    html = render("t", "s", [section])
+    assert "Add <code>sweep --kind steps</code>, not <code>&lt;b&gt;</code>." in html
+    assert "<li>A ` alone.</li>" in html
+
+
 def test_the_doctors_verdict_is_on_the_page_in_sentences(page):
     assert "Use with care. Two frequencies only." in page.text
 
@@ -197,6 +206,7 @@ def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
     assert len(images) == len(written.figures)
     assert all(len(a["alt"] or "") > 20 for a in images)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written.figures)
+    assert [p.stem for p in written.drawings] == [p.stem for p in written.figures]
 
 
 def test_the_finding_says_what_the_naive_lag_is_made_of(page):
@@ -262,7 +272,7 @@ def test_nothing_is_overwritten_without_force(tmp_path):
     first = write(tmp_path)
     victim = next(p for p in first.tables if p.stem == "ladder")
     victim.write_text("mine")
-    for path in (first.path, *first.figures, *first.tables):
+    for path in (first.path, *first.figures, *first.drawings, *first.tables):
         if path != victim:
             path.unlink()
     with pytest.raises(InputError, match=r"ladder\.csv exists already.*--force"):
@@ -380,6 +390,19 @@ def test_bode_intervals_follow_from_the_covariance():
     # 90 % of a Gaussian lies within 1.645 standard deviations; 1 % is 0.0869 dB or 0.573 degrees
     assert gain_db == pytest.approx(np.full(3, 1.645 * 2 * 0.08686), rel=1e-3)
     assert phase_deg == pytest.approx(np.full(3, 1.645 * 0.57296), rel=1e-3)
+
+
+def test_a_figure_is_written_as_its_ending_says(tmp_path):
+    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    figures.save(figure, tmp_path / "a.svg")
+    drawing = ElementTree.parse(tmp_path / "a.svg").getroot()
+    assert drawing.tag == "{http://www.w3.org/2000/svg}svg"
+    width, height = (float(drawing.attrib[k].removesuffix("pt")) for k in ("width", "height"))
+    assert (width, height) == pytest.approx(72 * figure.get_size_inches())
+    figures.save(figures.lag_budget_figure({"LF_thigh": result_of()}), tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    with pytest.raises(InputError, match=r"a\.jpg: pictures are written as \.png or \.svg"):
+        figures.save(figure, tmp_path / "a.jpg")
 
 
 def test_saving_a_figure_refuses_to_overwrite(tmp_path):
