@@ -21,6 +21,8 @@ from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, integrate
 _TONES_HZ, _AMPLITUDE_RAD = (1.0, 2.0, 4.0), 0.2  # a walk's speeds, below most servos' limits
 _LOOP_S = 0.0193  # no multiple of a step: a delay puts commands anywhere in one
 _WARM_UP_S, _LENGTH_S = 1.0, 3.0
+_FAR_RAD = 100.0  # further than a servo goes, near enough to be squared
+_RATTLE = 0.5  # random servos in steps of up to 10 ms are at most 0.4 from the usual
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,10 @@ MUJOCO = Engine()
 """MuJoCo's `<pid>`, with which calibrations are found."""
 
 
-def lag_in_steps_of(
+def tones_in_steps_of(
     parameters: DelayedPDParameters, time_step_s: float, engine: Engine = MUJOCO
-) -> NDArray[np.float64]:
-    """Mean lag behind slow tones [s] of servos stepped so, without their delay.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How servos stepped so follow slow tones, without their delay.
 
     Parameters
     ----------
@@ -57,12 +59,11 @@ def lag_in_steps_of(
 
     Returns
     -------
-    ndarray, shape (servos,)
-
-    Raises
-    ------
-    InputError
-        If the servo is not stable at this step.
+    lag : ndarray, shape (servos,)
+        Mean over the tones [s].
+    rest : ndarray, shape (servos,)
+        What of the motion is no tone, root mean square by the tone's amplitude; of the worst tone.
+        A servo that is not stable in such steps rattles between the limits of its torque.
     """
     count = round(_LENGTH_S / time_step_s)
     edge = time_step_s * np.arange(count + 1)
@@ -84,19 +85,16 @@ def lag_in_steps_of(
     told = np.broadcast_to(commands[:, None], (count, *batch))
     moved, _ = integrate(told, still, values, time_step_s, implicit=engine.implicit)
     late = edge[1:] > _WARM_UP_S
-    lags = []
-    for n, w in enumerate(turn):
-        at = w * edge[1:][late]
-        basis = np.stack([np.sin(at), np.cos(at), np.ones_like(at)], axis=1)
-        sine, cosine, _ = np.linalg.lstsq(basis, moved[late, :, n], rcond=None)[0]
-        lags.append(np.arctan2(-cosine, sine) / w)
-    found = np.mean(lags, axis=0)
-    if not (np.isfinite(found).all() and np.abs(moved).max() < 10 * _AMPLITUDE_RAD):
-        raise InputError(
-            f"a servo of this calibration is not stable in physics steps of {1e3 * time_step_s:g} "
-            "ms; take shorter ones."
-        )
-    return found
+    lags, rests = [], []
+    with np.errstate(over="ignore", invalid="ignore"):  # one that is not stable may end anywhere
+        for n, w in enumerate(turn):
+            at, track = w * edge[1:][late], np.clip(moved[late, :, n], -_FAR_RAD, _FAR_RAD)
+            basis = np.stack([np.sin(at), np.cos(at), np.ones_like(at)], axis=1)
+            tone = np.linalg.lstsq(basis, track, rcond=None)[0]
+            lags.append(np.arctan2(-tone[1], tone[0]) / w)
+            rest = np.sqrt(np.mean((track - basis @ tone) ** 2, axis=0))
+            rests.append(rest / np.hypot(tone[0], tone[1]))
+    return np.mean(lags, axis=0), np.max(rests, axis=0)
 
 
 def delay_at_step(
@@ -128,8 +126,11 @@ def delay_at_step(
     delay = np.atleast_1d(parameters.delay_s)
     if time_step_s == fitted_step_s and engine == MUJOCO:
         return delay
-    fitted, there = (
-        lag_in_steps_of(parameters, step, using)
-        for step, using in ((fitted_step_s, MUJOCO), (time_step_s, engine))
-    )
+    fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
+    there, rest = tones_in_steps_of(parameters, time_step_s, engine)
+    if not (rest - usual < _RATTLE).all():
+        raise InputError(
+            f"a servo of this calibration is not stable in physics steps of {1e3 * time_step_s:g} "
+            "ms; take shorter ones."
+        )
     return delay + fitted - there

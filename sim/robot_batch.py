@@ -63,7 +63,8 @@ class RobotBatch:
     Raises
     ------
     InputError
-        If a delay does not fit its buffer, or the servo model is of other joints or another rate.
+        If a servo is not stable in such physics steps, a delay does not fit its buffer, or the
+        servo model is of other joints or another rate.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class RobotBatch:
         threads: int,
         servo_model: JointArrays | None,
     ):
+        servos = servos.in_steps_of(config.physics_step_s)
         self.config, self.servos, self.ground = config, servos, ground
         self.servo_model, self.environments = servo_model, environments
         if servo_model is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from common.errors import InputError
 from common.joints import JOINT_NAMES
@@ -22,6 +22,7 @@ from servo_models.delayed_pd import DelayedPDParameters
 from servo_models.held_feedback import HeldFeedback
 from servo_models.joint_arrays import JointArrays
 from servo_models.servo_file import load_servo_model
+from servo_models.step_size import delay_at_step
 
 IDEAL = "ideal"
 _NO_LIMIT_NM, _NO_LIMIT_RAD_S = 1e3, 1e3
@@ -55,13 +56,24 @@ class ServoRanges:
         """The longest delay that can be drawn [s]."""
         return float(self.high["delay_s"].max())
 
-    def later(self, delay_s: float) -> ServoRanges:
-        """The same servos with every delay longer by `delay_s` [s]."""
-        moved = {
-            name: {**getattr(self, name), "delay_s": getattr(self, name)["delay_s"] + delay_s}
-            for name in ("low", "value", "high")
-        }
+    def later(self, delay_s: ArrayLike) -> ServoRanges:
+        """The same servos with every delay longer by `delay_s` [s], one or twelve; none below 0."""
+        moved = {}
+        for name in ("low", "value", "high"):
+            own = getattr(self, name)
+            moved[name] = {**own, "delay_s": np.maximum(own["delay_s"] + delay_s, 0.0)}
         return replace(self, **moved)
+
+    def in_steps_of(self, time_step_s: float) -> ServoRanges:
+        """The same servos for a simulation in other steps, with the lag they were measured with.
+
+        Raises
+        ------
+        InputError
+            If a servo is not stable in such steps.
+        """
+        middle = DelayedPDParameters(**self.value)
+        return self.later(delay_at_step(middle, time_step_s) - middle.delay_s)
 
     def nominal(self) -> dict[str, DelayedPDParameters]:
         """The middle of every interval, by joint."""

@@ -111,7 +111,8 @@ class Walking:
     episode_s: float = 20.0
     """Length of an episode."""
     physics_step_s: float = 0.002
-    """Time step of the physics."""
+    """Time step of the physics. In others than 2 ms the servos get the delay with which they lag as
+    they were measured."""
     control_step_s: float = 0.02
     """Time between two actions."""
     action_scale: float = 0.5

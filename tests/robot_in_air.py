@@ -41,10 +41,7 @@ def error_in_air(
 ) -> np.ndarray:
     """Largest difference [rad] of each servo from `DelayedPD` while all swing weightless links."""
     step = model.opt.timestep
-    for name in JOINT_NAMES:
-        body = model.body(name).id
-        model.body_mass[body], model.body_inertia[body] = 1e-9, 1e-15
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    _weightless(model)
     if exactly_solved:
         model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 100, 1e-15
     data = standing(model)
@@ -67,3 +64,34 @@ def error_in_air(
         expected[:, i] = alone.rollout(commands[:, i])
     assert np.ptp(expected, axis=0).min() > 0.1, "servos must move for this to be a comparison"
     return np.abs(angles - expected).max(axis=0)
+
+
+def lags_in_air(model: Any, control_step_s: float) -> np.ndarray:
+    """Lag [s] of each servo behind a tone of 2 Hz that is told every `control_step_s`."""
+    _weightless(model)
+    data = standing(model)
+    in_free_space(model, data)
+    start, turn, step = data.ctrl.copy(), 2 * np.pi * 2.0, model.opt.timestep
+    share, held = np.linspace(0.6, 1, 12), round(control_step_s / step)
+    angles = []
+    for tick in range(100):
+        data.ctrl[:] = start + 0.2 * np.sin(turn * tick * control_step_s) * share
+        for _ in range(held):
+            mujoco.mj_step(model, data)
+            angles.append(data.qpos[7:].copy())
+    moved = np.array(angles)
+    if model.ntendon:
+        moved[:, 2::3] += moved[:, 1::3]
+    half = len(moved) // 2  # whole periods, from the middle on
+    time = step * np.arange(1, len(moved) + 1)[half:]
+    basis = np.stack([np.sin(turn * time), np.cos(turn * time), np.ones_like(time)], axis=1)
+    sine, cosine, _ = np.linalg.lstsq(basis, moved[half:], rcond=None)[0]
+    return np.arctan2(-cosine, sine) / turn
+
+
+def _weightless(model: Any) -> None:
+    """Links that weigh next to nothing."""
+    for name in JOINT_NAMES:
+        body = model.body(name).id
+        model.body_mass[body], model.body_inertia[body] = 1e-9, 1e-15
+    mujoco.mj_setConst(model, mujoco.MjData(model))

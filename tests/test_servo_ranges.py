@@ -184,3 +184,8 @@ def test_a_calibration_is_not_a_learned_servo_model():
 def test_a_folder_without_a_model_is_refused(tmp_path):
     with pytest.raises(InputError):
         servo_model_of(tmp_path, 0.02)
+
+
+def test_no_delay_becomes_negative():
+    ranges = servo_ranges("paper").later(-1.0)
+    assert not ranges.low["delay_s"].any() and not ranges.high["delay_s"].any()

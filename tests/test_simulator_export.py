@@ -337,3 +337,13 @@ def test_what_cannot_become_an_actuator_is_refused_with_the_way_out(capsys, tmp_
     assert "--physics-step" in refused(
         capsys, cli.pupper_sysid, "export", CALIBRATED, "--to", "mjlab", "--physics-step", "5"
     )
+
+
+@pytest.mark.parametrize("to", ["mjcf", "isaaclab", "mjlab", "newton"])
+def test_steps_in_which_a_servo_only_rattles_are_refused(capsys, tmp_path, to):
+    # its torque is limited, so it does not fly away: it swings between the limits
+    said = refused(
+        capsys, cli.pupper_sysid, "export", CALIBRATED, "--to", to, "--physics-step", "0.05",
+        "--out", tmp_path / "x",
+    )  # fmt: skip
+    assert "not stable in physics steps of 50 ms; take shorter ones" in said

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from robot_in_air import error_in_air
+from robot_in_air import error_in_air, lags_in_air
 
 import sim.robot_batch
 from common.errors import InputError
@@ -374,6 +374,18 @@ def test_each_simulated_robot_has_the_servos_that_were_drawn_for_it(knee):
         error = error_in_air(env.robots.batch.get_model(i), servos)
         np.testing.assert_allclose(error, 0.0, atol=1e-6)
     assert (env.robots.drawn["stiffness"][0] != env.robots.drawn["stiffness"][1]).all()
+
+
+@pytest.mark.parametrize("step_s", [0.001, 0.004, 0.005])
+def test_in_other_physics_steps_servos_lag_as_in_those_they_were_measured_in(step_s):
+    measured = servo_ranges(MEASURED)
+    still_ones = replace(measured, low=measured.value, high=measured.value)
+    lags = []
+    for step in (H, step_s):
+        env = make(still_ones, replace(QUIET, physics_step_s=step), 1)
+        lags.append(lags_in_air(env.robots.batch.get_model(0), SPAN))
+    assert (lags[0] > 0.03).all()
+    np.testing.assert_allclose(lags[1], lags[0], atol=7e-4)  # without: 1.2 to 3.1 ms off
 
 
 def test_a_command_acts_after_the_delay_that_was_drawn_and_in_part_between_steps():
