@@ -80,7 +80,10 @@ def table(title: str, *columns: str) -> Table:
         min_width=min(len(title), out.width),  # or a long title is broken to a small table's width
     )  # fmt: skip
     for k, column in enumerate(columns):
-        made.add_column(column, justify="left" if k == 0 else "right", no_wrap=k == 0)
+        # folded, where it is too wide: a number that ends in … is none
+        made.add_column(
+            column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold"
+        )
     return made
 
 

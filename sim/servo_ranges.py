@@ -73,7 +73,7 @@ class ServoRanges:
             If a servo is not stable in such steps.
         """
         middle = DelayedPDParameters(**self.value)
-        return self.later(delay_at_step(middle, time_step_s) - middle.delay_s)
+        return self.later(delay_at_step(middle, time_step_s) - self.value["delay_s"])
 
     def nominal(self) -> dict[str, DelayedPDParameters]:
         """The middle of every interval, by joint."""
