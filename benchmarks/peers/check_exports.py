@@ -5,8 +5,9 @@
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with what `tests/test_simulator_export.py`
 holds the exports against. mjlab's delay buffer is run with the exported settings, and with the ones
-that its documentation suggests. Where `install.sh` has been run, Newton and mjlab run their
-exports: a tone through servos behind a floating base, against our own simulation.
+that its documentation suggests. Where `install.sh` has been run, Newton, mjlab and Isaac Lab's
+actuators run their exports: a tone through servos behind a floating base, against our own
+simulation.
 """
 
 from __future__ import annotations
@@ -25,9 +26,14 @@ import torch
 from numpy.typing import NDArray
 
 from servo_models.calibration import Calibration, load_calibration
-from servo_models.delayed_pd import TIME_STEP_S
+from servo_models.delayed_pd import FRICTION_SOLIMP, TIME_STEP_S, friction_solref
 from sim.newton_export import export_newton
-from sim.simulator_export import EXPLICIT_PD, MJLAB_PD, delays_at_step, to_mjlab
+from sim.simulator_export import (
+    EXPLICIT_PD,
+    MJLAB_PD,
+    SIMULATORS,
+    delays_at_step,
+)
 from sysid.tone import fit_phasor
 
 HERE = Path(__file__).resolve().parent
@@ -36,7 +42,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 CALIBRATED = str(ROOT / "data/samples/calibrated.yaml")
 STEP_S, TONE_HZ = 0.005, 3.0
-ENGINES = {"newton": EXPLICIT_PD, "mjlab": MJLAB_PD}
+ENGINES = {"isaaclab": EXPLICIT_PD, "newton": EXPLICIT_PD, "mjlab": MJLAB_PD}
 
 _CLASSES = {
     "isaaclab": ("actuators/", ("ActuatorBaseCfg", "IdealPDActuatorCfg", "DelayedPDActuatorCfg")),
@@ -108,16 +114,21 @@ def phasors(at: NDArray, moved: NDArray) -> list[complex]:
     return [fit_phasor(at[late], m, TONE_HZ) for m in moved[late].T]
 
 
-def ran(simulator: str, calibration: Calibration, folder: Path) -> list[complex]:
+def ran(
+    simulator: str, calibration: Calibration, delay_steps: list[int], folder: Path
+) -> list[complex]:
     """What a simulator makes of the tone with its export."""
     at, commands = tone(STEP_S)
     exported = folder / f"{simulator}_export"
     if simulator == "newton":
         export_newton(calibration, STEP_S, exported)
     else:
-        exported.write_text(to_mjlab(calibration, STEP_S))
+        exported.write_text(SIMULATORS[simulator](calibration, STEP_S))
     each = np.repeat(commands[:, None], len(calibration.joint_names), axis=1)
-    np.savez(folder / "commands.npz", command=each, step_s=STEP_S)
+    np.savez(
+        folder / "commands.npz", command=each, step_s=STEP_S, delay_steps=delay_steps,
+        solref=friction_solref(STEP_S), solimp=FRICTION_SOLIMP,
+    )  # fmt: skip
     subprocess.run(
         [HERE / f".venv-{simulator}/bin/python", HERE / f"in_{simulator}.py", exported,
          "commands.npz", "out.npz"],
@@ -142,11 +153,14 @@ def print_tones(folder: Path) -> None:
         if not (HERE / f".venv-{simulator}").exists():
             continue
         delays = delays_at_step(calibration, STEP_S, engine)
-        theirs = ran(simulator, calibration, folder)
-        for name, there, here in zip(calibration.joint_names, theirs, ours, strict=True):
-            turn, exact = 2 * np.pi * TONE_HZ, delays[name].value_s
+        steps = [round(delays[name].value_s / STEP_S) for name in calibration.joint_names]
+        theirs = ran(simulator, calibration, steps, folder)
+        for name, taken, there, here in zip(
+            calibration.joint_names, steps, theirs, ours, strict=True
+        ):
+            turn = 2 * np.pi * TONE_HZ
             lags = [1e3 * (-np.angle(1j * p) % (2 * np.pi)) / turn for p in (there, here)]
-            rounded = 1e3 * (STEP_S * round(exact / STEP_S) - exact)
+            rounded = 1e3 * (STEP_S * taken - delays[name].value_s)
             print(
                 f"| {simulator} | {name} | {abs(there):.4f} | {abs(here):.4f} | {lags[0]:.1f} "
                 f"| {lags[1]:.1f} | {rounded:+.1f} |"

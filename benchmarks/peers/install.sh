@@ -1,7 +1,8 @@
 #!/bin/sh
 # Environments for compare.py: one for the peers that run on this Python, one for BAM, which asks
 # for Python 3.12 (give another with PYTHON312=...). PyTorch and hardware drivers are left out.
-# Two more for check_exports.py: Newton and mjlab, which run their exports.
+# Three more for check_exports.py: Newton, mjlab and Isaac Lab's actuators (Isaac Sim is left out),
+# which run their exports.
 set -eu
 cd "$(dirname "$0")"
 python3 -m venv .venv
@@ -12,4 +13,8 @@ python3 -m venv .venv-newton
 .venv-newton/bin/pip install --quiet "newton==1.8.0" "mujoco~=3.17.0" "mujoco-warp~=3.17.0" onnx warp-nn
 python3 -m venv .venv-mjlab
 .venv-mjlab/bin/pip install --quiet "torch==2.13.0" && .venv-mjlab/bin/pip install --quiet "mjlab==1.6.0"
+python3 -m venv .venv-isaaclab
+.venv-isaaclab/bin/pip install --quiet "torch==2.13.0"
+.venv-isaaclab/bin/pip install --quiet "mujoco==4.0.0" toml warp-lang trimesh usd-core packaging
+.venv-isaaclab/bin/pip install --quiet --no-deps "isaaclab==2.3.2.post1"
 echo "Ready: .venv/bin/python benchmarks/peers/compare.py"
