@@ -145,6 +145,10 @@ class Bode:
 
     def run(self) -> None:
         """Measure and print."""
+        if self.plot:
+            from common.figure_style import refuse_picture
+
+            refuse_picture(self.plot, self.force)
         recordings = terminal.load_all(self.recordings)
         found = {}
         for joint in terminal.pick_joints(recordings, self.joints):
@@ -152,7 +156,8 @@ class Bode:
             rng = calibration.joint_rng(self.seed, joint)
             found[joint] = frequency_response.frequency_response(joint, trials, rng)
         if self.plot:
-            from sysid.figures import bode_figure, save
+            from common.figure_style import save
+            from sysid.figures import bode_figure
 
             save(bode_figure(found), self.plot, self.force)
         if self.json:

@@ -1,7 +1,7 @@
 """The report's figures: each function takes results and returns a matplotlib `Figure`.
 
 They only draw: curves come from `sysid.figure_data`, looks from `common.figure_style`. Every curve
-differs from the others in more than its colour. `save` writes a figure.
+differs from the others in more than its colour.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from common.figure_style import (
     RED,
     SKY,
     axes_column,
-    png,
-    save,
     styled,
 )
 from sysid.calibrate import JointCalibrationResult
@@ -48,17 +46,6 @@ from sysid.recording import Trial
 
 if TYPE_CHECKING:  # it brings python-control, which is not needed to draw
     from sysid.frequency_response import FrequencyResponse
-
-__all__ = [
-    "bode_figure",
-    "hold_histogram_figure",
-    "lag_budget_figure",
-    "overlay_figure",
-    "png",
-    "residual_figure",
-    "save",
-    "sweep_figure",
-]
 
 
 @styled

@@ -16,6 +16,7 @@ from browser import looks_right, needs_chromium
 from matplotlib.text import Text
 
 from common.errors import InputError
+from common.figure_style import save
 from common.page import Section, render
 from servo_models.delayed_pd import TIME_STEP_S
 from sysid import figures
@@ -394,23 +395,23 @@ def test_bode_intervals_follow_from_the_covariance():
 
 def test_a_figure_is_written_as_its_ending_says(tmp_path):
     figure = figures.lag_budget_figure({"LF_thigh": result_of()})
-    figures.save(figure, tmp_path / "a.svg")
+    save(figure, tmp_path / "a.svg")
     drawing = ElementTree.parse(tmp_path / "a.svg").getroot()
     assert drawing.tag == "{http://www.w3.org/2000/svg}svg"
     width, height = (float(drawing.attrib[k].removesuffix("pt")) for k in ("width", "height"))
     assert (width, height) == pytest.approx(72 * figure.get_size_inches())
-    figures.save(figures.lag_budget_figure({"LF_thigh": result_of()}), tmp_path / "b.svg")
+    save(figures.lag_budget_figure({"LF_thigh": result_of()}), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     with pytest.raises(InputError, match=r"a\.jpg: pictures are written as \.png or \.svg"):
-        figures.save(figure, tmp_path / "a.jpg")
+        save(figure, tmp_path / "a.jpg")
 
 
 def test_saving_a_figure_refuses_to_overwrite(tmp_path):
     path = tmp_path / "figure.png"
     figure = figures.lag_budget_figure({"LF_thigh": result_of()})
-    figures.save(figure, path)
+    save(figure, path)
     with pytest.raises(InputError, match="exists already"):
-        figures.save(figure, path)
+        save(figure, path)
 
 
 def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path):
