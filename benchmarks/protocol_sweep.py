@@ -4,8 +4,8 @@ The recorder runs here and talks through the pseudo-terminal or the socket, in r
 of a joint's lag is that of a servo with the true parameters which gets the goals at the very times
 at which the emulator's servo got them, without noise and every millisecond, as in
 `lag_accuracy.py`. Beside it stands what the same robot gives without a protocol, in process and in
-virtual time. (The dead time is that of a model with steps of 2 ms, which answers a little sooner
-than the emulator's servos with steps of 1 ms; so it comes out longer, on either way.)
+virtual time. The true dead time is what a model with steps of 2 ms has to have to lag as the
+emulator's servos do in steps of 1 ms.
 
     .venv/bin/python benchmarks/protocol_sweep.py
 """
@@ -25,7 +25,9 @@ from common.joints import DEFAULT_POSE, JOINT_NAMES
 from hardware.connect import open_bus, parse_address
 from hardware.guard import GuardedBus
 from hardware.loop import real_time_priority
-from sim.free_air_servo import FreeAirServo
+from servo_models.delayed_pd import TIME_STEP_S
+from servo_models.step_size import delay_at_step
+from sim.free_air_servo import PHYSICS_STEP_S, FreeAirServo
 from sysid.calibrate import calibrate
 from sysid.delay import tone_lags, tone_weights
 from sysid.excitation import plan
@@ -104,14 +106,17 @@ def main() -> None:
         )
         missing = recording.table.groupby("joint")["position_rad"].apply(lambda x: x.isna().mean())
         found, without = calibrate([recording], seed=0), calibrate([plain], seed=0)
-        errors, inside, apart = [], 0, []
+        errors, off, apart, inside, held = [], [], [], 0, 0
         for joint in joints:
             result, other = found[joint], without[joint]
             lag, delay = result.budget.lag, result.dead_time
             truth = true_lag(recording, server, joint, shift)
-            own = server.emulator.bench.robot.servos[JOINT_NAMES.index(joint)].actuator.delay_s
+            servo = server.emulator.bench.robot.servos[JOINT_NAMES.index(joint)].actuator
+            own = float(delay_at_step(servo, TIME_STEP_S, PHYSICS_STEP_S)[0])
             errors.append(lag.value - truth)
             inside += lag.low <= truth <= lag.high
+            held += delay.low <= own <= delay.high
+            off.append(delay.value - own)
             apart.append(delay.value - other.dead_time.value)
             print(
                 f"| {kind} | {joint} | {1e3 * lag.value:.1f} "
@@ -126,8 +131,9 @@ def main() -> None:
         print(
             f"\n{kind}: lag bias {1e3 * np.mean(errors):+.2f} ms, worst "
             f"{1e3 * np.abs(errors).max():.2f} ms; {inside} of {len(joints)} lag intervals hold "
-            f"the truth. Dead time against in process: {1e3 * np.mean(apart):+.2f} ms on average, "
-            f"{1e3 * np.abs(apart).max():.2f} ms at most.\n",
+            f"the truth. Dead time: bias {1e3 * np.mean(off):+.2f} ms, worst "
+            f"{1e3 * np.abs(off).max():.2f} ms; {held} intervals hold it; against in process "
+            f"{1e3 * np.mean(apart):+.2f} ms on average, {1e3 * np.abs(apart).max():.2f} at most.\n",
             flush=True,
         )
 
