@@ -132,8 +132,9 @@ def main() -> None:
             f"\n{kind}: lag bias {1e3 * np.mean(errors):+.2f} ms, worst "
             f"{1e3 * np.abs(errors).max():.2f} ms; {inside} of {len(joints)} lag intervals hold "
             f"the truth. Dead time: bias {1e3 * np.mean(off):+.2f} ms, worst "
-            f"{1e3 * np.abs(off).max():.2f} ms; {held} intervals hold it; against in process "
-            f"{1e3 * np.mean(apart):+.2f} ms on average, {1e3 * np.abs(apart).max():.2f} at most.\n",
+            f"{1e3 * np.abs(off).max():.2f} ms; {held} intervals hold it; against in "
+            f"process {1e3 * np.mean(apart):+.2f} ms on average, "
+            f"{1e3 * np.abs(apart).max():.2f} ms at most.\n",
             flush=True,
         )
 
