@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -136,13 +137,16 @@ def simulator(
         feedback = run.feedback if run else contract.feedback
         if feedback not in ("held", "ideal"):
             feedback = str(next(iter(_near(feedback, path)), feedback))
-    servos = servo_ranges(chosen, feedback)
-    if servos.borrowed:
-        kinds = sorted(set(servos.borrowed.values()))
-        warn(
-            [
-                f"{chosen} has no {', '.join(servos.borrowed)}: they take the numbers of "
-                f"{', '.join(kinds)}. Calibrate them to know."
-            ]
+    return task, servo_ranges(chosen, feedback)
+
+
+def tell_borrowed(servos: Iterable[ServoRanges]) -> None:
+    """Which joints go by another's numbers, once per calibration."""
+    warn(
+        dict.fromkeys(
+            f"{s.source} has no {', '.join(s.borrowed)}: they take the numbers of "
+            f"{', '.join(sorted(set(s.borrowed.values())))}. Calibrate them to know."
+            for s in servos
+            if s.borrowed
         )
-    return task, servos
+    )

@@ -15,7 +15,7 @@ import tyro
 from rich.table import Table
 
 from cli import terminal
-from cli.policy_choice import chosen_actuator, policy_at, run_folder, simulator
+from cli.policy_choice import chosen_actuator, policy_at, run_folder, simulator, tell_borrowed
 from cli.terminal import err, need_positive, out, print_json
 from cli.user_errors import run_program
 from common.errors import InputError
@@ -146,6 +146,7 @@ def _tries(paths: Sequence[Path], options: Analyze) -> Tries:
             task, servos, options.command, options.robots, options.seconds, options.seed
         )  # fmt: skip
         tries.append((name, policy, trial))
+    tell_borrowed(trial.servos for _, _, trial in tries)
     return tries
 
 

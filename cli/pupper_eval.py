@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import tyro
 
 from cli import terminal
-from cli.policy_choice import policy_at, run_folder, simulator
+from cli.policy_choice import policy_at, run_folder, simulator, tell_borrowed
 from cli.terminal import err, number, out, print_json
 from cli.user_errors import run_program
 from common.errors import InputError
@@ -81,6 +81,7 @@ def _run(options: Eval) -> None:
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
     task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
+    tell_borrowed([servos])
     flat = replace(task, terrain="flat")
     stages = 8 + len(options.terrain) + len(options.extra_delay_ms)
     with terminal.progress("walking", stages) as advance:

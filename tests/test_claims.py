@@ -291,6 +291,7 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     arguments = ("claims", *policies, "--actuator", SAMPLES / "calibrated.yaml")
     code, out, err = run_program(capsys, cli.pupper_analyze, *arguments, "--json")
     assert code == 0, err
+    assert " ".join(err.split()).count("they take the numbers of") == 1, "said once, not by policy"
     found = json.loads(out)
     assert set(found["claims"][0]) == {
         "id", "claim", "paper", "ours", "interval", "verdict", "how",
