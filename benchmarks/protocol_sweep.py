@@ -5,7 +5,7 @@ of a joint's lag is that of a servo with the true parameters which gets the goal
 at which the emulator's servo got them, without noise and every millisecond, as in
 `lag_accuracy.py`. Beside it stands what the same robot gives without a protocol, in process and in
 virtual time. The true dead time is what a model with steps of 2 ms has to have to lag as the
-emulator's servos do in steps of 1 ms.
+emulator's servos do in steps of 1 ms, and the time that commands take to the servo.
 
     .venv/bin/python benchmarks/protocol_sweep.py
 """
@@ -36,6 +36,8 @@ from sysid.recorder import record
 from sysid.recording import Recording, load
 from sysid.tone import tone_response
 
+_STAMP_S = 0.005  # a stamp may be later than what it stamps; commands are 19 ms apart
+
 
 def sweep(kind: str, seed: int, joints: list[str], frequencies: list[float], seconds: float):
     """Recordings with and without the protocol, the server, and bus time minus emulator time."""
@@ -65,6 +67,16 @@ def true_motion(server, joint: str, shift: float) -> tuple[np.ndarray, np.ndarra
             upcoming += 1
         position[n] = servo.position_at(float(now))
     return times + shift, position
+
+
+def on_the_way(recording: Recording, server, joint: str, shift: float) -> float:
+    """How long commands take from their stamp to the servo, median [s]."""
+    k = JOINT_NAMES.index(joint)
+    arrived = shift + np.array([at for at, i, _ in server.emulator.bench.commands if i == k])
+    sent = np.concatenate([trial.send_time_s for trial in recording.trials(joint)])
+    upcoming = np.searchsorted(arrived, sent - _STAMP_S)
+    inside = upcoming < len(arrived)
+    return float(np.median(arrived[upcoming[inside]] - sent[inside]))
 
 
 def true_lag(recording: Recording, server, joint: str, shift: float) -> float:
@@ -113,6 +125,7 @@ def main() -> None:
             truth = true_lag(recording, server, joint, shift)
             servo = server.emulator.bench.robot.servos[JOINT_NAMES.index(joint)].actuator
             own = float(delay_at_step(servo, TIME_STEP_S, PHYSICS_STEP_S)[0])
+            own += on_the_way(recording, server, joint, shift)
             errors.append(lag.value - truth)
             inside += lag.low <= truth <= lag.high
             held += delay.low <= own <= delay.high
