@@ -145,6 +145,9 @@ class FeetechBus:
         status = np.full(joints, 0)
         replies = self._ask(size)
         time_s[:] = self.now()
+        if replies and "reading_turn_s" not in self.metadata:
+            turns = [reply.after_s - reply.before_s for reply in replies.values()]
+            self.metadata["reading_turn_s"] = float(np.median(turns))
         for k, servo in enumerate(self._servos):
             reply = replies.get(servo.id)
             servo.misses = 0 if reply else servo.misses + 1

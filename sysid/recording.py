@@ -80,6 +80,8 @@ class Trial:
         Whether the servo itself answered each read, so that no reading can be an old one.
     truncation : Truncation
         How the bus cut the commands.
+    reading_turn_s : float
+        How long the exchange took of which `read_time_s` is the middle; 0 if unknown.
     """
 
     joint: str
@@ -93,6 +95,7 @@ class Trial:
     initial_command_rad: float
     direct: bool = False
     truncation: Truncation = Truncation()
+    reading_turn_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -166,6 +169,7 @@ class Recording:
                         (bus.get("command_rounding") or {}).get(joint),
                         (bus.get("count_zero_rad") or {}).get(joint),
                     ),
+                    bus.get("reading_turn_s") or 0.0,
                 )
             )
         return found

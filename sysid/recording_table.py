@@ -7,11 +7,11 @@ import difflib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import InputError
 from common.joints import strange_joint
@@ -23,13 +23,26 @@ _LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
 _TEXT_COLUMNS = ("joint", "signal")
 
 
+class Bus(BaseModel):
+    """What numbers are computed from, of what a bus says of itself; other keys are kept."""
+
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+    kind: str | None = None
+    command_quantum_rad: float | dict[str, float | None] | None = None
+    command_rounding: dict[str, Literal["up", "down", "nearest"] | None] | None = None
+    count_zero_rad: dict[str, float | None] | None = None
+    speed_limit_rad_s: Annotated[float, Field(gt=0)] | None = None
+    reading_turn_s: Annotated[float, Field(ge=0, le=1)] | None = None
+
+
 class Header(BaseModel):
     """What is known of a recording's header; other keys are kept as they are."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 
     schema_version: int = 1
-    bus: dict[str, Any] = {}
+    bus: Bus = Bus()
     joints: list[str] = []
     start_pose_rad: dict[str, float] = {}
     read_after_send_s: float | None = None

@@ -179,6 +179,24 @@ def test_each_trial_knows_how_its_bus_cut_commands(tmp_path):
     assert cut.truncation == Truncation(0.0057, "up")
 
 
+@pytest.mark.parametrize(
+    ("bus", "where"),
+    [
+        ({"command_quantum_rad": "wide"}, "command_quantum_rad"),
+        ({"command_quantum_rad": {"LF_hip": [1]}}, "command_quantum_rad"),
+        ({"command_rounding": {"LF_hip": "sideways"}}, "command_rounding.LF_hip"),
+        ({"count_zero_rad": {"LF_hip": "0"}}, "count_zero_rad.LF_hip"),
+        ({"reading_turn_s": -1}, "reading_turn_s"),
+        ({"speed_limit_rad_s": "fast"}, "speed_limit_rad_s"),
+        ({"kind": 7}, "kind"),
+    ],
+)
+def test_what_numbers_are_made_of_is_checked_in_the_header_s_bus(tmp_path, bus, where):
+    top = ("# pupper-sysid recording", f"# bus: {json.dumps(bus)}")
+    with pytest.raises(InputError, match=f"header, bus.{where}"):
+        load(write(tmp_path, rows(), top=top))
+
+
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         load(tmp_path / "nothing.csv")
