@@ -51,6 +51,8 @@ _GOAL_TRIES = 3
 _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
 _CHUNK = 16
+_DOUBTS = 10  # exchanges that say how well readings are dated
+_FRAME = 6  # bytes of an answer beside its data
 
 
 @dataclass
@@ -110,6 +112,7 @@ class FeetechBus:
             self._servos = [_Servo(i, series[i]) for i in self._map.ids]
             self._clock = HostClock()
             self._turn = 0
+            self._doubts_s: list[float] = []
             self.joint_names = self._map.joint_names
             self.limits = self._map.position_limits()
             self.metadata: dict[str, Any] = self._describe(device)
@@ -145,9 +148,9 @@ class FeetechBus:
         status = np.full(joints, 0)
         replies = self._ask(size)
         time_s[:] = self.now()
-        if replies and "reading_turn_s" not in self.metadata:
-            turns = [reply.after_s - reply.before_s for reply in replies.values()]
-            self.metadata["reading_turn_s"] = float(np.median(turns))
+        if replies and len(self._doubts_s) < _DOUBTS:
+            self._doubts_s.append(self._doubt_s(replies, size))
+            self.metadata["read_time_doubt_s"] = float(np.median(self._doubts_s))
         for k, servo in enumerate(self._servos):
             reply = replies.get(servo.id)
             servo.misses = 0 if reply else servo.misses + 1
@@ -236,6 +239,21 @@ class FeetechBus:
             for servo in silent:
                 servo.misses = 0
         return replies
+
+    def _doubt_s(self, replies: dict[int, Reply], size: int) -> float:
+        """By how much readings may have been taken earlier or later than they are stamped [s].
+
+        Half a servo's turn, at an unknown moment of which it looks, and half of what an exchange
+        with several took longer than the line needs: nobody knows where between them.
+        """
+        turns = [reply.after_s - reply.before_s for reply in replies.values()]
+        needed = 0.0
+        for joint, servo in zip(self.joint_names, self._servos, strict=True):
+            if servo.id in replies and servo.series.has_sync_read:
+                wait_s = 2e-6 * self.metadata["servos"][joint].get("return_delay", 0)
+                needed += wait_s + 10.0 / self.line.baud * (size + _FRAME)
+        longer = max(sum(turns) - needed, 0.0) if needed else 0.0
+        return 0.5 * (float(np.median(turns)) + longer)
 
     def _believable(self, servo: _Servo, index: int, at: float, count: int) -> bool:
         """Whether the servo can be there; a checksum of 8 bits lets one garbled frame in 256 by."""

@@ -184,10 +184,9 @@ def lag_budget(
             "are dated to the middle between two reads, which may put all lags off by half a loop "
             f"({1e3 * loop / 2:.0f} ms). A longer sweep would settle it."
         )
-    # a servo takes its reading at some moment of its turn, and is stamped with the middle of it
-    half_turn = max(t.reading_turn_s for t in trials) / 2
-    fresh, lag = fresh.widened(half_turn), lag.widened(half_turn)
-    by_frequency = tuple(replace(f, lag=f.lag.widened(half_turn)) for f in by_frequency)
+    doubt = max(t.read_time_doubt_s for t in trials)
+    fresh, lag = fresh.widened(doubt), lag.widened(doubt)
+    by_frequency = tuple(replace(f, lag=f.lag.widened(doubt)) for f in by_frequency)
     return LagBudget(
         joint, naive, fresh, lag,
         naive.value - fresh.value, fresh.value - lag.value,

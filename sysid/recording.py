@@ -80,8 +80,8 @@ class Trial:
         Whether the servo itself answered each read, so that no reading can be an old one.
     truncation : Truncation
         How the bus cut the commands.
-    reading_turn_s : float
-        How long the exchange took of which `read_time_s` is the middle; 0 if unknown.
+    read_time_doubt_s : float
+        By how much all readings may have been taken earlier or later than `read_time_s`.
     """
 
     joint: str
@@ -95,7 +95,7 @@ class Trial:
     initial_command_rad: float
     direct: bool = False
     truncation: Truncation = Truncation()
-    reading_turn_s: float = 0.0
+    read_time_doubt_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Recording:
                         (bus.get("command_rounding") or {}).get(joint),
                         (bus.get("count_zero_rad") or {}).get(joint),
                     ),
-                    bus.get("reading_turn_s") or 0.0,
+                    bus.get("read_time_doubt_s") or 0.0,
                 )
             )
         return found

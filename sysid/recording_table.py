@@ -33,7 +33,7 @@ class Bus(BaseModel):
     command_rounding: dict[str, Literal["up", "down", "nearest"] | None] | None = None
     count_zero_rad: dict[str, float | None] | None = None
     speed_limit_rad_s: Annotated[float, Field(gt=0)] | None = None
-    reading_turn_s: Annotated[float, Field(ge=0, le=1)] | None = None
+    read_time_doubt_s: Annotated[float, Field(ge=0, le=1)] | None = None
 
 
 class Header(BaseModel):

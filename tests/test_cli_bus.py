@@ -56,9 +56,9 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert recording.joints == ["LF_thigh"] and bus["baud"] == 1_000_000
     assert bus["servos"]["LF_thigh"]["p"] == 32 and bus["servos"]["LF_thigh"]["return_delay"] == 250
     assert recording.metadata["completed"]["guard"]["clipped"] == 0
-    turn = recording.trials("LF_thigh")[0].reading_turn_s
-    # asked, a return delay of 500 µs, answered, and what this host adds
-    assert 0.0005 < turn < 0.02 and turn == bus["reading_turn_s"]
+    doubt = recording.trials("LF_thigh")[0].read_time_doubt_s
+    # half of a turn with a return delay of 500 µs, and what this host adds
+    assert 0.0003 < doubt < 0.02 and doubt == bus["read_time_doubt_s"]
     assert {"voltage_v", "temperature_c", "load"} <= set(recording.table.columns)
     # at 3 Hz and 0.3 rad the servo follows: it moved by most of what it was told (a loaded machine
     # may miss a reading)

@@ -93,10 +93,10 @@ def test_reads_that_are_answered_at_once_and_sometimes_lost_make_no_poll(share):
         assert f.lag.low < 0.04 < f.lag.high
 
 
-def test_a_reading_s_turn_on_the_line_is_part_of_the_interval():
+def test_when_readings_were_taken_is_part_of_the_interval():
     trials = tone_trials(0.04, np.random.default_rng(13), period_s=0.0, quantum_rad=0.001)
-    turned = [replace(t, reading_turn_s=0.0008) for t in trials]
-    known, unknown = (lag_budget("LF_hip", t, np.random.default_rng(0)) for t in (trials, turned))
+    doubted = [replace(t, read_time_doubt_s=0.0004) for t in trials]
+    known, unknown = (lag_budget("LF_hip", t, np.random.default_rng(0)) for t in (trials, doubted))
     for a, b in ((known.lag, unknown.lag), (known.fresh, unknown.fresh)):
         assert (b.value, b.low, b.high) == (a.value, a.low - 0.0004, a.high + 0.0004)
     for a, b in zip(known.by_frequency, unknown.by_frequency, strict=True):

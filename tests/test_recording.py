@@ -186,7 +186,7 @@ def test_each_trial_knows_how_its_bus_cut_commands(tmp_path):
         ({"command_quantum_rad": {"LF_hip": [1]}}, "command_quantum_rad"),
         ({"command_rounding": {"LF_hip": "sideways"}}, "command_rounding.LF_hip"),
         ({"count_zero_rad": {"LF_hip": "0"}}, "count_zero_rad.LF_hip"),
-        ({"reading_turn_s": -1}, "reading_turn_s"),
+        ({"read_time_doubt_s": -1}, "read_time_doubt_s"),
         ({"speed_limit_rad_s": "fast"}, "speed_limit_rad_s"),
         ({"kind": 7}, "kind"),
     ],
