@@ -115,8 +115,9 @@ class Calibrate:
         elapsed: float,
     ) -> None:
         shown = terminal.table(
-            "DelayedPD per joint", "joint", "delay ms", "steps @500 Hz", "Kp", "Kd", "friction",
-            "armature", "speed rad/s", "error mrad", "unseen Hz mrad", "paper mrad",
+            "DelayedPD per joint", "joint", "delay ms", "steps @500 Hz", "Kp", "Kd",
+            "fric. N·m", "J 1e-4 kg·m²", "speed rad/s", "error mrad", "unseen Hz mrad",
+            "paper mrad",
         )  # fmt: skip
         for name, r in results.items():
             a, s = made.joint(name).actuator, r.rungs["delayed_pd"].scores
@@ -126,7 +127,7 @@ class Calibrate:
                 terminal.number(a.stiffness_nm_per_rad.value),
                 terminal.number(a.damping_nm_s_per_rad.value, 3),
                 terminal.number(a.friction_loss_nm.value, 3),
-                f"{a.armature_kg_m2.value:.1e}",
+                terminal.number(1e4 * a.armature_kg_m2.value, 2),
                 terminal.number(a.velocity_limit_rad_s.value), terminal.ms(s.fresh),
                 terminal.ms(s.leave_one_out), terminal.ms(paper.fresh if paper else None),
             )  # fmt: skip

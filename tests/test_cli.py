@@ -1,6 +1,7 @@
 """The command line as a user meets it: JSON alone on stdout, sentences, exit codes."""
 
 import importlib
+import io
 import json
 import os
 import signal
@@ -13,8 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import refused, run, run_program
+from rich.console import Console
 
 import cli.pupper_sysid
+from cli import terminal
 from servo_models.calibration import load_calibration
 from sysid.recording import load
 
@@ -195,6 +198,16 @@ def test_a_sweep_killed_half_way_leaves_a_file_that_every_command_reads(capsys, 
         code, _, err = run(capsys, *command, path)
         assert code == 0, err
     assert any("not recorded to its end" in w for w in load(path).warnings)
+
+
+def test_a_number_in_a_table_that_is_too_wide_is_folded_not_cut():
+    table = terminal.table("Gait", "policy", "Hz", "sine fit")
+    table.add_row("lstm", "3.27 (3.26–3.28)", "0.641234567890")
+    written = io.StringIO()
+    Console(width=24, file=written).print(table)
+    shown = written.getvalue()
+    assert "…" not in shown
+    assert sorted(c for c in shown if c.isdigit()) == sorted("327326328" + "0641234567890")
 
 
 def test_help_of_every_command_has_an_example(capsys):
