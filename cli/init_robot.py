@@ -54,6 +54,15 @@ class InitRobot:
                     " If they have servos, give them actuators there, or take all actuators out."
                 ]
             )
+        narrow = [n for n, r in zip(found.joint_names, room, strict=True) if r < _SMALLEST_RAD]
+        if narrow:
+            terminal.warn(
+                [
+                    f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of room, too little for "
+                    f"a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
+                    'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
+                ]
+            )
         if self.json:
             terminal.print_json(
                 {

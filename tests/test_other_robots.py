@@ -72,6 +72,16 @@ def test_what_is_guessed_is_said_with_what_corrects_it(capsys):
     assert 0 < said.find("monitor --joint-map arm.joints.yaml") < said.find("calibrate-joints")
 
 
+def test_limits_in_the_wrong_unit_are_said(capsys):
+    hinge = '<joint name="{}" axis="0 0 1" range="-1.5 1.5"/><geom size=".02"/>'
+    Path("odd_unit.xml").write_text(
+        f"<mujoco><worldbody><body>{hinge.format('lift')}</body></worldbody></mujoco>"
+    )
+    code, _, err = run(capsys, "init-robot", "odd_unit.xml", "--json")
+    assert code == 0 and "lift: less than 0.05 rad of room" in " ".join(err.split())
+    assert 'angle="radian"' in err
+
+
 def test_hinges_driven_through_tendons_and_in_the_parent_s_frame_are_taken_and_others_named(capsys):
     driven = """</worldbody><tendon><fixed name="t"><joint joint="elbow" coef="1"/></fixed></tendon>
     <actuator><position joint="base_yaw"/><position jointinparent="shoulder"/>
