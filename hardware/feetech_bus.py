@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from common.errors import BusError, InputError
 from hardware.bus import BusSample, Sent
 from hardware.clock import HostClock
-from hardware.feetech_line import FeetechLine, Reply, known_models
-from hardware.feetech_registers import SCS0009, STS3215, Series
+from hardware.feetech_line import FRAME_BYTES, FeetechLine, Reply, known_models
+from hardware.feetech_registers import RETURN_DELAY_UNIT_S, SCS0009, STS3215, Series
 from hardware.joint_map import JointMap, load_joint_map
 
 AUTO_BAUDS = (1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400)
@@ -52,7 +52,6 @@ _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
 _CHUNK = 16
 _DOUBTS = 10  # exchanges that say how well readings are dated
-_FRAME = 6  # bytes of an answer beside its data
 
 
 @dataclass
@@ -250,8 +249,8 @@ class FeetechBus:
         needed = 0.0
         for joint, servo in zip(self.joint_names, self._servos, strict=True):
             if servo.id in replies and servo.series.has_sync_read:
-                wait_s = 2e-6 * self.metadata["servos"][joint].get("return_delay", 0)
-                needed += wait_s + 10.0 / self.line.baud * (size + _FRAME)
+                wait_s = RETURN_DELAY_UNIT_S * self.metadata["servos"][joint].get("return_delay", 0)
+                needed += wait_s + 10.0 / self.line.baud * (size + FRAME_BYTES)
         longer = max(sum(turns) - needed, 0.0) if needed else 0.0
         return 0.5 * (float(np.median(turns)) + longer)
 

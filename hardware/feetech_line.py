@@ -42,6 +42,9 @@ REPLY_TIMEOUT_S = 0.003
 RETURN_DELAY_S = 0.00051
 """Longest that a servo may be set to wait before it answers (254 units of 2 µs)."""
 
+FRAME_BYTES = 6
+"""Of an answer, beside its data."""
+
 _POLL_S = 0.001
 _REOPEN_S = 0.01
 _MODEL = 3
@@ -220,7 +223,7 @@ class FeetechLine:
             return {}
         wanted = set(servos)
         reader = FrameReader(lambda frame_id, length: frame_id in wanted and length == size + 2)
-        answer = size + 6
+        answer = size + FRAME_BYTES
         wire = (asked + len(servos) * answer) * self._byte_s()
         deadline = max(before, self._busy_s) + wire + len(servos) * RETURN_DELAY_S + self.patience_s
         owed = self._port.sent if self.echoes else b""

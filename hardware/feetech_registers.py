@@ -20,6 +20,7 @@ HIGHEST_ID = 253
 
 ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+RETURN_DELAY_UNIT_S = 2e-6
 """By the number in the servo's baud register."""
 
 MODEL_ADDRESS = 3

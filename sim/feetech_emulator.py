@@ -20,6 +20,7 @@ from hardware.feetech_registers import (
     BROADCAST_ID,
     PING,
     READ,
+    RETURN_DELAY_UNIT_S,
     SYNC_READ,
     SYNC_WRITE,
     WRITE,
@@ -186,7 +187,7 @@ class FeetechEmulator:
         servo = self.servos.get(servo_id)
         if servo is None or self._free_at < self._brown_out_until:
             return []
-        begin = self._free_at + 2e-6 * self._get(servo_id, "return_delay")
+        begin = self._free_at + RETURN_DELAY_UNIT_S * self._get(servo_id, "return_delay")
         kind = self._strike(servo_id, begin)
         if begin < self._brown_out_until:
             return []

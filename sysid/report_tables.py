@@ -30,6 +30,7 @@ MODEL_NAMES = {
     "delayed_pd_backlash": "DelayedPD + backlash",
 }
 
+_LEVEL = "(90\N{NO-BREAK SPACE}%)"
 _KEY = Column("joint", lambda row: row["joint"], "key")
 
 
@@ -59,8 +60,8 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         _number("naive, ms", "naive_lag_ms"),
         _number("= feedback age", "feedback_age_ms"),
         _number("+ command hold", "command_hold_ms"),
-        _ranged("+ servo lag (90 %)", "lag_ms"),
-        _ranged("of it dead time (90 %)", "dead_time_ms"),
+        _ranged(f"+ servo lag {_LEVEL}", "lag_ms"),
+        _ranged(f"of it dead time {_LEVEL}", "dead_time_ms"),
         _number("and dynamics", "dynamics_ms"),
         _number("poll, ms", "poll_period_ms", 2),
         _number("lost polls, %", "loss", 0, 100.0),
@@ -109,7 +110,7 @@ def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         _number("Hz", "frequency_hz", 2),
         _number("gain", "gain", 2),
         _number("phase, °", "phase_deg", 0),
-        _ranged("lag, ms (90 %)", "lag_ms"),
+        _ranged(f"lag, ms {_LEVEL}", "lag_ms"),
         _number("naive gain", "naive_gain", 2),
         _number("naive lag, ms", "naive_lag_ms"),
     )
@@ -135,7 +136,7 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
         _text("form", "transfer_function"),
         Column("number", lambda row: _readable(row["parameter"], ""), "words"),
         Column(
-            "value (90 %)",
+            f"value {_LEVEL}",
             lambda row: _value_cell(row["value"], row["value_low"], row["value_high"]),
         ),
         Column("unit", lambda row: unit_of(row["parameter"]), "words"),
@@ -222,7 +223,7 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
     columns = (
         _KEY,
         Column("number", lambda row: _readable(row["parameter"], row["part"]), "words"),
-        Column("value (90 %)", lambda row: _value_cell(row["value"], row["low"], row["high"])),
+        Column(f"value {_LEVEL}", lambda row: _value_cell(row["value"], row["low"], row["high"])),
         _text("unit", "unit"),
         _text("identified", "identified"),
         Column("why", lambda row: row["why"], "prose"),
