@@ -215,7 +215,9 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise InputError(f"{path}, header, {where}: {first['msg']}.") from None
+        raise InputError(
+            f"{path}, header, {where}: {first['msg']}. Mend it, or leave it out."
+        ) from None
     if header.schema_version > 1:
         raise InputError(
             f"{path} has schema_version {header.schema_version}, written by a newer pupper-sysid; "

@@ -17,7 +17,7 @@ from matplotlib.text import Text
 
 from common.errors import InputError
 from common.figure_style import save
-from common.page import Section, render
+from common.page import Column, Section, Table, render
 from servo_models.delayed_pd import TIME_STEP_S
 from sysid import figures
 from sysid.calibrate import JointCalibrationResult, RungResult
@@ -196,6 +196,9 @@ def test_commands_in_sentences_are_set_as_code_and_escaped():
     html = render("t", "s", [section])
     assert "Add <code>sweep --kind steps</code>, not <code>&lt;b&gt;</code>." in html
     assert "<li>A ` alone.</li>" in html
+    words = Column("", lambda row: row[""], "words")
+    table = Table("t", "T", (words,), ({"": "run `delay`"},))
+    assert "run <code>delay</code></td>" in render("t", "s", [Section("a", "A", tables=[table])])
 
 
 def test_the_doctors_verdict_is_on_the_page_in_sentences(page):
