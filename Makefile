@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test check docs setup clean
+.PHONY: demo test check docs links setup clean
 
 demo: setup
 	$(BIN)/pupper-sysid sweep --freqs 1-10 --joints LF --seed 1 --out $(DEMO)/sweep.csv --truth --force
@@ -17,13 +17,21 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n 2
 
-check: setup
+check: setup links
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 
 docs: setup
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
+# the rooms as one package on disk, for tools that do not read setuptools' package-dir
+links: setup
+	mkdir -p $(VENV)/links/pupper_sysid
+	ln -sfn ../../../api/__init__.py $(VENV)/links/pupper_sysid/__init__.py
+	ln -sfn ../../../api/py.typed $(VENV)/links/pupper_sysid/py.typed
+	for room in common servo_models hardware sysid sim policies cli; do \
+		ln -sfn ../../../$$room $(VENV)/links/pupper_sysid/$$room; done
 
 setup: $(VENV)/.installed
 

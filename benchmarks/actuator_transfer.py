@@ -15,10 +15,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import torch
 
-from policies.evaluation import evaluation_task, summary, walk
-from policies.policy_file import load_policy
-from sim.servo_ranges import servo_ranges
-from sim.walking_config import Walking
+from pupper_sysid.policies.analysis.evaluation import evaluation_task, summary, walk
+from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 CALIBRATED = "data/samples/calibrated.yaml"
 

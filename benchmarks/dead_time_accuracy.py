@@ -21,8 +21,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from random_robots import sweep_random_robot
 
-from servo_models.delayed_pd import TIME_STEP_S
-from sysid.calibrate import calibrate
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.identify.calibrate import calibrate
 
 
 @dataclass(frozen=True)

@@ -26,19 +26,19 @@ import numpy as np
 import torch
 from emulators import KINDS, walking_servers
 
-from cli.fit_servo import FitServo
-from hardware.connect import open_guarded, parse_address
-from hardware.esp32_bus import Esp32Bus
-from hardware.joint_map import load_joint_map
-from hardware.loop import real_time_priority
-from policies.assembly import assemble, reassemble
-from policies.commands import constant
-from policies.deployment import deploy
-from policies.policy_file import load_policy
-from policies.stack_trials import walk_once
-from policies.stacks import STACKS
-from policies.walk_log import read_walk, replay
-from sysid.recording import RecordingWriter
+from pupper_sysid.cli.commands.fit_servo import FitServo
+from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.policies.deploy.assembly import assemble, reassemble
+from pupper_sysid.policies.deploy.commands import constant
+from pupper_sysid.policies.deploy.deployment import deploy
+from pupper_sysid.policies.deploy.stack_trials import walk_once
+from pupper_sysid.policies.deploy.stacks import STACKS
+from pupper_sysid.policies.deploy.walk_log import read_walk, replay
+from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.sysid.recordings.recording import RecordingWriter
 
 CALIBRATION = "data/samples/calibrated.yaml"
 POLICIES = Path("data/samples/policies")

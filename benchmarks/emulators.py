@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from hardware.feetech_registers import STS3215
-from hardware.joint_map import load_joint_map
-from sim.bus_faults import BusFaults
-from sim.emulated_bus import EmulatedBus
-from sim.emulated_robot import RobotSpec, draw_robot
-from sim.esp32_emulator import ImuProxy, ProxyEmulator
-from sim.esp32_socket import ProxySocket
-from sim.feetech_emulator import FeetechEmulator
-from sim.feetech_pty import FeetechPty
-from sim.servo_bench import ServoBench
-from sim.walking_robot import WalkingRobot
+from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
+from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.walking.robot import WalkingRobot
 
 KINDS = ("feetech", "esp32")
 

@@ -25,11 +25,11 @@ from itertools import pairwise
 import numpy as np
 from emulators import KINDS, served
 
-from common.joints import DEFAULT_POSE, JOINT_NAMES
-from hardware.bus import BusSample
-from hardware.connect import open_bus, parse_address
-from hardware.loop import real_time_priority
-from sim.bus_faults import ANSWER_KINDS, STATE_KINDS, BusFaults
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample
+from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.sim.emulator.faults import ANSWER_KINDS, STATE_KINDS, BusFaults
 
 POSE = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
 RATES = {"brown-out": 0.004, "unplugged": 0.004, "frozen": 0.03, "error-bits": 0.03}

@@ -20,11 +20,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from sim.emulated_bus import EmulatedBus
-from sim.emulated_robot import RobotSpec, draw_robot
-from sysid.excitation import plan
-from sysid.fleet import Settings, calibrate_fleet
-from sysid.recorder import record
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sysid.identify.fleet import Settings, calibrate_fleet
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
 
 JOINT, TONES_HZ, SECONDS = "LF_hip", (2.0, 4.0), 2.0
 

@@ -23,14 +23,14 @@ from functools import partial
 
 import numpy as np
 
-from hardware import esp32_datagrams as datagrams
-from hardware.feetech_frames import Frame, FrameReader
-from hardware.feetech_registers import SCS0009, STS3215, Series
-from hardware.joint_map import load_joint_map
-from sim.emulated_robot import RobotSpec, draw_robot
-from sim.esp32_emulator import ProxyEmulator
-from sim.feetech_emulator import FeetechEmulator
-from sim.servo_bench import ServoBench
+from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
+from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
 
 SERVOS = range(1, 13)
 MEMORY = 80

@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 from emulators import KINDS, in_process, served
 
-from common.joints import DEFAULT_POSE, JOINT_NAMES
-from sim.servo_bench import ServoBench
-from sysid.calibrate import calibrate
-from sysid.excitation import plan
-from sysid.recorder import record
-from sysid.recording import Recording, load
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
 
 JOINT = "LF_hip"
 SWEEP = ("sweep", "--joints", JOINT, "--freqs", "2,3,5", "--duration", "3")
@@ -47,7 +47,7 @@ def campaign(server, bus: str, folder: Path, kills: int, seed: int) -> dict:
     while len(parked) < kills:
         arguments = ["--resume", str(path)] if path.exists() else ["--bus", bus, "--out", str(path)]
         process = subprocess.Popen(
-            [sys.executable, "-m", "cli.pupper_sysid", *SWEEP, *arguments],
+            [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", *SWEEP, *arguments],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip
         # at any moment from the first row or, resumed, from the first torque on

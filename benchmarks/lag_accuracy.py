@@ -28,10 +28,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from random_robots import sweep_random_robot
 
-from common.errors import InputError
-from sysid.delay import lag_budget, tone_lags, tone_weights
-from sysid.poll_lattice import find_poll_lattice, readings
-from sysid.tone import tone_response
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
+from pupper_sysid.sysid.lag.lag_budget import lag_budget, tone_lags, tone_weights
+from pupper_sysid.sysid.lag.tone import tone_response
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,22 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from common.errors import InputError
-from common.figure_style import BLUE, GREEN, ORANGE, RED, SKY, axes_column, save, styled
-from policies.curves import IMITATION, PROGRESS
-from policies.evaluation import evaluation_task, summary, walk
-from policies.policy_file import load_policy
-from policies.run_file import Run, load_run
-from sim.servo_ranges import servo_ranges
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.figure_style import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    RED,
+    SKY,
+    axes_column,
+    save,
+    styled,
+)
+from pupper_sysid.policies.analysis.evaluation import evaluation_task, summary, walk
+from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.policies.train.curves import IMITATION, PROGRESS
+from pupper_sysid.policies.train.run_file import Run, load_run
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 COLOURS = {"mlp": BLUE, "mlp-actions": SKY, "lstm": RED, "gru": ORANGE, "transformer": GREEN}
 ERRORS = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")

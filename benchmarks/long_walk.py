@@ -24,14 +24,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from hardware.guard import GuardedBus
-from hardware.joint_map import load_joint_map
-from policies.assembly import assemble
-from policies.deployment import Tick, deploy
-from policies.policy_file import load_policy
-from policies.stacks import STACKS
-from sim.emulated_robot import draw_robot
-from sim.walking_bus import WalkingBus
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.deploy.assembly import assemble
+from pupper_sysid.policies.deploy.deployment import Tick, deploy
+from pupper_sysid.policies.deploy.stacks import STACKS
+from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.walking.bus import WalkingBus
 
 POLICY, CALIBRATION = Path("data/samples/policies/lstm"), "data/samples/calibrated.yaml"
 _EVERY_S = 10.0

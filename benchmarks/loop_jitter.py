@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from common.joints import DEFAULT_POSE, JOINT_NAMES
-from hardware.clock import HostClock
-from hardware.connect import open_guarded, parse_address
-from hardware.guard import GuardedBus
-from hardware.loop import FixedRateLoop, real_time_priority
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.clock import HostClock
+from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.loop import FixedRateLoop, real_time_priority
+from pupper_sysid.hardware.safety.guard import GuardedBus
 
 PERIOD_S = 0.02
 POSE = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
@@ -60,7 +60,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="jitter") as name, real_time_priority() as priority:
         link = Path(name) / "servos"
         emulator = subprocess.Popen(
-            [sys.executable, "-m", "cli.pupper_sysid", "emulate", "feetech", "--link", str(link)],
+            [
+                sys.executable,
+                "-m",
+                "pupper_sysid.cli.programs.pupper_sysid",
+                "emulate",
+                "feetech",
+                "--link",
+                str(link),
+            ],
             stdout=subprocess.DEVNULL,
         )
         try:

@@ -21,20 +21,20 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from emulators import KINDS, in_process, served
 
-from common.joints import DEFAULT_POSE, JOINT_NAMES
-from hardware.connect import open_bus, parse_address
-from hardware.guard import GuardedBus
-from hardware.loop import real_time_priority
-from servo_models.delayed_pd import TIME_STEP_S
-from servo_models.step_size import delay_at_step
-from sim.free_air_servo import PHYSICS_STEP_S, FreeAirServo
-from sysid.calibrate import calibrate
-from sysid.delay import tone_lags, tone_weights
-from sysid.excitation import plan
-from sysid.poll_lattice import Readings, find_poll_lattice, readings
-from sysid.recorder import record
-from sysid.recording import Recording, load
-from sysid.tone import tone_response
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.step_size import delay_at_step
+from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S, FreeAirServo
+from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.lag.lag_budget import tone_lags, tone_weights
+from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
 
 _STAMP_S = 0.005  # a stamp may be later than what it stamps; commands are 19 ms apart
 

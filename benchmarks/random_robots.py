@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from common.joints import JOINT_NAMES
-from servo_models.delayed_pd import DelayedPDParameters
-from servo_models.step_size import delay_at_step
-from sim.emulated_bus import EmulatedBus
-from sim.emulated_robot import EmulatedRobot, RobotSpec, draw_robot, random_spec
-from sim.free_air_servo import PHYSICS_STEP_S, FreeAirServo
-from sim.servo_plant import FreeAirServos
-from sysid.excitation import parse_frequencies, plan
-from sysid.poll_lattice import Readings
-from sysid.recorder import record
-from sysid.recording import Recording, Trial, load
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.step_size import delay_at_step
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S, FreeAirServo
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot, random_spec
+from pupper_sysid.sim.emulator.servo_plant import FreeAirServos
+from pupper_sysid.sysid.feedback.poll_lattice import Readings
+from pupper_sysid.sysid.recordings.recording import Recording, Trial, load
+from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
+from pupper_sysid.sysid.sweep.recorder import record
 
 
 @dataclass(frozen=True)

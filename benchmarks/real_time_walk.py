@@ -26,14 +26,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from hardware.connect import open_guarded, parse_address
-from hardware.joint_map import load_joint_map
-from hardware.loop import real_time_priority
-from policies.assembly import assemble
-from policies.commands import constant
-from policies.deployment import Tick, deploy
-from policies.policy_file import load_policy
-from policies.stacks import STACKS
+from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.policies.deploy.assembly import assemble
+from pupper_sysid.policies.deploy.commands import constant
+from pupper_sysid.policies.deploy.deployment import Tick, deploy
+from pupper_sysid.policies.deploy.stacks import STACKS
+from pupper_sysid.policies.network.policy_file import load_policy
 
 POLICY, CALIBRATION = Path("data/samples/policies/lstm"), "data/samples/calibrated.yaml"
 _LATE = 1.5  # of a period between two ticks: the one between was left out
@@ -121,7 +121,8 @@ def main() -> None:
         socket = Path(name) / "socket"
         emulator = subprocess.Popen(
             [
-                sys.executable, "-m", "cli.pupper_sysid", "emulate", "esp32", "--walking",
+                sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
+            "emulate", "esp32", "--walking",
                 "--seed", "0", "--socket", socket,
             ],
             stdout=subprocess.DEVNULL, preexec_fn=_before_others,

@@ -23,21 +23,21 @@ import numpy as np
 import pandas as pd
 from emulators import in_process
 
-from common.figure_style import save
-from common.joints import DEFAULT_POSE
-from servo_models.interface import ServoModel
-from sysid import servo_scores as scores
-from sysid.command_playback import playback
-from sysid.excitation import LEAD_IN_S
-from sysid.network_fit import fit_network, past_ticks
-from sysid.physics_fit import delayed_pd_fits, delayed_pd_model
-from sysid.published_networks import fit_published
-from sysid.recorder import record
-from sysid.recording import Recording, load
-from sysid.servo_data import ServoData, servo_data
-from sysid.servo_data_curve import FILE, data_curve_figure, measured
-from sysid.servo_data_curve import MODELS as CURVES
-from sysid.servo_samples import Part, grouped, merged_groups, samples
+from pupper_sysid.common.figure_style import save
+from pupper_sysid.common.joints import DEFAULT_POSE
+from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.report.data_curve import FILE, data_curve_figure, measured
+from pupper_sysid.sysid.report.data_curve import MODELS as CURVES
+from pupper_sysid.sysid.servo_fit import scores
+from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
+from pupper_sysid.sysid.servo_fit.physics import delayed_pd_fits, delayed_pd_model
+from pupper_sysid.sysid.servo_fit.published import fit_published
+from pupper_sysid.sysid.servo_fit.windows import Part, grouped, merged_groups, samples
+from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S
+from pupper_sysid.sysid.sweep.playback import playback
+from pupper_sysid.sysid.sweep.recorder import record
 
 JOINTS = ("LF_hip", "LF_calf")
 PERIOD_S, LOOP_ROWS = 0.02, 500

@@ -19,9 +19,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from servo_models.command_network import CommandNetwork
-from sysid.recording import load
-from sysid.servo_fit import Split, fit_servo
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
 
 REAL = Path(os.environ.get("PUPPER_REAL_DATA", Path(__file__).parents[2] / "shared" / "real"))
 SPLIT = Split(

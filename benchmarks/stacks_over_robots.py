@@ -22,9 +22,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import torch
 from deploy_protocols import CALIBRATION, DIRECTIONS, POLICIES, servo_model
 
-from policies.policy_file import load_policy
-from policies.stack_trials import Walker, compare_stacks
-from policies.stacks import STACKS
+from pupper_sysid.policies.deploy.stack_trials import Walker, compare_stacks
+from pupper_sysid.policies.deploy.stacks import STACKS
+from pupper_sysid.policies.network.policy_file import load_policy
 
 ERRORS = {"mae_vx_m_s": "forward m/s", "mae_vy_m_s": "sideways m/s", "mae_yaw_rad_s": "turn rad/s"}
 CLOSED = STACKS["closed-loop"]

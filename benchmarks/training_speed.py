@@ -24,13 +24,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 
-from policies.hyperparameters import KINDS
-from policies.run_file import preset
-from policies.speed import environment_rates, measure
-from policies.transformer import CONTEXT, CausalAttention
-from sim.servo_ranges import servo_ranges
-from sim.walking_config import Walking
-from sim.walking_env import PupperEnv
+from pupper_sysid.policies.network.hyperparameters import KINDS
+from pupper_sysid.policies.network.transformer import CONTEXT, CausalAttention
+from pupper_sysid.policies.train.run_file import preset
+from pupper_sysid.policies.train.speed import environment_rates, measure
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 ACTUATOR = "data/samples/calibrated.yaml"
 SIZES = (64, 256, 1024, 4096, 8192)

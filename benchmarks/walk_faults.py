@@ -25,10 +25,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from emulators import KINDS, walking_servers
 
-from common.joints import JOINT_NAMES
-from policies.walk_log import read_walk
-from sim.bus_faults import BusFaults
-from sim.esp32_emulator import ProxyEmulator
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.deploy.walk_log import read_walk
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.faults import BusFaults
 
 ROOT = Path(__file__).resolve().parents[1]
 POLICY, CALIBRATION = ROOT / "data/samples/policies/lstm", ROOT / "data/samples/calibrated.yaml"
@@ -94,7 +94,8 @@ def walk(kind: str, strike: Strike) -> str:
         bus = f"esp32:{folder}/socket" if kind == "esp32" else f"feetech:{folder}/servos"
         process = subprocess.Popen(
             [
-                sys.executable, "-m", "cli.pupper_deploy", POLICY, "--actuator", CALIBRATION,
+                sys.executable, "-m", "pupper_sysid.cli.programs.pupper_deploy",
+            POLICY, "--actuator", CALIBRATION,
                 "--bus", bus, "--imu", folder / "socket", "--seconds", "20", "--name", "w",
             ],
             cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)},

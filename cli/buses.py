@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from cli import terminal
-from hardware.connect import open_guarded, parse_address
-from hardware.guard import GuardedBus
-from hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.cli import terminal
+from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
 
 JOINTS_FILE = Path("joints.yaml")
 

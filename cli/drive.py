@@ -14,11 +14,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from cli import terminal
-from common.errors import InputError
-from common.joints import JOINT_NAMES
-from hardware.bus import BusSample
-from policies.deployment import Tick
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample
+from pupper_sysid.policies.deploy.deployment import Tick
 
 STEP = np.array([0.05, 0.04, 0.1])
 """What one key press adds [m/s, m/s, rad/s]."""
@@ -33,7 +33,7 @@ _SHOWN_EVERY_S = 0.2
 class Driver:
     """Commands from the keyboard; also watches the ticks to show them.
 
-    Use it as a context; it is a `policies.commands.Commands`.
+    Use it as a context; it is a `policies.deploy.commands.Commands`.
     """
 
     def __init__(self) -> None:

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 
 from rich.text import Text
 
-from cli import terminal
-from common.errors import InputError
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
 
 
 class Keyboard:

@@ -9,16 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cli.terminal import err, warn
-from common.errors import InputError
-from common.files import sha256
-from policies.run_file import RUN_FILE, Run, load_run
-from servo_models.calibration import PRESETS
-from sim.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
-from sim.walking_config import Walking
+from pupper_sysid.cli.terminal import err, warn
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
+from pupper_sysid.servo_models.calibration.calibration import PRESETS
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
 if TYPE_CHECKING:
-    from policies.policy_file import Policy
+    from pupper_sysid.policies.network.policy_file import Policy
 
 _CONTRACT = "contract.json"
 
@@ -47,7 +47,10 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
     InputError
         If there is none.
     """
-    from policies.policy_file import CONTRACT, load_policy  # torch takes seconds to import
+    from pupper_sysid.policies.network.policy_file import (  # torch takes seconds to import
+        CONTRACT,
+        load_policy,
+    )
 
     if (path / CONTRACT).is_file():
         # a shipped policy has its run's settings beside it, one in a run above it
@@ -121,7 +124,7 @@ def simulator(
     path: Path, policy: Policy, run: Run | None, actuator: str | None, feedback: str | None
 ) -> tuple[Walking, ServoRanges]:
     """Task and servos to run the policy at `path` in: its own, unless told otherwise."""
-    from policies.policy_file import refuse_other_observation
+    from pupper_sysid.policies.network.policy_file import refuse_other_observation
 
     contract = policy.contract
     refuse_other_observation(contract)

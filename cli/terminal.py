@@ -18,12 +18,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from common.errors import InputError
-from common.joints import select_joints
-from sysid.recording import Recording, load, newest_recording
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import select_joints
+from pupper_sysid.sysid.recordings.recording import Recording, load, newest_recording
 
 if TYPE_CHECKING:
-    from sysid.fleet import Fleet
+    from pupper_sysid.sysid.identify.fleet import Fleet
 
 # no markup: names of files and joints may have brackets; `Text` where something is to stand out
 out = Console(highlight=False, markup=False)
@@ -114,7 +114,7 @@ def print_fleet(
 
     `what` is made of each robot; `columns` has, by column of the fleet's table, title and digits.
     """
-    from sysid.fleet import TABLE
+    from pupper_sysid.sysid.identify.fleet import TABLE
 
     if as_json:
         print_json(fleet.summary(folder, elapsed_s))

@@ -18,9 +18,9 @@ from typing import TypeVar
 import tyro
 from rich.text import Text
 
-from cli.terminal import err, out
-from common.errors import InputError, PupperError
-from common.files import versions
+from pupper_sysid.cli.terminal import err, out
+from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.files import versions
 
 _COMPLETIONS = {
     "bash": ".local/share/bash-completion/completions/{}",

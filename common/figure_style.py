@@ -21,8 +21,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
 
-from common.errors import InputError
-from common.files import refuse_overwrite, write_bytes
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType

@@ -11,7 +11,7 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
 
 PACKAGE = "pupper-sysid"
 

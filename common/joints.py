@@ -10,7 +10,7 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
-from common.errors import InputError
+from pupper_sysid.common.errors import InputError
 
 LEGS = ("LF", "RF", "LB", "RB")
 KINDS = ("hip", "thigh", "calf")

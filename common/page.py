@@ -22,8 +22,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from common.figure_style import png, svg
-from common.files import refuse_overwrite, write_bytes, write_text
+from pupper_sysid.common.figure_style import png, svg
+from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 
 Row = dict[str, Any]
 
@@ -196,7 +196,7 @@ def write_page(
 def render(title: str, subtitle: str, sections: Sequence[Section]) -> str:
     """The page as HTML. Every text is escaped: names of files are the user's."""
     environment = Environment(
-        loader=PackageLoader("common", "templates"), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("pupper_sysid.common"), autoescape=True, undefined=StrictUndefined
     )
     environment.filters["code"] = _code
     template = environment.get_template("page.html.j2")

@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from common.errors import InputError
+from pupper_sysid.common.errors import InputError
 
 MAX_BYTES = 2_000_000
 MAX_DEPTH = 20

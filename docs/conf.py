@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import re
-import sys
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import get_args
 from unittest.mock import patch
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))
 _PLAIN = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
 
 project = "pupper-sysid"
@@ -37,14 +35,14 @@ def _help(module: str, *words: str) -> str:
     """What `--help` prints, without colours and without the lines' empty ends."""
     said, plain = io.StringIO(), patch.dict(os.environ, _PLAIN)
     with plain, redirect_stdout(said), redirect_stderr(said), suppress(SystemExit):
-        import_module(f"cli.{module}").main([*words, "--help"])
+        import_module(f"pupper_sysid.cli.programs.{module}").main([*words, "--help"])
     text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
     return "\n".join(line.rstrip() for line in text.splitlines()).strip()
 
 
 def subcommands(module: str) -> list[str]:
     """Names of a program's commands, those of a command's own as two words; empty without any."""
-    return _names(getattr(import_module(f"cli.{module}"), "Command", None))
+    return _names(getattr(import_module(f"pupper_sysid.cli.programs.{module}"), "Command", None))
 
 
 def _names(command: object, *before: str) -> list[str]:

@@ -5,8 +5,8 @@ virtual time, where `sleep_until` costs nothing. All times are seconds of that c
 are over `joint_names`, in that order; all angles are radians of the simulator frame, absolute.
 
 A bus that has trouble says so in what it returns, not by raising: a reading that did not come is
-missing (NaN), a command that could not be sent has no send time (NaN). `hardware.guard` decides
-when trouble has lasted too long.
+missing (NaN), a command that could not be sent has no send time (NaN). `hardware.safety.guard`
+decides when trouble has lasted too long.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware.limits import PositionLimits
+from pupper_sysid.hardware.safety.limits import PositionLimits
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.errors import InputError
-from hardware.bus import ServoBus
-from hardware.esp32_bus import SOCKET, Esp32Bus
-from hardware.feetech_bus import FeetechBus
-from hardware.guard import GuardedBus
-from hardware.joint_map import JointMap
-from hardware.watchdog import Watchdog
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.bus import ServoBus
+from pupper_sysid.hardware.esp32.bus import SOCKET, Esp32Bus
+from pupper_sysid.hardware.feetech.bus import FeetechBus
+from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ lies, less the centre of the encoder. The *limits* are the ends of a joint's tra
 margin. The *scale* (counts per radian) is checked by moving one joint through a known angle; it is
 the one number on which published sources disagree, so limits stay in counts whatever it is.
 
-Nothing here talks to a bus or to a person: `cli.calibrate_joints` does both.
+Nothing here talks to a bus or to a person: `cli.commands.calibrate_joints` does both.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import InputError
-from common.joints import JOINT_NAMES
-from hardware.joint_map import JointMap, JointMapFile, joint_map_from
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.joint_map import JointMap, JointMapFile, joint_map_from
 
 MARGIN = 0.02
 """Share of the travel by which limits stay away from each end."""

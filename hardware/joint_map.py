@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from common.errors import InputError
-from common.files import write_text
-from common.joints import DEFAULT_POSE, JOINT_NAMES, in_order, strange_joint
-from common.strict_yaml import dump, place_text, read
-from hardware.limits import Coupling, PositionLimits
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import write_text
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order, strange_joint
+from pupper_sysid.common.strict_yaml import dump, place_text, read
+from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
 
 SCHEMA = "pupper-sysid joint map"
 SCHEMA_VERSION = 1
@@ -358,7 +358,7 @@ def load_joint_map(path_or_preset: Path | str) -> JointMap:
     True
     """
     if isinstance(path_or_preset, str) and path_or_preset in PRESETS:
-        with resources.as_file(resources.files("hardware") / "presets") as folder:
+        with resources.as_file(resources.files("pupper_sysid.hardware") / "presets") as folder:
             return _load(folder / f"{path_or_preset}.yaml")
     path = Path(path_or_preset)
     if not path.exists():

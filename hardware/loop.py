@@ -19,8 +19,8 @@ from typing import Protocol
 
 import numpy as np
 
-from common.durations import Durations
-from common.errors import InputError, SafetyStop
+from pupper_sysid.common.durations import Durations
+from pupper_sysid.common.errors import InputError, SafetyStop
 
 MOST_MISSES_IN_A_ROW = 10
 """After so many ticks in a row without a timely one, nobody is in control of the robot."""

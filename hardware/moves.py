@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import BusError
-from hardware.bus import ServoBus
-from hardware.loop import FixedRateLoop
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.bus import ServoBus
+from pupper_sysid.hardware.loop import FixedRateLoop
 
 GENTLE_RAD_S = 1.0
 """Highest speed of a joint on the way."""

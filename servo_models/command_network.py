@@ -21,8 +21,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.errors import InputError
-from servo_models.joint_arrays import JointArrays
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.joint_arrays import JointArrays
 
 _FEW = 16
 """Environments up to which all joints go through one call, because calls cost more than work."""

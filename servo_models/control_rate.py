@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.errors import InputError
-from servo_models.delayed_pd import TIME_STEP_S
-from servo_models.interface import ServoModel
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.interface import ServoModel
 
 
 def substeps(time_step_s: float) -> int:

@@ -29,8 +29,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.errors import InputError
-from servo_models.delay_line import DelayLine
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delay_line import DelayLine
 
 TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.errors import InputError
+from pupper_sysid.common.errors import InputError
 
 
 @dataclass(frozen=True)

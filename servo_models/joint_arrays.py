@@ -13,7 +13,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.errors import InputError
+from pupper_sysid.common.errors import InputError
 
 _SAME_RATE = 0.02
 

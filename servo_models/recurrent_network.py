@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from servo_models.command_network import Parameters, bounded
-from servo_models.joint_arrays import JointArrays
+from pupper_sysid.servo_models.command_network import Parameters, bounded
+from pupper_sysid.servo_models.joint_arrays import JointArrays
 
 
 class RecurrentNetwork(JointArrays):

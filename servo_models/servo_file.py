@@ -23,15 +23,15 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from common.errors import InputError
-from common.files import refuse_overwrite, write_bytes, write_text
-from common.joints import strange_joint
-from servo_models.command_network import CommandNetwork
-from servo_models.control_rate import AtControlRate, substeps
-from servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from servo_models.joint_arrays import same_rate
-from servo_models.recurrent_network import RecurrentNetwork
-from servo_models.sparse_equation import COEFFICIENTS, SparseEquation
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
+from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.joint_arrays import same_rate
+from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
 SCHEMA_VERSION = 1
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"

@@ -1,4 +1,4 @@
-"""SparseEquation: a servo as one short, readable equation of motion, found by `sysid.sindy`.
+"""SparseEquation: a servo as one short, readable equation of motion.
 
     q̈ = stiffness · e + saturated_stiffness · sat(e, e₀)
         − damping · q̇ − drag · q̇|q̇| − friction · sign(q̇),      e = u(t − delay) − q
@@ -29,9 +29,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from common.errors import InputError
-from servo_models.delay_line import DelayLine
-from servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delay_line import DelayLine
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 
 
 class Coefficient(NamedTuple):

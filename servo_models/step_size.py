@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import InputError
-from servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, integrate
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, integrate
 
 _TONES_HZ, _AMPLITUDE_RAD = (1.0, 2.0, 4.0), 0.2  # a walk's speeds, below most servos' limits
 _LOOP_S = 0.0193  # no multiple of a step: a delay puts commands anywhere in one

@@ -31,10 +31,10 @@ def real_sweeps(real_data: Path) -> list[Path]:
 @pytest.fixture(scope="module")
 def walker():
     """The shipped LSTM, and two robots with calibrated servos to walk on."""
-    from policies.policy_file import load_policy
-    from policies.robustness import Trial
-    from sim.servo_ranges import servo_ranges
-    from sim.walking_config import Walking
+    from pupper_sysid.policies.analysis.robustness import Trial
+    from pupper_sysid.policies.network.policy_file import load_policy
+    from pupper_sysid.sim.walking.config import Walking
+    from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
     samples = Path(__file__).resolve().parents[1] / "data/samples"
     trial = Trial(

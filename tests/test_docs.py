@@ -9,9 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import docs_conf
 import pytest
-from command_line import run_program
+
+from support import docs_conf
+from support.command_line import run_program
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -31,7 +32,7 @@ EXAMPLES = {
 def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for words in EXAMPLES[page]:
-        module = importlib.import_module(f"cli.{words[0].replace('-', '_')}")
+        module = importlib.import_module(f"pupper_sysid.cli.programs.{words[0].replace('-', '_')}")
         code, _, err = run_program(capsys, module, *words[1:])
         assert code == 0, f"{shlex.join(words)}: {err}"
     if page.stem == "tutorial":

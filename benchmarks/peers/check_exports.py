@@ -25,16 +25,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from servo_models.calibration import Calibration, load_calibration
-from servo_models.delayed_pd import FRICTION_SOLIMP, TIME_STEP_S, friction_solref
-from sim.newton_export import export_newton
-from sim.simulator_export import (
+from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
+from pupper_sysid.servo_models.delayed_pd import FRICTION_SOLIMP, TIME_STEP_S, friction_solref
+from pupper_sysid.sim.export.newton import export_newton
+from pupper_sysid.sim.export.simulator_export import (
     EXPLICIT_PD,
     MJLAB_PD,
     SIMULATORS,
     delays_at_step,
 )
-from sysid.tone import fit_phasor
+from pupper_sysid.sysid.lag.tone import fit_phasor
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]

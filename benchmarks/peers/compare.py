@@ -32,13 +32,13 @@ from exchange import Trial as PeerTrial
 from numpy.typing import NDArray
 from random_robots import SweptRobot, sweep_random_robot
 
-from servo_models.delayed_pd import TIME_STEP_S
-from sysid.calibrate import calibrate, joint_trials
-from sysid.ladder import rung
-from sysid.ladder_fit import leave_one_out_folds
-from sysid.model_scores import rms, score
-from sysid.output_error import TrialData, look_up, positions
-from sysid.recording import Recording, load
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.identify.calibrate import calibrate, joint_trials
+from pupper_sysid.sysid.identify.models import rung
+from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
+from pupper_sysid.sysid.identify.scores import rms, score
+from pupper_sysid.sysid.identify.search import leave_one_out_folds
+from pupper_sysid.sysid.recordings.recording import Recording, load
 
 HERE = Path(__file__).parent
 if STEP_S != TIME_STEP_S:

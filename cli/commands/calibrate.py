@@ -1,0 +1,151 @@
+"""`calibrate`: fit the ladder to recordings and write the calibration file."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, calibrate
+from pupper_sysid.sysid.identify.calibration_file import (
+    STALL_TORQUE_NM,
+    STALL_TORQUE_SOURCE,
+    preset_parameters,
+    to_calibration,
+)
+from pupper_sysid.sysid.report.json_objects import calibrate_json
+
+_SHOWN = {
+    "lag_ms": ("lag ms", 1),
+    "delay_ms": ("dead time ms", 1),
+    "stiffness_per_s2": ("stiffness 1/s²", 0),
+    "speed_rad_s": ("speed rad/s", 2),
+    "loss": ("loss", 2),
+}
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Fit a servo model per joint and write it as YAML, with intervals and caveats.
+
+    Example: pupper-sysid calibrate recordings/sweep.csv --out calibrated.yaml
+
+    Example: pupper-sysid calibrate robots/ --jobs 4
+    """
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings, pooled per joint; by default the newest in recordings/. A folder is a fleet: each
+    recording in it is a robot of its own."""
+    out: Path | None = None
+    """Calibration file to write, calibrated.yaml by default; of a fleet the folder, by default the
+    given one's name and _calibrated."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    stall_torque: float = STALL_TORQUE_NM
+    """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature."""
+    jobs: int = 2
+    """Robots of a fleet that are calibrated at the same time."""
+    cluster: str | None = None
+    """Dask scheduler to calibrate a fleet on, such as tcp://host:8786."""
+    force: bool = False
+    """Replace the calibration file if it exists."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the bootstrap and of the models' global starts."""
+
+    def run(self) -> None:
+        """Calibrate, print, write."""
+        started = time.perf_counter()
+        terminal.need_positive("--stall-torque", self.stall_torque)
+        if len(self.recordings) == 1 and self.recordings[0].is_dir():
+            self._fleet(self.recordings[0], started)
+            return
+        if self.cluster:
+            raise InputError("--cluster is for a fleet: give the folder of its recordings.")
+        out = self.out or Path("calibrated.yaml")
+        refuse_overwrite(out, self.force)  # before the work, not after it
+        recordings = terminal.load_all(self.recordings)
+        joints = terminal.pick_joints(recordings, self.joints)
+        with terminal.progress("calibrating", len(joints)) as advance:
+            results = calibrate(
+                recordings, joints, self.seed, preset_parameters(), progress=advance
+            )
+        made = to_calibration(results, recordings, self.seed, self.stall_torque, self._source())
+        made.save(out, force=self.force)
+        elapsed = time.perf_counter() - started
+        if self.json:
+            terminal.print_json(calibrate_json(results, made, elapsed))
+        else:
+            self._print(results, made, out, elapsed)
+
+    def _source(self) -> str:
+        """Where the torque anchor comes from."""
+        given = self.stall_torque != STALL_TORQUE_NM
+        return "given with --stall-torque" if given else STALL_TORQUE_SOURCE
+
+    def _fleet(self, root: Path, started: float) -> None:
+        """Many robots, one after the other or side by side."""
+        from pupper_sysid.sysid.identify.fleet import Settings, calibrate_fleet, robots_in
+
+        if self.joints != "all":
+            raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
+        out = self.out or root.resolve().with_name(f"{root.resolve().name}_calibrated")
+        settings = Settings(self.seed, self.stall_torque, self._source())
+        with terminal.progress("calibrating", len(robots_in(root))) as advance:
+            fleet = calibrate_fleet(
+                root, out, settings, self.jobs, self.cluster, self.force, advance
+            )
+        terminal.print_fleet(
+            fleet, out, time.perf_counter() - started, self.json, "a calibration", _SHOWN
+        )
+
+    def _print(
+        self,
+        results: dict[str, JointCalibrationResult],
+        made: Calibration,
+        out: Path,
+        elapsed: float,
+    ) -> None:
+        shown = terminal.table(
+            "DelayedPD per joint", "joint", "delay ms", "steps @500 Hz", "Kp", "Kd",
+            "fric. N·m", "J 1e-4 kg·m²", "speed rad/s", "error mrad", "unseen Hz mrad",
+            "paper mrad",
+        )  # fmt: skip
+        for name, r in results.items():
+            a, s = made.joint(name).actuator, r.rungs["delayed_pd"].scores
+            paper = r.presets.get("paper")
+            shown.add_row(
+                name, terminal.ms(a.delay_s.value), "{}–{}".format(*r.delay_steps),
+                terminal.number(a.stiffness_nm_per_rad.value),
+                terminal.number(a.damping_nm_s_per_rad.value, 3),
+                terminal.number(a.friction_loss_nm.value, 3),
+                terminal.number(1e4 * a.armature_kg_m2.value, 2),
+                terminal.number(a.velocity_limit_rad_s.value), terminal.ms(s.fresh),
+                terminal.ms(s.leave_one_out), terminal.ms(paper.fresh if paper else None),
+            )  # fmt: skip
+        terminal.out.print(shown)
+        terminal.out.print(
+            f"\nTorques assume a stall torque of {self.stall_torque:g} N·m; free-air recordings "
+            "give only their ratios. Errors are free-run, on fresh readings.",
+            soft_wrap=True,
+        )
+        for r in results.values():
+            terminal.warn(r.warnings)
+        if self.stall_torque == STALL_TORQUE_NM and not set(results) <= set(JOINT_NAMES):
+            terminal.warn(
+                [
+                    f"{self.stall_torque:g} N·m is the stall torque of the Mini Pupper's servo. "
+                    "Give --stall-torque from your servo's data sheet: all torques scale with it."
+                ]
+            )
+        terminal.err.print(
+            f"Wrote {out} in {elapsed:.1f} s. Next: pupper-sysid report", soft_wrap=True
+        )

@@ -1,0 +1,339 @@
+"""`calibrate-joints`: measure the joint map of a limp robot, together with whoever moves it."""
+
+from __future__ import annotations
+
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Group
+from rich.live import Live
+from rich.text import Text
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.keyboard import Keyboard
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.joints import JOINT_NAMES, select_joints
+from pupper_sysid.hardware import joint_calibration as jc
+from pupper_sysid.hardware.bus import ServoBus
+from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+
+_PERIOD_S = 0.02
+_MEAN_OVER_S = 0.5
+_DRAW_EVERY_S = 0.1
+_TORQUE_OFF_TRIES = 5
+
+
+@dataclass(frozen=True)
+class CalibrateJoints:
+    """Measure where each servo's middle is, how far it may go, and what its counts mean.
+
+    The robot goes limp and you move it by hand; nothing moves by itself, and the servos stay limp
+    at the end. Example: pupper-sysid calibrate-joints --bus feetech:/dev/ttyUSB0
+    """
+
+    bus: str
+    """esp32 (on the robot) or feetech:DEVICE."""
+    joint_map: str | None = None
+    """Joint map to start from, a file or a preset: its ids, signs and limits_rad are kept. By
+    default the preset that fits the bus."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; the others keep what
+    the starting map says."""
+    out: Path = Path("joints.yaml")
+    """File to write; the other commands take joints.yaml by themselves."""
+    scale_joint: str | None = None
+    """Joint on which counts per radian are checked; by default the first."""
+    scale_deg: float = 90.0
+    """Angle that it is moved by for that [degrees]."""
+    force: bool = False
+    """Replace the file if it exists."""
+
+    def run(self) -> None:
+        """Ask, measure, write."""
+        refuse_overwrite(self.out, self.force)
+        if self.out.suffix not in (".yaml", ".yml"):
+            raise InputError(f"--out {self.out}: a joint map is a .yaml file.")
+        if not 5 <= self.scale_deg <= 300:
+            raise InputError(
+                f"--scale-deg {self.scale_deg:g}: give the angle in degrees, 5 to 300; the larger "
+                "it is, the better."
+            )
+        if self.bus == "emulated":
+            raise InputError(
+                "--bus emulated: nobody can move that one by hand. Start `pupper-sysid emulate "
+                "feetech --by-hand` in another terminal and use the bus that it names."
+            )
+        address = parse_address(self.bus)
+        given = load_joint_map(self.joint_map) if self.joint_map else None
+        names = select_joints(self.joints, given.joint_names if given else JOINT_NAMES)
+        if self.scale_joint and self.scale_joint not in names:
+            raise InputError(
+                f"--scale-joint {self.scale_joint}: it is not among the joints that are "
+                f"calibrated ({', '.join(names)})."
+            )
+        asked = None if self.joints == "all" else names
+        bus = open_bus(address, given.per_servo() if given else None, asked)
+        try:
+            start = given or load_joint_map(bus.metadata["joint_map"])
+            # a line need not have all servos
+            here = [n for n in names if n in bus.joint_names]
+            silent = [n for n in names if n not in here]
+            if silent:
+                terminal.warn(
+                    [f"{', '.join(silent)}: no answer; their part of the map stays as it was."]
+                )
+            if self.scale_joint in silent:
+                raise BusError(f"--scale-joint {self.scale_joint}: it does not answer.")
+            self._lead(Guide(bus, start, here, Keyboard()), self.scale_joint or here[0])
+        finally:
+            bus.close()
+
+    def _lead(self, guide: Guide, scale_joint: str) -> None:
+        guide.go_limp()
+        offsets = guide.offsets()
+        limits = guide.limits()
+        scale, use_it = guide.scale(scale_joint, self.scale_deg)
+        measured = jc.Measured(offsets, limits, scale_joint, scale, use_it)
+        new = jc.calibrated(guide.start.file, measured, time.strftime("%Y-%m-%d"))
+        terminal.warn(jc.doubts(new, offsets))
+        guide.stay_limp()
+        new.save(self.out, self.force)
+        table = terminal.table(
+            f"{self.out}: {new.file.name}", "joint", "id", "offset", "limits", "counts/rad"
+        )
+        for name in offsets:
+            entry = new.file.joints[name]
+            low, high = entry.limits_counts
+            table.add_row(
+                name, str(entry.id), f"{entry.offset_counts:+d}",
+                f"{low}–{high}" + ("" if name in limits else " kept"),
+                terminal.number(entry.counts_per_rad, 2),
+            )  # fmt: skip
+        terminal.out.print(table)
+        terminal.out.print(
+            f"Wrote {self.out}. The servos are limp.\nNext:\n"
+            f"  pupper-sysid monitor --bus {self.bus} --joint-map {self.out}\n"
+            f"  pupper-sysid sweep --freqs 1-10 --joints {next(iter(offsets))} --bus {self.bus} "
+            f"--joint-map {self.out}",
+            soft_wrap=True,
+        )
+
+
+class Guide:
+    """Leads a person through the steps; every method is one of them.
+
+    Parameters
+    ----------
+    bus : ServoBus
+        Only read, and told to go limp.
+    start : JointMap
+        The map to start from.
+    joints : list of str
+        Those to calibrate.
+    keyboard : Keyboard
+    """
+
+    def __init__(self, bus: ServoBus, start: JointMap, joints: list[str], keyboard: Keyboard):
+        self.bus, self.start, self._keyboard = bus, start, keyboard
+        self.joints = tuple(joints)
+        self._index = [bus.joint_names.index(name) for name in joints]
+        self._counts = start.file.counts
+
+    def go_limp(self) -> None:
+        """Torque off, once whoever holds the robot is ready."""
+        if self.start.frame == "proxy":
+            terminal.err.print(
+                "Counts here are the proxy's: the firmware has added its own stored calibration, "
+                "and the offsets that are measured now come on top of that."
+            )
+        self._keyboard.ask(
+            "The robot will go limp. Lay it on its stand, hold what could fall, then press Enter."
+        )
+        self.stay_limp()
+        terminal.err.print("All servos are limp; move them by hand, gently.")
+
+    def stay_limp(self) -> None:
+        """Torque off, insisted on."""
+        for _ in range(_TORQUE_OFF_TRIES):
+            if self.bus.torque(False):
+                return
+        raise BusError(
+            "not every servo confirmed that it is limp, so nothing was written. Check the cable "
+            "and the power, and do not force a joint that holds."
+        )
+
+    def offsets(self) -> dict[str, int]:
+        """Step 1: the middle pose; offset of each joint."""
+        pose = jc.middle_pose_in_words(self.start.file, self.joints)
+        terminal.err.print(Text.assemble(("\nStep 1 of 3: the middle pose.\n", "bold"), pose))
+        while True:
+            self._keyboard.ask("Hold it still and press Enter.")
+            mean, strayed = self._mean()
+            moved = [
+                f"{name} by {by:.0f}"
+                for name, by in zip(self.joints, strayed, strict=True)
+                if by > jc.STILL * self._counts
+            ]
+            if not moved:
+                break
+            answer = self._choice(
+                f"Moved while being measured, in counts: {_some(moved)}. "
+                "Enter to measure again, k to keep this",
+                {"": "again", "k": "keep"},
+            )
+            if answer == "keep":
+                break
+        return {
+            name: jc.offset_counts(float(count), self._counts)
+            for name, count in zip(self.joints, mean, strict=True)
+        }
+
+    def limits(self) -> dict[str, tuple[int, int]]:
+        """Step 2: the whole range; limits of the joints that were moved through it."""
+        terminal.err.print(Text("\nStep 2 of 3: the whole range.", "bold"))
+        travel = jc.Travel(len(self.joints), self._counts)
+        while True:
+            terminal.err.print(
+                "Move every joint slowly to both of its ends, without force. Enter when all are "
+                "done."
+            )
+            self._follow(travel)
+            refused = travel.refusals(self.joints)
+            if not refused:
+                break
+            for name, why in refused.items():
+                terminal.err.print(Text.assemble((name, "yellow"), f" {why}."))
+            answer = self._choice(
+                "Enter to go on moving, k to keep the starting map's limits for "
+                f"{'it' if len(refused) == 1 else 'these'}",
+                {"": "again", "k": "keep"},
+            )
+            if answer == "keep":
+                break
+            for name in refused:
+                travel.forget(self.joints.index(name))
+        cut = [n for n in travel.cut_off(self.joints) if n not in refused]
+        if cut:
+            terminal.warn(
+                [f"{_some(cut)}: the travel runs into the end of the encoder; an end is not seen."]
+            )
+        return {
+            name: jc.limits_within(int(travel.low[k]), int(travel.high[k]))
+            for k, name in enumerate(self.joints)
+            if name not in refused
+        }
+
+    def scale(self, joint: str, angle_deg: float) -> tuple[float | None, bool]:
+        """Step 3: the scale measured, None if that was skipped, and whether to use it."""
+        stated = self.start.file.joints[joint].counts_per_rad
+        terminal.err.print(
+            Text.assemble(
+                ("\nStep 3 of 3: the scale.\n", "bold"),
+                f"{joint} will be moved by {angle_deg:g} degrees, in one direction. Measure the "
+                "angle at the horn, for example with a set square.",
+            )
+        )
+        which = self.joints.index(joint)
+        while True:
+            answer = self._choice(
+                f"Hold {joint} at the first position and press Enter, or s to skip this step",
+                {"": "go", "s": "skip"},
+            )
+            if answer == "skip":
+                return None, False
+            before = self._mean()[0][which]
+            self._keyboard.ask(
+                f"Now move {joint} by {angle_deg:g} degrees, hold it and press Enter."
+            )
+            after = self._mean()[0][which]
+            measured = jc.counts_per_rad(before, after, angle_deg)
+            said = f"{abs(after - before):.0f} counts: {measured:.1f} counts per radian"
+            if abs(after - before) < jc.SMALLEST_TRAVEL * self._counts:
+                terminal.err.print(f"{said}. That is too little motion to tell; try again.")
+                continue
+            if jc.scales_agree(measured, stated):
+                terminal.err.print(
+                    f"{said}, within {100 * jc.SCALE_AGREES:.0f} % of the map's {stated:.1f}, "
+                    "which is kept."
+                )
+                return measured, False
+            known = jc.known_scale_near(measured, self._counts)
+            terminal.err.print(
+                f"{said}; the starting map says {stated:.1f} "
+                f"({100 * (measured / stated - 1):+.0f} %)."
+                + (f" It agrees with {known}." if known else "")
+            )
+            if not jc.is_plausible_scale(measured, self._counts):
+                range_deg = np.degrees(self._counts / measured)
+                terminal.err.print(
+                    f"The whole range would be {range_deg:.0f} degrees, which no such servo has, "
+                    "so the number is not offered. Was it the right joint, and the right angle?"
+                )
+                continue
+            answer = self._choice(
+                "For all joints, use n the new number, or m the map's; r to repeat",
+                {"n": "new", "m": "map", "r": "repeat"},
+            )
+            if answer != "repeat":
+                return measured, answer == "new"
+
+    def _follow(self, travel: jc.Travel) -> None:
+        """Take in readings, and show them, until Enter."""
+        live = Live(console=terminal.err, auto_refresh=False) if terminal.err.is_terminal else None
+        drawn_s, tick = -np.inf, self.bus.now()
+        with self._keyboard.unseen(), live or nullcontext():
+            while self._keyboard.line() is None:
+                travel.add(self.bus.read().position_count[self._index])
+                if live and self.bus.now() - drawn_s > _DRAW_EVERY_S:
+                    drawn_s = self.bus.now()
+                    live.update(self._table(travel), refresh=True)
+                tick = max(tick + _PERIOD_S, self.bus.now())
+                self.bus.sleep_until(tick)
+            if live:
+                live.update(self._table(travel), refresh=True)
+        if not live:
+            terminal.err.print(self._table(travel))
+
+    def _table(self, travel: jc.Travel) -> Group:
+        table = terminal.table("", "joint", "min", "now", "max", "travel", "°", "")
+        refused = travel.refusals(self.joints)
+        for k, name in enumerate(self.joints):
+            low, now, high = (int(x[k]) for x in (travel.low, travel.now, travel.high))
+            degrees = np.degrees((high - low) / self.start.file.joints[name].counts_per_rad)
+            state = "wraps" if travel.wrapped[k] else "move it" if name in refused else "ok"
+            cells = ["–" if x < 0 else str(x) for x in (low, now, high, high - low)]
+            table.add_row(name, *cells, f"{degrees:.0f}", state)
+        return Group(table, Text("Enter when every joint has been at both ends.", style="bold"))
+
+    def _mean(self):
+        """Mean counts over half a second, and how far they strayed."""
+        readings = []
+        until = self.bus.now() + _MEAN_OVER_S
+        while self.bus.now() < until:
+            readings.append(self.bus.read().position_count[self._index])
+            self.bus.sleep_until(self.bus.now() + _PERIOD_S)
+        mean, strayed = jc.mean_counts(np.array(readings))
+        silent = [n for n, c in zip(self.joints, mean, strict=True) if np.isnan(c)]
+        if silent:
+            raise BusError(
+                f"{', '.join(silent)} did not answer for {_MEAN_OVER_S} s, so nothing was "
+                "written. Check the cable and the power; the servos are limp."
+            )
+        return mean, strayed
+
+    def _choice(self, question: str, choices: dict[str, str]) -> str:
+        while True:
+            answer = self._keyboard.ask(question + ".")
+            if answer in choices:
+                return choices[answer]
+            known = ", ".join(key or "Enter" for key in choices)
+            terminal.err.print(f"'{answer}' is none of {known}.")
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

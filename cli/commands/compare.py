@@ -1,0 +1,81 @@
+"""`compare`: servo models and calibrations on the same readings, as a table and a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Which model moves like the servo? Free run of each on the same recording, per joint.
+
+    Example: pupper-sysid compare recordings/playback.csv --models servo/ calibrated.yaml
+    """
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings to compare on; by default the newest in recordings/."""
+    models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL [MODEL ...]")] = ()
+    """Folders of fit-servo, calibration files, or presets (paper, release)."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    readings: Literal["auto", "fresh", "all"] = "auto"
+    """Which readings count: fresh ones at the time they were taken, all rows as logged, or what
+    suits the recording."""
+    plot: Path = Path("compare.png")
+    """Picture to draw, PNG or SVG."""
+    force: bool = False
+    """Replace the picture if it exists."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the bootstrap."""
+
+    def run(self) -> None:
+        """Compare, print, draw."""
+        from pupper_sysid.common.figure_style import refuse_picture, save
+        from pupper_sysid.sysid.report.servo_figures import compare_figure
+        from pupper_sysid.sysid.servo_fit.compare import compare, to_json
+
+        if not self.models:
+            raise InputError(
+                "Nothing to compare: name models, such as `--models servo/ calibrated.yaml`."
+            )
+        refuse_picture(self.plot, self.force)
+        recordings = terminal.load_all(self.recordings)
+        joints = terminal.pick_joints(recordings, self.joints)
+        found = compare(recordings, joints, self.models, self.readings, self.seed)
+        save(compare_figure(found), self.plot, self.force)
+        made = to_json(found, self.seed)
+        if self.json:
+            terminal.print_json(made | {"written": str(self.plot)})
+            return
+        names, models = list(made["models"]), list(made["models"].values())
+        shown = terminal.table(
+            "RMS error in free run, mrad", "joint", *names, "stays put", "robot repeats"
+        )
+        for joint in joints:
+            shown.add_row(
+                joint,
+                *(terminal.ms(m["joints"][joint]["rmse_free_run_rad"]) for m in models),
+                terminal.ms(found.persistence[joint]), terminal.ms(found.repeatability[joint]),
+            )  # fmt: skip
+        if len(joints) > 1:
+            shown.add_row(
+                "mean", *(terminal.ms(m["mean"]["rmse_free_run_rad"]) for m in models), style="bold"
+            )  # fmt: skip
+        terminal.out.print(shown)
+        for title, key in (
+            ("through the hold", "rmse_held_rad"), ("rows as logged", "rmse_raw_rad"),
+            ("one step", "rmse_one_step_rad"),
+        ):  # fmt: skip
+            parts = [f"{n} {terminal.ms(made['models'][n]['mean'][key])}" for n in names]
+            terminal.out.print(f"Mean, {title}: {', '.join(parts)}", soft_wrap=True)
+        terminal.warn(found.notes)
+        terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)

@@ -1,0 +1,207 @@
+"""`emulate`: a robot without a robot, behind the real protocols."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+import yaml
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import write_text
+from pupper_sysid.hardware.esp32.bus import SOCKET
+from pupper_sysid.hardware.feetech.registers import BAUD_RATES, SCS0009, STS3215
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
+from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.walking.robot import WalkingRobot
+
+
+@dataclass(frozen=True)
+class Common:
+    """What both emulators take."""
+
+    seed: int = 0
+    """Seed of the robot: its servos, its lost polls, its noise."""
+    faults: str = ""
+    """What goes wrong, as kind=probability per answer: lost=0.02,late=0.01,corrupted=0.01. Kinds:
+    lost, late, truncated, corrupted, duplicated, foreign, wrong-length, error-bits, frozen,
+    brown-out, unplugged, second-writer."""
+    walking: bool = False
+    """The robot stands on the ground and walks where its servos carry it; otherwise its legs hang
+    in free air."""
+    by_hand: bool = False
+    """Someone swings the joints while they are limp, for trying calibrate-joints."""
+    truth: Path | None = None
+    """Write what the robot really is to this YAML file."""
+    force: bool = False
+    """Replace the file of --truth."""
+
+
+@dataclass(frozen=True)
+class Esp32(Common):
+    """The Mini Pupper 2's proxy: a socket, with the real one's quirks, in real time.
+
+    Example: pupper-sysid emulate esp32 --socket /tmp/pupper.socket
+    """
+
+    socket: Path = SOCKET
+    """Where to listen."""
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        rng = np.random.default_rng(self.seed)
+        bench = _bench(self, draw_robot(rng), load_joint_map("mini_pupper_2"), rng)
+        emulator = ProxyEmulator(bench, rng, BusFaults.parse(self.faults, rng))
+        with closing(ProxySocket(emulator, self.socket)) as server:
+            _write_truth(self, bench)
+            name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
+            what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
+            _serve(server, f"{what} at {self.socket}.", name, self.walking)
+
+
+@dataclass(frozen=True)
+class Feetech(Common):
+    """A line of Feetech servos: a serial device, in real time, at the pace of its baud rate.
+
+    Example: pupper-sysid emulate feetech --model sts3215 --ids 1-12
+    """
+
+    model: Literal["sts3215", "scs0009"] = "sts3215"
+    """Which servos."""
+    joint_map: str | None = None
+    """Joint map of another robot, such as `init-robot` writes."""
+    ids: str = "all"
+    """Which of them are there: 1-12, 4,5,6, or all."""
+    baud: int | None = None
+    """Rate at which they listen; default 1000000 (STS3215) or 500000 (SCS0009)."""
+    link: Path | None = None
+    """A stable name for the device; survives being unplugged."""
+    echo: bool = False
+    """The adapter sends the host's own bytes back."""
+    imu_socket: Path | None = None
+    """Serve the robot's IMU here, as the Mini Pupper 2's proxy does: a serial line has none."""
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        rng = np.random.default_rng(self.seed)
+        series = STS3215 if self.model == "sts3215" else SCS0009
+        preset = "sts3215" if series is STS3215 else "mini_pupper_2_direct"
+        layout = load_joint_map(self.joint_map or preset)
+        if self.joint_map and self.walking:
+            raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
+        baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
+        if baud not in BAUD_RATES:
+            raise InputError(f"--baud {baud}: servos know {', '.join(map(str, BAUD_RATES))}.")
+        # read directly, a servo answers for the very moment: no polls in between, none lost
+        spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
+        robot = draw_robot(rng, spec, layout if self.joint_map else None)
+        bench = _bench(self, robot, layout, rng)
+        emulator = FeetechEmulator(
+            bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
+            BusFaults.parse(self.faults, rng), self.echo,
+        )  # fmt: skip
+        link = self.link or Path(tempfile.mkdtemp()) / "servos"
+        with (
+            _imu_beside(bench, self.imu_socket, rng),
+            closing(FeetechPty(emulator, link)) as server,
+        ):
+            _write_truth(self, bench)
+            what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
+            what += f"; IMU at {self.imu_socket}." if self.imu_socket else "."
+            _serve(server, what, f"feetech:{server.device}", self.walking, self.joint_map)
+
+
+Emulate = (
+    Annotated[Esp32, tyro.conf.subcommand("esp32")]
+    | Annotated[Feetech, tyro.conf.subcommand("feetech")]
+)
+
+
+def _bench(
+    options: Common, robot: EmulatedRobot, layout: JointMap, rng: np.random.Generator
+) -> ServoBench:
+    """The servos of a robot in free air or on the ground."""
+    if options.walking and options.by_hand:
+        raise InputError("--by-hand swings legs in free air: leave out --walking.")
+    own, imu = rng.spawn(2)
+    plant = WalkingRobot(robot, imu) if options.walking else None
+    return ServoBench(robot, layout, own, options.by_hand, keep_log=False, plant=plant)
+
+
+@contextmanager
+def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) -> Iterator[None]:
+    """The IMU of the same robot on a socket of its own, if there is a path, during the block."""
+    if path is None:
+        yield
+        return
+    # a proxy polls its servos, although nobody can ask this one for them
+    polled = replace(bench.robot, spec=RobotSpec())
+    shown = ServoBench(
+        polled, load_joint_map("mini_pupper_2"), rng.spawn(1)[0], keep_log=False, plant=bench.plant
+    )
+    with closing(ProxySocket(ImuProxy(shown, rng.spawn(1)[0]), path)) as server:
+        thread = threading.Thread(target=server.serve, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            server.stop()
+            thread.join()
+
+
+def _write_truth(options: Common, bench: ServoBench) -> None:
+    if options.truth:
+        text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
+        write_text(options.truth, text, options.force)
+
+
+def _serve(
+    server: ProxySocket | FeetechPty,
+    what: str,
+    name: str,
+    walking: bool,
+    own_map: str | None = None,
+) -> None:
+    terminal.out.print(what, soft_wrap=True)
+    which, bus = ("", f"{name} --joint-map {own_map}") if own_map else (" --joints LF", name)
+    # a sweep is for legs in free air
+    sweep = "" if walking else f"  pupper-sysid sweep --freqs 1-10{which} --bus {bus}\n"
+    terminal.out.print(
+        f"In another terminal:\n{sweep}  pupper-sysid monitor --bus {bus}\nCtrl-C ends it.",
+        soft_wrap=True,
+    )
+    with real_time_priority():  # bytes that come late would look like a slow servo
+        server.serve()
+
+
+def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
+    """Ids that `text` names: 1-12, 4,5,6, or all."""
+    if text == "all":
+        return sorted(known)
+    ids: list[int] = []
+    for part in (piece.strip() for piece in text.split(",")):
+        low, dash, high = part.partition("-")
+        if not low.isdecimal() or (dash and not high.isdecimal()):
+            raise InputError(f"--ids: '{part}' is no id. Write 1-12 or 4,5,6.")
+        ids += range(int(low), int(high if dash else low) + 1)
+    wrong = [i for i in ids if i not in known]
+    if wrong or not ids:
+        raise InputError(
+            f"--ids {text}: the emulated robot has the ids {min(known)} to {max(known)}."
+        )
+    return sorted(set(ids))

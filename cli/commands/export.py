@@ -1,0 +1,138 @@
+"""`export`: a calibration, recording, servo model or policy in a form that other programs read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.policy_choice import is_policy, policy_at
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import write_text
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
+from pupper_sysid.sysid.export.tidy_csv import to_csv
+from pupper_sysid.sysid.recordings.recording import load
+
+_MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a calibration, a preset, a recording, a servo model or a policy for other programs.
+
+    Example: pupper-sysid export calibrated.yaml --to isaaclab --physics-step 0.005
+
+    Example: pupper-sysid export calibrated.yaml --to csv --out calibrated.csv
+
+    Example: pupper-sysid export servo/ --to onnx --out servo.onnx
+
+    Example: pupper-sysid export runs/mlp --to onnx --out policy.onnx
+    """
+
+    source: tyro.conf.Positional[str]
+    """calibrated.yaml, the name of a preset (paper, release), a recording, or the folder of a servo
+    model, a policy or a training run."""
+    to: Literal["csv", "mjcf", "isaaclab", "mjlab", "newton", "json", "onnx", "torchscript"] = "csv"
+    """Format: csv, a tidy table; mjcf, isaaclab, mjlab, newton and json of calibrations, for other
+    simulators; onnx and torchscript of learned servo models and policies."""
+    physics_step: float | None = None
+    """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf and
+    0.005 for the others."""
+    out: Path | None = None
+    """File to write (newton: folder); by default the source's name with the format's ending, in
+    this folder."""
+    force: bool = False
+    """Replace the file if it exists."""
+    json: bool = False
+    """Print one JSON object that names the file written, and nothing else."""
+
+    def run(self) -> None:
+        """Convert and write."""
+        path = Path(self.source)
+        if self.source not in PRESETS and path.is_dir():
+            target = self._policy(path) if is_policy(path) else self._servo_model(path)
+        else:
+            target = self._table(path)
+        if self.json:
+            terminal.print_json({"written": str(target)})
+        else:
+            terminal.err.print(f"Wrote {target}.", soft_wrap=True)
+
+    def _policy(self, folder: Path) -> Path:
+        if self.to not in ("onnx", "torchscript"):
+            raise InputError(
+                f"{folder} is a policy: export it with `--to onnx` or `--to torchscript`."
+            )
+        from pupper_sysid.policies.network.policy_export import ENDINGS, export_policy
+
+        policy, _ = policy_at(folder)
+        target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
+        worst = export_policy(policy, self.to, target, self.force)
+        terminal.err.print(f"Its actions equal the policy's to {worst:.1e}.")
+        return target
+
+    def _servo_model(self, folder: Path) -> Path:
+        from pupper_sysid.servo_models.servo_file import load_servo_model
+        from pupper_sysid.sysid.export.servo_networks import ENDINGS, export_servo_model
+
+        if self.to not in ("csv", "onnx", "torchscript"):
+            raise InputError(
+                f"{folder} is a servo model, which says where a servo will be and not how strong "
+                f"it is; {self.to} needs a calibration (`pupper-sysid calibrate`). A servo model "
+                f"becomes {', '.join(ENDINGS)}."
+            )
+        saved = load_servo_model(folder)
+        # not with_suffix: a folder may be called servo-0.5
+        target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
+        export_servo_model(saved, self.to, target, self.force)
+        return target
+
+    def _table(self, path: Path) -> Path:
+        if path.name in ("contract.json", "weights.safetensors"):
+            raise InputError(f"{self.source} is part of a servo model; give its folder.")
+        kind = path.suffix.lower()
+        if self.source not in PRESETS and kind not in (".yaml", ".yml", ".csv"):
+            raise InputError(
+                f"{self.source}: neither a calibration (.yaml), nor a recording (.csv), nor the "
+                f"folder of a servo model, nor one of the presets {', '.join(PRESETS)}."
+            )
+        if self.to in ("onnx", "torchscript"):
+            raise InputError(
+                f"{self.source} cannot become {self.to}: only a learned servo model can, a folder "
+                "that `pupper-sysid fit-servo` wrote. Export it with `--to csv`."
+            )
+        if self.source in PRESETS or kind != ".csv":
+            found = load_calibration(self.source)
+            if self.to != "csv":
+                return self._simulator(path, found)
+        elif self.to != "csv":
+            raise InputError(
+                f"{self.source} is a recording; {self.to} needs a calibration. Make one with "
+                f"`pupper-sysid calibrate {self.source}`."
+            )
+        else:
+            found = load(path)
+            terminal.warn(found.warnings)
+        target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
+        to_csv(found, target, self.force)
+        return target
+
+    def _simulator(self, path: Path, calibration: Calibration) -> Path:
+        """The calibration for another simulator."""
+        from pupper_sysid.sim.export.newton import export_newton
+        from pupper_sysid.sim.export.simulator_export import ENDINGS, SIMULATORS
+
+        step = self.physics_step
+        if step is None:
+            step = _MJCF_STEP_S if self.to == "mjcf" else _TRAINING_STEP_S
+        if self.to == "newton":
+            target = self.out or Path(f"{path.stem}_newton")
+            export_newton(calibration, step, target, self.force)
+        else:
+            target = self.out or Path(f"{path.stem}{ENDINGS[self.to]}")
+            write_text(target, SIMULATORS[self.to](calibration, step), self.force)
+        terminal.err.print(f"For a physics step of {1e3 * step:g} ms (--physics-step).")
+        return target

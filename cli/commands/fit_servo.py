@@ -1,0 +1,202 @@
+"""`fit-servo`: fit a servo model per joint, score it on unseen data, save it with its contract."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import tyro
+from rich.text import Text
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.servo_models.servo_file import CONTRACT
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.servo_fit.fit import Split
+
+_SHOWN = {
+    "free_run_mrad": ("free run mrad", 1),
+    "linear_mrad": ("linear mrad", 1),
+    "delayed_pd_mrad": ("delayed PD mrad", 1),
+    "persistence_mrad": ("stays put mrad", 1),
+}
+
+
+@dataclass(frozen=True)
+class FitServo:
+    """Fit a model per joint that predicts, from commands alone, where the servo is.
+
+    Example: pupper-sysid fit-servo recordings/walk.csv --train-loops 0,1 --test-loops 2
+
+    Example: pupper-sysid fit-servo robots/ --arch fir --jobs 4
+    """
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings at one rate, pooled per joint; by default the newest in recordings/. A folder is a
+    fleet: each recording in it is a robot of its own."""
+    arch: Literal["mlp", "lstm", "fir", "delayed-pd", "sindy"] = "mlp"
+    """Kind of model: networks, the linear filter they build on, or a physical model."""
+    preset: Literal["default", "paper"] = "default"
+    """paper: an mlp or lstm trained as in the paper, one step ahead from measured positions."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    out: Path | None = None
+    """Folder to write the model to; by default servo/, or the next free servo-2/, servo-3/, …; of a
+    fleet the folder of its models, by default the given one's name and _servos."""
+    train_loops: str = ""
+    """Trials (loops) to train on, such as 0,1; goes with --test-loops."""
+    test_loops: str = ""
+    """Trials (loops) to test on, such as 2."""
+    train_before: float | None = None
+    """Train on the first seconds of each trial; goes with --test-after."""
+    test_after: float | None = None
+    """Test on what comes after so many seconds of each trial."""
+    leave_one_frequency_out: bool = False
+    """Test on each tone (or loop) with a model that has not seen it; what is done by default."""
+    readings: Literal["auto", "fresh", "all"] = "auto"
+    """Which readings count: fresh ones at the time they were taken, all rows as logged, or what
+    suits the recording."""
+    jobs: int = 2
+    """Robots of a fleet that are fitted at the same time."""
+    cluster: str | None = None
+    """Dask scheduler to fit a fleet on, such as tcp://host:8786."""
+    force: bool = False
+    """Replace the model in --out."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the networks, of the physical models' starts and of the bootstrap."""
+
+    def run(self) -> None:
+        """Fit, score, save, print."""
+        from pupper_sysid.sysid.recordings.recording import Recording
+        from pupper_sysid.sysid.servo_fit.fit import ServoFit, fit_servo
+        from pupper_sysid.sysid.servo_fit.save import save_fit, to_json
+
+        split = self._split()
+        if len(self.recordings) == 1 and self.recordings[0].is_dir():
+            self._fleet(self.recordings[0], split)
+            return
+        if self.cluster:
+            raise InputError("--cluster is for a fleet: give the folder of its recordings.")
+        folder = self.out or _free_folder()
+        refuse_overwrite(folder / CONTRACT, self.force)
+        started = time.perf_counter()
+        recordings: list[Recording] = terminal.load_all(self.recordings)
+        joints = terminal.pick_joints(recordings, self.joints)
+        with terminal.share_progress(f"fitting {self.arch}") as advance:
+            fit: ServoFit = fit_servo(
+                recordings, joints, self.arch, self.preset, split, self.readings, self.seed, advance
+            )
+        elapsed = time.perf_counter() - started
+        found = to_json(fit, elapsed)
+        save_fit(folder, fit, recordings, self.seed, self.force)
+        if self.json:
+            terminal.print_json(found | {"written": str(folder)})
+            return
+        self._print(found)
+        terminal.warn(fit.notes)
+        terminal.err.print(
+            f"Wrote {folder}/ in {elapsed:.0f} s. Next: pupper-sysid compare --models {folder}",
+            soft_wrap=True,
+        )
+
+    def _fleet(self, root: Path, split: Split) -> None:
+        """Many robots, one after the other or side by side."""
+        from pupper_sysid.sysid.identify.fleet import robots_in
+        from pupper_sysid.sysid.servo_fit.fleet import ServoSettings, fit_servo_fleet
+
+        if self.joints != "all":
+            raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
+        started = time.perf_counter()
+        out = self.out or root.resolve().with_name(f"{root.resolve().name}_servos")
+        settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
+        with terminal.progress(f"fitting {self.arch}", len(robots_in(root))) as advance:
+            fleet = fit_servo_fleet(
+                root, out, settings, self.jobs, self.cluster, self.force, advance
+            )
+        terminal.print_fleet(
+            fleet, out, time.perf_counter() - started, self.json, "a servo model", _SHOWN
+        )
+
+    def _split(self) -> Split:
+        from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split
+
+        loops, times = (self.train_loops, self.test_loops), (self.train_before, self.test_after)
+        ways = [any(loops), times != (None, None), self.leave_one_frequency_out]
+        if sum(ways) > 1:
+            raise InputError(
+                "Choose one way to hold data out: --train-loops with --test-loops, --train-before "
+                "with --test-after, or --leave-one-frequency-out."
+            )
+        if any(loops):
+            if not all(loops):
+                raise InputError("--train-loops and --test-loops go together, such as 0,1 and 2.")
+            train, test = _numbers("--train-loops", loops[0]), _numbers("--test-loops", loops[1])
+            if set(train) & set(test):
+                raise InputError(
+                    f"Loop {min(set(train) & set(test))} is in --train-loops and in --test-loops; "
+                    "a model would be tested on what it has seen."
+                )
+            return Split(
+                f"trained on loops {loops[0]}, tested on {loops[1]}",
+                lambda number, elapsed, group: np.isin(number, train),
+                lambda number, elapsed, group: np.isin(number, test),
+            )
+        if times == (None, None):
+            return EACH_GROUP_IN_TURN
+        if self.train_before is None or self.test_after is None:
+            raise InputError("--train-before and --test-after go together, such as 2 and 2.")
+        before, after = self.train_before, self.test_after
+        if not 0 < before <= after:
+            raise InputError(
+                f"--train-before is {before:g} and --test-after {after:g}; training must end "
+                "after 0 s and before testing begins."
+            )
+        return Split(
+            f"trained on the first {before:g} s of each trial, tested after {after:g} s",
+            lambda number, elapsed, group: elapsed < before,
+            lambda number, elapsed, group: elapsed >= after,
+        )
+
+    def _print(self, found: dict) -> None:
+        shown = terminal.table(
+            f"{self.arch}, {found['split']}; RMS error in mrad", "joint", "free run",
+            "through the hold", "rows as logged", "one step", "linear", "delayed PD",
+            "stays put", "robot repeats",
+        )  # fmt: skip
+        keys = (
+            "rmse_free_run_rad", "rmse_held_rad", "rmse_raw_rad", "rmse_one_step_rad",
+            "linear_rmse_rad", "delayed_pd_rmse_rad", "persistence_rmse_rad", "repeatability_rad",
+        )  # fmt: skip
+        for name, entry in found["joints"].items():
+            shown.add_row(name, *(terminal.ms(entry[k]) for k in keys))
+        if len(found["joints"]) > 1:
+            shown.add_row("mean", *(terminal.ms(found["mean"][k]) for k in keys), style="bold")
+        terminal.out.print(shown)
+        terminal.out.print(
+            "\nFree run: commands only, from the start of each run. DelayedPD, the linear filter "
+            "and the model were fitted to the same readings and scored on the same unseen ones.",
+            soft_wrap=True,
+        )
+        terminal.out.print(Text(f"\n{found['verdict']}", "bold"), soft_wrap=True)
+
+
+def _free_folder() -> Path:
+    """`servo`, or the next name that is free: trying another model must not cost the last one."""
+    n = 1
+    while (Path(f"servo-{n}" if n > 1 else "servo") / CONTRACT).exists():
+        n += 1
+    return Path(f"servo-{n}" if n > 1 else "servo")
+
+
+def _numbers(option: str, text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} is '{text}'; write loop numbers with commas: 0,1.") from None

@@ -1,0 +1,108 @@
+"""`init-robot`: a joint map and a plan to sweep another robot, from its own model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from pupper_sysid.cli import terminal
+
+_AMPLITUDE_RAD, _SMALLEST_RAD = 0.3, 0.05
+
+
+@dataclass(frozen=True)
+class InitRobot:
+    """Make a joint map of another robot with hobby servos, and say how to sweep it.
+
+    Example: pupper-sysid init-robot my_robot.xml --servo sts3215
+    """
+
+    model: tyro.conf.Positional[Path]
+    """The robot's MJCF or URDF."""
+    servo: Literal["sts3215", "scs0009"] = "sts3215"
+    """Which servos it has."""
+    out: Path | None = None
+    """Joint map to write; by default the model's name and .joints.yaml, in this folder."""
+    force: bool = False
+    """Replace the file if it exists."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Read the model, write the map, show what to do next."""
+        from pupper_sysid.sim.robot.robot_map import joint_map_of
+
+        found, left_out = joint_map_of(self.model, self.servo)
+        target = self.out or Path(f"{self.model.stem}.joints.yaml")
+        found.save(target, self.force)
+        servos = found.per_servo()
+        room = servos.position_limits().room(servos.rest_pose())
+        plan = _plan(found.joint_names, room)
+        sweeps = [
+            f"pupper-sysid sweep --joint-map {target} --joints {','.join(names)} --freqs 1-6 "
+            f"--amplitude {amplitude:g}"
+            for amplitude, names in plan
+        ]
+        if left_out:
+            terminal.warn(
+                [
+                    f"left out, for no actuator of {self.model} drives them: {', '.join(left_out)}."
+                    " If they have servos, give them actuators there, or take all actuators out."
+                ]
+            )
+        narrow = [n for n, r in zip(found.joint_names, room, strict=True) if r < _SMALLEST_RAD]
+        if narrow:
+            terminal.warn(
+                [
+                    f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of room, too little for "
+                    f"a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
+                    'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
+                ]
+            )
+        if self.json:
+            terminal.print_json(
+                {
+                    "joint_map": str(target),
+                    "joints": list(found.joint_names),
+                    "ids": list(found.ids),
+                    "left_out": left_out,
+                    "room_rad": dict(zip(found.joint_names, map(float, room), strict=True)),
+                    "sweeps": sweeps,
+                }
+            )
+            return
+        table = terminal.table(f"{target}", "joint", "id", "centre rad", "limits rad", "room rad")
+        for k, name in enumerate(found.joint_names):
+            entry = found.file.joints[name]
+            low, high = entry.limits_rad
+            table.add_row(
+                name, str(entry.id), f"{entry.neutral_rad:.2f}", f"{low:.2f} … {high:.2f}",
+                f"{room[k]:.2f}",
+            )  # fmt: skip
+        terminal.out.print(table)
+        terminal.out.print(
+            "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
+            "servos limp, move one joint after the other by hand to its positive side and watch\n"
+            f"  pupper-sysid monitor --joint-map {target} --bus feetech:/dev/ttyUSB0\n"
+            f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
+            "Then measure centres, ranges and scale:\n"
+            f"  pupper-sysid calibrate-joints --joint-map {target} --out {target} --force "
+            "--bus feetech:/dev/ttyUSB0\n"
+            "Sweep, first without the robot, then with --bus feetech:/dev/ttyUSB0:\n"
+            + "".join(f"  {line}\n" for line in sweeps)
+            + "Then doctor, delay, calibrate, fit-servo and export, as for any recording.",
+            soft_wrap=True,
+        )
+
+
+def _plan(names: tuple[str, ...], room: np.ndarray) -> list[tuple[float, list[str]]]:
+    """Amplitudes that leave a fifth of each joint's room, and the joints that take them."""
+    groups: dict[float, list[str]] = {}
+    for name, free in zip(names, room, strict=True):
+        amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
+        groups.setdefault(float(amplitude), []).append(name)
+    return sorted(groups.items(), reverse=True)

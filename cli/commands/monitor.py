@@ -1,0 +1,238 @@
+"""`monitor`: what every servo says of itself, live; it only reads."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Group
+from rich.live import Live
+from rich.text import Text
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import chosen_map
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.bus import BusSample, ServoBus
+from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.feetech.registers import error_words
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import draw_robot
+
+EMULATED = "emulated"
+
+_ONCE_S = 0.3  # voltage and temperature come with every other answer only
+_GOALS_EVERY_S = 1.0  # one question per servo, and only another program could change them
+_DRAW_EVERY_S = 0.1
+_PLAIN_EVERY_S = 1.0
+
+
+@dataclass(frozen=True)
+class Monitor:
+    """Show what every servo says: goal, position, load, voltage, temperature, errors.
+
+    It only reads: no goal is written and no torque is switched. Ctrl-C ends it. Angles are each
+    servo's own, as in a sweep: a calf's is told as if its thigh stood in its middle.
+    Example: pupper-sysid monitor --bus feetech:/dev/ttyUSB0
+    """
+
+    bus: str
+    """esp32 (on the robot), feetech:DEVICE, or emulated."""
+    joint_map: str | None = None
+    """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
+    fits the bus."""
+    rate: float = 20.0
+    """Readings per second."""
+    seconds: float | None = None
+    """End after this long [s]; by default only with Ctrl-C."""
+    once: bool = False
+    """Print one table and end."""
+    json: bool = False
+    """Print one JSON object and nothing else, and end."""
+
+    def run(self) -> None:
+        """Read and show until told to end."""
+        terminal.need_positive("--rate", self.rate)
+        if self.seconds is not None:
+            terminal.need_positive("--seconds", self.seconds)
+        bus = _open(self.bus, self.joint_map)
+        try:
+            watched = Watched(bus)
+            if self.once or self.json:
+                self._watch(watched, self.seconds or _ONCE_S)
+                if self.json:
+                    terminal.print_json(watched.as_data(self.bus))
+                else:
+                    terminal.out.print(watched.table(self.bus))
+                return
+            self._show(watched)
+        except KeyboardInterrupt:  # the way out of a monitor is no mishap
+            terminal.err.print("Stopped.")
+        finally:
+            bus.close()
+
+    def _show(self, watched: Watched) -> None:
+        live = None
+        if terminal.out.is_terminal:
+            live = Live(console=terminal.out, auto_refresh=False, vertical_overflow="visible")
+        shown_s = -np.inf
+
+        def show() -> None:
+            nonlocal shown_s
+            every = _DRAW_EVERY_S if live else _PLAIN_EVERY_S
+            if watched.now_s - shown_s < every:
+                return
+            shown_s = watched.now_s
+            if live:
+                live.update(watched.table(self.bus), refresh=True)
+            else:
+                terminal.out.print(watched.table(self.bus))
+
+        with live or nullcontext():
+            self._watch(watched, self.seconds or np.inf, show)
+
+    def _watch(self, watched: Watched, seconds: float, show=lambda: None) -> None:
+        bus = watched.bus
+        until = bus.now() + seconds
+        tick = bus.now()
+        while True:
+            watched.look()
+            show()
+            tick = max(tick + 1 / self.rate, bus.now())
+            if tick > until:
+                return
+            bus.sleep_until(tick)
+
+
+class Watched:
+    """A bus that is only read, and since when each of its joints has said the same.
+
+    A serial servo answers for the very moment, so the age of its reading is the time since it last
+    answered. The proxy and the emulated robot hand on old readings without saying so: of those is
+    told for how long the value has not changed, which a joint at rest makes long.
+    """
+
+    def __init__(self, bus: ServoBus):
+        self.bus = bus
+        self.answers_now = bus.metadata["kind"] == "feetech"
+        joints = len(bus.joint_names)
+        self.now_s = self._start_s = bus.now()
+        self._seen_s = np.full(joints, np.nan)
+        self._seen_changing = np.zeros(joints, bool)
+        self._position, self._goal = np.full((2, joints), np.nan)
+        self._count = np.full(joints, -1)
+        self._here = np.zeros(joints, bool)
+        self._goal_s = -np.inf
+        self._sample: BusSample | None = None
+        self._voltage, self._temperature = np.full((2, joints), np.nan)
+
+    def look(self) -> None:
+        """Read once."""
+        sample = self._sample = self.bus.read()
+        here = self._here = np.isfinite(sample.position_rad)
+        changed = here & (sample.position_rad != self._position) & np.isfinite(self._position)
+        self._seen_changing |= changed
+        news = here if self.answers_now else changed | (here & np.isnan(self._seen_s))
+        self._seen_s = np.where(news, sample.time_s, self._seen_s)
+        self._position = np.where(here, sample.position_rad, self._position)
+        self._count = np.where(here, sample.position_count, self._count)
+        self._voltage = _latest(self._voltage, sample.voltage_v)
+        self._temperature = _latest(self._temperature, sample.temperature_c)
+        goals = getattr(self.bus, "goals", None)
+        if goals and self.bus.now() - self._goal_s > _GOALS_EVERY_S:
+            self._goal, self._goal_s = goals(), self.bus.now()
+        self.now_s = self.bus.now()
+
+    def as_data(self, bus_name: str) -> dict[str, Any]:
+        """Everything as plain numbers."""
+        return {
+            "bus": bus_name,
+            "joint_map": self.bus.metadata.get("joint_map"),
+            "coordinates": self.bus.metadata.get("coordinates"),
+            "joints": self.rows(),
+        }
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One dict per joint; None where the bus does not tell."""
+        sample = self._sample
+        assert sample is not None
+        rows = []
+        for k, name in enumerate(self.bus.joint_names):
+            status = None if sample.status is None or not self._here[k] else int(sample.status[k])
+            since = _known(self.now_s - self._seen_s[k])
+            rows.append(
+                {
+                    "joint": name,
+                    "answers": bool(self._here[k]),
+                    "goal_rad": _known(self._goal[k]),
+                    "position_rad": _known(self._position[k]),
+                    "count": int(self._count[k]) if self._count[k] >= 0 else None,
+                    "age_s": since if self.answers_now else None,
+                    "unchanged_s": None if self.answers_now else since,
+                    "load": None if sample.load is None else _known(sample.load[k]),
+                    "voltage_v": _known(self._voltage[k]),
+                    "temperature_c": _known(self._temperature[k]),
+                    "errors": None if status is None else error_words(status),
+                }
+            )
+        return rows
+
+    def table(self, bus_name: str) -> Group:
+        """The table and what its columns mean."""
+        table = terminal.table(
+            bus_name, "joint", "goal", "rad", "count", "age" if self.answers_now else "unchanged",
+            "load %", "volt", "°C", "errors",
+        )  # fmt: skip
+        for k, row in enumerate(self.rows()):
+            errors = "–" if row["errors"] is None else row["errors"] or "none"
+            load = None if row["load"] is None else 100 * row["load"]
+            table.add_row(
+                row["joint"], terminal.number(row["goal_rad"], 3),
+                terminal.number(row["position_rad"], 3),
+                "–" if row["count"] is None else str(row["count"]),
+                self._age(k, row["age_s" if self.answers_now else "unchanged_s"]),
+                terminal.number(load, 0),
+                terminal.number(row["voltage_v"], 1), terminal.number(row["temperature_c"], 0),
+                errors if row["answers"] else Text("silent", "red"),
+            )  # fmt: skip
+        if self.answers_now:
+            said = "age: since the last good answer. goal: what stands in the servo."
+        elif self.bus.metadata["kind"] == "emulated":
+            said = "unchanged: since the value last changed; old readings do not say so."
+        else:
+            said = (
+                "unchanged: since the value last changed; the proxy does not say how old a reading "
+                "is, nor goals, temperatures or errors."
+            )
+        return Group(table, Text(said, style="dim"))
+
+    def _age(self, joint: int, seconds: float | None) -> str:
+        if seconds is None:
+            return "–"
+        if self.answers_now and seconds < 1:
+            return f"{1e3 * seconds:.0f} ms"
+        # it may have stood there long before the first look
+        since_before = not self.answers_now and not self._seen_changing[joint]
+        return ("≥" if since_before else "") + f"{seconds:.1f} s"
+
+
+def _open(bus: str, joint_map: str | None) -> ServoBus:
+    """The bus to read, without guard and watchdog: nothing will move."""
+    if bus == EMULATED:
+        if joint_map:
+            raise InputError("--joint-map: the emulated robot has its own; leave it out.")
+        rng = np.random.default_rng(0)
+        return EmulatedBus(draw_robot(rng), rng, real_time=True)
+    address = parse_address(bus)
+    chosen = chosen_map(joint_map)
+    return open_bus(address, chosen.per_servo() if chosen else None)
+
+
+def _latest(before: NDArray[np.float64], now: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    return before if now is None else np.where(np.isfinite(now), now, before)
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,69 @@
+"""`sindy`: a sparse equation of motion per joint, with units, beside DelayedPD's error."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.text import Text
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.sysid.identify.sparse_equations import EquationResult, identify, to_json
+
+
+@dataclass(frozen=True)
+class Sindy:
+    """A short equation of motion per joint, with units (SINDy, refined by output error).
+
+    Example: pupper-sysid sindy recordings/sweep.csv --joints LF_thigh
+    """
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings, pooled per joint; by default the newest in recordings/."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the bootstrap and of the models' global starts."""
+
+    def run(self) -> None:
+        """Find the equations and print them."""
+        started = time.perf_counter()
+        recordings = terminal.load_all(self.recordings)
+        joints = terminal.pick_joints(recordings, self.joints)
+        with terminal.progress("finding equations", len(joints)) as advance:
+            results = identify(recordings, joints, self.seed, progress=advance)
+        elapsed = time.perf_counter() - started
+        if self.json:
+            terminal.print_json({**to_json(results), "elapsed_s": elapsed})
+        else:
+            self._print(results, elapsed)
+
+    def _print(self, results: dict[str, EquationResult], elapsed: float) -> None:
+        for name, r in results.items():
+            terminal.out.print(Text.assemble((name, "bold"), f": {r.equation}"), soft_wrap=True)
+            for line in r.explanation():
+                terminal.out.print(f"  - {line}", soft_wrap=True)
+            terminal.out.print()
+        shown = terminal.table(
+            "Free-run error, mrad", "joint", "equation, fresh", "all rows", "unseen Hz",
+            "DelayedPD, fresh", "unseen Hz", "structures tried",
+        )  # fmt: skip
+        for name, r in results.items():
+            shown.add_row(
+                name, terminal.ms(r.scores.fresh), terminal.ms(r.scores.held),
+                terminal.ms(r.scores.leave_one_out), terminal.ms(r.delayed_pd.fresh),
+                terminal.ms(r.delayed_pd.leave_one_out), str(len(r.candidates)),
+            )  # fmt: skip
+        terminal.out.print(shown)
+        terminal.out.print(
+            "\nq: joint angle, u: command, e: error. Per unit of inertia; each reading is compared "
+            "with the motion at the time it was measured, none is fed back.",
+            soft_wrap=True,
+        )
+        for r in results.values():
+            terminal.warn(r.warnings)
+        terminal.err.print(f"Took {elapsed:.1f} s.")

@@ -1,0 +1,248 @@
+"""`sweep`: move the joints, write down what happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import JOINTS_FILE, connect
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.joints import JOINT_NAMES, select_joints
+from pupper_sysid.hardware.bus import ServoBus
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import directly_read, draw_robot
+from pupper_sysid.sysid.recordings.recording import FOLDER
+from pupper_sysid.sysid.sweep.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan
+from pupper_sysid.sysid.sweep.playback import playback
+from pupper_sysid.sysid.sweep.recorder import LOOP_PERIOD_S, record
+from pupper_sysid.sysid.sweep.resume import footer, header_of, resume_point
+
+EMULATED = "emulated"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Record the response of joints to a sweep of tones (or steps, a chirp, …).
+
+    Example: pupper-sysid sweep --freqs 1-10 --joints LF
+    """
+
+    freqs: str = "1-10"
+    """Frequencies [Hz]: 1-10, 1-10:0.5 or 1,2,4,6.5."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; one after the other."""
+    bus: str = EMULATED
+    """emulated (no robot needed), esp32 (on the robot), or feetech:DEVICE, e.g.
+    feetech:/dev/ttyUSB0."""
+    joint_map: str | None = None
+    """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
+    fits the bus. With the emulated bus, the robot that is emulated."""
+    kind: Literal["sine", "chirp", "multisine", "steps", "square"] = "sine"
+    """Shape of the motion."""
+    playback: Path | None = None
+    """Play the commands of this recording or command file instead."""
+    loops: int = 1
+    """How often to play them."""
+    amplitude: float = 0.3
+    """Largest excursion from the start pose [rad]; less where the speed limit asks for it."""
+    duration: float | None = None
+    """Length of each trial [s]; by default 5 s or five periods, whichever is longer."""
+    rate: float = round(1 / LOOP_PERIOD_S, 2)
+    """Control loop [Hz]."""
+    out: Path | None = None
+    """File to write; by default recordings/<kind>_<date>_<time>.csv."""
+    resume: Path | None = None
+    """Continue this unfinished recording, as it was planned; other options are not looked at."""
+    truth: bool = False
+    """Also write what the emulated robot really did, beside the recording."""
+    real_time: bool = False
+    """Let the emulated robot take as long as a real one."""
+    force: bool = False
+    """Replace files that exist."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the emulated robot: its servos, its lost polls, its noise."""
+
+    def run(self) -> None:
+        """Plan, record, and say what to run next."""
+        if self.resume:
+            path = self.resume
+            request = dict(header_of(path)["sweep"])
+        else:
+            request = self._request()
+            name = "playback" if self.playback else self.kind
+            path = self.out or FOLDER / f"{name}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
+            if path.suffix != ".csv":
+                raise InputError(f"--out {path}: a recording is a .csv file.")
+            refuse_overwrite(path, self.force)
+        stem = path.with_suffix("")
+        for other in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
+            refuse_overwrite(Path(other), self.force)
+        if self.truth and (self.resume or request["bus"] != EMULATED):
+            raise InputError("--truth: only a new recording of the emulated robot has its truth.")
+        bus = _open(request)
+        try:
+            chosen = _plan(request, bus)
+            resume = resume_point(path, chosen, request["loop_period_s"]) if self.resume else None
+        except BaseException:
+            bus.close()
+            raise
+        terminal.warn(chosen.warnings)
+        if resume:
+            terminal.err.print(
+                f"Continuing {path} at trial {resume.next_trial + 1} of {len(chosen.trials)}."
+            )
+        started = time.perf_counter()
+        existed = path.exists()
+        try:
+            with (
+                _priority(request) as priority,
+                terminal.seconds_progress("recording", chosen.duration_s) as advance,
+            ):
+                record(
+                    bus, chosen, path, loop_period_s=request["loop_period_s"],
+                    metadata={"seed": request["seed"], "sweep": request, "priority": priority},
+                    force=self.force, resume=resume, progress=advance,
+                )  # fmt: skip
+        except (BusError, KeyboardInterrupt):
+            if path.exists() and (resume or not existed or self.force):
+                terminal.err.print(
+                    f"What was recorded is in {path}; go on with\n"
+                    f"  pupper-sysid sweep --resume {path}",
+                    soft_wrap=True,
+                )
+            raise
+        terminal.warn(_guard_warnings(path))
+        written = [path]
+        if self.truth and isinstance(bus, EmulatedBus):
+            written += bus.write_truth(stem, self.force)
+        self._say(request, chosen, written, time.perf_counter() - started)
+
+    def _request(self) -> dict[str, Any]:
+        """All that decides what will be done; the recording keeps it, so that it can go on."""
+        terminal.need_positive("--rate", self.rate)
+        bus = self.bus
+        if self.loops < 1:
+            raise InputError(f"--loops is {self.loops}; it must be at least 1.")
+        if self.real_time and bus != EMULATED:
+            raise InputError("--real-time: a real bus knows no other time; leave it out.")
+        return {
+            "bus": bus,
+            "joint_map": self.joint_map,
+            "real_time": self.real_time,
+            "seed": self.seed,
+            "loop_period_s": 1.0 / self.rate,
+            "kind": self.kind,
+            "joints": select_joints(self.joints, self._joints_there()),
+            "frequencies_hz": parse_frequencies(self.freqs),
+            "amplitude_rad": self.amplitude,
+            "duration_s": self.duration,
+            "playback": str(self.playback) if self.playback else None,
+            "loops": self.loops,
+        }
+
+    def _joints_there(self) -> tuple[str, ...]:
+        """Joints to choose from: of the joint map, if one was named or lies here."""
+        here = JOINTS_FILE if self.bus != EMULATED and JOINTS_FILE.exists() else None
+        chosen = self.joint_map or here
+        return load_joint_map(chosen).joint_names if chosen else JOINT_NAMES
+
+    def _say(
+        self, request: dict[str, Any], chosen: Plan, written: list[Path], elapsed: float
+    ) -> None:
+        path, joints = written[0], request["joints"]
+        if self.json:
+            terminal.print_json(
+                {
+                    "recording": str(path),
+                    "written": [str(p) for p in written],
+                    "joints": joints,
+                    "trials": len(chosen.trials),
+                    "recorded_s": chosen.duration_s,
+                    "elapsed_s": elapsed,
+                    "warnings": list(chosen.warnings),
+                }
+            )
+            return
+        terminal.out.print(
+            f"Recorded {len(chosen.trials)} trials of {len(joints)} joints, "
+            f"{chosen.duration_s:.0f} s of motion, in {elapsed:.1f} s.",
+            soft_wrap=True,
+        )
+        for name in written:
+            terminal.out.print(f"  {name}", soft_wrap=True)
+        terminal.out.print(
+            f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid delay {path}\n"
+            f"  pupper-sysid calibrate {path} --out calibrated.yaml",
+            soft_wrap=True,
+        )
+
+
+def _open(request: dict[str, Any]) -> ServoBus:
+    """The bus that a request names."""
+    if request["bus"] == EMULATED:
+        rng = np.random.default_rng(request["seed"])
+        real_time = bool(request["real_time"])
+        own = load_joint_map(request["joint_map"]) if request["joint_map"] else None
+        whose = f"one with the servos of {own.file.name}" if own else "the emulated one"
+        terminal.err.print(
+            f"No robot: using {whose}" + (", in real time." if real_time else "."), soft_wrap=True
+        )
+        robot = draw_robot(rng, directly_read(own) if own else None, own)
+        return EmulatedBus(robot, rng, real_time=real_time)
+    return connect(request["bus"], request["joint_map"], request["joints"])
+
+
+def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
+    """The plan that a request describes, within the limits of the bus."""
+    joints = request["joints"]
+    if request["playback"]:
+        chosen = playback(Path(request["playback"]), joints)
+        return replace(chosen, trials=chosen.trials * request.get("loops", 1))
+    pose = bus.metadata["rest_pose_rad"]
+    room = bus.limits.room(np.array([pose[name] for name in bus.joint_names]))
+    return plan(
+        request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
+        request["duration_s"], request["loop_period_s"], bus.metadata["speed_limit_rad_s"],
+        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ),
+        dict(zip(bus.joint_names, map(float, room), strict=True)), pose,
+    )  # fmt: skip
+
+
+@contextmanager
+def _priority(request: dict[str, Any]) -> Iterator[str]:
+    if request["bus"] == EMULATED and not request["real_time"]:
+        yield "none: virtual time"
+        return
+    with real_time_priority() as said:
+        terminal.err.print(f"Control loop at {said}.")
+        yield said
+
+
+def _guard_warnings(path: Path) -> list[str]:
+    """What a user should know of what the guard did to the commands."""
+    did = footer(path).get("guard", {})
+    found = []
+    if did.get("clipped"):
+        found.append(
+            f"{did['clipped']} commands were outside the joints' limits and were held at them."
+        )
+    if did.get("slowed"):
+        found.append(
+            f"{did['slowed']} commands came later than asked, at the guard's speed and "
+            "acceleration limits; the recording holds what was sent."
+        )
+    if did.get("unsent"):
+        found.append(f"{did['unsent']} commands could not be sent; the servos kept the last goal.")
+    return found

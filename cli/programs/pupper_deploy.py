@@ -1,0 +1,287 @@
+"""`pupper-deploy`: run a policy on a robot, or on an emulated one, behind the same bus."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import chosen_map
+from pupper_sysid.cli.commands.sweep import EMULATED, Sweep
+from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, trained_actuator
+from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
+from pupper_sysid.cli.user_errors import end_politely, run_program
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.esp32.bus import SOCKET, Esp32Bus
+from pupper_sysid.hardware.imu import Imu
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, StackName, suited
+from pupper_sysid.sysid.recordings.recording import RecordingWriter
+
+DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
+
+The robot stands up, is measured at rest for a second, walks, and sits down. Ctrl-C ends it there,
+a fault leaves it limp. Every input and output is in walks/<name>/walk.csv, which --replay repeats
+bit for bit; walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
+
+Example: pupper-deploy runs/<name> --command 0.15 0 0 --seconds 20
+"""
+
+PLAYBACK_LOOPS, PLAYBACK_HZ = 3, 50.0
+
+
+@dataclass(frozen=True)
+class Deploy:
+    """What to run, and on what."""
+
+    policy: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run (`runs/<name>`) or a policy folder."""
+    bus: str = "sim"
+    """`sim` (an emulated robot, as fast as it goes), `esp32`, `esp32:SOCKET`, `feetech:DEVICE`."""
+    imu: Path | None = None
+    """Socket of the proxy whose IMU to read, for a Feetech line, which has none."""
+    joint_map: str | None = None
+    """Joint map of the bus: a file of `calibrate-joints` or a preset."""
+    stack: Literal["auto", "closed-loop", "lstm-servo", "mlp-observer"] = "auto"
+    """`closed-loop`: the policy sees the servos' readings; `lstm-servo`: a servo model's
+    prediction; `mlp-observer`: that of a simulated PD; `auto`: what it was trained with."""
+    servo: Path | None = None
+    """Servo model's folder, for `lstm-servo`."""
+    actuator: str | None = None
+    """Calibration of this robot, for `mlp-observer`, and to be compared with the one the policy was
+    trained with before the start; by default that one."""
+    observer: ObserverKind | None = None
+    """Instead of the stack's."""
+    lowpass_hz: float | None = None
+    """Instead of the stack's; 0 for none."""
+    fade_in_s: float | None = None
+    """Instead of the stack's."""
+    scale_rad: float | None = None
+    """Radians per unit of action, instead of the trained scale."""
+    rate: float | None = None
+    """Hz of the loop, instead of the policy's own; its time then runs faster or slower."""
+    command: tuple[float, float, float] = (0.15, 0.0, 0.0)
+    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    script: Path | None = None
+    """CSV of commands with the columns seconds,forward_m_s,left_m_s,turn_rad_s, one after the
+    other, instead of --command."""
+    keyboard: bool = False
+    """Drive: w/s forward, a/d sideways, q/e turn, space stands, x ends."""
+    seconds: float = 20.0
+    """How long to walk."""
+    playback: Path | None = None
+    """Instead of a policy: play the commands of this CSV three times and record the servos, for
+    `pupper-sysid fit-servo`."""
+    replay: Path | None = None
+    """Instead of walking: repeat the log `walk.csv` through the policy and compare."""
+    name: str | None = None
+    """Of the folder in walks/; by default the policy's and the time."""
+    seed: int = 0
+    """Of the emulated robot."""
+    json: bool = False
+    """Print one JSON object."""
+    force: bool = False
+    """Replace an existing log."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
+    run_program(Deploy, _run, "pupper-deploy", DESCRIPTION, arguments)
+
+
+def _run(options: Deploy) -> None:
+    end_politely()
+    need_positive("--seconds", options.seconds)
+    if options.playback:
+        Sweep(
+            playback=options.playback, loops=PLAYBACK_LOOPS, joint_map=options.joint_map,
+            bus=EMULATED if options.bus == "sim" else options.bus, seed=options.seed,
+            rate=options.rate or PLAYBACK_HZ, json=options.json, force=options.force,
+        ).run()  # fmt: skip
+        return
+    if options.policy is None:
+        raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
+    import torch
+
+    torch.set_num_threads(1)
+    from pupper_sysid.policies.deploy.assembly import assemble
+
+    policy, run = policy_at(options.policy)
+    name, stack = _stack(options, policy.contract)
+    if options.replay:
+        _replay(options.replay, policy)
+        return
+    folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
+    with ExitStack() as open_things:
+        bus, imu, joint_map, truth = _open(options, open_things)
+        actuator = chosen_actuator(options.policy, policy, run, options.actuator)
+        trained, known = trained_actuator(options.policy, policy, run)
+        parts = assemble(
+            policy, stack, joint_map, actuator, options.servo, trained if known else None
+        )
+        if stack.observer == "readings" and options.actuator is None:
+            err.print(
+                "The policy is shown the servos' own readings. Whether they move as in its "
+                "training can be told with a calibration of this robot: --actuator."
+            )
+        elif not known:
+            warn(
+                [
+                    "the actuator with which the policy was trained is not here, so whether the "
+                    "observer moves like it was not checked."
+                ]
+            )
+        else:
+            _say_match(parts.match)
+        header = parts.header | {
+            "policy": str(options.policy), "stack_name": name, "seed": options.seed,
+            "bus": {"name": bus.name} | bus.metadata,
+        }  # fmt: skip
+        _walk(options, bus, imu, parts.controller, header, folder, truth)
+
+
+def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
+    """The stack, with what the user changed of it."""
+    name = suited(contract) if options.stack == "auto" else options.stack
+    stack = STACKS[name]
+    if options.observer:
+        stack = replace(stack, observer=options.observer)
+    if options.lowpass_hz is not None:
+        stack = replace(stack, lowpass_hz=options.lowpass_hz or None)
+    if options.fade_in_s is not None:
+        stack = replace(stack, fade_in_s=options.fade_in_s)
+    stack = replace(stack, scale_rad=options.scale_rad, rate_hz=options.rate)
+    own = 1 / contract.control_step_s
+    if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
+        warn(
+            [
+                f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its time "
+                f"runs {stack.rate_hz / own:.2f} times as fast, its gait too."
+            ]
+        )
+    return name, stack
+
+
+def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:
+    """Bus, IMU, joint map, and the emulated robot if it is one."""
+    if options.bus == "sim":
+        from pupper_sysid.sim.emulator.robot import draw_robot
+        from pupper_sysid.sim.walking.bus import WalkingBus
+
+        rng = np.random.default_rng(options.seed)
+        inner = WalkingBus(draw_robot(rng), rng, real_time=options.keyboard)
+        bus = open_things.enter_context(closing(GuardedBus(inner)))
+        return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
+    address = parse_address(options.bus)
+    preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
+    joint_map = chosen_map(options.joint_map) or load_joint_map(preset)
+    if address.kind == "feetech" and options.imu is None:
+        raise InputError(
+            "A Feetech line has no IMU, and a policy needs one. Give the proxy's socket with --imu."
+        )
+    bus = open_things.enter_context(closing(open_guarded(address, joint_map)))
+    if isinstance(bus.bus, Imu):
+        return bus, bus.bus, joint_map, None
+    other = open_things.enter_context(closing(Esp32Bus(options.imu or SOCKET)))
+    return bus, other, joint_map, None
+
+
+def _replay(path: Path, policy: Any) -> None:
+    """Repeat a log and compare."""
+    from pupper_sysid.policies.deploy.assembly import reassemble
+    from pupper_sysid.policies.deploy.walk_log import read_walk, replay
+
+    walk = read_walk(path)
+    differs = replay(walk, reassemble(policy, walk.header, path))
+    ended = walk.ended or "it was cut short"
+    if differs is not None:
+        raise InputError(
+            f"{path}: tick {differs} of {len(walk.senses)} gives another action than it gave then. "
+            "The policy and all settings are the same; the libraries or the processor are not."
+        )
+    out.print(f"{len(walk.senses)} ticks repeated, every action equal bit for bit ({ended}).")
+
+
+def _say_match(match: Any) -> None:
+    if match.fits:
+        err.print(match.sentence())
+        return
+    warn([match.sentence()])
+    rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
+    titles = (name.replace("_", " ") for name in rows[0])
+    table = terminal.table("Swing over command, and phase", *titles)
+    for row in rows:
+        table.add_row(*(terminal.cell(v, 2) for v in row.values()))
+    err.print(table)
+
+
+def _walk(
+    options: Deploy, bus: GuardedBus, imu: Imu, controller: Any, header: dict[str, Any],
+    folder: Path, truth: Any,
+) -> None:  # fmt: skip
+    """Walk, log, and say how it went."""
+    from pupper_sysid.cli.drive import Driver
+    from pupper_sysid.policies.deploy.commands import constant, script
+    from pupper_sysid.policies.deploy.deployment import deploy
+    from pupper_sysid.policies.deploy.walk_score import WalkScore
+
+    told = script(options.script) if options.script else constant(options.command)
+    score = WalkScore(bus, truth) if truth else None
+    log, table = folder / "walk.csv", folder / "recording.csv"
+    about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
+    with ExitStack() as open_things:
+        priority = open_things.enter_context(real_time_priority())
+        if options.bus != "sim":
+            err.print(f"Running with {priority}.")
+        watchers: list[Any] = [score] if score else []
+        if options.keyboard:
+            driver = open_things.enter_context(Driver().driving())
+            told, watchers = driver, [*watchers, driver.watch]
+        rows = open_things.enter_context(RecordingWriter(table, about, options.force))
+        outcome = deploy(
+            bus, imu, controller, told, options.seconds, log, header, rows, watchers, options.force
+        )
+        rows.close({"stop_reason": outcome.stop_reason})
+    steps = outcome.steps
+    # only an emulated robot says where it really went
+    motion: dict[str, Any] = score.summary() if score else dict.fromkeys(WalkScore.NAMES)
+    found = {
+        "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),
+        "seconds": outcome.seconds,
+        "deadline_misses": outcome.deadline_misses,
+        "step_ms": {
+            "p50": 1e3 * steps.quantile(0.5), "p99": 1e3 * steps.quantile(0.99),
+            "max": 1e3 * steps.largest_s,
+        },
+        "fell": outcome.fell,
+        **motion,
+        "stop_reason": outcome.stop_reason,
+        "guard": outcome.guard,
+        "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},
+        "log": str(log),
+    }  # fmt: skip
+    if options.json:
+        print_json(found)
+        return
+    shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
+    for key, value in found.items():
+        shown.add_row(key, terminal.cell(value, 3))
+    out.print(shown)
+    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()

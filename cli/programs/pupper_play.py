@@ -1,0 +1,192 @@
+"""`pupper-play`: watch a policy walk, in a window or as a video."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if sys.platform == "linux":
+    os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a display; --viewer opens a window
+
+import numpy as np
+import tyro
+
+from pupper_sysid.cli.policy_choice import policy_at, simulator, tell_borrowed
+from pupper_sysid.cli.terminal import err, need_positive, out, warn
+from pupper_sysid.cli.user_errors import run_program
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.sim.robot.terrain import Terrain
+
+DESCRIPTION = """Watch a policy walk in the simulator it was trained in.
+
+Example: pupper-play runs/<name> --command 0.15 0 0 --video walk.mp4
+"""
+_SIZE = (480, 640)
+
+
+@dataclass(frozen=True)
+class Play:
+    """What to watch, and how."""
+
+    policy: Annotated[Path, tyro.conf.Positional]
+    """A run (`runs/<name>`) or a policy folder."""
+    command: tuple[float, float, float] = (0.15, 0.0, 0.0)
+    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    seconds: float = 10.0
+    """How long."""
+    video: Path | None = None
+    """Write an .mp4 file."""
+    viewer: bool = False
+    """Open a window."""
+    actuator: str | None = None
+    """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
+    feedback: str | None = None
+    """`held`, `ideal` or a calibration instead of what it was trained with."""
+    terrain: Terrain = "flat"
+    """Kind of ground."""
+    seed: int = 0
+    """Of servos, friction, start and ground."""
+    force: bool = False
+    """Replace an existing video."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
+    run_program(Play, _run, "pupper-play", DESCRIPTION, arguments)
+
+
+def _run(options: Play) -> None:
+    need_positive("--seconds", options.seconds)
+    if options.video:
+        if options.video.suffix.lower() != ".mp4":
+            raise InputError(f"--video {options.video}: give a name that ends in .mp4.")
+        refuse_overwrite(options.video, options.force)
+    import torch
+
+    from pupper_sysid.policies.analysis.evaluation import evaluation_task
+    from pupper_sysid.sim.walking.env import PupperEnv
+    from pupper_sysid.sim.walking.servo_ranges import servo_model_of
+
+    torch.set_num_threads(1)
+    policy, run = policy_at(options.policy)
+    task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
+    tell_borrowed([servos])
+    task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
+    model = servo_model_of(servos.source, task.control_step_s)
+    env = PupperEnv(task, servos, 1, options.seed, 1, model)
+    env.set_command(np.array(options.command))
+    screen = _Screen(env, options)
+    observation, _ = env.observe()
+    policy.reset(env.action)
+    start = env.robots.qpos[0, :2].copy()
+    velocities, ended, away = [], "", np.zeros(2)
+    for step in range(round(options.seconds / task.control_step_s)):
+        found = env.step(policy.act(observation))
+        observation = found.observation
+        if found.done[0]:
+            what = "Left the ground's edge" if found.timed_out[0] else "Fell"
+            ended = f"{what} after {(step + 1) * task.control_step_s:.1f} s."
+            break
+        away = env.robots.qpos[0, :2] - start
+        facts = found.facts
+        velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
+        if not screen.show(task.control_step_s):
+            break
+    screen.close()
+    moved = np.mean(velocities, axis=0) if velocities else np.zeros(3)
+    if ended:
+        out.print(ended)
+    out.print(
+        "asked {:.2f} m/s forward, {:.2f} m/s left, {:.2f} rad/s; mean ".format(*options.command)
+        + "{:.2f}, {:.2f}, {:.2f}".format(*moved)
+        + f"; {np.linalg.norm(away):.2f} m from the start"
+    )
+
+
+class _Screen:
+    """A video, a window, or nothing."""
+
+    def __init__(self, env: Any, options: Play):
+        self._env = env
+        self._path = options.video or Path()
+        self._renderer: Any = None
+        self._writer: Any = None
+        self._viewer: Any = None
+        self._model = env.robots.batch.get_model(0)
+        self._data: Any = None
+        if options.viewer:
+            self._open_viewer()
+        if options.video:
+            self._open_video()
+
+    def _open_viewer(self) -> None:
+        try:
+            viewer = importlib.import_module("mujoco.viewer")
+            self._data = self._env.robots.batch.get_data(0)
+            self._viewer = viewer.launch_passive(self._model, self._data)
+        except Exception as error:  # whatever the window system raises
+            raise InputError(
+                f"No window could be opened ({error}). Use --video walk.mp4 instead."
+            ) from error
+
+    def _open_video(self) -> None:
+        try:
+            mujoco: Any = importlib.import_module("mujoco")
+            self._renderer = mujoco.Renderer(self._model, *_SIZE)
+        except Exception as error:  # EGL, OSMesa and GLFW each fail in their own way
+            warn(
+                [
+                    f"No frames can be drawn here ({type(error).__name__}: {error}), so there will "
+                    "be no video. Install EGL or OSMesa, or set MUJOCO_GL; the walk goes on."
+                ]
+            )
+            return
+        try:
+            imageio: Any = importlib.import_module("imageio.v2")
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            # a picture per action: at the policy's own rate the video runs as fast as the robot
+            self._writer = imageio.get_writer(
+                self._path, fps=1 / self._env.config.control_step_s, codec="libx264",
+                macro_block_size=None,
+            )  # fmt: skip
+        except (ImportError, ValueError, RuntimeError) as error:  # no imageio, or no ffmpeg
+            raise InputError(
+                "Writing video needs the package imageio: pip install 'pupper-sysid[video]'."
+            ) from error
+
+    def show(self, span_s: float) -> bool:
+        """One more picture; False when the window was closed."""
+        if self._viewer is None and self._writer is None:
+            return True
+        self._data = self._env.robots.batch.get_data(0, self._data)
+        mujoco: Any = importlib.import_module("mujoco")
+        mujoco.mj_forward(self._model, self._data)
+        if self._writer is not None:
+            self._renderer.update_scene(self._data, camera="track")
+            self._writer.append_data(self._renderer.render())
+        if self._viewer is not None:
+            if not self._viewer.is_running():
+                return False
+            self._viewer.sync()
+            time.sleep(span_s)
+        return True
+
+    def close(self) -> None:
+        """Finish the video."""
+        if self._writer is not None:
+            self._writer.close()
+            err.print(f"Wrote {self._path}.", soft_wrap=True)
+        if self._viewer is not None:
+            self._viewer.close()
+
+
+if __name__ == "__main__":
+    main()

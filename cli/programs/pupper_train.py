@@ -1,0 +1,179 @@
+"""`pupper-train`: train a walking policy on the measured robot."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+# Physics threads and torch threads take turns, so waiting must not spin.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import tyro
+import yaml
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pupper_sysid.cli.terminal import err, out, print_json
+from pupper_sysid.cli.user_errors import user_errors
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.network.hyperparameters import Kind
+from pupper_sysid.policies.train.run_file import Run, plain, preset
+from pupper_sysid.sim.walking.servo_ranges import check_actuator
+
+DESCRIPTION = """Train a walking policy in a simulator that moves like the measured robot.
+
+Start with `pupper-train --actuator calibrated.yaml`; Ctrl-C saves and ends, `--resume` goes on.
+Then `pupper-play runs/<name>` and `pupper-eval runs/<name>`.
+"""
+Preset = Literal["fast", "paper", "release"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to train, and where to put it."""
+
+    run: Annotated[Run, tyro.conf.arg(name="")] = field(default_factory=Run)
+    policy: Kind = "mlp"
+    """Kind of network; sets --architecture.* to sizes that suit it."""
+    preset: Preset = "fast"
+    """`fast`: sizes, task and rewards for a few cores; `paper`, `release`: as published."""
+    name: str | None = None
+    """Name of the run's folder in runs/; by default policy, date and time."""
+    resume: Path | None = None
+    """Folder of a run to go on with; only --iterations and --minutes can be new."""
+    print_config: bool = False
+    """Show all settings as YAML and stop."""
+    benchmark: bool = False
+    """Measure how fast environment, update and both together are, and stop."""
+    json: bool = False
+    """Print one JSON object instead of a table (with --benchmark)."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(given, "pupper-train") as rest:
+        _run(_parse(rest), rest)
+
+
+def _parse(given: list[str]) -> Options:
+    """Options; --preset and --policy decide what the other flags start from."""
+    start = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind))
+    return tyro.cli(
+        Options, args=given, default=Options(start), description=DESCRIPTION, prog="pupper-train",
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )  # fmt: skip
+
+
+def _choice(given: list[str], flag: str, kind: Any) -> Any:
+    """Value of a flag, or its default: what is wrong with it, tyro will say."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument(flag, nargs="?")
+    value = vars(parser.parse_known_args(given)[0]).popitem()[1]
+    return value if value in get_args(kind) else get_args(kind)[0]
+
+
+def _run(options: Options, given: list[str]) -> None:
+    run = options.run
+    if options.print_config:
+        print(yaml.safe_dump(plain(run), sort_keys=False), end="")
+        return
+    if options.resume is None:
+        check_actuator(run.actuator)
+    # torch and rsl_rl take seconds to import: not before the settings are known to be good
+    warnings.filterwarnings("ignore", category=UserWarning, module="torch")
+    from pupper_sysid.policies.train.learner import Ranks
+    from pupper_sysid.policies.train.training import train
+
+    if options.benchmark:
+        from pupper_sysid.policies.train.speed import measure
+
+        found = measure(run)
+        if options.json:
+            print_json(found)
+        else:
+            for name, value in found.items():
+                text = f"{value:,.3g}" if isinstance(value, float) else str(value)
+                out.print(f"{name:28} {text}")
+        return
+    ranks = Ranks.join()
+    folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
+    if options.resume is not None and not options.resume.is_dir():
+        raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
+    if ranks.rank == 0:
+        err.print(
+            f"{'Going on with' if options.resume else 'Training into'} {folder}.", soft_wrap=True
+        )
+    with _bar() as watch:
+        if options.resume:
+            train(folder, None, watch, *_extension(options, given))
+        else:
+            train(folder, run, watch)
+    if ranks.rank > 0:
+        return
+    err.print(
+        f"Saved. Look at it: pupper-play {folder} --video walk.mp4; measure it: "
+        f"pupper-eval {folder}; go on: pupper-train --resume {folder} (longer than it was begun "
+        "for: with --iterations or --minutes)"
+    )
+
+
+def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:
+    """New --iterations and --minutes of a run that goes on; anything else would be ignored."""
+    flags = {a.split("=")[0] for a in given if a.startswith("--")}
+    other = flags - {"--resume", "--iterations", "--minutes"}
+    if other:
+        raise InputError(
+            f"A resumed run keeps its own settings, so {sorted(other)[0]} would change nothing. "
+            "Leave it out, or start a new run."
+        )
+    return (
+        options.run.iterations if "--iterations" in flags else None,
+        options.run.minutes if "--minutes" in flags else None,
+    )
+
+
+def _name(options: Options) -> str:
+    return f"{options.policy}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+@contextlib.contextmanager
+def _bar() -> Iterator:
+    """Progress with what matters and when it ends; one line per ten updates where no terminal."""
+    terminal = err.is_terminal
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(), TextColumn("{task.fields[left]}"), TextColumn("{task.fields[what]}"),
+        console=err, disable=not terminal,
+    ) as bar:  # fmt: skip
+        task = bar.add_task("starting", total=None, what="", left="")
+
+        def watch(now) -> None:
+            if now.phase == "imitation":
+                what = f"difference to the trot {now.row['difference']:.3f}"
+            else:
+                what = (
+                    f"reward {now.row['reward'] * 50:.2f}/s, "
+                    f"falls {now.row['falls_per_1000_steps']:.2f} per 1,000 steps"
+                )
+            label = {"imitation": "first gait", "ppo": "PPO"}[now.phase]
+            left = f"{now.left_s / 60:.0f} min left"
+            bar.update(
+                task, description=label, completed=now.done, total=now.total, what=what, left=left
+            )
+            if not terminal and (now.done % 10 == 0 or now.done == 1):
+                err.print(f"{label} {now.done}/{now.total}, {left}: {what}")
+
+        yield watch
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,309 @@
+"""A `ServoBus` through the Mini Pupper 2's own proxy: `esp32-proxy`, a socket on the robot.
+
+The proxy shares one block of memory among all who connect: the last writer wins, nothing watches
+over a client that died, and the feedback in it was polled some 20 to 100 ms ago without saying so.
+Hence: one owner at a time (a lock file beside the socket), a time-out on every exchange, a new
+connection after anything unexpected, and every position read twice, because the datagrams have no
+checksum. Old readings are passed on as they come; `sysid` finds out how old they are.
+
+The counts are those of the firmware's stored calibration, not raw ones.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.clock import HostClock
+from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.imu import ImuSample, from_chip
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+
+SOCKET = Path("/tmp/esp32-proxy.socket")
+TIMEOUT_S = 0.03
+VOLTAGE_BAND_V = (4.2, 8.7)
+"""Below, the firmware soon cuts the servos off for good; above, no pack of this robot goes."""
+SPEED_LIMIT_RAD_S = 7.5
+
+_POWER_EVERY_S = 0.5
+_RECONNECT_S = 0.01
+_LARGEST_REPLY = 64
+_MOST_STALE = 16
+_SAME_READINGS = 3
+_TORQUE_TRIES = 5
+_ANY_COUNT = 512
+
+Answer = TypeVar("Answer")
+
+
+class Esp32Bus:
+    """The twelve servos behind the proxy.
+
+    Parameters
+    ----------
+    path : Path
+        The proxy's socket.
+    joint_map : JointMap, optional
+        Of the proxy's counts; by default the preset mini_pupper_2, in servo coordinates.
+
+    Raises
+    ------
+    BusError
+        If the socket is not there or another program owns it.
+    InputError
+        If the map is for raw counts or another encoder, or lacks a servo.
+    """
+
+    name = "esp32"
+
+    def __init__(self, path: Path = SOCKET, joint_map: JointMap | None = None):
+        self.path = Path(path)
+        self._map = joint_map or load_joint_map("mini_pupper_2").per_servo()
+        if self._map.frame != "proxy":
+            raise InputError(
+                f"the joint map {self._map.file.name} holds raw counts, and the proxy speaks "
+                "calibrated ones. Make a map with `pupper-sysid calibrate-joints --bus esp32`."
+            )
+        if self._map.file.counts != datagrams.HIGHEST_COUNT + 1:
+            raise InputError(
+                f"the joint map {self._map.file.name} is for servos of {self._map.file.counts} "
+                f"counts; the proxy's have {datagrams.HIGHEST_COUNT + 1}. Choose another map, such "
+                "as mini_pupper_2."
+            )
+        if sorted(self._map.ids) != list(range(1, datagrams.SERVOS + 1)):
+            raise InputError(
+                f"the joint map {self._map.file.name} has the ids {sorted(self._map.ids)}; the "
+                "proxy drives the servos 1 to 12 together, so the map must have them all."
+            )
+        self._by_id = np.array(self._map.ids) - 1
+        self._owner = _own(self.path)
+        self._socket: socket.socket | None = None
+        self._retry_s = 0.0
+        self._clock = HostClock()
+        self._power: datagrams.Power | None = None
+        self._power_s = -np.inf
+        self._on = np.ones(datagrams.SERVOS, bool)
+        self._goal = np.full(datagrams.SERVOS, datagrams.NO_COUNT)  # which cannot be sent
+        self.joint_names = self._map.joint_names
+        self.limits = self._map.position_limits()
+        self.metadata: dict[str, Any] = {
+            "kind": "esp32 proxy",
+            "socket": str(self.path),
+            "speed_limit_rad_s": SPEED_LIMIT_RAD_S,
+            "voltage_band_v": list(VOLTAGE_BAND_V),
+            "real_time": True,
+        } | self._map.metadata()
+        if not self._connected():
+            self.close()
+            raise BusError(
+                f"{self.path}: nobody answers there. On the robot, check `systemctl status "
+                "esp32-proxy`; without a robot, start one with `pupper-sysid emulate esp32`."
+            )
+
+    def now(self) -> float:
+        """Time of the host's clock [s], from 0 at construction."""
+        return self._clock.now()
+
+    def sleep_until(self, time_s: float) -> None:
+        """Sleep until `now()` has reached `time_s`."""
+        self._clock.sleep_until(time_s)
+
+    def write(self, position_rad: NDArray[np.float64]) -> Sent:
+        """Send goals; the proxy's answer means that it has them, not that a servo does."""
+        goal = np.asarray(position_rad, float)
+        if goal.shape != (datagrams.SERVOS,) or not np.isfinite(goal).all():
+            raise BusError(f"{self.path}: goals must be 12 finite angles, got {goal}.")
+        counts = self._map.clip_counts(self._map.to_counts(goal))
+        self._goal[self._by_id] = counts
+        sent = time.monotonic()
+        return Sent(self._clock.at(sent) if self._send_goals() else float("nan"), goal)
+
+    def read(self) -> BusSample:
+        """Whatever the proxy's block holds; NaN where it holds nothing yet or did not answer."""
+        before = self.now()
+        by_id = self._settled_counts()
+        at = round((before + self.now()) / 2, 6)
+        count = by_id[self._by_id]
+        load = self._ask(datagrams.GET_LOAD, datagrams.parse_load)
+        if self.now() - self._power_s > _POWER_EVERY_S:
+            self._power = self._ask(datagrams.GET_POWER, datagrams.parse_power)
+            self._power_s = self.now() if self._power else self._power_s
+        joints = len(self.joint_names)
+        missing = np.full(joints, np.nan)
+        return BusSample(
+            np.full(joints, at),
+            self._map.to_angles(np.where(count < 0, np.nan, count)),
+            count,
+            voltage_v=missing if self._power is None else np.full(joints, self._power.voltage_v),
+            load=missing if load is None else load[self._by_id],
+        )
+
+    def imu(self) -> ImuSample | None:
+        """The IMU, of at most some milliseconds ago; None if it or the proxy did not answer.
+
+        As with positions, an answer counts when another one agrees.
+        """
+        before = self.now()
+        seen: list[list[float]] = []
+        for _ in range(_SAME_READINGS):
+            raw = self._ask(datagrams.GET_IMU, datagrams.parse_imu)
+            if raw is None:
+                return None
+            if raw.tolist() in seen:
+                return from_chip(round((before + self.now()) / 2, 6), raw)
+            seen.append(raw.tolist())
+        return None
+
+    def torque(self, on: bool) -> bool:
+        """Hold the present pose, or let all servos go limp.
+
+        While a servo does not say where it is, nothing is sent: all goals go out together, and its
+        own would be a guess.
+        """
+        if on and not self._hold_present():
+            return False
+        self._on[:] = on
+        for _ in range(_TORQUE_TRIES):
+            if self._send_goals():
+                return True
+            time.sleep(_RECONNECT_S)
+        return False
+
+    def goals(self) -> NDArray[np.float64]:
+        """Unknown: the proxy does not tell what it was last told."""
+        return np.full(len(self.joint_names), np.nan)
+
+    def close(self) -> None:
+        """Let go of the socket; the servos keep what they were told."""
+        self._retry_s = float("inf")
+        self._disconnect()
+        if self._owner is not None:
+            os.close(self._owner)
+            self._owner = None
+
+    def _hold_present(self) -> bool:
+        """Make the present counts the goals; False if not all became known in time."""
+        present = np.full(datagrams.SERVOS, datagrams.NO_COUNT)
+        for _ in range(_TORQUE_TRIES):
+            counts = self._settled_counts()
+            present = np.where(counts > 0, counts, present)
+            if (present > 0).all():
+                self._goal = present
+                return True
+            time.sleep(_RECONNECT_S)
+        return False
+
+    def _settled_counts(self) -> NDArray[np.int64]:
+        """Counts by id on which two successive answers agree."""
+        last = None
+        settled = np.full(datagrams.SERVOS, datagrams.NO_COUNT)
+        for _ in range(_SAME_READINGS):
+            counts = self._ask(datagrams.GET_POSITION, datagrams.parse_counts)
+            if counts is None:
+                break
+            if last is not None:
+                # the block is refreshed between the two now and then: a third answer decides
+                settled = np.where(counts == last, counts, settled)
+                if (counts == last).all():
+                    break
+            last = counts
+        return settled
+
+    def _send_goals(self) -> bool:
+        # what stands beside a torque byte of 0 goes to no servo, but must be a count
+        goal = np.where(self._on | (self._goal > 0), self._goal, _ANY_COUNT)
+        request = datagrams.set_position(self._on, goal)
+        acknowledged = self._exchange(request) == datagrams.ACKNOWLEDGED
+        if not acknowledged:
+            self._disconnect()
+        return acknowledged
+
+    def _ask(self, opcode: int, parse: Callable[[bytes], Answer | None]) -> Answer | None:
+        reply = self._exchange(datagrams.request(opcode))
+        parsed = None if reply is None else parse(reply)
+        if parsed is None:
+            # what else it might still say belongs to no question of ours
+            self._disconnect()
+        return parsed
+
+    def _exchange(self, request: bytes) -> bytes | None:
+        """One question, one answer; None if there was none in time."""
+        if not self._connected():
+            return None
+        assert self._socket is not None
+        reply = b""
+        try:
+            # what is there already answers an earlier question
+            for _ in range(_MOST_STALE):
+                if not select.select([self._socket], [], [], 0)[0]:
+                    break
+                self._socket.recv(_LARGEST_REPLY)
+            self._socket.sendall(request)
+            reply = self._socket.recv(_LARGEST_REPLY)
+        except OSError:  # time-outs too
+            pass
+        if not reply:
+            self._disconnect()
+            return None
+        return reply
+
+    def _connected(self) -> bool:
+        """Whether there is a connection; makes a new one if it is time to try."""
+        if self._socket is not None:
+            return True
+        if time.monotonic() < self._retry_s:
+            return False
+        self._retry_s = time.monotonic() + _RECONNECT_S
+        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        made.settimeout(TIMEOUT_S)
+        try:
+            made.connect(str(self.path))
+        except OSError:
+            made.close()
+            return False
+        self._socket = made
+        return True
+
+    def _disconnect(self) -> None:
+        """Drop the connection."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _own(path: Path) -> int:
+    """Descriptor of the lock file beside the socket; held until closed, or until death."""
+    if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
+        raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
+    lock = path.with_name(path.name + ".lock")
+    try:
+        try:
+            # reading is enough to lock it, so that one which root has left keeps nobody out
+            descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            descriptor = os.open(lock, os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        advice = ""
+        if lock.exists():
+            advice = f" Run this as its owner, or, while nobody drives the robot, `sudo rm {lock}`."
+        raise BusError(f"{lock} cannot be opened: {error.strerror}.{advice}") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise BusError(
+            f"{path}: another pupper-sysid is driving this robot. Stop it first; the servos obey "
+            "the last writer, so there must be only one."
+        ) from None
+    return descriptor

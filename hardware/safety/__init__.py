@@ -1,0 +1,1 @@
+"""Limits, monitoring and emergency stop between a program and its servos."""

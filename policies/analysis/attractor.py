@@ -1,0 +1,193 @@
+"""The orbit of a gait: the closed curve that actions and hidden states run along, and its shape.
+
+A gait is a limit cycle: seen along its few largest directions of variance, what a policy does and
+what it has in mind go round one closed curve. `principal_components` finds these directions for
+several conditions together (no delay, more delay …), so that their orbits can be drawn on the same
+axes; `closure` says how well an orbit returns to itself after a period, `ellipse` and `collapse`
+how large and how round it is.
+
+Variance explained alone says little: noise in three dimensions is explained by three components,
+too. Read it beside the closure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from pupper_sysid.common.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PrincipalComponents:
+    """Directions of largest variance of states with d numbers.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (d,)
+    axes : ndarray, shape (k, d)
+        Orthonormal, largest variance first; the largest number of each is positive.
+    variance : ndarray, shape (d,)
+        Along all d directions, largest first.
+    """
+
+    mean: Array
+    axes: Array
+    variance: Array
+
+    @property
+    def explained(self) -> Array:
+        """Share of the variance along each axis, shape (k,)."""
+        return self.variance[: len(self.axes)] / self.variance.sum()
+
+    @property
+    def participation_ratio(self) -> float:
+        """How many directions the variance is spread over, 1 to d: (Σ λ)² / Σ λ²."""
+        return float(self.variance.sum() ** 2 / (self.variance**2).sum())
+
+    def orbit(self, states: NDArray[np.floating]) -> Array:
+        """States (..., d) along the axes, shape (..., k)."""
+        return (np.asarray(states, float) - self.mean) @ self.axes.T
+
+
+class Ellipse(NamedTuple):
+    """Half axes of the ellipse with an orbit's covariance."""
+
+    major: float
+    minor: float
+
+    @property
+    def area(self) -> float:
+        """π · major · minor."""
+        return float(np.pi * self.major * self.minor)
+
+    @property
+    def roundness(self) -> float:
+        """Minor over major axis: 1 for a circle, 0 for a band or a point."""
+        return self.minor / self.major if self.major > 0 else 0.0
+
+
+class Collapse(NamedTuple):
+    """What is left of an orbit in another condition: 1 if all, 0 if nothing."""
+
+    area: float
+    """Ratio of the areas."""
+    roundness: float
+    """Ratio of the ratios of minor to major axis; it does not see a change of size."""
+
+
+def principal_components(
+    conditions: Sequence[NDArray[np.floating]], count: int
+) -> PrincipalComponents:
+    """Principal components of several conditions together.
+
+    States are centred on their common mean and not standardised: all of them have one unit, and a
+    joint that hardly moves should count little. Every state counts the same, so conditions count
+    by their lengths.
+
+    Parameters
+    ----------
+    conditions : sequence of ndarray, each of shape (..., d)
+        Actions or hidden states, for example (steps, robots, d).
+    count : int
+        How many axes to keep.
+
+    Raises
+    ------
+    InputError
+        If nothing varies, or there are fewer states than axes.
+    """
+    states = np.concatenate([np.asarray(c, float).reshape(-1, np.shape(c)[-1]) for c in conditions])
+    if len(states) <= count or states.shape[1] < count:
+        raise InputError(
+            f"{count} principal components need more than {count} states of at least {count} "
+            f"numbers; these are {len(states)} of {states.shape[1]}."
+        )
+    mean = states.mean(axis=0)
+    # of the small d × d matrix: states are many
+    variance, axes = np.linalg.eigh((states - mean).T @ (states - mean) / len(states))
+    variance, axes = np.clip(variance[::-1], 0.0, None), axes.T[::-1][:count]
+    if not variance[0] > 0:
+        raise InputError("Nothing varies in these states: there is no orbit to look at.")
+    # an axis is as good as its opposite: settle on one, or figures would flip between machines
+    largest = np.abs(axes).argmax(axis=1)
+    axes = axes * np.sign(axes[np.arange(count), largest])[:, None]
+    return PrincipalComponents(mean, axes, variance)
+
+
+def closure(orbit: NDArray[np.floating], step_s: float, frequency_hz: float) -> float:
+    """How far an orbit is from itself one period later: 0 closed, 1 as far as unrelated points.
+
+    Root mean square distance between points one period apart, over the one between two points
+    drawn at random from the orbit (√2 times its RMS radius). Between samples the orbit is
+    interpolated by a cubic spline, since a period is no whole number of steps.
+
+    Parameters
+    ----------
+    orbit : ndarray, shape (steps, k)
+        Of one robot; any number of dimensions.
+    step_s : float
+    frequency_hz : float
+        Of the gait.
+
+    Raises
+    ------
+    InputError
+        If it does not last two periods, or does not move.
+    """
+    orbit = np.asarray(orbit, float)
+    time = step_s * np.arange(len(orbit))
+    period = 1.0 / frequency_hz
+    if not time[-1] >= 2 * period:
+        raise InputError(
+            f"An orbit of {time[-1]:.2f} s is too short for two periods of {period:.2f} s."
+        )
+    radius2 = ((orbit - orbit.mean(axis=0)) ** 2).sum(axis=1).mean()
+    if not radius2 > 0:
+        raise InputError("The orbit stays at one point: nothing can return to itself.")
+    before = time + period <= time[-1]
+    later = CubicSpline(time, orbit)(time[before] + period)
+    away2 = ((later - orbit[before]) ** 2).sum(axis=1).mean()
+    return float(np.sqrt(away2 / (2 * radius2)))
+
+
+def ellipse(orbit: NDArray[np.floating]) -> Ellipse:
+    """The ellipse that, run through evenly, has the covariance of an orbit in the plane.
+
+    A half axis a has the variance a²/2. Noise makes a band look rounder than it is; `closure`
+    tells noise from an orbit.
+
+    Parameters
+    ----------
+    orbit : ndarray, shape (steps, 2) or (steps, n, 2)
+        Of n robots, each about its own centre.
+    """
+    orbit = np.asarray(orbit, float)
+    away = (orbit - orbit.mean(axis=0)).reshape(-1, 2)
+    minor, major = np.sqrt(2 * np.clip(np.linalg.eigvalsh(away.T @ away / len(away)), 0.0, None))
+    return Ellipse(float(major), float(minor))
+
+
+def collapse(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> Collapse:
+    """What is left of the orbit `reference` in the orbit of another condition, on the same axes.
+
+    Parameters
+    ----------
+    orbit, reference : ndarray, shape (steps, 2) or (steps, n, 2)
+
+    Raises
+    ------
+    InputError
+        If the reference encloses nothing.
+    """
+    now, before = ellipse(orbit), ellipse(reference)
+    if not before.area > 0:
+        raise InputError("The reference orbit encloses no area: nothing of it can be left.")
+    return Collapse(now.area / before.area, now.roundness / before.roundness)

@@ -1,0 +1,391 @@
+"""What a gait is like, in numbers: frequency, regularity, phases and duty of feet, jitter, size.
+
+`describe` takes a rollout and gives a `GaitReport`; the measures themselves are functions of
+arrays, time along the first axis, for logs of other origin. Signals are joint angles or targets
+[rad], contacts are booleans per foot in the order LF, RF, LB, RB.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import fftconvolve
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.analysis.rhythm import (
+    SHORTEST_S,
+    STILL,
+    Array,
+    Estimate,
+    Signal,
+    frequency,
+    mean_of,
+    null_r2,
+    sine_fit_r2,
+    sine_frequency,
+    standardised,
+    times,
+)
+from pupper_sysid.policies.analysis.rollouts import Rollout
+
+SETTLE_S = 2.0
+"""From a stand to a steady walk [s]."""
+_FALL_S = 0.5  # before a fall is recognised, it is no gait any more
+_NULL_DRAWS = 100
+_NULL_QUANTILE = 0.95
+
+
+class Correlation(NamedTuple):
+    """How alike two recordings of a gait are, mean over joints of Pearson's r."""
+
+    r: float
+    """At no lag."""
+    best: float
+    """At the lag that suits them best, the same for all joints."""
+    lag_steps: int
+    """That lag; positive if the second is later."""
+
+
+@dataclass(frozen=True)
+class GaitReport:
+    """A gait, as means over robots with intervals of those means.
+
+    Intervals come from the spread between robots (each with its own servos, friction and payload)
+    by Student's t, and hold for this one policy: another training may walk otherwise. With one
+    robot there are none, but for that of the frequency, which is then its own.
+
+    Attributes
+    ----------
+    robots, left_out : int
+        Robots that walked long enough, and those that fell before.
+    frequency_hz : Estimate
+        Of the actions; see `frequency`.
+    rhythmic : float
+        Share of robots whose actions a sine explains better than it explains noise (5 % of noise
+        would pass).
+    action_r2, joint_r2 : Estimate
+        R² of the best common sine, mean over joints, of actions and true joint angles.
+    null_r2 : float
+        What 95 % of noise like the actions stays below in `action_r2`.
+    action_r2_by_joint, joint_r2_by_joint : tuple of 12 Estimate
+    phase : tuple of 4 Estimate
+        Of feet, from their contacts; see `phases`.
+    duty : tuple of 4 Estimate
+        Share of time that each foot stands.
+    diagonal : Estimate
+        See `diagonal_coordination`.
+    jitter_rad : Estimate
+        Of actions; see `jitter` [rad per step²].
+    fast_share : Estimate
+        Of actions; see `fast_share`.
+    half_range_rad, deviation_rad : tuple of 12 Estimate
+        Of actions, by joint; see `amplitude` [rad].
+    joint_half_range_rad, joint_deviation_rad : tuple of 12 Estimate
+        Of true joint angles.
+    """
+
+    robots: int
+    left_out: int
+    frequency_hz: Estimate
+    rhythmic: float
+    action_r2: Estimate
+    joint_r2: Estimate
+    null_r2: float
+    action_r2_by_joint: tuple[Estimate, ...]
+    joint_r2_by_joint: tuple[Estimate, ...]
+    phase: tuple[Estimate, ...]
+    duty: tuple[Estimate, ...]
+    diagonal: Estimate
+    jitter_rad: Estimate
+    fast_share: Estimate
+    half_range_rad: tuple[Estimate, ...]
+    deviation_rad: tuple[Estimate, ...]
+    joint_half_range_rad: tuple[Estimate, ...]
+    joint_deviation_rad: tuple[Estimate, ...]
+
+
+def steady(rollout: Rollout) -> dict[int, slice]:
+    """Which steps of which robots belong to a gait: from `SETTLE_S` to the end or before a fall.
+
+    Robots that fell too soon are left out.
+    """
+    step_s = rollout.step_s
+    start, shortest = round(SETTLE_S / step_s), round(SHORTEST_S / step_s)
+    up = rollout.alive.sum(axis=0)
+    ends = np.where(rollout.alive[-1], up, up - round(_FALL_S / step_s))
+    return {int(i): slice(start, ends[i]) for i in np.flatnonzero(ends - start >= shortest)}
+
+
+def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
+    """Describe the gait in a rollout, from two seconds after its start.
+
+    A robot that fell counts up to half a second before its fall, if that leaves enough.
+
+    Parameters
+    ----------
+    rollout : Rollout
+    rng : numpy.random.Generator
+        Draws the noise of `null_r2`.
+
+    Raises
+    ------
+    InputError
+        If no robot walked for long enough.
+    """
+    step_s = rollout.step_s
+    walked = steady(rollout)
+    if not walked:
+        raise InputError(
+            f"No robot walked for {SETTLE_S + SHORTEST_S:g} s: the longest was up for "
+            f"{rollout.alive.sum(axis=0).max() * step_s:.1f} s. Collect a longer rollout, or "
+            "describe no gait here."
+        )
+    found = []
+    for i, now in walked.items():
+        found.append(
+            _describe_one(
+                rollout.action_rad[now, i], rollout.joint_position[now, i],
+                rollout.contact[now, i], step_s, rng,
+            )
+        )  # fmt: skip
+    each = {name: np.array([f[name] for f in found]) for name in found[0]}
+    rate, low, high = each["frequency"].T
+    alone = Estimate(float(rate[0]), float(low[0]), float(high[0]))
+    whole_rate = mean_of(rate) if len(walked) > 1 else alone
+    return GaitReport(
+        len(walked), rollout.alive.shape[1] - len(walked),
+        whole_rate,
+        float((each["action_r2"].mean(axis=1) > each["null_r2"]).mean()),
+        mean_of(each["action_r2"].mean(axis=1)), mean_of(each["joint_r2"].mean(axis=1)),
+        float(each["null_r2"].mean()), _means(each["action_r2"]), _means(each["joint_r2"]),
+        tuple(_mean_phase(p) for p in each["phase"].T), _means(each["duty"]),
+        mean_of(each["diagonal"]), mean_of(each["jitter"]), mean_of(each["fast_share"]),
+        *(_means(each[f"{which}_{name}"]) for which in ("action", "joint")
+          for name in ("half_range", "deviation")),
+    )  # fmt: skip
+
+
+# --------------------------------------------------------------------------------- feet
+
+
+def phases(signal: Signal, step_s: float, frequency_hz: float) -> Array:
+    """By which share of a cycle each channel is behind the first.
+
+    From the analytic signal in a band about the gait frequency (each channel times exp(-2πj f t),
+    averaged over two strides under a Hann window): the angle of its mean product with the first
+    channel's. A rhythm that wanders takes all channels along, and leaves their phases alone.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (steps, channels)
+        For feet: contacts, or thigh angles.
+    step_s : float
+    frequency_hz : float
+
+    Returns
+    -------
+    ndarray, shape (channels,)
+        From -0.25 up to 0.75, so that neither 0 (together) nor 0.5 (in turn) is at the border;
+        NaN where a channel, or the first, does not change.
+    """
+    y = standardised(signal)
+    angle = 2 * np.pi * frequency_hz * times(len(y), step_s)
+    window = np.hanning(2 + round(2 / (frequency_hz * step_s)))
+    analytic = fftconvolve(y * np.exp(-1j * angle)[:, None], window[:, None], "valid", axes=0)
+    product = (analytic * analytic[:, :1].conj()).sum(axis=0)
+    moves = np.any(y, axis=0)
+    return np.where(moves & moves[0], _wrapped(-np.angle(product) / (2 * np.pi)), np.nan)
+
+
+def duty(contact: NDArray[np.bool_]) -> Array:
+    """Share of time for which feet stand, (steps, …) to (…)."""
+    return np.mean(contact, axis=0)
+
+
+def diagonal_coordination(contact: NDArray[np.bool_]) -> float:
+    """How much diagonal feet stand and swing together: φ, mean over the two pairs.
+
+    φ is Pearson's r of two booleans: 1 in a trot, 0 if they know nothing of each other however
+    long they stand, below 0 if they take turns (pace, bound). Feet that always stand together are
+    together, too, in a pronk: look at `phases`.
+
+    Parameters
+    ----------
+    contact : ndarray of bool, shape (steps, 4)
+
+    Returns
+    -------
+    float
+        NaN if one of the feet never changes.
+    """
+    down = standardised(contact)
+    together = (down[:, 0] * down[:, 3]).mean(), (down[:, 1] * down[:, 2]).mean()
+    return float(np.mean(together)) if np.any(down, axis=0).all() else float("nan")
+
+
+def intervals(down: NDArray[np.bool_], step_s: float) -> Array:
+    """When a foot was down, for bars: start and length of each stance [s], shape (k, 2).
+
+    Those that the recording cuts are as long as they are seen. Swings are `intervals(~down, …)`.
+
+    Parameters
+    ----------
+    down : ndarray of bool, shape (steps,)
+        Of one foot.
+    step_s : float
+
+    Examples
+    --------
+    >>> intervals(np.array([True, False, False, True, True]), 1.0).tolist()
+    [[0.0, 1.0], [3.0, 2.0]]
+    """
+    edges = np.diff(np.concatenate([[0], np.asarray(down, int), [0]]))
+    starts, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    return step_s * np.stack([starts, ends - starts], axis=1).astype(float)
+
+
+# --------------------------------------------------------------------------------- actions
+
+
+def jitter(signal: Signal) -> float:
+    """Root mean square second difference of a signal (steps, …) [its unit per step²].
+
+    A sine of amplitude A and frequency f has 2√2 A sin²(πf · step): compare gaits of like
+    frequency and amplitude only, or look at `fast_share`.
+    """
+    return float(np.sqrt(np.mean(np.diff(np.asarray(signal, float), 2, axis=0) ** 2)))
+
+
+def fast_share(signal: Signal, step_s: float, frequency_hz: float) -> float:
+    """Share of the power that is faster than the gait and its second harmonic.
+
+    The border is at 2.5 times the gait frequency, midway between harmonics: at twice, half of the
+    second one would fall on either side.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (steps, channels)
+    step_s : float
+    frequency_hz : float
+
+    Returns
+    -------
+    float
+        Of the power of all channels; NaN if nothing moves.
+    """
+    y = np.asarray(signal, float)
+    away = (y - y.mean(axis=0)) * np.hanning(len(y))[:, None]
+    power = (np.abs(np.fft.rfft(away, axis=0)) ** 2).sum(axis=1)
+    fast = np.fft.rfftfreq(len(y), step_s) > 2.5 * frequency_hz
+    return float(power[fast].sum() / power.sum()) if y.std(axis=0).max() > STILL else float("nan")
+
+
+def amplitude(signal: Signal) -> tuple[Array, Array]:
+    """Half of the range between the 5 % and 95 % quantiles, and standard deviation.
+
+    Of a sine of amplitude A they are 0.988 A and 0.707 A.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (steps, …)
+
+    Returns
+    -------
+    half_range, deviation : ndarray, shape (…)
+    """
+    y = np.asarray(signal, float)
+    low, high = np.quantile(y, [0.05, 0.95], axis=0)
+    return (high - low) / 2, y.std(axis=0)
+
+
+def correlation(actions_a: Signal, actions_b: Signal, most_lag: int) -> Correlation:
+    """How alike two recordings of a gait are: mean over joints (and robots) of Pearson's r.
+
+    A joint that stands still in the second only counts as r = 0: it keeps nothing of the gait. One
+    that stands still in the first is left out: there is nothing to keep.
+
+    Parameters
+    ----------
+    actions_a, actions_b : ndarray, shape (steps, 12) or (steps, n, 12)
+        The gait to compare with, and the other.
+    most_lag : int
+        Look for the best lag up to so many steps to either side; well under half a period, or the
+        next stride will do as well.
+
+    Raises
+    ------
+    InputError
+        If the two are of different shapes or no longer than the lags, or nothing moves in the
+        first.
+    """
+    a, b = (np.asarray(x, float).reshape(len(x), -1) for x in (actions_a, actions_b))
+    if a.shape != b.shape or len(a) <= most_lag + 1:
+        raise InputError(
+            f"Actions of shapes {np.shape(actions_a)} and {np.shape(actions_b)} cannot be compared "
+            f"over lags of {most_lag} steps: they must be alike, and longer."
+        )
+    moves = a.std(axis=0) > STILL
+    if not moves.any():
+        raise InputError("Nothing moves in the actions to compare with: there is no gait in them.")
+    lags = range(-most_lag, most_lag + 1)
+    found = []
+    for lag in lags:
+        early, late = (a, b) if lag >= 0 else (b, a)
+        shift = abs(lag)
+        x, y = standardised(early[: len(a) - shift]), standardised(late[shift:])
+        found.append(float((x * y).mean(axis=0)[moves].mean()))
+    best = int(np.argmax(found))
+    return Correlation(found[most_lag], found[best], lags[best])
+
+
+# --------------------------------------------------------------------------------- parts
+
+
+def _describe_one(
+    action: Array, joints: Array, contact: NDArray[np.bool_], step_s: float,
+    rng: np.random.Generator,
+) -> dict[str, object]:  # fmt: skip
+    """All measures of one robot, by name."""
+    moves = bool((action.std(axis=0) > STILL).any())
+    rate = frequency(action, step_s) if moves else Estimate(*[float("nan")] * 3)
+    found: dict[str, object] = {
+        "frequency": rate,
+        "null_r2": float("nan"),
+        "duty": duty(contact),
+        "diagonal": diagonal_coordination(contact),
+        "jitter": jitter(action),
+        "fast_share": fast_share(action, step_s, rate.value),
+        "phase": phases(contact, step_s, rate.value) if moves else np.full(4, np.nan),
+    }
+    if moves:
+        null = null_r2(action, step_s, rng, _NULL_DRAWS).mean(axis=1)
+        found["null_r2"] = float(np.quantile(null, _NULL_QUANTILE))
+    for name, signal in (("action", action), ("joint", joints)):
+        found[f"{name}_half_range"], found[f"{name}_deviation"] = amplitude(signal)
+        best = sine_frequency(signal, step_s) if signal.std(axis=0).max() > STILL else 1.0
+        found[f"{name}_r2"] = sine_fit_r2(signal, step_s, best)
+    return found
+
+
+def _wrapped(cycles: NDArray[np.floating]) -> Array:
+    """Shares of a cycle, from -0.25 up to 0.75."""
+    return np.asarray((cycles + 0.25) % 1.0 - 0.25, float)
+
+
+def _means(values: Array) -> tuple[Estimate, ...]:
+    """The same for each column."""
+    return tuple(mean_of(column) for column in values.T)
+
+
+def _mean_phase(cycles: Array) -> Estimate:
+    """Mean over robots of shares of a cycle, which has no ends."""
+    known = cycles[np.isfinite(cycles)]
+    if not len(known):
+        return Estimate(*[float("nan")] * 3)
+    centre = float(np.angle(np.exp(2j * np.pi * known).mean()) / (2 * np.pi))
+    away = mean_of((known - centre + 0.5) % 1.0 - 0.5)
+    start = float(_wrapped(np.array(centre)))
+    return Estimate(*(start + x for x in away))

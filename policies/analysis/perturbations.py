@@ -1,0 +1,96 @@
+"""What can be done to an observation before a policy sees it: delay, noise, zeros, staleness.
+
+Each function makes a `Change` for `policies.analysis.rollouts.collect`, or alters a recorded
+sequence for `replay`. Parts of the observation are named as in `sim.walking.env.OBSERVATION`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.policies.analysis.rollouts import Change
+from pupper_sysid.sim.walking.env import OBSERVATION_PARTS as PARTS
+
+Observations = NDArray[np.float32]
+
+JOINTS = slice(PARTS["joint_position_relative"].start, PARTS["joint_effort"].stop)
+"""All that comes from the servos: positions, velocities, efforts (12:48)."""
+
+
+def delayed(part: slice, steps: int) -> Change:
+    """Show a part as it was so many control steps ago."""
+    past: list[Observations] = []
+
+    def change(step: int, observation: Observations) -> Observations:
+        past.append(observation[:, part].copy())
+        if len(past) > steps + 1:
+            past.pop(0)
+        observation[:, part] = past[0]
+        return observation
+
+    return change
+
+
+def jittered(part: slice, mean_steps: int, rng: np.random.Generator) -> Change:
+    """Show a part with a delay that wanders between 0 and twice its mean, never back in time.
+
+    A lag grows by at most one step per step, or an older value would follow a newer one.
+    """
+    past: list[Observations] = []
+    lag = np.zeros(0, int)
+
+    def change(step: int, observation: Observations) -> Observations:
+        nonlocal lag
+        if not len(lag):
+            lag = np.full(len(observation), mean_steps)
+        past.insert(0, observation[:, part].copy())
+        del past[2 * mean_steps + 1 :]
+        wanted = rng.integers(0, 2 * mean_steps + 1, len(lag))
+        lag = np.minimum(np.minimum(wanted, lag + 1), len(past) - 1)
+        observation[:, part] = np.stack(past)[lag, np.arange(len(lag))]
+        return observation
+
+    return change
+
+
+def noisy(part: slice, sigma: NDArray[np.floating], rng: np.random.Generator) -> Change:
+    """Add white noise of a standard deviation per number of the part, in its own unit."""
+    size = np.asarray(sigma, np.float32)
+
+    def change(step: int, observation: Observations) -> Observations:
+        shape = observation[:, part].shape
+        observation[:, part] += size * rng.standard_normal(shape, np.float32)
+        return observation
+
+    return change
+
+
+def zeroed(part: slice) -> Change:
+    """Show zeros."""
+
+    def change(step: int, observation: Observations) -> Observations:
+        observation[:, part] = 0.0
+        return observation
+
+    return change
+
+
+def held(part: slice, steps: int) -> Change:
+    """Refresh a part only every so many control steps: staleness, as slow polls make it."""
+    kept: list[Observations] = []
+
+    def change(step: int, observation: Observations) -> Observations:
+        if step % steps == 0:
+            kept[:] = [observation[:, part].copy()]
+        observation[:, part] = kept[0]
+        return observation
+
+    return change
+
+
+def applied(change: Change, observations: Observations) -> Observations:
+    """A recorded sequence, shape (steps, n, 60), as a policy would have seen it."""
+    return np.stack([change(i, seen.copy()) for i, seen in enumerate(observations)]).astype(
+        np.float32
+    )

@@ -1,0 +1,236 @@
+"""Rollouts: what a policy saw, did and had in mind while it walked, step by step.
+
+`collect` lets a policy walk in the simulator under one command and keeps everything that the
+analyses of gait and internal dynamics look at; it may alter what the policy sees on the way
+(ablated, delayed or frozen observations). `replay` shows a policy recorded observations again, open
+loop: it acts, but nothing follows from it. Neither touches the state of the policy it is given, so
+probing a policy in the middle of a walk does not change the walk.
+
+The hidden state is what the published analyses look at: the cell of an LSTM, the state of a GRU,
+the latent of a Transformer, the last hidden layer of an MLP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+from torch.utils.hooks import RemovableHandle
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.analysis.evaluation import evaluation_task
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
+
+Array = NDArray[np.float64]
+Change = Callable[[int, NDArray[np.float32]], NDArray[np.floating]]
+"""`change(step, observation)` gives the observation, shape (n, 60), that the policy sees instead;
+it may alter and return the one it got."""
+
+Disturb = Callable[[int, PupperEnv], None]
+"""`disturb(step, environment)` does something to the robots before they act, such as a push."""
+
+_LAST_ACTION = slice(-ACTIONS, None)  # of an observation
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What happened in n robots under one command.
+
+    Observation, action and hidden state belong to the start of a control step, all else to its
+    end. Rows of a robot that is no longer `alive` belong to nothing: it was picked up.
+
+    Attributes
+    ----------
+    step_s : float
+        Control step [s].
+    command : (float, float, float)
+        Forward and sideways speed [m/s], turn rate [rad/s].
+    action_scale : float
+        Radians per unit of action.
+    observation : ndarray of float32, shape (steps, n, 60)
+        As the policy saw it, changes included.
+    action : ndarray of float32, shape (steps, n, 12)
+        Raw outputs of the policy.
+    hidden : ndarray of float32, shape (steps, n, k)
+        LSTM: cell; GRU: state; Transformer: latent; MLP: last hidden layer.
+    joint_position : ndarray, shape (steps, n, 12)
+        True joint angles [rad], not readings.
+    contact : ndarray of bool, shape (steps, n, 4)
+        Which feet were on the ground.
+    velocity : ndarray, shape (steps, n, 3)
+        Forward and sideways speed in the trunk's frame [m/s], turn rate [rad/s].
+    position : ndarray, shape (steps, n, 3)
+        Trunk's x and y [m] and heading [rad, continuous] in the world.
+    alive : ndarray of bool, shape (steps, n)
+        Whether the robot has neither fallen nor left the ground's edge so far.
+    """
+
+    step_s: float
+    command: tuple[float, float, float]
+    action_scale: float
+    observation: NDArray[np.float32]
+    action: NDArray[np.float32]
+    hidden: NDArray[np.float32]
+    joint_position: Array
+    contact: NDArray[np.bool_]
+    velocity: Array
+    position: Array
+    alive: NDArray[np.bool_]
+
+    @property
+    def action_rad(self) -> Array:
+        """Joint targets from the default pose [rad], before limits, shape (steps, n, 12)."""
+        return self.action_scale * self.action.astype(float)
+
+
+def collect(
+    policy: Policy,
+    task: Walking,
+    servos: ServoRanges,
+    command: tuple[float, float, float],
+    robots: int,
+    seconds: float,
+    seed: int,
+    threads: int = 0,
+    change: Change | None = None,
+    disturb: Disturb | None = None,
+) -> Rollout:
+    """Let a policy walk from a gentle start, without pushes but those of `disturb`.
+
+    Rollouts of one seed differ only by what follows from these, policy or command: servos,
+    ground, start and noise are the same until a robot falls.
+
+    Parameters
+    ----------
+    policy : Policy
+        Keeps its own state.
+    task : Walking
+        Made gentle by `evaluation_task`.
+    servos : ServoRanges
+    command : (float, float, float)
+        Forward and sideways speed [m/s], turn rate [rad/s].
+    robots : int
+    seconds : float
+        How long; it ends sooner when no robot is up any more.
+    seed, threads : int
+    change : callable, optional
+        What to do to observations before the policy sees them.
+    disturb : callable, optional
+        What to do to the robots before they act.
+
+    Raises
+    ------
+    InputError
+        If `seconds` is shorter than a step, or the environment cannot be made.
+    """
+    step_s = task.control_step_s
+    steps = round(seconds / step_s)
+    if steps < 1:
+        raise InputError(f"A rollout of {seconds} s is shorter than one step of {step_s} s.")
+    # a step longer than asked, so that nobody's time is up within it
+    task = evaluation_task(task, (steps + 1) * step_s)
+    env = PupperEnv(task, servos, robots, seed, threads, servo_model_of(servos.source, step_s))
+    env.set_command(np.array(command))
+    observation, _ = env.observe()
+    alive = np.ones(robots, bool)
+    seen, acted, joints, contact, velocity, position, lives = ([] for _ in range(7))
+    with _observed(policy) as (own, hidden):
+        own.reset(env.action)
+        for step in range(steps):
+            shown = observation if change is None else change(step, observation)
+            action = own.act(shown)
+            if disturb:
+                disturb(step, env)
+            found = env.step(action)
+            observation, facts = found.observation, found.facts
+            alive = alive & ~found.done
+            seen.append(np.array(shown, np.float32))
+            acted.append(action)
+            joints.append(facts.position_relative + env.default)
+            contact.append(facts.contact)
+            velocity.append(
+                np.column_stack([facts.linear_velocity[:, :2], facts.angular_velocity[:, 2]])
+            )
+            position.append(_place(env.robots.qpos))
+            lives.append(alive)
+            if not alive.any():
+                break
+    place = np.array(position)
+    place[..., 2] = np.unwrap(place[..., 2], axis=0)
+    return Rollout(
+        step_s, command, task.action_scale, np.array(seen), np.array(acted), np.array(hidden),
+        np.array(joints), np.array(contact), np.array(velocity), place, np.array(lives),
+    )  # fmt: skip
+
+
+def replay(
+    policy: Policy, observations: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a policy does when it is shown recorded observations, whatever it did before.
+
+    It starts anew, as at the start of an episode; a policy that sees its past actions takes the
+    one in the first observation for all of them, and then remembers its own.
+
+    Parameters
+    ----------
+    policy : Policy
+        Keeps its own state.
+    observations : ndarray, shape (steps, n, 60)
+
+    Returns
+    -------
+    actions : ndarray of float32, shape (steps, n, 12)
+    hidden : ndarray of float32, shape (steps, n, k)
+        See `Rollout`.
+    """
+    with _observed(policy) as (own, hidden):
+        own.reset(observations[0][:, _LAST_ACTION])
+        actions = [own.act(row) for row in observations]
+    return np.array(actions), np.array(hidden)
+
+
+@contextmanager
+def _observed(policy: Policy) -> Iterator[tuple[Policy, list[NDArray[np.float32]]]]:
+    """A policy with the same network and a state of its own, and its hidden states as it acts."""
+    hidden: list[NDArray[np.float32]] = []
+
+    def keep(state: torch.Tensor) -> None:
+        hidden.append(state.numpy().copy())
+
+    handle = _listen(policy.network, keep)
+    try:
+        # a policy replaces its state and never writes into it
+        yield copy(policy), hidden
+    finally:
+        handle.remove()
+
+
+def _listen(network: PolicyNetwork, keep: Callable[[torch.Tensor], None]) -> RemovableHandle:
+    """Call `keep` with the hidden state, shape (n, k), each time the network runs."""
+    if network.kind in ("lstm", "gru"):
+
+        def of_memory(_: nn.Module, given: tuple, found: tuple) -> None:
+            state = found[1][1] if network.kind == "lstm" else found[1]
+            keep(state[0])
+
+        return network.rnn["rnn"].register_forward_hook(of_memory)
+    # a Transformer's latent enters its head; an MLP's last hidden layer enters its output layer
+    reader = network.mlp if network.kind == "transformer" else network.mlp[-1]
+    return reader.register_forward_pre_hook(lambda _, given: keep(given[0]))
+
+
+def _place(qpos: Array) -> Array:
+    """Trunk's x, y and heading, shape (n, 3)."""
+    w, x, y, z = qpos[:, 3:7].T
+    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.column_stack([qpos[:, :2], heading])

@@ -1,0 +1,1 @@
+"""Run a policy on a robot: controller, observers, filters, logs."""

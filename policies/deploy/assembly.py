@@ -1,0 +1,133 @@
+"""A controller from its parts: policy, stack, observer, and the check that they belong together."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.policies.deploy.controller import Controller
+from pupper_sysid.policies.deploy.observer_match import Match, compare
+from pupper_sysid.policies.deploy.observers import make_observer
+from pupper_sysid.policies.deploy.stacks import Stack
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.servo_file import WEIGHTS
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A controller, and what was found while it was put together.
+
+    Attributes
+    ----------
+    controller : Controller
+    match : Match
+        What the observer will say of this robot against the actuator the policy was trained with.
+    header : dict
+        What a log must say so that the same can be put together again.
+    """
+
+    controller: Controller
+    match: Match
+    header: dict[str, Any]
+
+
+def assemble(
+    policy: Policy,
+    stack: Stack,
+    joint_map: JointMap,
+    actuator: str,
+    servo: Path | None,
+    trained: str | None = None,
+) -> Assembly:
+    """Put a controller together.
+
+    Parameters
+    ----------
+    policy : Policy
+    stack : Stack
+    joint_map : JointMap
+        Of the bus, in joint coordinates.
+    actuator : str
+        Calibration or preset of the robot at hand, which a simulated PD moves like.
+    servo : Path or None
+        A learned servo model's folder.
+    trained : str, optional
+        Calibration or preset with which the policy was trained, if not with `actuator`.
+
+    Raises
+    ------
+    InputError
+        If a part is missing, damaged, or for another rate.
+    """
+    contract = policy.contract
+    period = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
+    servos = servo_ranges(actuator)
+    parameters = DelayedPDParameters(**servos.value)
+    limits = joint_map.per_servo().position_limits()
+    model = None
+    if stack.observer == "servo-model" and servo is not None:
+        if not servo.is_dir():
+            raise InputError(f"--servo {servo}: there is no such folder.")
+        model = servo_model_of(servo, period)
+    observer = make_observer(
+        stack.observer, period, contract.velocity_steps, parameters,
+        (limits.low_rad, limits.high_rad), model,
+    )  # fmt: skip
+    if trained is None or trained == actuator:
+        match = compare(observer, parameters, period)
+    else:
+        of_training = DelayedPDParameters(**servo_ranges(trained).value)
+        match = compare(observer, of_training, period, parameters)
+    controller = Controller(policy, stack, observer, joint_map, _stall_torque(servos))
+    header = {
+        "policy_sha256": contract.weights_sha256, "stack": asdict(stack),
+        "joint_map": joint_map.file.name, "actuator": actuator,
+        "actuator_sha256": _hash(Path(actuator)),
+        "servo": str(servo) if model else None,
+        "servo_sha256": _hash(servo / WEIGHTS) if servo and model else None,
+    }  # fmt: skip
+    return Assembly(controller, match, header)
+
+
+def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:
+    """The controller of a log, from its header.
+
+    Raises
+    ------
+    InputError
+        If the policy, or a file it was used with, is not what it was.
+    """
+    try:
+        if header["policy_sha256"] != policy.contract.weights_sha256:
+            raise InputError(f"{log} was made with another policy. Give that one.")
+        stack = Stack(**header["stack"])
+        joint_map = load_joint_map(header["joint_map"])
+        servo = Path(header["servo"]) if header["servo"] else None
+        found = assemble(policy, stack, joint_map, header["actuator"], servo)
+        changed = [
+            key for key in ("actuator_sha256", "servo_sha256") if header[key] != found.header[key]
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{log}: its header is damaged: {error}.") from error
+    if changed:
+        file = header[changed[0].removesuffix("_sha256")]
+        raise InputError(f"{log} was made with another file at {file}. Put that back.")
+    return found.controller
+
+
+def _stall_torque(servos: ServoRanges) -> float:
+    """Torque at full duty [N·m]."""
+    limit = float(np.median(servos.value["effort_limit"]))
+    return limit if np.isfinite(limit) else 0.0
+
+
+def _hash(path: Path) -> str | None:
+    return sha256(path) if path.is_file() else None

@@ -1,0 +1,223 @@
+"""The controller: from what a robot senses in one tick to where its joints are sent.
+
+It is a pure function of its inputs and of its own state: it reads no clock and talks to no bus, so
+that a log of its inputs gives the same actions again, bit for bit (`policies.deploy.walk_log`).
+
+    controller = Controller(policy, stack, observer)
+    controller.reset(position, rest)          # standing, at rest
+    for senses in ...:
+        decision = controller.step(senses)    # decision.target is what to send
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.policies.deploy.filters import ComplementaryFilter, LowPass, Rest
+from pupper_sysid.policies.deploy.observers import JointEstimate, Observer
+from pupper_sysid.policies.deploy.stacks import Stack
+from pupper_sysid.policies.network.policy_file import Policy, refuse_other_observation
+
+Array = NDArray[np.float64]
+
+_PUBLISHED_SPEED_SHARE = 0.7
+
+
+@dataclass(frozen=True)
+class Senses:
+    """What came in at a tick.
+
+    Attributes
+    ----------
+    elapsed_s : float
+        Since the first tick.
+    command : ndarray, shape (3,)
+        Forward and sideways speed [m/s], turn rate [rad/s].
+    position : ndarray, shape (12,)
+        Reported joint angles [rad]; NaN where a reading is missing.
+    load : ndarray, shape (12,)
+        Reported torque [N·m]; 0 where the bus has none.
+    rate, acceleration : ndarray, shape (3,)
+        Of the IMU, in the trunk's frame [rad/s, m/s²]; NaN if it did not answer.
+    """
+
+    elapsed_s: float
+    command: Array
+    position: Array
+    load: Array
+    rate: Array
+    acceleration: Array
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the controller made of it.
+
+    Attributes
+    ----------
+    observation : ndarray of float32, shape (60,)
+    action : ndarray of float32, shape (12,)
+        Of the policy, as it is.
+    target : ndarray, shape (12,)
+        Joint angles to send [rad], within the limits.
+    room : ndarray, shape (12,)
+        How far each target is from its nearest limit [rad].
+    """
+
+    observation: NDArray[np.float32]
+    action: NDArray[np.float32]
+    target: Array
+    room: Array
+
+
+class Controller:
+    """A policy with its observer and filters.
+
+    Parameters
+    ----------
+    policy : Policy
+    stack : Stack
+    observer : Observer
+        In servo coordinates, at the loop's period.
+    joint_map : JointMap
+        Of the bus, in joint coordinates: limits, and how the knees are linked.
+    stall_torque_nm : float
+        Torque at a reported load of 1 [N·m].
+
+    Raises
+    ------
+    InputError
+        If the policy expects another observation than this gives.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        stack: Stack,
+        observer: Observer,
+        joint_map: JointMap,
+        stall_torque_nm: float = 0.35,
+    ):
+        contract = policy.contract
+        refuse_other_observation(contract)
+        if joint_map.joint_names != JOINT_NAMES or joint_map.coordinates != "joint":
+            raise InputError("A policy needs a bus of all twelve joints, in joint coordinates.")
+        self.policy, self.stack, self.observer = policy.for_one(), stack, observer
+        self.stall_torque_nm = stall_torque_nm
+        self.period_s = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
+        self._to_servo = _affine(joint_map, joint_map.per_servo())
+        self._to_joint = _affine(joint_map.per_servo(), joint_map)
+        self._limits = joint_map.position_limits()
+        self.default = np.array([contract.default_pose_rad[name] for name in JOINT_NAMES])
+        self._scale = stack.scale_rad or contract.action_scale_rad
+        self._smooth = (
+            LowPass(stack.lowpass_hz, 1 / self.period_s, len(JOINT_NAMES))
+            if stack.lowpass_hz
+            else None
+        )
+        self._attitude = ComplementaryFilter()
+        self._told = self.default.copy()
+        self._action = np.zeros(len(JOINT_NAMES), np.float32)
+        self._last_s: float | None = None
+        self._rate = np.zeros(3)
+
+    def reset(self, position: Array, rest: Rest) -> None:
+        """Begin from standing still.
+
+        Parameters
+        ----------
+        position : ndarray, shape (12,)
+            Where the joints are [rad], and have been told to be.
+        rest : Rest
+            Bias of the gyroscope and direction of gravity, measured at rest.
+        """
+        self.observer.reset(self.to_servo(position))
+        self._attitude.reset(rest)
+        self._told = np.asarray(position, float).copy()
+        self._action = np.zeros(len(JOINT_NAMES), np.float32)
+        self.policy.reset(self._action[None])
+        if self._smooth:
+            self._smooth.reset(np.zeros(len(JOINT_NAMES)))
+        self._last_s = None
+        self._rate = rest.bias_rad_s
+
+    def step(self, senses: Senses) -> Decision:
+        """One tick.
+
+        Raises
+        ------
+        SafetyStop
+            If the policy's output is not a number.
+        """
+        since = self.period_s if self._last_s is None else senses.elapsed_s - self._last_s
+        self._last_s = senses.elapsed_s
+        heard = np.isfinite(senses.rate).all() and np.isfinite(senses.acceleration).all()
+        if heard:
+            self._rate = senses.rate
+        # without an answer the trunk is taken to turn on; no force is no direction
+        force = senses.acceleration if heard else np.zeros(3)
+        attitude = self._attitude.step(self._rate, force, since)
+        joints = self._estimate(senses)
+        observation = np.concatenate(
+            [
+                self._speed(senses.command), attitude.rate_rad_s, attitude.gravity,
+                senses.command, joints.position - self.default, joints.velocity, joints.effort,
+                self._action,
+            ],
+            dtype=np.float32,
+        )  # fmt: skip
+        action = self.policy.act(observation[None])[0]
+        if not np.isfinite(action).all():
+            raise SafetyStop(
+                f"the policy's output is not a number after {senses.elapsed_s:.2f} s; its inputs "
+                "are in the last row of the log."
+            )
+        self._action = action
+        sent = np.asarray(action, float)
+        if self._smooth:
+            sent = self._smooth(sent)
+        fade = self.stack.fade_in_s
+        grown = min(senses.elapsed_s / fade, 1.0) if fade > 0 else 1.0
+        target = self._limits.clip(self.default + grown * self._scale * sent)
+        self._told = target
+        return Decision(observation, action, target, self._limits.room(target))
+
+    def _estimate(self, senses: Senses) -> JointEstimate:
+        """Where the joints are, as the policy is told, in joint coordinates."""
+        found = self.observer.step(self.to_servo(self._told), self.to_servo(senses.position))
+        position = _apply(self._to_joint, found.position)
+        velocity = found.velocity @ self._to_joint[0]
+        measured = self.stack.observer == "readings"
+        return JointEstimate(position, velocity, senses.load if measured else found.effort)
+
+    def _speed(self, command: Array) -> Array:
+        """The trunk's speed, which nobody measures: zeros, or the paper's guess from commands."""
+        if self.policy.contract.base_velocity == "zero":
+            return np.zeros(3)
+        return np.array([*(_PUBLISHED_SPEED_SHARE * command[:2]), 0.0])
+
+    def to_servo(self, joints: Array) -> Array:
+        """Joint angles as the servos' own (`hardware.joint_map`, servo coordinates)."""
+        return _apply(self._to_servo, joints)
+
+
+def _affine(source: JointMap, target: JointMap) -> tuple[Array, Array]:
+    """Matrix and constant that turn angles of one map into those of another of the same counts."""
+    constant = target.to_angles(source.to_counts(np.zeros(len(JOINT_NAMES))))
+    return target.to_angles(source.to_counts(np.eye(len(JOINT_NAMES)))) - constant, constant
+
+
+def _apply(affine: tuple[Array, Array], angles: Array) -> Array:
+    """Each row of the matrix is what one source angle moves; a missing angle stays its own."""
+    matrix, constant = affine
+    missing = np.isnan(angles)
+    if not missing.any():
+        return angles @ matrix + constant
+    lost = missing @ (matrix != 0) > 0
+    return np.where(lost, np.nan, np.where(missing, 0.0, angles) @ matrix + constant)

@@ -1,0 +1,293 @@
+"""Run a policy on a robot: stand up, find out what rest is, walk, stop, sit down.
+
+`deploy` owns the order of things and the way out of all of them. Whatever happens, the robot ends
+parked, or limp after a fault, within a second, and the log's last line says why. The controller
+itself (`policies.deploy.controller`) is pure, the guard (`hardware.safety.guard`) stands before
+every servo.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.durations import Durations
+from pupper_sysid.common.errors import BusError, PupperError, SafetyStop
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.imu import Imu, ImuSample
+from pupper_sysid.hardware.loop import FixedRateLoop
+from pupper_sysid.hardware.moves import first_pose, glide
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.deploy.commands import Commands
+from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
+from pupper_sysid.policies.deploy.filters import Rest, at_rest
+from pupper_sysid.policies.deploy.walk_log import WalkLog, start_header
+from pupper_sysid.sim.walking.env import FALLEN_TILT, OBSERVATION_PARTS
+
+Array = NDArray[np.float64]
+STAND_S = 3.0
+SETTLE_S = 0.5
+REST_SAMPLES = 50
+IMU_SILENT_S = 0.2
+STALL_S = 0.25
+"""A loop that stood still for so long does not go on: the robot has gone on without it."""
+_REST_PERIOD_S = 0.02
+_GRAVITY = OBSERVATION_PARTS["projected_gravity"]
+
+
+class Rows(Protocol):
+    """Where the servos' rows go: a recording's writer."""
+
+    def append(self, rows: list[dict[str, Any]]) -> None:
+        """Write rows."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One tick of a walk, for whoever watches.
+
+    Attributes
+    ----------
+    elapsed_s : float
+    senses : Senses
+    decision : Decision
+    sent : ndarray, shape (12,)
+        What the guard let out [rad].
+    reading : BusSample
+    """
+
+    elapsed_s: float
+    senses: Senses
+    decision: Decision
+    sent: Array
+    reading: BusSample
+
+
+@dataclass
+class Outcome:
+    """How a walk went.
+
+    Attributes
+    ----------
+    seconds : float
+        Walked.
+    steps : Durations
+        What the controller took per tick, on the host's clock.
+    deadline_misses : int
+    fell : bool
+    stop_reason : str
+    guard : dict
+    loop : dict
+    clipped_imu_samples, missing_imu_samples : int
+    """
+
+    seconds: float = 0.0
+    steps: Durations = field(default_factory=Durations)
+    deadline_misses: int = 0
+    fell: bool = False
+    stop_reason: str = "time is up"
+    guard: dict[str, int] = field(default_factory=dict)
+    loop: dict[str, float] = field(default_factory=dict)
+    clipped_imu_samples: int = 0
+    missing_imu_samples: int = 0
+
+
+def deploy(
+    bus: GuardedBus,
+    imu: Imu,
+    controller: Controller,
+    commands: Commands,
+    seconds: float,
+    log: Path,
+    header: dict[str, Any],
+    rows: Rows | None = None,
+    watchers: Sequence[Callable[[Tick], None]] = (),
+    force: bool = False,
+) -> Outcome:
+    """Walk for `seconds`, or until `commands` says to stop, or something goes wrong.
+
+    The bus is parked at the end; closing it is the caller's.
+
+    Parameters
+    ----------
+    bus : GuardedBus
+        In joint coordinates.
+    imu : Imu
+    controller : Controller
+    commands : Commands
+    seconds : float
+    log : Path
+        CSV file to write, see `policies.deploy.walk_log`.
+    header : dict
+        More keys for its header.
+    rows : Rows, optional
+        Is given the servos' rows of each tick, as of a recording.
+    watchers : sequence of callable
+        Each called with each tick.
+    force : bool
+        Replace an existing log.
+
+    Returns
+    -------
+    Outcome
+        Also of a walk that a fault ended; `stop_reason` says which.
+
+    Raises
+    ------
+    BusError
+        If the robot does not say where it is, or cannot be switched on.
+    InputError
+        If it moves when it should stand still, or the log cannot be written.
+    """
+    outcome = Outcome()
+    position = first_pose(bus, controller.period_s)
+    try:
+        bus.torque(True)
+        standing = FixedRateLoop(bus, _REST_PERIOD_S)
+        glide(standing, lambda pose: _send(bus, pose), position, controller.default, STAND_S)
+        rest = _rest(bus, imu, standing, controller.default)
+        start = first_pose(bus, controller.period_s)
+        writer = WalkLog(log, header | start_header(start, rest), force)
+        try:
+            controller.reset(start, rest)
+            _walk(bus, imu, controller, commands, seconds, writer, rows, watchers, outcome)
+            glide(standing, lambda pose: _send(bus, pose), bus.sent, controller.default, SETTLE_S)
+        except (SafetyStop, BusError) as fault:
+            outcome.stop_reason = str(fault)
+            # first: a bus in trouble takes its time, and the watchdog may lose its patience
+            writer.close(outcome.stop_reason)
+            bus.limp()
+        except KeyboardInterrupt:
+            outcome.stop_reason = "Ctrl-C"
+        except PupperError as fault:
+            outcome.stop_reason = str(fault)
+            raise
+        finally:
+            try:
+                bus.park()
+            finally:
+                writer.close(outcome.stop_reason)
+    finally:
+        bus.park()
+        outcome.guard = bus.report.summary()
+    return outcome
+
+
+def _walk(
+    bus: GuardedBus,
+    imu: Imu,
+    controller: Controller,
+    commands: Commands,
+    seconds: float,
+    writer: WalkLog,
+    rows: Rows | None,
+    watchers: Sequence[Callable[[Tick], None]],
+    outcome: Outcome,
+) -> None:
+    """The control loop."""
+    period = controller.period_s
+    loop = FixedRateLoop(bus, period, most_misses=max(round(STALL_S / period) - 1, 1))
+    # what is there already is not searched for garbage in the middle of a step
+    gc.collect()
+    gc.freeze()
+    imu_s = bus.now()
+    load_nm = np.zeros(len(JOINT_NAMES))
+    try:
+        for elapsed in loop.ticks(seconds):
+            command = commands(elapsed)
+            if command is None:
+                outcome.stop_reason = "told to stop"
+                return
+            reading = bus.read()
+            sample = imu.imu()
+            if sample is not None:
+                imu_s = bus.now()
+                outcome.clipped_imu_samples += sample.clipped
+            elif bus.now() - imu_s > IMU_SILENT_S:
+                raise SafetyStop(
+                    f"the IMU has not answered for {bus.now() - imu_s:.2f} s: which way is down is "
+                    "not known. Check its cable."
+                )
+            else:
+                outcome.missing_imu_samples += 1
+            if reading.load is not None:
+                load_nm = np.nan_to_num(reading.load) * controller.stall_torque_nm
+            senses = Senses(elapsed, command, reading.position_rad, load_nm, *_motion(sample))
+            begun = time.perf_counter()
+            decision = controller.step(senses)
+            outcome.steps.add(time.perf_counter() - begun)
+            sent = bus.write(decision.target)
+            writer.append(senses, decision, sent.position_rad)
+            if rows:
+                rows.append(_rows(controller, sent, reading))
+            for watch in watchers:
+                watch(Tick(elapsed, senses, decision, sent.position_rad, reading))
+            outcome.seconds = elapsed
+            if decision.observation[_GRAVITY][2] > -FALLEN_TILT:
+                outcome.fell = True
+                raise SafetyStop(f"the robot fell after {elapsed:.2f} s.")
+    finally:
+        gc.unfreeze()
+        outcome.loop = loop.summary()
+        outcome.deadline_misses = loop.missed_deadlines
+
+
+def _rest(bus: GuardedBus, imu: Imu, loop: FixedRateLoop, pose: Array) -> Rest:
+    """Bias and gravity while the robot stands."""
+    rates, forces = [], []
+    for _ in loop.ticks(SETTLE_S):
+        _send(bus, pose)
+    for _ in loop.ticks(REST_SAMPLES * _REST_PERIOD_S):
+        _send(bus, pose)
+        sample = imu.imu()
+        if sample is not None:
+            rates.append(sample.rate_rad_s)
+            forces.append(sample.acceleration_m_s2)
+    if len(rates) < REST_SAMPLES // 2:
+        raise BusError(
+            f"the IMU answered {len(rates)} times of {REST_SAMPLES}. Check its cable, and that "
+            "nothing else talks to it."
+        )
+    return at_rest(np.array(rates), np.array(forces))
+
+
+def _send(bus: GuardedBus, pose: Array) -> None:
+    """A goal whose effect the guard watches."""
+    bus.write(pose)
+    bus.read()
+
+
+def _motion(sample: ImuSample | None) -> tuple[Array, Array]:
+    if sample is None:
+        return np.full(3, np.nan), np.full(3, np.nan)
+    return sample.rate_rad_s, sample.acceleration_m_s2
+
+
+def _rows(controller: Controller, sent: Sent, reading: BusSample) -> list[dict[str, Any]]:
+    """One row per joint, as a recording has them: of the servos' own angles."""
+    goal = controller.to_servo(sent.position_rad)
+    position = controller.to_servo(reading.position_rad)
+    optional = {
+        name: values
+        for name in ("voltage_v", "temperature_c", "load")
+        if (values := getattr(reading, name)) is not None
+    }
+    return [
+        {
+            "send_time_s": sent.time_s, "read_time_s": float(reading.time_s[i]), "trial": 0,
+            "joint": joint, "frequency_hz": float("nan"), "command_rad": float(goal[i]),
+            "position_rad": float(position[i]),
+            "position_count": int(reading.position_count[i]),
+        }
+        | {name: float(values[i]) for name, values in optional.items()}
+        for i, joint in enumerate(JOINT_NAMES)
+    ]  # fmt: skip

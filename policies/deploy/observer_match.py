@@ -1,0 +1,290 @@
+"""Does an observer move like the actuator a policy was trained with? Asked before it is deployed.
+
+A policy has learned how far and how late its joints follow its targets. `compare` drives the
+observer and the trained actuator with the same sines, at every frequency up to that of a gait, and
+says where they differ most. The paper's observer, for one, swings three times as far as it is told
+at 3 Hz, where the actuator that its policies were trained with does not resonate at all
+(facts/paper.md, sections 5.2 and 7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, KINDS
+from pupper_sysid.policies.deploy.observers import Observer, SyntheticPD
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+
+FREQUENCIES_HZ = np.arange(2, 25) / 4
+"""Where the two are compared: up to the band of a gait [Hz]."""
+
+AMPLITUDE_RAD = 0.15
+"""How far a walking policy swings its targets, about: friction and limits depend on it [rad]."""
+
+MOST_GAIN_ERROR = 0.25
+"""How much farther or less far an observer may swing, as a share of the actuator's swing."""
+
+MOST_PHASE_DEG = 20.0
+"""At 6 Hz 9 ms, about what a calibration leaves open in a dead time."""
+
+_SETTLE_S = 3.0
+_WINDOW_S = 4.0
+_STILL = 1e-9  # a gain below it has no phase
+
+
+def response(
+    observer: Observer, frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float
+) -> NDArray[np.complex128]:
+    """Frequency response of an observer to its targets, with no reading ever given to it.
+
+    Sines about the default pose, all frequencies side by side on a leading axis. After a settling
+    time, each response is fitted by least squares over a whole number of cycles. A target is held
+    for its control period and the estimate is of the period's end, so half a period of hold is part
+    of the lag, as it is on the robot.
+
+    Parameters
+    ----------
+    observer : Observer
+        Left in some state: reset it before use.
+    frequencies_hz : array_like, shape (frequencies,)
+        Below half the control rate.
+    amplitude_rad : float
+    period_s : float
+        Control period of the controller that the observer is meant for [s].
+
+    Returns
+    -------
+    ndarray of complex, shape (frequencies, 12)
+        Its size is how far a joint swings over how far it was told, its angle the phase.
+
+    Raises
+    ------
+    InputError
+        If a frequency or the amplitude is out of range, or the observer has another period.
+    """
+    targets = _sines(frequencies_hz, amplitude_rad, period_s)
+    positions = _drive(observer, targets, np.full_like(targets, np.nan), period_s)
+    return _phasors(positions, frequencies_hz, period_s) / amplitude_rad
+
+
+@dataclass(frozen=True)
+class Match:
+    """An observer's frequency response beside that of the trained actuator.
+
+    Attributes
+    ----------
+    frequencies_hz : ndarray, shape (frequencies,)
+    observer, actuator : ndarray of complex, shape (frequencies, 12)
+        See `response`.
+    """
+
+    frequencies_hz: NDArray[np.float64]
+    observer: NDArray[np.complex128]
+    actuator: NDArray[np.complex128]
+
+    @property
+    def gain_ratio(self) -> NDArray[np.float64]:
+        """How much farther the observer swings than the actuator, shape (frequencies, 12)."""
+        return np.abs(self.observer) / np.abs(self.actuator)
+
+    @property
+    def phase_difference_deg(self) -> NDArray[np.float64]:
+        """Phase of the observer minus the actuator's, shape (frequencies, 12); later is negative.
+
+        Unwrapped from the lowest frequency up, so that a long delay is not mistaken for an advance.
+        """
+        quotient = self.observer * self.actuator.conj()
+        quotient = np.where(np.abs(self.observer) > _STILL, quotient, 1.0)
+        return np.degrees(np.unwrap(np.angle(quotient), axis=0))
+
+    @property
+    def worst_gain_ratio(self) -> float:
+        """The gain ratio that is farthest from 1."""
+        return float(self.gain_ratio[self._worst_gain()])
+
+    @property
+    def worst_phase_difference_deg(self) -> float:
+        """The phase difference that is farthest from 0."""
+        return float(self.phase_difference_deg[self._worst_phase()])
+
+    @property
+    def fits(self) -> bool:
+        """Whether a policy would hardly notice: see `MOST_GAIN_ERROR` and `MOST_PHASE_DEG`."""
+        return self._gain_fits() and abs(self.worst_phase_difference_deg) <= MOST_PHASE_DEG
+
+    def sentence(self) -> str:
+        """What to know before deploying: the worst place and both numbers there."""
+        if not self._gain_fits():
+            i, j = self._worst_gain()
+            told, trained = abs(self.observer[i, j]), abs(self.actuator[i, j])
+            meaning = (
+                "the policy would follow the observer's resonance instead of its legs"
+                if told > trained
+                else "the policy would not see how far its legs move"
+            )
+            return (
+                f"The observer swings {told:#.2g} times as far as commanded at "
+                f"{self.frequencies_hz[i]:.1f} Hz where the trained actuator swings "
+                f"{trained:#.2g} times ({self._joints(i, j)}): {meaning}. {_ADVICE}"
+            )
+        if not self.fits:
+            i, j = self._worst_phase()
+            phase = self.phase_difference_deg[i, j]
+            late = -phase / 360 / self.frequencies_hz[i]
+            return (
+                f"The observer is {1e3 * abs(late):.0f} ms {'later' if late > 0 else 'earlier'} "
+                f"than the trained actuator at {self.frequencies_hz[i]:.1f} Hz, {abs(phase):.0f}° "
+                f"({self._joints(i, j)}): the policy would time its steps by legs that are "
+                f"elsewhere. {_ADVICE}"
+            )
+        return (
+            f"The observer moves like the trained actuator from {self.frequencies_hz[0]:g} to "
+            f"{self.frequencies_hz[-1]:g} Hz: gain ratio {self.worst_gain_ratio:.2f} and phase "
+            f"{self.worst_phase_difference_deg:+.0f}° at worst."
+        )
+
+    def table(self) -> list[dict[str, str | float]]:
+        """One row per kind of joint and frequency: gain and phase of both, averaged over legs."""
+        rows: list[dict[str, str | float]] = []
+        for kind in KINDS:
+            legs = [i for i, name in enumerate(JOINT_NAMES) if name.endswith(kind)]
+            observer, actuator = (h[:, legs].mean(axis=1) for h in (self.observer, self.actuator))
+            phases = [np.degrees(np.unwrap(np.angle(h))) for h in (observer, actuator)]
+            rows += [
+                {
+                    "joints": kind,
+                    "frequency_hz": float(f),
+                    "observer_gain": float(abs(observer[i])),
+                    "actuator_gain": float(abs(actuator[i])),
+                    "observer_phase_deg": float(phases[0][i]),
+                    "actuator_phase_deg": float(phases[1][i]),
+                }
+                for i, f in enumerate(self.frequencies_hz)
+            ]
+        return rows
+
+    def _gain_fits(self) -> bool:
+        return abs(self.worst_gain_ratio - 1) <= MOST_GAIN_ERROR
+
+    def _worst_gain(self) -> tuple[int, int]:
+        return _largest(np.abs(self.gain_ratio - 1))
+
+    def _worst_phase(self) -> tuple[int, int]:
+        return _largest(np.abs(self.phase_difference_deg))
+
+    def _joints(self, i: int, j: int) -> str:
+        """Joint `j`, or all joints if the others answer alike at frequency `i`."""
+        alike = all(np.allclose(h[i], h[i, j], atol=0.01) for h in (self.observer, self.actuator))
+        return "all joints" if alike else JOINT_NAMES[j]
+
+
+_ADVICE = (
+    "Use an observer with the parameters that the policy was trained with, or train one with this "
+    "robot's calibration."
+)
+
+
+def compare(
+    observer: Observer,
+    actuator: DelayedPDParameters,
+    period_s: float,
+    robot: DelayedPDParameters | None = None,
+) -> Match:
+    """Compare an observer with the actuator a policy was trained with.
+
+    Parameters
+    ----------
+    observer : Observer
+        Left in some state: reset it before use. One that needs readings is given those of
+        `robot`.
+    actuator : DelayedPDParameters
+        Scalars or arrays of 12: the middle of what training drew from.
+    period_s : float
+        Control period of the controller [s].
+    robot : DelayedPDParameters, optional
+        Of the robot at hand; by default it is one of the training's.
+
+    Raises
+    ------
+    InputError
+        If the observer has another period, or the actuator's parameters are out of range.
+
+    Examples
+    --------
+    >>> trained = DelayedPDParameters(
+    ...     stiffness=70.0, damping=1.2, friction_loss=0.03, armature=0.005, effort_limit=5.0,
+    ...     velocity_limit=10.5, delay_s=0.076)
+    >>> compare(SyntheticPD(trained, 0.02), trained, 0.02).fits
+    True
+    """
+    targets = _sines(FREQUENCIES_HZ, AMPLITUDE_RAD, period_s)
+    nothing = np.full_like(targets, np.nan)
+    moved = _drive(SyntheticPD(actuator, period_s), targets, nothing, period_s)
+    readings = moved
+    if robot is not None:
+        readings = _drive(SyntheticPD(robot, period_s), targets, nothing, period_s)
+    seen = _drive(observer, targets, readings, period_s)
+    told, trained = (_phasors(x, FREQUENCIES_HZ, period_s) / AMPLITUDE_RAD for x in (seen, moved))
+    return Match(FREQUENCIES_HZ.copy(), told, trained)
+
+
+def _sines(frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float) -> NDArray[np.float64]:
+    """Targets [rad], shape (steps, frequencies, 12), at the start of each control period."""
+    frequencies = np.asarray(frequencies_hz, float)
+    if frequencies.ndim != 1 or not len(frequencies):
+        raise InputError("A frequency response needs a list of frequencies.")
+    if not (np.all(frequencies > 0) and np.all(frequencies * period_s < 0.5)):
+        raise InputError(
+            f"A frequency response was asked for at {frequencies.min():g} … "
+            f"{frequencies.max():g} Hz; a controller with a period of {period_s:g} s can only "
+            f"command between 0 and {0.5 / period_s:g} Hz."
+        )
+    if not amplitude_rad > 0:
+        raise InputError(f"The amplitude is {amplitude_rad:g} rad; it must be positive.")
+    span = _SETTLE_S + max(_WINDOW_S, 2 / frequencies.min())
+    time = period_s * np.arange(int(np.ceil(span / period_s)))
+    swing = amplitude_rad * np.sin(2 * np.pi * time[:, None] * frequencies)
+    return swing[..., None] + np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
+
+
+def _drive(
+    observer: Observer,
+    targets: NDArray[np.float64],
+    readings: NDArray[np.float64],
+    period_s: float,
+) -> NDArray[np.float64]:
+    """Positions [rad] at the end of each control period, shape (steps, frequencies, 12)."""
+    if abs(observer.period_s - period_s) > 1e-9:
+        raise InputError(
+            f"The observer {observer.name} steps every {observer.period_s:g} s, the controller "
+            f"every {period_s:g} s: its joints would move at another speed. Make it for this rate."
+        )
+    observer.reset(targets[0])
+    return np.stack([observer.step(t, r).position for t, r in zip(targets, readings, strict=True)])
+
+
+def _phasors(
+    positions: NDArray[np.float64], frequencies_hz: ArrayLike, period_s: float
+) -> NDArray[np.complex128]:
+    """Swing of each joint as a multiple of sin(2πft), shape (frequencies, 12) [rad]."""
+    steps = len(positions)
+    time = period_s * np.arange(1, steps + 1)
+    window = steps * period_s - _SETTLE_S
+    found = []
+    for i, f in enumerate(np.asarray(frequencies_hz, float)):
+        cycles = np.floor(window * f + 1e-9)
+        last = slice(steps - round(cycles / f / period_s), None)
+        angle = 2 * np.pi * f * time[last]
+        design = np.column_stack([np.sin(angle), np.cos(angle), np.ones_like(angle)])
+        in_phase, quadrature, _ = np.linalg.pinv(design) @ positions[last, i]
+        found.append(in_phase + 1j * quadrature)
+    return np.array(found)
+
+
+def _largest(values: NDArray[np.float64]) -> tuple[int, int]:
+    i, j = np.unravel_index(np.argmax(values), values.shape)
+    return int(i), int(j)

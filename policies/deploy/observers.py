@@ -1,0 +1,442 @@
+"""Observers: what a policy is told about its joints where their encoders cannot be trusted.
+
+In the simulator a policy sees its joints as the measured bus would report them. On a robot the
+same is needed, or a substitute: a model of the servos that runs along with them and sees only what
+they are told (`SyntheticPD`, `ServoModelObserver`), the readings themselves (`HeldEncoder`), or
+nothing (`Zero`).
+
+An observer is asked once per control period, when it ends: `target` is what the servos were told
+for that period, `reading` what the bus reports at its end, and the estimate is of that instant. So
+a controller reads the bus, steps its observer with the target of the period that is over, and then
+lets the policy act.
+
+Arrays are (..., 12) in the order of `common.joints.JOINT_NAMES`, with any leading axes
+(environments). Angles are radians in servo coordinates: one number per servo, as its `DelayedPD` or
+servo model was fitted (`hardware.joint_map.JointMap.per_servo`: a calf behind a push rod is told as
+if its thigh stood at the neutral). The caller converts from joint coordinates and back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.deploy.stacks import ObserverKind
+from pupper_sysid.servo_models.control_rate import substeps as physics_substeps
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters, integrate
+from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
+
+Array = NDArray[np.float64]
+
+_JOINTS = len(JOINT_NAMES)
+_PAPER_SUBSTEPS = 4
+_PAPER_DELAY_STEPS = {0.02: 9, 0.04: 5}  # by control period: 180 and 200 ms
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """What an observer believes of the joints at the end of a control period.
+
+    Attributes
+    ----------
+    position : ndarray, shape (..., 12)
+        [rad], servo coordinates.
+    velocity : ndarray, shape (..., 12)
+        [rad/s]
+    effort : ndarray, shape (..., 12)
+        Torque [N·m]; 0 where it is not known.
+    """
+
+    position: Array
+    velocity: Array
+    effort: Array
+
+
+class Observer(Protocol):
+    """Stands in for the encoders in what a policy sees. See the module's text."""
+
+    name: str
+    period_s: float
+
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], shape (..., 12), which sets the leading axes.
+
+        It has been the target, and the reading, for ever.
+
+        Raises
+        ------
+        InputError
+            If it is not of twelve joints, or not finite.
+        """
+        ...
+
+    def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
+        """Let one control period pass, and say where the joints are at its end.
+
+        Parameters
+        ----------
+        target : array_like, shape (..., 12)
+            What the servos were told for this period [rad].
+        reading : array_like, shape (..., 12)
+            What the bus reports at its end [rad]; NaN where it reports nothing.
+
+        Raises
+        ------
+        InputError
+            If what it uses of the two has another shape than at `reset`, or a target is not finite.
+        """
+        ...
+
+
+class SyntheticPD:
+    """A simulated PD servo per joint: `DelayedPD`, held at joint limits, free-running on targets.
+
+    Given the parameters the policy was trained with, this is the trained actuator in free air.
+
+    Parameters
+    ----------
+    parameters : DelayedPDParameters
+        Scalars or arrays of 12.
+    period_s : float
+        Control period [s].
+    substeps : int, optional
+        Time steps per period; by default those of training, 2 ms each.
+    limits_rad : (array_like, array_like)
+        Lowest and highest position, scalars or arrays of 12 [rad]. A joint that reaches one stops.
+
+    Raises
+    ------
+    InputError
+        If a parameter is out of range, of another number of joints, or the time step so long that
+        the integration would explode.
+    """
+
+    name = "synthetic-pd"
+
+    def __init__(
+        self,
+        parameters: DelayedPDParameters,
+        period_s: float,
+        substeps: int | None = None,
+        limits_rad: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
+    ):
+        self.period_s = _positive(period_s)
+        substeps = physics_substeps(period_s) if substeps is None else substeps
+        if substeps < 1:
+            raise InputError(f"SyntheticPD: {substeps} substeps; it must be at least 1.")
+        for value in (*astuple(parameters), *limits_rad):
+            if np.shape(value) not in ((), (_JOINTS,)):
+                raise InputError(
+                    f"SyntheticPD: a parameter has shape {np.shape(value)}; it must be one number "
+                    f"or {_JOINTS}, in the order of the joints."
+                )
+        low, high = (np.asarray(limit, float) for limit in limits_rad)
+        if not np.all(low < high):
+            raise InputError("SyntheticPD: a lower limit is not below its upper limit.")
+        self._substeps = substeps
+        self._servo = _StoppedServo(parameters, period_s / substeps, low, high)
+        needed = self._servo.longest_time_step_s()
+        if period_s / substeps > needed:
+            raise InputError(
+                f"SyntheticPD: {substeps} substeps of {1e3 * period_s / substeps:.3g} ms are too "
+                f"long for so stiff a servo; take {int(np.ceil(period_s / needed))} or more."
+            )
+        self.reset(np.zeros(_JOINTS))
+
+    @classmethod
+    def paper(
+        cls, period_s: float, limits_rad: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf)
+    ) -> SyntheticPD:
+        """The observer of the Mini Pupper 2 paper's deployment, to compare with.
+
+        Stiffness 70, damping 1.2, inertia 0.20, friction 0.03, delay 9 control steps at 50 Hz and 5
+        at 25 Hz (facts/paper.md, 5.1 and 5.2). It resonates: near 3 Hz it swings three times as far
+        as it is told. As in the authors' final controller its torque has no limit, and the effort
+        it reports is 0.
+
+        Raises
+        ------
+        InputError
+            If the rate is neither 50 nor 25 Hz: nothing was published for others.
+        """
+        delay = next((n for t, n in _PAPER_DELAY_STEPS.items() if abs(t - period_s) < 1e-9), None)
+        if delay is None:
+            raise InputError(
+                f"The paper's observer is known for control periods of 0.02 and 0.04 s, not "
+                f"{period_s:g} s."
+            )
+        damping, inertia = 1.2, 0.20
+        parameters = DelayedPDParameters(
+            stiffness=70.0,
+            damping=damping,
+            friction_loss=0.03,
+            # the authors integrate damping explicitly, v += h / I (torque - d v); the implicit
+            # v = (v + h / J torque) / (1 + h d / J) is the same number with J = I - h d
+            armature=inertia - damping * period_s / _PAPER_SUBSTEPS,
+            effort_limit=np.inf,
+            velocity_limit=np.inf,
+            delay_s=delay * period_s,
+        )
+        found = cls(parameters, period_s, _PAPER_SUBSTEPS, limits_rad)
+        found.name = "paper-pd"
+        return found
+
+    def reset(self, position: ArrayLike) -> None:
+        """See `Observer`."""
+        self._servo.reset(_resting(position))
+
+    def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
+        """See `Observer`; `reading` is not used."""
+        return self._servo.advance(_told(target, self._servo.batch), self._substeps)
+
+
+class _StoppedServo(DelayedPD):
+    """`DelayedPD` whose joint stops at its limits, and that says all of its state."""
+
+    def __init__(
+        self, parameters: DelayedPDParameters, time_step_s: float, low: Array, high: Array
+    ):
+        super().__init__(parameters, time_step_s)
+        self._low, self._high = low, high
+
+    def longest_time_step_s(self) -> float:
+        """Beyond it the spring, integrated explicitly, feeds the oscillation [s].
+
+        With k and d, stiffness and damping over inertia, the characteristic polynomial
+        (1 + h d) z² - (2 + h d - h² k) z + 1 leaves the unit circle at z = -1, where
+        h² k = 4 + 2 h d.
+        """
+        one = self.parameters.per_inertia()
+        k, d = np.broadcast_arrays(np.asarray(one.stiffness), np.asarray(one.damping))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            longest = (d + np.sqrt(d * d + 4 * k)) / k
+        return float(np.min(np.where(k > 0, longest, np.inf)))
+
+    def advance(self, target: Array, steps: int) -> JointEstimate:
+        """The state after `steps` time steps under `target`, shape of the batch."""
+        arriving = self._delay_line.shift(np.broadcast_to(target, (steps, *self.batch)))
+        start = (self._position, self._velocity, self._setpoint)
+        path, state = integrate(arriving, start, self._values, self.time_step_s)
+        if ((path < self._low) | (path > self._high)).any():
+            # again, one time step after the other: a joint stops where it meets its limit
+            state = start
+            for goal in arriving:
+                _, (position, velocity, setpoint) = integrate(
+                    goal[None], state, self._values, self.time_step_s
+                )
+                within = np.clip(position, self._low, self._high)
+                state = (within, np.where(within == position, velocity, 0.0), setpoint)
+        position, velocity, setpoint = self._position, self._velocity, self._setpoint = state
+        own = self._values
+        torque = own["stiffness"] * (setpoint - position) - own["damping"] * velocity
+        limit = np.broadcast_to(own["effort_limit"], self.batch)
+        # nothing was said of a torque without a limit: its scale is anyone's guess
+        effort = np.where(np.isfinite(limit), np.clip(torque, -limit, limit), 0.0)
+        return JointEstimate(position.copy(), velocity.copy(), effort)
+
+
+class ServoModelObserver:
+    """A learned servo model that free-runs on targets; it never looks at a reading.
+
+    Parameters
+    ----------
+    model : JointArrays
+        Of all twelve joints, in order, one step per control period. The observer owns its state.
+    period_s : float
+        Control period [s].
+
+    Raises
+    ------
+    InputError
+        If the model is of other joints or another rate.
+    """
+
+    name = "servo-model"
+
+    def __init__(self, model: JointArrays, period_s: float):
+        self.period_s = _positive(period_s)
+        if model.joints != JOINT_NAMES:
+            raise InputError(
+                f"The servo model is of {', '.join(model.joints)}; an observer needs all twelve "
+                "joints, in order. Fit it with --joints all."
+            )
+        if not same_rate(model.time_step_s, period_s):
+            raise InputError(
+                f"The servo model steps every {model.time_step_s:g} s, the controller every "
+                f"{period_s:g} s. Fit a model at the controller's rate, or run it at the model's."
+            )
+        self._model = model
+        self.reset(np.zeros(_JOINTS))
+
+    def reset(self, position: ArrayLike) -> None:
+        """See `Observer`."""
+        self._position = _resting(position)
+        self._model.reset(self._position)
+
+    def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
+        """See `Observer`; `reading` is not used. Effort is not known."""
+        position = self._model.step(_told(target, self._position.shape)).astype(float)
+        velocity = (position - self._position) / self.period_s
+        self._position = position
+        return JointEstimate(position.copy(), velocity, np.zeros_like(position))
+
+
+class HeldEncoder:
+    """The readings themselves, as `sim.walking.env` shows them to the policy in training.
+
+    A missing reading leaves the last one in place. Velocity is the difference of the readings
+    `velocity_steps` control periods apart: cheap buses poll too rarely for less.
+
+    Parameters
+    ----------
+    period_s : float
+        Control period [s].
+    velocity_steps : int
+        Of the policy's contract.
+
+    Raises
+    ------
+    InputError
+        If the period is not positive or there is no step between readings.
+    """
+
+    name = "encoder"
+
+    def __init__(self, period_s: float, velocity_steps: int):
+        self.period_s = _positive(period_s)
+        if velocity_steps < 1:
+            raise InputError(f"HeldEncoder: {velocity_steps} velocity steps; at least 1 is needed.")
+        self._velocity_steps = velocity_steps
+        self.reset(np.zeros(_JOINTS))
+
+    def reset(self, position: ArrayLike) -> None:
+        """See `Observer`."""
+        rest = _resting(position)
+        # readings, newest first
+        self._seen = np.broadcast_to(rest, (self._velocity_steps + 1, *rest.shape)).copy()
+
+    def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
+        """See `Observer`; `target` is not used. Effort is not known."""
+        now = _spread(reading, self._seen.shape[1:], "A reading")
+        self._seen[1:] = self._seen[:-1].copy()
+        self._seen[0] = np.where(np.isfinite(now), now, self._seen[1])
+        velocity = (self._seen[0] - self._seen[-1]) / (self._velocity_steps * self.period_s)
+        return JointEstimate(self._seen[0].copy(), velocity, np.zeros_like(velocity))
+
+
+class Zero:
+    """Joints that rest for ever: what a policy does when it is told nothing of its legs.
+
+    Parameters
+    ----------
+    period_s : float
+        Control period [s].
+
+    Raises
+    ------
+    InputError
+        If the period is not positive.
+    """
+
+    name = "zero"
+
+    def __init__(self, period_s: float):
+        self.period_s = _positive(period_s)
+        self.reset(np.zeros(_JOINTS))
+
+    def reset(self, position: ArrayLike) -> None:
+        """See `Observer`."""
+        self._position = _resting(position)
+
+    def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
+        """See `Observer`; neither is used."""
+        nothing = np.zeros_like(self._position)
+        return JointEstimate(self._position.copy(), nothing, nothing.copy())
+
+
+def _positive(period_s: float) -> float:
+    if not (np.isfinite(period_s) and period_s > 0):
+        raise InputError(f"An observer's control period is {period_s} s; it must be positive.")
+    return float(period_s)
+
+
+def _resting(position: ArrayLike) -> Array:
+    """An observer's first position, checked, as an array of its own."""
+    position = np.array(position, float)
+    if position.shape[-1:] != (_JOINTS,):
+        raise InputError(
+            f"An observer was reset to positions of shape {position.shape}; the last axis must be "
+            f"the {_JOINTS} joints."
+        )
+    if not np.isfinite(position).all():
+        raise InputError("An observer was reset to positions that are not finite.")
+    return position
+
+
+def _told(target: ArrayLike, batch: tuple[int, ...]) -> Array:
+    """A target, checked: one NaN would stay in a model's state for ever."""
+    target = _spread(target, batch, "A target")
+    if not np.isfinite(target).all():
+        raise InputError("A target is not finite: the policy or a filter before it failed.")
+    return target
+
+
+def _spread(value: ArrayLike, batch: tuple[int, ...], name: str) -> Array:
+    value = np.asarray(value, float)
+    try:
+        return np.broadcast_to(value, batch)
+    except ValueError:
+        raise InputError(
+            f"{name} has shape {value.shape}; the observer was reset with {batch}."
+        ) from None
+
+
+def make_observer(
+    kind: ObserverKind,
+    period_s: float,
+    velocity_steps: int,
+    actuator: DelayedPDParameters,
+    limits_rad: tuple[ArrayLike, ArrayLike],
+    servo_model: JointArrays | None,
+) -> Observer:
+    """The observer that a stack names.
+
+    Parameters
+    ----------
+    kind : str
+        See `policies.deploy.stacks.Stack`.
+    period_s : float
+        Control period [s].
+    velocity_steps : int
+        Of the policy's contract, for `readings`.
+    actuator : DelayedPDParameters
+        Each (12,), for `synthetic-pd`.
+    limits_rad : tuple of ndarray, shape (12,)
+        Of the servos' angles, where a simulated one stops.
+    servo_model : JointArrays or None
+        For `servo-model`.
+
+    Raises
+    ------
+    InputError
+        If a servo model is asked for and none is given, or it does not fit.
+    """
+    if kind == "readings":
+        return HeldEncoder(period_s, velocity_steps)
+    if kind == "synthetic-pd":
+        return SyntheticPD(actuator, period_s, limits_rad=limits_rad)
+    if kind == "published-pd":
+        return SyntheticPD.paper(period_s, limits_rad)
+    if kind == "rest":
+        return Zero(period_s)
+    if servo_model is None:
+        raise InputError(
+            "This stack shows the policy a servo model's prediction: name one with --servo FOLDER "
+            "(`pupper-sysid fit-servo` makes one)."
+        )
+    return ServoModelObserver(servo_model, period_s)

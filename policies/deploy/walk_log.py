@@ -1,0 +1,186 @@
+"""The log of a deployment: every input and output of the controller, tick by tick, as one CSV file.
+
+It begins with comment lines (`# pupper-sysid walk`, then one `# key: JSON` per line: schema, policy
+and its hash, stack, bus, start), then has one row per tick with all numbers in full, so that
+`replay` gives the same actions again bit for bit. Rows are on the disk within a second. A log that
+ended properly says why in its last line, `# ended: …`; one without it was cut short.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import SyncedText, versions
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
+from pupper_sysid.policies.deploy.filters import Rest
+from pupper_sysid.policies.network.file_version import refuse_other_version
+from pupper_sysid.sim.walking.env import OBSERVATION_SIZE
+
+TITLE = "# pupper-sysid walk"
+SCHEMA_VERSION = 1
+
+_AXES = ("x", "y", "z")
+_COMMAND = ("forward_m_s", "left_m_s", "turn_rad_s")
+_SENSES = (
+    ("command", tuple(f"command_{c}" for c in _COMMAND)),
+    ("position", tuple(f"{j}_position_rad" for j in JOINT_NAMES)),
+    ("load", tuple(f"{j}_load_nm" for j in JOINT_NAMES)),
+    ("rate", tuple(f"rate_{a}_rad_s" for a in _AXES)),
+    ("acceleration", tuple(f"acceleration_{a}_m_s2" for a in _AXES)),
+)
+_OBSERVATION = tuple(f"observation_{i}" for i in range(OBSERVATION_SIZE))
+_ACTION = tuple(f"{j}_action" for j in JOINT_NAMES)
+_TARGET = tuple(f"{j}_target_rad" for j in JOINT_NAMES)
+_SENT = tuple(f"{j}_sent_rad" for j in JOINT_NAMES)
+COLUMNS = (
+    "elapsed_s", *(name for _, names in _SENSES for name in names), *_OBSERVATION, *_ACTION,
+    *_TARGET, *_SENT,
+)  # fmt: skip
+
+
+class WalkLog:
+    """Writes a log.
+
+    Parameters
+    ----------
+    path : Path
+    header : dict
+        What is known at the start; each value must be JSON.
+    force : bool
+        Replace an existing file.
+    """
+
+    def __init__(self, path: Path, header: dict[str, Any], force: bool = False):
+        self._file = SyncedText(path, force)
+        about = {"schema_version": SCHEMA_VERSION, "versions": versions("torch")} | header
+        lines = [f"# {k}: {json.dumps(v, ensure_ascii=False)}" for k, v in about.items()]
+        self._file.write([TITLE, *lines, ",".join(COLUMNS)])
+
+    def append(self, senses: Senses, decision: Decision, sent: NDArray[np.float64]) -> None:
+        """One tick: what came in, what was decided, and what the guard let out [rad]."""
+        numbers = np.concatenate(
+            [
+                [senses.elapsed_s], *(getattr(senses, name) for name, _ in _SENSES),
+                decision.observation, decision.action, decision.target, sent,
+            ]
+        )  # fmt: skip
+        self._file.write([",".join(map(repr, numbers.tolist()))])
+
+    def close(self, reason: str | None = None) -> None:
+        """Close; `reason` becomes the last line. May be called twice."""
+        self._file.close([f"# ended: {reason}"] if reason else [])
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A log that was read.
+
+    Attributes
+    ----------
+    header : dict
+    rest : Rest
+        At the start.
+    start : ndarray, shape (12,)
+        Joint angles at the start [rad].
+    senses : list of Senses
+    observation, action, target, sent : ndarray, shape (ticks, 60 or 12)
+    ended : str or None
+        Why; None if the log was cut short.
+    """
+
+    header: dict[str, Any]
+    rest: Rest
+    start: NDArray[np.float64]
+    senses: list[Senses]
+    observation: NDArray[np.float32]
+    action: NDArray[np.float32]
+    target: NDArray[np.float64]
+    sent: NDArray[np.float64]
+    ended: str | None
+
+
+def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:
+    """The part of a header that `read_walk` needs."""
+    return {
+        "start_rad": np.asarray(position, float).tolist(),
+        "rest": {"gravity": rest.gravity.tolist(), "bias_rad_s": rest.bias_rad_s.tolist()},
+    }
+
+
+def read_walk(path: Path) -> Walk:
+    """Read a log; a torn last line is left out.
+
+    Raises
+    ------
+    InputError
+        If it is none, or damaged; the sentence says where.
+    """
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from error
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    if not lines or lines[0] != TITLE:
+        raise InputError(f"{path} is no log of a walk; pupper-deploy writes them.")
+    header: dict[str, Any] = {}
+    ended = None
+    for line in lines[1:]:
+        key, colon, value = line.removeprefix("# ").partition(": ")
+        if not line.startswith("# ") or not colon:
+            continue
+        if key == "ended":
+            ended = value
+            continue
+        try:
+            header[key] = json.loads(value)
+        except ValueError as error:
+            raise InputError(f"{path}: its header's {key} is not JSON: {error}.") from error
+    refuse_other_version(path, header.get("schema_version"), SCHEMA_VERSION)
+    rows = [row for row in csv.reader(line for line in lines if not line.startswith("#"))]
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise InputError(f"{path}: its columns are not those of a walk. Was it edited?")
+    try:
+        numbers = np.array([[float(x) for x in row] for row in rows[1:]]).reshape(-1, len(COLUMNS))
+        rest = header["rest"]
+        begin = Rest(np.array(rest["gravity"], float), np.array(rest["bias_rad_s"], float))
+        start = np.array(header["start_rad"], float).reshape(len(JOINT_NAMES))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: a row or its header is damaged: {error}.") from error
+    place = {name: i for i, name in enumerate(COLUMNS)}
+
+    def columns(names: tuple[str, ...]) -> NDArray[np.float64]:
+        return numbers[:, place[names[0]] : place[names[0]] + len(names)]
+
+    parts = {name: columns(names) for name, names in _SENSES}
+    senses = [
+        Senses(float(numbers[i, 0]), **{name: part[i] for name, part in parts.items()})
+        for i in range(len(numbers))
+    ]
+    return Walk(
+        header, begin, start, senses, columns(_OBSERVATION).astype(np.float32),
+        columns(_ACTION).astype(np.float32), columns(_TARGET), columns(_SENT), ended,
+    )  # fmt: skip
+
+
+def replay(walk: Walk, controller: Controller) -> int | None:
+    """Run a controller over a log's inputs; the first tick that differs, None if none does."""
+    controller.reset(walk.start, walk.rest)
+    for i, senses in enumerate(walk.senses):
+        found = controller.step(senses)
+        same = (
+            np.array_equal(found.observation, walk.observation[i], equal_nan=True)
+            and np.array_equal(found.action, walk.action[i])
+            and np.array_equal(found.target, walk.target[i])
+        )
+        if not same:
+            return i
+    return None

@@ -1,0 +1,1 @@
+"""Policy networks and the files that hold them."""

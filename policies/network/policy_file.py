@@ -1,0 +1,241 @@
+"""Policy files: a folder with weights (safetensors) and a contract (JSON); nothing is unpickled.
+
+The contract says what a policy must be given and what its numbers mean: names and order of the
+observation, scales, default pose, joint order, rates, the actuator and feedback it was trained
+with, and how. `load_policy` refuses what does not keep it. `refuse_bad` is the gate every policy
+passes before it is written: no NaN, right shapes, and actions that depend on what is seen.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from copy import copy
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.policies.network.file_version import refuse_other_version
+from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
+from pupper_sysid.sim.walking.env import OBSERVATION, VELOCITY_STEPS
+
+SCHEMA, VERSION = "pupper-policy", 1
+CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
+_MOST_BYTES = 200_000_000
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class ObservationPart(_Part):
+    """One part of what the policy sees, in order."""
+
+    name: str
+    size: Annotated[int, Field(gt=0, le=10_000)]
+    unit: str
+
+
+class Contract(_Part):
+    """What a policy must be given, and what it gives."""
+
+    schema_name: Annotated[Literal["pupper-policy"], Field(alias="schema")]
+    schema_version: Literal[1]
+    kind: Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
+    hidden: Annotated[list[Annotated[int, Field(gt=0, le=8192)]], Field(max_length=16)]
+    memory: Annotated[int, Field(gt=0, le=8192)]
+    normalise: bool
+    observation: Annotated[list[ObservationPart], Field(min_length=1, max_length=32)]
+    base_velocity: Literal["zero", "true"]
+    """Whether the trunk's speed is zeros or must be known."""
+    velocity_steps: int
+    """Joint velocity is the difference of readings so many control steps apart."""
+    action_history: Annotated[int, Field(ge=0, le=1000)]
+    """How many past actions it sees, newest first."""
+    action_scale_rad: Annotated[float, Field(gt=0, le=10)]
+    default_pose_rad: dict[str, float]
+    """Target = default pose + scale · action, in this order of joints."""
+    control_step_s: Annotated[float, Field(gt=0, le=1)]
+    physics_step_s: Annotated[float, Field(gt=0, le=1)]
+    knee: Literal["linkage", "serial"]
+    actuator: str
+    actuator_sha256: str | None
+    feedback: str
+    delay_s: list[float]
+    """Shortest and longest dead time it was trained with."""
+    training: dict[str, Any]
+    versions: dict[str, str]
+    weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+    @property
+    def observation_size(self) -> int:
+        """Of everything it sees, past actions included."""
+        return sum(p.size for p in self.observation) + ACTIONS * self.action_history
+
+
+class Policy:
+    """A policy that acts for many robots at once and keeps their states.
+
+    Parameters
+    ----------
+    network : PolicyNetwork
+    contract : Contract
+    """
+
+    def __init__(self, network: PolicyNetwork, contract: Contract):
+        self.network, self.contract = network, contract
+        self._run: Callable[..., tuple[torch.Tensor, ...]] = network
+        self._state: tuple[torch.Tensor, ...] = ()
+        self._past = np.zeros((0, 0, ACTIONS), np.float32)
+
+    def reset(self, action: np.ndarray) -> None:
+        """Start anew for all robots, whose last action was `action`, shape (n, 12)."""
+        self._state = self.network.initial_state(len(action))
+        history = self.contract.action_history
+        self._past = np.repeat(np.asarray(action, np.float32)[:, None], history, axis=1)
+
+    def for_one(self) -> Policy:
+        """A copy with a state of its own that acts for one robot: same bits in half the time."""
+        own = copy(self)
+        shown = torch.zeros(1, self.contract.observation_size)
+        with warnings.catch_warnings(), torch.inference_mode():
+            warnings.simplefilter("ignore")  # a trace is of one size, which is what is wanted
+            state = self.network.initial_state(1)
+            traced: Any = torch.jit.trace(self.network.eval(), (shown, *state))
+            own._run = torch.jit.freeze(traced)
+        return own
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Actions, shape (n, 12), for observations (n, 60)."""
+        seen = np.concatenate([observation, self._past.reshape(len(observation), -1)], axis=1)
+        with torch.inference_mode():
+            action, *state = self._run(torch.from_numpy(seen.astype(np.float32)), *self._state)
+        self._state = tuple(s.clone() for s in state)
+        found = action.numpy()
+        if self._past.shape[1]:
+            self._past = np.concatenate([found[:, None], self._past[:, :-1]], axis=1)
+        return found
+
+
+def save_policy(
+    folder: Path, network: PolicyNetwork, about: dict[str, Any], force: bool = False
+) -> None:
+    """Write a policy; `about` is the contract without schema, versions and hash.
+
+    Raises
+    ------
+    InputError
+        If the gate refuses it, or the folder holds one and `force` is not given.
+    """
+    refuse_bad(network, "This policy")
+    refuse_overwrite(folder / CONTRACT, force)
+    data = save_tensors({k: v.contiguous() for k, v in network.state_dict().items()})
+    write_bytes(folder / WEIGHTS, data, force=True)
+    contract = Contract.model_validate(
+        {
+            "schema": SCHEMA, "schema_version": VERSION, **about,
+            "versions": versions("torch", "rsl-rl-lib"),
+            "weights_sha256": sha256(folder / WEIGHTS),
+        }
+    )  # fmt: skip
+    text = json.dumps(contract.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
+    write_text(folder / CONTRACT, text + "\n", force=True)
+
+
+def load_policy(folder: Path) -> Policy:
+    """Read a policy.
+
+    Raises
+    ------
+    InputError
+        If anything about it cannot be trusted; one sentence says what.
+    """
+    path, weights = folder / CONTRACT, folder / WEIGHTS
+    for file in (path, weights):
+        if not file.is_file():
+            raise InputError(f"{folder} holds no policy: there is no {file.name} in it.")
+        if file.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{file} is too large to be part of a policy.")
+    _refuse_other_version(path)
+    try:
+        contract = Contract.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(p) for p in first["loc"])
+        raise InputError(f"{path}: {place or 'the file'}: {first['msg']}.") from error
+    if list(contract.default_pose_rad) != list(JOINT_NAMES):
+        raise InputError(f"{path}: default_pose_rad must name the joints in this project's order.")
+    if sha256(weights) != contract.weights_sha256:
+        raise InputError(f"{weights} is not the file that {path.name} describes. Copy both again.")
+    network = PolicyNetwork(
+        contract.kind, contract.observation_size, tuple(contract.hidden), contract.memory,
+        contract.normalise,
+    )  # fmt: skip
+    try:
+        network.take(load_tensors(weights.read_bytes()))
+    except (SafetensorError, KeyError, RuntimeError) as error:
+        raise InputError(
+            f"{weights} does not fit {path.name}: weights of another shape."
+        ) from error
+    refuse_bad(network, str(folder))
+    return Policy(network, contract)
+
+
+def _refuse_other_version(path: Path) -> None:
+    """A newer contract would only be said to have a wrong number in it."""
+    with suppress(OSError, ValueError, RecursionError):  # damaged: the contract's own check says so
+        found = json.loads(path.read_bytes())
+        version = found.get("schema_version") if isinstance(found, dict) else VERSION
+        refuse_other_version(path, version, VERSION)
+
+
+def refuse_other_observation(contract: Contract) -> None:
+    """A policy that expects other numbers than it would be given only looks confused.
+
+    Raises
+    ------
+    InputError
+    """
+    expected = [(p.name, p.size) for p in contract.observation]
+    given = [(name, size) for name, size, _ in OBSERVATION]
+    if expected != given or contract.velocity_steps != VELOCITY_STEPS:
+        raise InputError(
+            "The policy's observation is not the one this version gives "
+            f"({', '.join(name for name, _ in given)}; velocity over {VELOCITY_STEPS} steps). "
+            "Use the version that trained it, or train it again."
+        )
+
+
+def refuse_bad(network: PolicyNetwork, name: str) -> None:
+    """The gate: refuse a policy that is not finite, or does not depend on what it sees.
+
+    Raises
+    ------
+    InputError
+    """
+    if not all(torch.isfinite(p).all() for p in network.state_dict().values()):
+        raise InputError(f"{name} has weights that are not numbers. Train it again.")
+    generator = torch.Generator().manual_seed(0)
+    seen = torch.randn(64, network.observation_size, generator=generator)
+    with torch.inference_mode():
+        action = network(seen, *network.initial_state(64))[0]
+    if action.shape != (64, ACTIONS) or not torch.isfinite(action).all():
+        raise InputError(f"{name} gives actions that are not 12 numbers. Train it again.")
+    if float(action.std(0).max()) < 1e-5:
+        raise InputError(f"{name} does the same whatever it sees. Train it again.")
+
+
+def default_pose() -> dict[str, float]:
+    """Default pose by joint, in order [rad]."""
+    return {name: DEFAULT_POSE[name] for name in JOINT_NAMES}

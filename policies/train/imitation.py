@@ -1,0 +1,81 @@
+"""A first gait: the policy learns to continue an open-loop trot before PPO begins.
+
+Rewards alone seldom find a walk within the samples that two cores can give. So the policy is first
+shown one (DAgger: it acts, the teacher says what it would have done). The teacher has no clock
+either: it reads the phase of the trot off the last two actions and returns the next point, so
+the rhythm that is learned needs none. PPO then owns the policy; nothing of the trot is left in
+its rewards.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from pupper_sysid.policies.network.hyperparameters import Imitation
+from pupper_sysid.policies.train.learner import Learner
+from pupper_sysid.sim.walking.env import PupperEnv
+
+
+def teacher_actions(env: PupperEnv) -> np.ndarray:
+    """What the trot would do next in every environment, shape (n, 12), in units of actions."""
+    trot, scale = env.trot, env.config.action_scale
+    span = env.config.control_step_s
+    now, before = (env.default + scale * a for a in (env.action, env.last_action))
+    phase = trot.phase_of(now, before, span, env.command) + 2 * np.pi * trot.frequency_hz * span
+    return (trot.joints(phase, env.command) - env.default) / scale
+
+
+def imitate(learner: Learner, how: Imitation, round_: int) -> float:
+    """One round: act, ask the teacher, learn; root mean square difference to it.
+
+    Early rounds let the teacher act in some environments, so that the policy sees a walk.
+    """
+    env, ppo = learner.env.env, learner.ppo
+    share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
+    led = torch.from_numpy(env.rng.random(env.environments) < share)
+    asked: list[torch.Tensor] = []
+    with torch.inference_mode():
+        for _ in range(learner.hyper.steps_per_environment):
+            teacher = torch.from_numpy(teacher_actions(env).astype(np.float32))
+            asked.append(teacher)
+            actions = ppo.act(learner.observations)
+            noise = actions - ppo.actor.output_mean
+            actions = torch.where(led[:, None], teacher + noise, actions)
+            learner.observations, rewards, dones, extras = learner.env.step(actions)
+            ppo.process_env_step(learner.observations, rewards, dones, extras)
+        ppo.compute_returns(learner.observations)
+    # where PPO would find the actions taken, put those it should have taken
+    storage = ppo.storage
+    storage.actions = torch.stack(asked)
+    seen = storage.observations.flatten(0, 1)
+    if round_ == 0:
+        ppo.actor.update_normalization(seen)
+        ppo.critic.update_normalization(seen)
+    for group in ppo.optimizer.param_groups:
+        group["lr"] = how.learning_rate * (1.0 - 0.9 * round_ / how.iterations)
+    parts = how.minibatches
+    if ppo.actor.is_recurrent:
+        parts = min(parts, env.environments)  # it divides robots, not steps
+        batches = storage.recurrent_mini_batch_generator(parts, how.epochs)
+    else:
+        batches = storage.mini_batch_generator(parts, how.epochs)
+    errors = []
+    for batch in batches:
+        mean = ppo.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0])
+        value = ppo.critic(batch.observations, masks=batch.masks)
+        error = (mean - batch.actions).pow(2).mean()
+        loss = error + 0.1 * (value - batch.returns).pow(2).mean()
+        ppo.optimizer.zero_grad()
+        loss.backward()
+        if ppo.is_multi_gpu:
+            ppo.reduce_parameters()
+        torch.nn.utils.clip_grad_norm_(ppo.actor.parameters(), learner.hyper.gradient_norm)
+        torch.nn.utils.clip_grad_norm_(ppo.critic.parameters(), learner.hyper.gradient_norm)
+        ppo.optimizer.step()
+        errors.append(float(error.detach()))
+    if round_ > 0:
+        ppo.actor.update_normalization(seen)
+        ppo.critic.update_normalization(seen)
+    storage.clear()
+    return float(np.sqrt(np.mean(errors[-parts:])))

@@ -1,0 +1,302 @@
+"""PPO: rsl_rl's, with what it lacks, in thin subclasses.
+
+- At a time-out the value of the state reached is added, not that of the state before it.
+- A checkpoint holds everything that a run needs to go on as if it had never stopped: networks,
+  optimiser, learning rate, random numbers, recurrent state, environments with their delay lines,
+  the last observation and the counters. It is written atomically and read with `weights_only`.
+- Several processes exchange gradients through gloo: all of it runs on processors, as the physics
+  does, whatever else the machine has.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import write_bytes
+from pupper_sysid.policies.network.actor_critic import build
+from pupper_sysid.policies.network.file_version import refuse_other_version
+from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
+from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+
+CHECKPOINT_SCHEMA = "pupper-checkpoint"
+CHECKPOINT_VERSION = 1
+_PARTS = (
+    "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
+    "learning_rate", "iteration", "torch_rng", "hidden", "observations", "environment", "more",
+)  # fmt: skip
+
+
+class TerminalPPO(PPO):
+    """PPO that bootstraps time-outs with the value of the state that was reached."""
+
+    def process_env_step(
+        self,
+        obs: TensorDict,
+        rewards: torch.Tensor,
+        dones: torch.Tensor,
+        extras: dict[str, Any],
+    ) -> None:
+        """Record one step; `extras` as `WalkingVecEnv.step` gives them."""
+        late = extras["terminal_ids"]
+        if len(late):
+            reached = self.critic(extras["terminal_observations"]).detach()
+            rewards = rewards.clone()
+            rewards[late] += self.gamma * reached[:, 0]
+        super().process_env_step(obs, rewards, dones, {})
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among those that train together."""
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+
+    @classmethod
+    def join(cls) -> Ranks:
+        """Join the processes that `torchrun` started; alone if it did not."""
+        size = int(os.environ.get("WORLD_SIZE", "1"))
+        if size == 1:
+            return cls()
+        found = cls(int(os.environ["RANK"]), size, int(os.environ.get("LOCAL_RANK", "0")))
+        if not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("gloo", rank=found.rank, world_size=size)
+        return found
+
+    def same(self, text: str) -> str:
+        """The first process's `text`, in all."""
+        found = [text]
+        if self.size > 1:
+            torch.distributed.broadcast_object_list(found, src=0)
+        return found[0]
+
+    def any(self, here: bool) -> bool:
+        """Whether it is so in any process: what all must decide alike, or they wait for ever."""
+        return bool(self._reduced(float(here), "MAX"))
+
+    def mean(self, here: float) -> float:
+        """Mean over the processes, the same in all."""
+        return self._reduced(here, "SUM") / self.size
+
+    def _reduced(self, here: float, operation: str) -> float:
+        if self.size == 1:
+            return here
+        found = torch.tensor(here, dtype=torch.float64)
+        torch.distributed.all_reduce(found, getattr(torch.distributed.ReduceOp, operation))
+        return float(found)
+
+
+class Learner:
+    """An environment, a policy, a critic and PPO.
+
+    Parameters
+    ----------
+    env : WalkingVecEnv
+    architecture : Architecture
+    hyper : Hyperparameters
+    seed : int
+    ranks : Ranks
+
+    Raises
+    ------
+    InputError
+        If a recurrent policy has fewer environments than minibatches.
+    """
+
+    def __init__(
+        self,
+        env: WalkingVecEnv,
+        architecture: Architecture,
+        hyper: Hyperparameters,
+        seed: int,
+        ranks: Ranks | None = None,
+    ):
+        self.env, self.architecture, self.hyper = env, architecture, hyper
+        self.ranks = ranks or Ranks()
+        # the networks of all ranks start alike; what they sample later must differ
+        torch.manual_seed(seed)
+        # as if begun at different times: not all episodes shall end in the same update
+        env.episode_length_buf = torch.randint(0, env.max_episode_length, (env.num_envs,))
+        self.observations = env.get_observations()
+        actor, critic = build(architecture, self.observations, hyper)
+        # a recurrent policy's minibatches are whole environments
+        if actor.is_recurrent and env.num_envs < hyper.minibatches:
+            raise InputError(
+                f"{env.num_envs} environments cannot be split into {hyper.minibatches} "
+                "minibatches. Give more --environments or fewer --learner.minibatches."
+            )
+        storage = RolloutStorage(
+            "rl", env.num_envs, hyper.steps_per_environment, self.observations,
+            [env.num_actions],
+        )  # fmt: skip
+        group = None
+        if self.ranks.size > 1:
+            group = {
+                "global_rank": self.ranks.rank, "local_rank": self.ranks.local_rank,
+                "world_size": self.ranks.size,
+            }  # fmt: skip
+        self.ppo = TerminalPPO(
+            actor, critic, storage, num_learning_epochs=hyper.epochs,
+            num_mini_batches=hyper.minibatches, clip_param=hyper.clip, gamma=hyper.discount,
+            lam=hyper.gae_lambda, value_loss_coef=hyper.value_weight, entropy_coef=hyper.entropy,
+            learning_rate=hyper.learning_rate, max_grad_norm=hyper.gradient_norm,
+            desired_kl=hyper.desired_kl, use_mixed_precision=hyper.mixed_precision,
+            multi_gpu_cfg=group,
+        )  # fmt: skip
+        if group:
+            self.ppo.broadcast_parameters()
+            torch.manual_seed(seed + 1000 * self.ranks.rank)
+        self.iteration = 0
+
+    @property
+    def actor(self) -> MLPModel:
+        """The policy's network."""
+        return self.ppo.actor
+
+    def rollout(self, watch=None) -> None:
+        """Act for one update's worth of steps; `watch(rewards, dones, extras)` sees each."""
+        with torch.inference_mode():
+            for _ in range(self.hyper.steps_per_environment):
+                actions = self.ppo.act(self.observations)
+                self.observations, rewards, dones, extras = self.env.step(actions)
+                self.ppo.process_env_step(self.observations, rewards, dones, extras)
+                if watch:
+                    watch(rewards, dones, extras)
+            self.ppo.compute_returns(self.observations)
+
+    def update(self) -> dict[str, float]:
+        """Improve policy and critic on what `rollout` collected; mean losses."""
+        losses = self.ppo.update()
+        self.iteration += 1
+        return losses
+
+    # ------------------------------------------------------------------------- checkpoints
+
+    def networks(self) -> dict[str, Any]:
+        """A copy of networks, optimiser and learning rate; `take_back` returns to it."""
+        return copy.deepcopy(self.ppo.save()) | {
+            "learning_rate": self.ppo.learning_rate, "iteration": self.iteration,
+        }  # fmt: skip
+
+    def take_back(self, networks: dict[str, Any]) -> None:
+        """Undo what was learned since `networks`; the environments stay where they are."""
+        self.ppo.load(networks, None, True)
+        self.ppo.learning_rate = networks["learning_rate"]
+        self.iteration = networks["iteration"]
+
+    @property
+    def finite(self) -> bool:
+        """Whether networks, observations and recurrent state are all numbers."""
+        hidden = self.actor.get_hidden_state()
+        states = hidden if isinstance(hidden, tuple) else (hidden,)
+        whole: list[Any] = [
+            *self.ppo.actor.state_dict().values(), *self.ppo.critic.state_dict().values(),
+            *self.observations.values(), *(s for s in states if s is not None),
+        ]  # fmt: skip
+        return all(bool(torch.isfinite(t).all()) for t in whole)
+
+    def save(self, path: Path, more: dict[str, Any]) -> None:
+        """Write a checkpoint in one atomic step; the one before survives if that fails.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written, for example because the disk is full.
+        """
+        hidden = self.actor.get_hidden_state()
+        content = {
+            "schema": CHECKPOINT_SCHEMA,
+            "schema_version": CHECKPOINT_VERSION,
+            "architecture": self.architecture.kind,
+            **self.ppo.save(),
+            "learning_rate": self.ppo.learning_rate,
+            "iteration": self.iteration,
+            "torch_rng": torch.get_rng_state(),
+            "hidden": list(hidden) if isinstance(hidden, tuple) else hidden,
+            "observations": dict(self.observations.items()),
+            "environment": {
+                k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v
+                for k, v in self.env.state.items()
+            },
+            "more": more,
+        }
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_bytes(path, buffer.getvalue(), force=True)
+
+    def load(self, path: Path) -> dict[str, Any]:
+        """Go back to a checkpoint exactly; returns what `save` was given as `more`.
+
+        Raises
+        ------
+        InputError
+            If it is damaged, or of another architecture or environment.
+        """
+        content = read_checkpoint(path)
+        if content["architecture"] != self.architecture.kind:
+            raise InputError(
+                f"{path} holds a policy of kind {content['architecture']}, but the run says "
+                f"{self.architecture.kind}. Resume without --policy, or start a new run."
+            )
+        try:
+            self.take_back(content)
+        except (RuntimeError, KeyError, ValueError) as error:
+            raise InputError(
+                f"{path} does not fit this run's networks ({str(error).splitlines()[0]}). "
+                "Resume with the settings of the run."
+            ) from error
+        state = {
+            k: v.numpy() if isinstance(v, torch.Tensor) else v
+            for k, v in content["environment"].items()
+        }
+        differ = sorted(state.keys() ^ self.env.state.keys())
+        if differ:
+            raise InputError(
+                f"{path} does not fit this run's environments ({differ[0]}). Resume with the "
+                "settings of the run."
+            )
+        self.env.restore(state)
+        hidden = content["hidden"]
+        self.actor.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
+        self.observations = TensorDict(content["observations"], batch_size=[self.env.num_envs])
+        torch.set_rng_state(content["torch_rng"])
+        return content["more"]
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's content, nothing in it executed.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is damaged.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Give the folder of a run that has a checkpoint.")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged files
+        raise InputError(
+            f"{path} is damaged and cannot be read. Resume from another checkpoint of the run."
+        ) from error
+    if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
+        raise InputError(f"{path} is not a checkpoint of pupper-train.")
+    refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)
+    missing = [part for part in _PARTS if part not in content]
+    if missing:
+        raise InputError(f"{path} has no {missing[0]}. Resume from another checkpoint of the run.")
+    return content

@@ -1,0 +1,224 @@
+"""Settings of a training run, and the file in its folder that holds them.
+
+`Run` is all settings (every field a flag of `pupper-train`); `preset` gives complete ones for a
+kind of policy. `save_run` writes `run.yaml` into a run's folder, with hashes and versions;
+`load_run` reads it back and refuses, in a sentence, what it does not understand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import yaml
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256, versions, write_text
+from pupper_sysid.policies.network.file_version import refuse_other_version
+from pupper_sysid.policies.network.hyperparameters import (
+    Architecture,
+    Hyperparameters,
+    Imitation,
+    Kind,
+)
+from pupper_sysid.sim.walking.config import PRESETS, Observation, Walking
+
+RUN_SCHEMA = "pupper-run"
+RUN_VERSION = 1
+RUN_FILE = "run.yaml"
+_DROPPED: dict[type, set[str]] = {Observation: {"privileged_critic"}}
+"""Settings that changed nothing; older files have them."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything that a training run is made of."""
+
+    actuator: str = "calibrated.yaml"
+    """A calibration (`pupper-sysid calibrate` writes one), `paper`, `release` or `ideal`; or a
+    servo model's folder (`pupper-sysid fit-servo`)."""
+    feedback: str = "held"
+    """`held`: readings as the calibration measured them; `ideal`: fresh and exact; or another
+    calibration whose feedback to take."""
+    architecture: Architecture = field(default_factory=Architecture)
+    task: Walking = field(default_factory=Walking)
+    learner: Hyperparameters = field(default_factory=Hyperparameters)
+    imitation: Imitation = field(default_factory=Imitation)
+    environments: int = 512
+    """How many robots learn together (per process)."""
+    iterations: int = 400
+    """Updates of PPO, after imitation; training ends when they are done."""
+    minutes: float = 120.0
+    """Training ends after this time, too."""
+    threads: int = 0
+    """Of physics and of torch, each; 0 for all cores (one per process with torchrun)."""
+    seed: int = 0
+    """Of everything that is drawn."""
+
+    def __post_init__(self):
+        for name in ("threads", "seed"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
+
+
+def preset(name: Literal["fast", "paper", "release"], kind: Kind) -> Run:
+    """Complete settings for one kind of policy.
+
+    `fast` suits a few cores; `paper` and `release` follow the published sizes.
+    """
+    task = PRESETS[name]
+    if name == "fast":
+        # without a memory, reading the gait's phase off one action takes a wide network
+        hidden = (512, 256, 128) if kind in ("mlp", "mlp-actions") else (128, 64)
+        memory = 64
+        return Run(architecture=Architecture(kind, hidden, memory, (256, 128, 64)), task=task)
+    wide = (512, 256, 128)
+    return Run(
+        architecture=Architecture(kind, wide, 128, wide, privileged_critic=False), task=task,
+        learner=Hyperparameters(
+            epochs=5, learning_rate=1e-3, value_weight=1.0, initial_std=1.0, normalise=False,
+            entropy=0.0025 if kind == "mlp" else 0.005,
+        ),
+        imitation=Imitation(iterations=0), environments=4096, iterations=20_000, minutes=1e6,
+    )  # fmt: skip
+
+
+def load_run(folder: Path) -> Run:
+    """Settings of the run in `folder`.
+
+    Raises
+    ------
+    InputError
+        If there is none, or they cannot be understood.
+    """
+    path = folder / RUN_FILE
+    return _from_dict(Run, _read(path).get("settings"), str(path))
+
+
+def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
+    """Settings of a run that goes on, perhaps for longer than it was meant to; kept in its file.
+
+    Raises
+    ------
+    InputError
+        If they cannot be understood, or the actuator's file is not what it was.
+    """
+    path, run = folder / RUN_FILE, load_run(folder)
+    before, source = _read(path).get("actuator_sha256"), Path(run.actuator)
+    if before and not source.is_file():
+        raise InputError(
+            f"{run.actuator}, with which {folder} was trained, is not there. Put it back, or go to "
+            "the folder where the run was begun."
+        )
+    if before and sha256(source) != before:
+        raise InputError(
+            f"{run.actuator} is no longer the file with which {folder} was begun. Put that back, "
+            "or start a new run with this one."
+        )
+    longer = replace(run, iterations=iterations or run.iterations, minutes=minutes or run.minutes)
+    if longer != run:
+        _write(path, longer)
+    return longer
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        raise InputError(f"{path.parent} holds no run: there is no {RUN_FILE} in it.")
+    try:
+        found = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not readable YAML.") from error
+    if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
+        raise InputError(f"{path} is not the settings of a training run.")
+    refuse_other_version(path, found.get("schema_version"), RUN_VERSION)
+    return found
+
+
+def _from_dict(kind: type, given: Any, where: str) -> Any:
+    """A frozen dataclass from plain data, checked against its own types."""
+    if not isinstance(given, dict):
+        raise InputError(f"{where}: expected settings by name.")
+    given = {k: v for k, v in given.items() if k not in _DROPPED.get(kind, ())}
+    default, types = kind(), get_type_hints(kind)
+    unknown = [name for name in given if name not in types]
+    if unknown:
+        raise InputError(f"{where}: unknown setting {unknown[0]}.")
+    values = {}
+    for name, value in given.items():
+        if is_dataclass(types[name]):
+            values[name] = _from_dict(type(getattr(default, name)), value, f"{where}, {name}")
+        else:
+            values[name] = _value(types[name], value, f"{where}: {name}")
+    return replace(default, **values)
+
+
+def _value(kind: Any, given: Any, where: str) -> Any:
+    """A setting that is no dataclass: a number, a word, a list of them."""
+    if get_origin(kind) is tuple and isinstance(given, list):
+        kinds = get_args(kind)
+        if kinds[-1] is Ellipsis:
+            kinds = kinds[:1] * len(given)
+        if len(kinds) == len(given):
+            return tuple(_value(k, g, where) for k, g in zip(kinds, given, strict=True))
+    elif get_origin(kind) is Literal:
+        if given in get_args(kind):
+            return given
+        raise InputError(f"{where} is {given!r}; expected one of {', '.join(get_args(kind))}.")
+    elif kind is float and type(given) in (int, float) and math.isfinite(given):
+        return float(given)
+    elif type(given) is kind and kind is not float:
+        return given
+    wanted = {float: "a number", int: "a whole number", str: "a word", bool: "true or false"}
+    raise InputError(f"{where} is {given!r}; expected {wanted.get(kind, 'a list of numbers')}.")
+
+
+def save_run(folder: Path, run: Run) -> None:
+    """Write the settings of a run that begins.
+
+    Raises
+    ------
+    InputError
+        If the folder holds a run already.
+    """
+    refuse_taken(folder)
+    _write(folder / RUN_FILE, run)
+
+
+def refuse_taken(folder: Path) -> None:
+    """Raise if the folder holds a run already.
+
+    Raises
+    ------
+    InputError
+    """
+    if (folder / RUN_FILE).exists():
+        raise InputError(
+            f"{folder} holds a run already. Resume it with --resume {folder}, or give another "
+            "--name."
+        )
+
+
+def _write(path: Path, run: Run) -> None:
+    source = Path(run.actuator)
+    found = {
+        "schema": RUN_SCHEMA,
+        "schema_version": RUN_VERSION,
+        "settings": plain(run),
+        "actuator_sha256": sha256(source) if source.is_file() else None,
+        "versions": versions("torch", "rsl-rl-lib"),
+    }
+    text = "# Settings of a training run, written by pupper-train.\n"
+    write_text(path, text + yaml.safe_dump(found, sort_keys=False), force=True)
+
+
+def plain(value: Any) -> Any:
+    """Settings as dictionaries and lists."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {k: plain(v) for k, v in asdict(value).items()}
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(v) for v in value]
+    return value

@@ -1,0 +1,315 @@
+"""A training run: a folder with its settings, curves, checkpoints and policies.
+
+`train` begins or resumes one. Its folder holds `run.yaml` (settings, seed, hashes, versions),
+`progress.csv` and TensorBoard events (one row per update), `last.pt` and `best.pt` (checkpoints,
+see `policies.train.learner`), and `policy_last/`, `policy_best/` (see
+`policies.network.policy_file`).
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from pupper_sysid.common.errors import PupperError
+from pupper_sysid.common.memory import keep_freed_memory
+from pupper_sysid.policies.network.policy_export import write_policy
+from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
+from pupper_sysid.policies.train.imitation import imitate
+from pupper_sysid.policies.train.learner import Learner, Ranks
+from pupper_sysid.policies.train.run_file import Run, refuse_taken, resume_run, save_run
+from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
+
+LAST, BEST = "last.pt", "best.pt"
+_SAVE_EVERY = 10
+_SMOOTHED = 0.1  # weight of the newest update in the mean reward that decides what is best
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands; handed to whoever watches it."""
+
+    phase: Literal["imitation", "ppo"]
+    done: int
+    total: int
+    elapsed_s: float
+    row: dict[str, float]
+    left_s: float
+
+
+def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> PupperEnv:
+    """The environment of a run (of this process)."""
+    threads = threads_of(run, ranks)
+    return PupperEnv(
+        run.task, servos or servo_ranges(run.actuator, run.feedback), run.environments,
+        run.seed + 7919 * ranks.rank, threads,
+        servo_model_of(run.actuator, run.task.control_step_s),
+    )  # fmt: skip
+
+
+def threads_of(run: Run, ranks: Ranks) -> int:
+    """How many threads physics and torch may use, each in turn."""
+    return run.threads or (1 if ranks.size > 1 else os.cpu_count() or 1)
+
+
+def make_learner(run: Run, ranks: Ranks) -> Learner:
+    """Environment, policy, critic and PPO of a run."""
+    torch.set_num_threads(threads_of(run, ranks))
+    keep_freed_memory()
+    env = make_env(run, ranks)
+    return Learner(
+        WalkingVecEnv(env, action_history(run, env.servos)), run.architecture, run.learner,
+        run.seed, ranks,
+    )  # fmt: skip
+
+
+def action_history(run: Run, servos: ServoRanges) -> int:
+    """How many past actions make the delayed system Markov: those still on their way, and one."""
+    if run.architecture.kind != "mlp-actions":
+        return 0
+    return int(np.ceil(servos.longest_delay_s / run.task.control_step_s)) + 1
+
+
+def train(
+    folder: Path,
+    run: Run | None,
+    watch: Callable[[Progress], None] | None = None,
+    iterations: int | None = None,
+    minutes: float | None = None,
+) -> Learner:
+    """Begin a run in an empty folder, or (with `run` None) resume the one in it.
+
+    Ctrl-C (or a termination signal) ends it after the present update, with everything saved.
+
+    Parameters
+    ----------
+    folder : Path
+    run : Run or None
+    watch : callable, optional
+        Called after each update.
+    iterations, minutes : optional
+        Until when a resumed run goes on, instead of what it was begun with.
+
+    Raises
+    ------
+    InputError
+        If the folder is in use, or holds no run to resume.
+    PupperError
+        If the numbers stop being numbers; the networks before are saved.
+    """
+    resumed = run is None
+    settings = resume_run(folder, iterations, minutes) if run is None else run
+    session = _Session(folder, settings, resumed, watch)
+    with _interruptible() as asked:
+        session.learn_first_gait(asked)
+        session.improve(asked)
+        session.save(LAST)
+    session.finish()
+    return session.learner
+
+
+class _Session:
+    """One sitting of a run: from its beginning, or from a checkpoint, until someone stops it."""
+
+    def __init__(
+        self,
+        folder: Path,
+        run: Run,
+        resumed: bool,
+        watch: Callable[[Progress], None] | None,
+    ):
+        self.ranks = Ranks.join()
+        self.folder, self.watch = folder, watch
+        self.run = run
+        self.learner = make_learner(self.run, self.ranks)
+        self.counters: dict[str, Any] = {
+            "elapsed_s": 0.0, "imitated": 0, "smooth": None, "best": None,
+        }  # fmt: skip
+        if resumed:
+            self.counters = self.learner.load(folder / _rank_file(LAST, self.ranks))
+        else:
+            self._begin()
+        self.done_before = {
+            "imitation": self.counters["imitated"], "ppo": self.learner.iteration,
+        }  # fmt: skip
+        self.writer = CurveWriter(folder, self.done_before) if self.ranks.rank == 0 else None
+        self.started = time.monotonic() - self.counters["elapsed_s"]
+        self.phase_began = self.started
+
+    def _begin(self) -> None:
+        """A first checkpoint, then the settings: from then on a run that dies can be resumed."""
+        if self.ranks.rank == 0:
+            refuse_taken(self.folder)
+        self.ranks.any(False)  # before that is known, nobody writes
+        self.save(LAST)
+        self.ranks.any(False)  # all have one before there is a run to resume
+        if self.ranks.rank == 0:
+            save_run(self.folder, self.run)
+
+    def learn_first_gait(self, asked: Callable[[], bool]) -> None:
+        """Rounds of imitation that are still to do."""
+        learner, rounds = self.learner, self.run.imitation.iterations
+        self.phase_began = time.monotonic()
+        while self.counters["imitated"] < rounds and not self.ranks.any(asked()):
+            before = learner.networks()
+            error = imitate(learner, self.run.imitation, self.counters["imitated"])
+            self.refuse_nan(before, [error])
+            self.counters["imitated"] += 1
+            if self.counters["imitated"] == rounds:
+                _fresh_optimiser(learner)
+            self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
+            if self.counters["imitated"] % _SAVE_EVERY == 0:
+                self.save(LAST)
+
+    def improve(self, asked: Callable[[], bool]) -> None:
+        """Updates of PPO, until they are done, time is up or someone asks to stop."""
+        if self.counters["imitated"] < self.run.imitation.iterations:
+            return
+        learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
+        self.phase_began = time.monotonic()
+        while learner.iteration < self.run.iterations and not self.ranks.any(
+            asked() or time.monotonic() - self.started >= 60 * self.run.minutes
+        ):
+            begun = time.perf_counter()
+            learner.rollout(episodes)
+            collected = time.perf_counter()
+            before = learner.networks()
+            losses = learner.update()
+            ended = time.perf_counter()
+            self.refuse_nan(before, losses.values())
+            row = episodes.row() | {
+                "value_loss": losses["value"],
+                "entropy": losses["entropy"],
+                "std": float(learner.actor.output_std.detach().mean()),
+                "learning_rate": learner.ppo.learning_rate,
+                "nan_resets": learner.env.env.nan_resets,
+                "samples": self.samples,
+                "collect_s": collected - begun,
+                "update_s": ended - collected,
+            }
+            smooth, reward = self.counters["smooth"], self.ranks.mean(row["reward"])
+            self.counters["smooth"] = (
+                reward if smooth is None else smooth + _SMOOTHED * (reward - smooth)
+            )
+            self.report("ppo", learner.iteration, self.run.iterations, row)
+            if learner.iteration % _SAVE_EVERY == 0:
+                best = self.counters["best"]
+                if best is None or self.counters["smooth"] > best:
+                    self.counters["best"] = self.counters["smooth"]
+                    self.save(BEST)
+                    self.write_policy("policy_best")
+                self.save(LAST)  # after that, or a resumed run would not know its best
+
+    def finish(self) -> None:
+        """Write the last policy, and end the curves."""
+        self.write_policy("policy_last")
+        if self.writer:
+            self.writer.close()
+
+    @property
+    def samples(self) -> int:
+        """Control steps of all robots of all processes that PPO has learned from."""
+        env = self.learner.env
+        per_update = self.learner.hyper.steps_per_environment * env.num_envs * self.ranks.size
+        return self.learner.iteration * per_update
+
+    def save(self, name: str) -> None:
+        """Write a checkpoint."""
+        self.learner.save(self.folder / _rank_file(name, self.ranks), self.counters)
+
+    def write_policy(self, name: str) -> None:
+        """Write a policy folder."""
+        if self.ranks.rank != 0:
+            return
+        servos = self.learner.env.env.servos
+        about = {
+            "iteration": self.learner.iteration, "imitation_rounds": self.counters["imitated"],
+            "reward": self.counters["smooth"], "seed": self.run.seed, "samples": self.samples,
+            "elapsed_s": self.counters["elapsed_s"],
+        }  # fmt: skip
+        write_policy(
+            self.folder / name, self.learner.actor.state_dict(), self.run, servos,
+            action_history(self.run, servos), about,
+        )  # fmt: skip
+
+    def report(
+        self, phase: Literal["imitation", "ppo"], done: int, total: int, row: dict[str, float]
+    ) -> None:
+        """One row of the curves, and word to whoever watches."""
+        now = time.monotonic()
+        elapsed = self.counters["elapsed_s"] = now - self.started
+        row = {"elapsed_s": elapsed, **row}
+        if self.writer:
+            self.writer.write(phase, done, row)
+        if self.watch and self.ranks.rank == 0:
+            steps = max(done - self.done_before[phase], 1)
+            left = (total - done) * (now - self.phase_began) / steps
+            if phase == "ppo":
+                left = min(left, 60 * self.run.minutes - elapsed)
+            self.watch(Progress(phase, done, total, elapsed, row, max(left, 0.0)))
+
+    def refuse_nan(self, before: dict[str, Any], numbers: Iterable[float]) -> None:
+        """Raise if anything stopped being a number; the networks of before are then saved."""
+        learner, last = self.learner, self.folder / LAST
+        fine = all(np.isfinite(x) for x in numbers) and learner.finite
+        if not self.ranks.any(not fine):
+            return
+        learner.take_back(before)
+        if self.ranks.any(not learner.finite):
+            raise PupperError(
+                f"The simulation gave observations that are not numbers after update "
+                f"{learner.iteration}. Nothing was saved; {last} is what it was before."
+            )
+        # a resumed run then collects other data with the networks from before
+        self.save(LAST)
+        raise PupperError(
+            f"The policy's numbers stopped being numbers after update {learner.iteration}. The "
+            f"networks before that are in {last}: pupper-train --resume {self.folder} goes on "
+            "from them; if it happens again, start a run with a lower --learner.learning-rate."
+        )
+
+
+def _rank_file(name: str, ranks: Ranks) -> str:
+    """Each rank has environments of its own, so each keeps a checkpoint."""
+    return name if ranks.rank == 0 else name.replace(".pt", f".rank{ranks.rank}.pt")
+
+
+def _fresh_optimiser(learner: Learner) -> None:
+    """Forget imitation's momentum, and give PPO its own learning rate."""
+    ppo = learner.ppo
+    ppo.optimizer = torch.optim.Adam(
+        [*ppo.actor.parameters(), *ppo.critic.parameters()], lr=learner.hyper.learning_rate
+    )
+    ppo.learning_rate = learner.hyper.learning_rate
+
+
+@contextmanager
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and termination become a question that is asked between updates."""
+    asked = False
+
+    def note(number, frame) -> None:
+        nonlocal asked
+        asked = True
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {n: signal.signal(n, note) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,99 @@
+"""WalkingVecEnv: `sim.walking.env.PupperEnv` with the contract that rsl_rl's learner expects.
+
+Observation groups: `policy` is the observation of 60 numbers, `privileged` what a critic in the
+simulator may know beside it, and `actions` the last `action_history` actions, newest first: with
+them the delayed system is Markov again (the paper's augmented state). Tensors are copies, since the
+learner keeps them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from pupper_sysid.sim.walking.env import PupperEnv
+
+
+class WalkingVecEnv:
+    """Adapter; `env` is the environment itself.
+
+    Parameters
+    ----------
+    env : PupperEnv
+    action_history : int
+        How many past actions the group `actions` holds; 0 leaves the group out.
+    """
+
+    num_actions = 12
+
+    def __init__(self, env: PupperEnv, action_history: int = 0):
+        self.env = env
+        self.num_envs = env.environments
+        self.max_episode_length = env.config.episode_steps
+        self.cfg: dict[str, Any] = {}
+        self._past = np.zeros((env.environments, action_history, self.num_actions))
+        self._past[:] = env.action[:, None]
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps of each episode so far."""
+        return torch.from_numpy(self.env.episode_step.copy())
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self.env.episode_step[:] = steps.cpu().numpy()
+
+    def get_observations(self) -> TensorDict:
+        """Observations of the present state; lets no time pass."""
+        return self._groups(*self.env.observe(), self._past)
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """One control step; see `PupperEnv.step`.
+
+        Returns
+        -------
+        observations, rewards, dones, extras
+            `extras` has `terminal_ids` and `terminal_observations` of the environments whose time
+            was up, and `terms`, the reward terms.
+        """
+        found = self.env.step(actions.detach().cpu().numpy())
+        ended = self._past
+        if self._past.shape[1]:
+            ended = np.concatenate([actions.cpu().numpy()[:, None], self._past[:, :-1]], axis=1)
+            self._past = ended.copy()
+            self._past[found.done] = self.env.action[found.done][:, None]
+        late = found.terminal["ids"]
+        extras: dict[str, Any] = {"terms": found.terms, "terminal_ids": torch.from_numpy(late)}
+        if len(late):
+            extras["terminal_observations"] = self._groups(
+                found.terminal["observation"], found.terminal["privileged"], ended[late]
+            )
+        return (
+            self._groups(found.observation, found.privileged, self._past),
+            torch.from_numpy(found.reward.astype(np.float32)),
+            torch.from_numpy(found.done),
+            extras,
+        )
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Everything that changes; `restore` takes it back exactly."""
+        return self.env.state | {"past_actions": self._past.copy()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go back to a `state`."""
+        self.env.restore(state)
+        self._past[:] = state["past_actions"]
+
+    def _groups(self, observation, privileged, past) -> TensorDict:
+        groups = {"policy": observation, "privileged": privileged}
+        if past.shape[1]:
+            groups["actions"] = past.reshape(len(past), -1).astype(np.float32)
+        return TensorDict(
+            {k: torch.from_numpy(v) for k, v in groups.items()}, batch_size=[len(observation)]
+        )

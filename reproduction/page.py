@@ -1,0 +1,363 @@
+"""`pupper-analyze claims`: every published claim beside what is found here, as two pages.
+
+`claims.md` is for a repository, `claims.html` for reading: one file with its pictures inside.
+Beside them lie the pictures as PNG and SVG and the tables as CSV.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, run_folder
+from pupper_sysid.cli.terminal import err, out, print_json
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_text
+
+if TYPE_CHECKING:
+    from pupper_sysid.cli.programs.pupper_analyze import Analyze, Tries
+    from pupper_sysid.common.page import Picture, Section
+    from reproduction.claims import Claim
+    from reproduction.evidence import PolicyEvidence
+    from reproduction.servos import ServoEvidence
+
+PAGE, REPORT = "claims.md", "claims.html"
+PICTURES = (
+    "sweep", "gait-lstm", "gait-mlp", "orbits", "late", "ablation", "delay", "autonomy", "terrain",
+    "compliance", "servos",
+)  # fmt: skip
+"""All that may be drawn; which are depends on the evidence."""
+TABLES = ("claims", "table_one", "inputs")
+_STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
+_STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
+
+
+def write_claims(options: Analyze, tries: Tries) -> None:
+    """Gather, judge, draw and write."""
+    from pupper_sysid.common.page import write_page
+    from reproduction import servos as servo_claims
+    from reproduction.evidence import KINDS, gather
+    from reproduction.policies import judge
+
+    page, report = options.folder / PAGE, options.folder / REPORT
+    figures = [f"figures/{name}{ending}" for name in PICTURES for ending in (".png", ".svg")]
+    tables = [f"tables/{name}.csv" for name in TABLES]
+    for name in (PAGE, REPORT, *figures, *tables):  # before hours of work, not after them
+        refuse_overwrite(options.folder / name, options.force)
+    for name, policy, _ in tries:
+        if policy.contract.kind not in KINDS:
+            raise InputError(
+                f"{name} is of the kind {policy.contract.kind}, about which nothing was published, "
+                f"so no claim would count it. Leave it out; claims are about {', '.join(KINDS)}."
+            )
+    recordings = terminal.load_all(options.recordings) if options.recordings else []
+    say = _say
+    robot = servo_claims.gather(recordings, options.seed, say)
+    evidence = []
+    for (name, policy, trial), path in zip(tries, options.policies, strict=True):
+        evidence.append(gather(name, policy, trial, run_folder(path), say))
+    stacks = _stacks(options, say)
+    found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
+    pictures = _draw(evidence, robot)
+    inputs = _inputs(options, tries)
+    text = _page(found, evidence, pictures, inputs, options)
+    write_text(page, text, options.force)
+    write_page(
+        report, _TITLE, _tally(found), _sections(found, evidence, pictures, inputs, options),
+        options.force,
+    )  # fmt: skip
+    if options.json:
+        print_json(
+            {
+                "claims": [asdict(c) for c in found], "page": str(page), "report": str(report),
+                "pictures": [_file(p) for p in pictures], "inputs_sha256": inputs,
+                "versions": versions(*_MORE),
+            }
+        )  # fmt: skip
+        return
+    shown = terminal.table("Published claims", "", "claim", "paper", "here", "verdict")
+    for c in found:
+        shown.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
+    out.print(shown)
+    err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.", soft_wrap=True)
+
+
+def _say(what: str) -> None:
+    err.print(f"{what} …", style="dim")
+
+
+def _stacks(options: Analyze, say: Any) -> list[dict[str, Any]]:
+    """Closed loop against the servo model's prediction, walked by the first policy."""
+    if options.servo is None:
+        return []
+    from dataclasses import replace
+
+    from pupper_sysid.policies.deploy.stack_trials import Walker, compare_stacks
+    from pupper_sysid.policies.deploy.stacks import STACKS
+
+    policy, run = policy_at(options.policies[0])
+    actuator = chosen_actuator(options.policies[0], policy, run, options.actuator)
+    closed = STACKS["closed-loop"]
+    # the same smoothing in both: only what the policy is shown differs
+    predicted = replace(closed, observer="servo-model")
+    # a servo model is one robot's: the one of --seed
+    walkers = [Walker(options.seed, options.servo, k) for k in range(_STACK_ROUNDS)]
+    return compare_stacks(
+        policy, {"encoders": closed, "servo model": predicted}, walkers, _STACK_COMMANDS,
+        _STACK_SECONDS, actuator, say,
+    )  # fmt: skip
+
+
+def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Longest trial of each joint of the playback."""
+    if robot.played is None:
+        return {}
+    found = {}
+    for joint in robot.played.joints:
+        trial = max(robot.played.trials(joint), key=lambda t: len(t.send_time_s))
+        found[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
+    return found
+
+
+def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]:
+    """What can be shown of the evidence."""
+    from pupper_sysid.common.page import Picture
+    from pupper_sysid.policies.analysis import figures
+    from pupper_sysid.sysid.report.figures import sweep_figure
+    from pupper_sysid.sysid.report.servo_figures import compare_figure
+    from reproduction.evidence import DELAYS_MS
+
+    made: list[Picture] = []
+    if robot.sweep is not None:
+        joint = robot.sweep.joints[-1]
+        trials = [t for t in robot.sweep.trials(joint) if np.isfinite(t.frequency_hz)]
+        caption = "As the paper's figure 2: commands and readings by frequency. Faint ones are old."
+        made.append(Picture("sweep", caption, sweep_figure(trials)))
+    for kind in ("lstm", "mlp"):
+        first = next((e for e in evidence if e.kind == kind), None)
+        if first:
+            caption = f"As figure 4: the gait of {first.name}."
+            made.append(Picture(f"gait-{kind}", caption, figures.gait_figure(first.walk)))
+    shown = _one_per_kind([e for e in evidence if e.orbits])
+    if shown:
+        orbits = {f"{e.name} {k}": v["orbits"] for e in shown for k, v in e.orbits.items()}
+        late = {e.name: e.orbits["actions"]["states"] for e in shown}
+        made += [
+            Picture(
+                "orbits",
+                "As figure 5: orbits of actions and hidden states, joints late by 0, 160, 320 ms.",
+                figures.orbit_figure(orbits, DELAYS_MS),
+            ),
+            Picture(
+                "late",
+                "As figure 6: the LF thigh's action in replay with late joints.",
+                figures.delay_trace_figure(late, DELAYS_MS, shown[0].walk.step_s),
+            ),
+        ]
+    every = _one_per_kind(evidence)
+    own_rhythm = {e.name: {"frozen": e.frozen, "push": e.push, "rate": e.rate} for e in every}
+    made += [
+        Picture(
+            "ablation",
+            "As figure 7a: correlation of actions against noise in all that comes from the joints.",
+            figures.ablation_figure({e.name: e.ablation for e in every}),
+        ),
+        Picture(
+            "delay",
+            "Closed loop and replay against more delay, which the paper shows in replay only.",
+            figures.delay_figure({e.name: e.delay for e in every}),
+        ),
+        Picture(
+            "autonomy",
+            "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
+            figures.autonomy_figure(own_rhythm),
+        ),
+        Picture("terrain", "Other ground.",
+                figures.terrain_figure({e.name: e.terrain for e in every})),
+        Picture(
+            "compliance",
+            "As figure 7b: where one robot goes in six directions in ten seconds.",
+            figures.compliance_figure({e.name: e.compliance for e in every}),
+        ),
+    ]  # fmt: skip
+    if robot.servos is not None:
+        caption = "As the extension's figure: four ways to say where a servo will be, unseen loop."
+        made.append(Picture("servos", caption, compare_figure(robot.servos)))
+    return made
+
+
+def _file(picture: Picture) -> str:
+    """Where a page finds its picture."""
+    return f"figures/{picture.name}.png"
+
+
+def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
+    """The first policy of each architecture."""
+    return list({e.kind: e for e in reversed(evidence)}.values())[::-1]
+
+
+def _page(
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
+    inputs: dict[str, str], options: Analyze,
+) -> str:  # fmt: skip
+    """The report as Markdown."""
+    lines = [
+        f"# {_TITLE}", "", _tally(found), "", "Made by", "", "```", _command(options), "```", "",
+        _ABOUT, "",
+        "| | claim | paper | here | interval | verdict | how |", "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for c in found:
+        lines.append(
+            f"| {c.id} | {c.claim} | {c.paper} | {c.ours} | {_bounds(c)} | **{c.verdict}** | "
+            f"{c.how} |"
+        )
+    kinds, rows = _table_one(evidence)
+    lines += ["", f"## {_TABLE_ONE}", "", "| | " + " | ".join(kinds) + " |"]
+    lines += ["|---|" + "---|" * len(kinds)]
+    lines += [f"| {title} | " + " | ".join(cells) + " |" for title, cells in rows]
+    lines += ["", "## Pictures", ""]
+    for picture in pictures:
+        lines += [f"![{picture.caption}]({_file(picture)})", "", picture.caption, ""]
+    lines += [f"## {_MADE}", "", f"{_versions()}.", "", "| input | SHA-256 |", "|---|---|"]
+    lines += [f"| {name} | `{digest}` |" for name, digest in inputs.items()]
+    return "\n".join([*lines, ""])
+
+
+def _sections(
+    found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
+    inputs: dict[str, str], options: Analyze,
+) -> list[Section]:  # fmt: skip
+    """The same as a page in the style of the other reports."""
+    from pupper_sysid.common.page import Column, Section, Table
+
+    claims = tuple(
+        {**asdict(c), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
+        for c in found
+    )
+    columns = (
+        Column("", lambda row: row["id"], "key"),
+        *(
+            Column(heading, lambda row, key=key: row[key], "prose")
+            for heading, key in (
+                ("claim", "claim"), ("paper", "paper"), ("here", "here"), ("how", "how"),
+            )
+        ),
+        Column("verdict", lambda row: row["verdict"], "words"),
+    )  # fmt: skip
+    kinds, rows = _table_one(evidence)
+    one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
+    first = Column("", lambda row: row[""], "words")
+    return [
+        Section(
+            "claims", "Claims", [_ABOUT],
+            tables=[Table("claims", "What the paper says, and what is found here",
+                          columns, claims)],
+        ),
+        Section(
+            "table", _TABLE_ONE,
+            tables=[Table("table_one", "Architectures, means and 90 % intervals",
+                          (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
+        ),
+        Section(
+            "pictures", "Pictures",
+            figures=pictures,
+        ),
+        Section(
+            "made", _MADE, [f"Made by: {_command(options)}", f"{_versions()}."],
+            tables=[Table("inputs", "What it was made from", (
+                Column("input", lambda row: row["input"], "words"),
+                Column("SHA-256", lambda row: row["digest"], "prose"),
+            ), tuple({"input": k, "digest": v} for k, v in inputs.items()))],
+        ),
+    ]  # fmt: skip
+
+
+_TITLE, _TABLE_ONE = "The published claims, one by one", "Table I, regenerated"
+_MADE = "Where this comes from"
+_MORE = ("torch", "pandas")  # packages that shape these numbers beside the usual ones
+_ABOUT = (
+    "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
+    "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
+    "what needs the physical one is said to."
+)
+
+
+def _tally(found: list[Claim]) -> str:
+    verdicts = [c.verdict for c in found]
+    tally = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    return f"{len(found)} claims: {tally}."
+
+
+def _command(options: Analyze) -> str:
+    """What was typed, with files by their names."""
+    parts = ["pupper-analyze claims", *(str(p) for p in options.policies)]
+    if options.recordings:
+        parts += ["--recordings", *(p.name for p in options.recordings)]
+    if options.servo:
+        parts += ["--servo", options.servo.name]
+    for flag in ("actuator", "feedback"):
+        if getattr(options, flag):
+            parts += [f"--{flag}", str(getattr(options, flag))]
+    parts += ["--command", *(f"{c:g}" for c in options.command)]
+    for flag in ("robots", "seconds", "seed"):
+        parts += [f"--{flag}", f"{getattr(options, flag):g}"]
+    return " ".join([*parts, "--out", str(options.folder)])
+
+
+def _versions() -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions(*_MORE).items())
+
+
+def _inputs(options: Analyze, tries: Tries) -> dict[str, str]:
+    """SHA-256 of everything the page rests on, by name."""
+    from pupper_sysid.servo_models.servo_file import WEIGHTS
+
+    found = {f"policy {name}": policy.contract.weights_sha256 for name, policy, _ in tries}
+    servos = {Path(trial.servos.source) for _, _, trial in tries}
+    if options.servo:
+        servos.add(options.servo)
+    files = [p / WEIGHTS if p.is_dir() else p for p in sorted(servos)]
+    files += options.recordings
+    return found | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
+
+
+def _bounds(claim: Claim) -> str:
+    known = (claim.interval or {}).items()
+    return "; ".join(f"{k} {_number(v[0])} to {_number(v[1])}" for k, v in known) or "–"
+
+
+def _table_one(evidence: list[PolicyEvidence]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """A column per architecture: their names, and rows of a title and a cell for each."""
+    from reproduction.evidence import KINDS, over
+
+    kinds = [k for k in KINDS if any(e.kind == k for e in evidence)]
+    known = [e for e in evidence if e.trained]
+    rows: dict[str, Any] = {
+        "reward per second": (known, lambda e: e.trained["reward"], 2),
+        "action noise": (known, lambda e: e.trained["std"], 4),
+        "updates of PPO": (known, lambda e: e.trained["updates"], 0),
+        "steps/s in training": (known, lambda e: e.trained["steps_per_s"], 0),
+        "still up after 10 s, flat": (evidence, lambda e: e.terrain[0]["survival"], 2),
+        "still up, other ground": (
+            evidence, lambda e: float(np.mean([r["survival"] for r in e.terrain[1:]])), 2,
+        ),
+        "forward error, m/s": (evidence, lambda e: e.terrain[0]["mae_vx_m_s"], 3),
+    }  # fmt: skip
+    made = [("policies", [str(sum(e.kind == k for e in evidence)) for k in kinds])]
+    for title, (where, value, digits) in rows.items():
+        cells = []
+        for kind in kinds:
+            found = over(where, kind, value)
+            cells.append(terminal.number(found.value, digits))
+            if np.isfinite(found.low):
+                cells[-1] += f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
+        made.append((title, cells))
+    return [KINDS[k] for k in kinds], made
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"

@@ -1,0 +1,216 @@
+"""The published claims about servos, judged by recordings of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pupper_sysid.sysid.doctor.examination import JointExamination, examine
+from pupper_sysid.sysid.identify.calibrate import DeadTime, dead_times
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.servo_fit import scores as servo_scores
+from pupper_sysid.sysid.servo_fit.compare import Comparison
+from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
+from reproduction.claims import Claim, Finding, NotTestable, claim, holds
+
+
+@dataclass
+class ServoEvidence:
+    """What recordings of a robot say."""
+
+    lag: dict[str, DeadTime] = field(default_factory=dict)
+    """Per joint, from sweeps."""
+    health: dict[str, JointExamination] = field(default_factory=dict)
+    """Of the joints of sweeps."""
+    sweep: Recording | None = None
+    """The sweep with most rows."""
+    servos: Comparison | None = None
+    """From a playback or walk."""
+    played: Recording | None = None
+    """That playback or walk: the recording with most joints that is no sweep."""
+
+
+def gather(
+    recordings: Sequence[Recording], seed: int, say: Callable[[str], None] = lambda what: None
+) -> ServoEvidence:
+    """Lag and staleness from sweeps, servo models from the recording with most joints."""
+    found = ServoEvidence()
+    rng = np.random.default_rng(seed)
+    tones = [bool(np.isfinite(r.table["frequency_hz"]).any()) for r in recordings]
+    sweeps = [r for r, tone in zip(recordings, tones, strict=True) if tone]
+    others = [r for r, tone in zip(recordings, tones, strict=True) if not tone]
+    for recording in sweeps:
+        found.health |= {
+            f"{recording.name} {name}": one for name, one in examine(recording, rng).joints.items()
+        }
+    if sweeps:
+        say("lag of the sweeps")
+        found.lag = dead_times(sweeps, None, seed)
+        found.sweep = max(sweeps, key=lambda r: len(r.table))
+    if others:
+        found.played = max(others, key=lambda r: (len(r.joints), len(r.table)))
+        say(f"servo models on {found.played.name}")
+        found.servos = four_way(found.played, found.played.joints, seed)
+    return found
+
+
+def judge(evidence: ServoEvidence) -> list[Claim]:
+    """All claims about servos."""
+    return [one(evidence) for one in _CLAIMS]
+
+
+@claim(
+    "A1", "Transport delay is a constant 76 ms from 1 to 6 Hz", "76 ms, same at all rates",
+    "Sweeps: lag of all rows, of fresh rows, and of the servo (`pupper-sysid delay`).",
+)  # fmt: skip
+def constant_lag(found: ServoEvidence) -> Finding:
+    """A1."""
+    budgets = [d.budget for d in _sweeps(found).values()]
+    naive, fresh, servo = (
+        1e3 * np.mean([getattr(b, k).value for b in budgets]) for k in ("naive", "fresh", "lag")
+    )
+    by_rate = [1e3 * f.lag.value for b in budgets for f in b.by_frequency]
+    dead = 1e3 * np.mean([d.dead_time.value for d in found.lag.values()])
+    ours = (
+        f"{naive:.0f} ms in all rows, {fresh:.0f} ms in fresh ones, {servo:.0f} ms the servo's own "
+        f"({dead:.0f} ms of it dead time); {min(by_rate):.0f} to {max(by_rate):.0f} ms by frequency"
+    )
+    bounds = {
+        "servo": [1e3 * min(b.lag.low for b in budgets), 1e3 * max(b.lag.high for b in budgets)]
+    }
+    stale = float(1 - servo / naive)
+    return Finding(
+        ours, bounds, holds(stale <= 0.15, True),
+        f"It holds as a sum; {100 * stale:.0f} % of it is bus and stale feedback.",
+    )  # fmt: skip
+
+
+@claim(
+    "A2", "Tracking degrades above 3 Hz", "visible loss of amplitude above 3 Hz",
+    "Sweeps: gain per tone, of all rows and of fresh ones.",
+)  # fmt: skip
+def above_three_hertz(found: ServoEvidence) -> Finding:
+    """A2."""
+    tones = [f for d in found.lag.values() for f in d.budget.by_frequency]
+    high = [f for f in tones if f.frequency_hz > 3.0]
+    if not high:
+        raise NotTestable("Give sweeps above 3 Hz with --recordings.")
+    low = [f.gain for f in tones if f.frequency_hz <= 3.0]
+    before, after = float(np.mean(low)), float(np.mean([f.gain for f in high]))
+    naive = float(np.mean([f.naive_gain for f in high]))
+    lost = 1 - after / before
+    return Finding(
+        f"gain {before:.2f} up to 3 Hz, {after:.2f} above (all rows, as the paper: {naive:.2f})",
+        None, holds(lost >= 0.3, lost >= 0.05),
+        f"Lost: {100 * lost:.0f} %; 30 % would hold, 5 % partly.",
+    )  # fmt: skip
+
+
+@claim(
+    "A3", "Readings are noisy", "σ 0.101 rad in position, 3.17 rad/s in velocity",
+    "Sweeps: noise of fresh readings about their tone; share of rows that repeat an old value.",
+)  # fmt: skip
+def reading_noise(found: ServoEvidence) -> Finding:
+    """A3."""
+    noise = float(np.mean([d.budget.noise_rad for d in _sweeps(found).values()]))
+    fresh = float(np.mean([h.fresh_fraction for h in found.health.values()]))
+    return Finding(
+        f"σ {1e3 * noise:.1f} mrad in fresh readings; {100 * (1 - fresh):.0f} % of rows are old",
+        None, holds(noise >= 0.03),
+        "It is staleness, not noise: √2 · 0.101 · 25 Hz gives their velocity, too.",
+    )  # fmt: skip
+
+
+@claim(
+    "S1", "A servo network is far better than a PD", "PD 0.1 to 1.8 rad, MLP 0.003 to 0.03 rad",
+    "Playback, last loop held out, free run from commands alone, per joint.",
+)  # fmt: skip
+def servo_error(found: ServoEvidence) -> Finding:
+    """S1."""
+    published, fitted, mlp = (_by_joint(found, name) for name in (PUBLISHED, FITTED, "MLP"))
+    return Finding(
+        f"published PD {_range(published)}, a fitted PD {_range(fitted)}, MLP {_range(mlp)} mrad",
+        None, holds(bool(np.mean(fitted) > 3 * np.mean(mlp))),
+        "Holds if a fitted PD is 3 times worse.",
+    )  # fmt: skip
+
+
+@claim(
+    "S2", "In free run the LSTM servo drifts", "RMSE LSTM 0.070, MLP 0.028 rad",
+    "As S1, mean of the joints, 90 % intervals over stretches of time.",
+)  # fmt: skip
+def free_run(found: ServoEvidence) -> Finding:
+    """S2."""
+    mean = {k: 1e3 * float(np.mean(_by_joint(found, k))) for k in ("LSTM", "MLP")}
+    errors = _servos(found).errors
+    return Finding(
+        f"LSTM {mean['LSTM']:.1f}, MLP {mean['MLP']:.1f} mrad",
+        {k: [1e3 * x for x in servo_scores.interval(errors[k], 0)] for k in mean},
+        holds(mean["LSTM"] > 1.5 * mean["MLP"]),
+        "Ours is driven by commands only; holds if it is 1.5 times worse.",
+    )  # fmt: skip
+
+
+@claim(
+    "S3", "One step ahead the LSTM servo is better", "LSTM better in one step",
+    "As S1, one step ahead of the last reading; beside it a servo that stays put.",
+)  # fmt: skip
+def one_step(found: ServoEvidence) -> Finding:
+    """S3."""
+    servos = _servos(found)
+    ahead = {
+        k: 1e3 * float(np.mean([servo_scores.rms(e.one_step) for e in servos.errors[k].values()]))
+        for k in ("LSTM", "MLP")
+    }
+    still = 1e3 * float(np.nanmean(list(servos.persistence.values())))
+    return Finding(
+        f"LSTM {ahead['LSTM']:.1f}, MLP {ahead['MLP']:.1f}, stays put {still:.1f} mrad", None,
+        holds(ahead["LSTM"] < 0.95 * ahead["MLP"]), "Holds if 5 % better.",
+    )  # fmt: skip
+
+
+@claim(
+    "S4", "390 samples per joint are enough", "390 samples in 3 loops",
+    "As S1: MLP against how well the robot repeats itself.",
+)  # fmt: skip
+def enough_data(found: ServoEvidence) -> Finding:
+    """S4."""
+    mlp = 1e3 * float(np.mean(_by_joint(found, "MLP")))
+    known = [v for v in _servos(found).repeatability.values() if np.isfinite(v)]
+    if not known:
+        raise NotTestable("Give a playback that sends the same commands more than once.")
+    floor = 1e3 * float(np.mean(known))
+    rows = len(found.played.table) // len(found.played.joints) if found.played else 0
+    return Finding(
+        f"{rows} rows per joint: MLP {mlp:.1f} mrad, the robot repeats to {floor:.1f}", None,
+        holds(mlp <= 1.1 * floor, True), "More data: the data curve of the servo report.",
+    )  # fmt: skip
+
+
+def _sweeps(found: ServoEvidence) -> dict[str, DeadTime]:
+    if not found.lag:
+        raise NotTestable("Give sweeps with --recordings.")
+    return found.lag
+
+
+def _servos(found: ServoEvidence) -> Comparison:
+    if found.servos is None:
+        raise NotTestable("Give a playback or walk with --recordings.")
+    return found.servos
+
+
+def _by_joint(found: ServoEvidence, model: str) -> np.ndarray:
+    """Free-run error of each joint [rad]."""
+    return np.array([servo_scores.rms(e.free_run) for e in _servos(found).errors[model].values()])
+
+
+def _range(values: np.ndarray) -> str:
+    """Smallest to largest, in mrad."""
+    return f"{1e3 * np.nanmin(values):.0f} to {1e3 * np.nanmax(values):.0f}"
+
+
+_CLAIMS = (
+    constant_lag, above_three_hertz, reading_noise, servo_error, free_run, one_step, enough_data,
+)  # fmt: skip

@@ -1,0 +1,1 @@
+"""The calibration file: what was measured of a robot's servos."""

@@ -1,0 +1,276 @@
+"""Calibration: what was measured of a robot's servos, in one YAML file that others can read.
+
+A calibration holds, per joint, an actuator (what the servo does with a command) and a feedback
+(what makes its readings old, coarse and off), each number with its 90 % interval and whether the
+data identified it, and beside them what a reader needs to distrust it: scores, input hashes,
+versions, seed. `load_calibration` reads a file or a preset and refuses, in one sentence, whatever
+it cannot trust; `Calibration.save` writes one. `Calibration.delayed_pd` and
+`Calibration.held_feedback` are the models that a simulator runs.
+
+Presets are published settings in the same form: `paper` is the actuator of the paper
+"Reinforcement Learning on Cost-Constrained Quadrupedal Hardware" (Mini Pupper 2) as its text gives
+it, `release` the one in the training configuration its authors released. Neither is a measurement.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import write_text
+from pupper_sysid.common.joints import in_order, strange_joint
+from pupper_sysid.common.strict_yaml import dump, read
+from pupper_sysid.servo_models.calibration.parts import (
+    PARAMETER_KEYS,
+    JointCalibration,
+    Part,
+    Whole,
+)
+from pupper_sysid.servo_models.calibration.refusals import explain
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.held_feedback import HeldFeedback
+
+SCHEMA = "pupper-calibration"
+SCHEMA_VERSION = 1
+PRESETS = ("paper", "release")
+
+UNITS = (
+    "SI: radians of the simulator frame, seconds, N·m, kg·m²; every name ends in its unit; "
+    "ratios_to_armature are per kg·m²; low and high are the ends of the 90 % interval."
+)
+
+_HEADER = """\
+# Calibration of a robot's servos, written by pupper-sysid.
+#
+# Per joint: `actuator` is what the servo does with a command, `feedback` is what makes a reading
+# of it old, coarse and off. Simulate them apart: the one on the torque, the other on the reading.
+# A number reads {value, low, high, identified, why}: low and high are the ends of its 90 %
+# interval (null: none), and `identified` says whether the recording determined it:
+#   yes         the recording determined it
+#   ratio only  its ratio to the armature was determined; the scale was assumed (see `scale`)
+#   no          the recording says nothing about it (see `why`)
+# Times are in seconds, angles in radians, torques in N·m. Unknown keys are refused.
+"""
+
+
+class InputFile(Part):
+    """A file the calibration was made from."""
+
+    name: str
+    """File name, without folders."""
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    """SHA-256 of the file, 64 hexadecimal digits."""
+
+
+class Calibration(Part):
+    """What was measured of a robot's servos. See the module's text.
+
+    Built from its parts, or by `load_calibration`. Frozen.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        If built in Python from parts that do not fit; `load_calibration` raises `InputError`.
+    """
+
+    schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
+    """What kind of file this is."""
+    schema_version: Literal[1] = SCHEMA_VERSION
+    """Version of the file's form."""
+    robot: str
+    """What was measured."""
+    created: str
+    """When, in UTC and ISO 8601."""
+    inputs: Annotated[tuple[InputFile, ...], Field(strict=False)] = ()
+    """The recordings it was made from."""
+    seed: Whole | None = None
+    """Seed of the random numbers that were used, or null."""
+    versions: dict[str, str] = Field(default_factory=dict)
+    """Versions of this project and of the libraries that shape its numbers."""
+    units: str = UNITS
+    """What the numbers are in."""
+    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """What a reader should know, in sentences."""
+    joints: Annotated[dict[str, JointCalibration], Field(min_length=1)]
+    """The joints, by name."""
+
+    @field_validator("created")
+    @classmethod
+    def _check_created(cls, text: str) -> str:
+        try:
+            offset = datetime.fromisoformat(text).utcoffset()
+        except ValueError:
+            offset = None
+        if offset != timedelta(0):
+            raise PydanticCustomError(
+                "created",
+                "'{text}' is no time in UTC; write it like 2026-01-31T12:00:00+00:00",
+                {"text": text},
+            )
+        return text
+
+    @field_validator("joints")
+    @classmethod
+    def _check_joints(cls, joints: dict[str, JointCalibration]) -> dict[str, JointCalibration]:
+        if strange := strange_joint(joints):
+            name, hint = strange
+            raise PydanticCustomError(
+                "joint", "{name} is no joint; {hint}", {"name": name, "hint": hint.rstrip(".?")}
+            )
+        return {name: joints[name] for name in in_order(joints)}
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints of this calibration, in the order of `common.joints.in_order`."""
+        return tuple(self.joints)
+
+    def joint(self, name: str) -> JointCalibration:
+        """Calibration of the joint `name`.
+
+        Raises
+        ------
+        InputError
+            If this calibration does not have that joint.
+        """
+        if name not in self.joints:
+            raise InputError(
+                f"The calibration of {self.robot} has no joint {name}. "
+                f"It has {', '.join(self.joints)}."
+            )
+        return self.joints[name]
+
+    def delayed_pd(
+        self, joints: Sequence[str] | None = None, time_step_s: float = TIME_STEP_S
+    ) -> DelayedPD:
+        """The servo model of some joints, vectorised over them.
+
+        Parameters
+        ----------
+        joints : sequence of str, optional
+            Their names; all of this calibration if not given.
+        time_step_s : float
+            Time step of the model [s].
+
+        Returns
+        -------
+        DelayedPD
+            Its batch has shape (joints,), in the order asked for.
+
+        Raises
+        ------
+        InputError
+            If this calibration does not have one of the joints.
+        """
+        wanted = self.joint_names if joints is None else tuple(joints)
+        actuators = [self.joint(name).actuator for name in wanted]
+        if not actuators:
+            raise InputError("No joint was named. Name at least one.")
+
+        parameters = DelayedPDParameters(
+            **{
+                field: np.array([getattr(actuator, key).value for actuator in actuators])
+                for field, key in PARAMETER_KEYS.items()
+            }
+        )
+        return DelayedPD(parameters, time_step_s)
+
+    def held_feedback(self, joint: str) -> HeldFeedback:
+        """The feedback of one joint.
+
+        Raises
+        ------
+        InputError
+            If this calibration does not have that joint.
+        """
+        feedback = self.joint(joint).feedback
+        return HeldFeedback(
+            poll_period_s=feedback.poll_period_s.value,
+            loss=feedback.loss.value,
+            quantum_rad=feedback.quantum_rad.value,
+            offset_rad=feedback.offset_rad.value,
+        )
+
+    def to_yaml(self) -> str:
+        """The text of the file: a header that explains it, then the data."""
+        return f"{_HEADER}\n{dump(self.model_dump(mode='json', by_alias=True))}"
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write this calibration to `path` as YAML, in one atomic step.
+
+        Raises
+        ------
+        InputError
+            If `path` exists and `force` is not given, or if it cannot be written.
+        """
+        write_text(Path(path), self.to_yaml(), force)
+
+
+def utc_now() -> str:
+    """The present time as `Calibration.created` holds it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def load_calibration(path_or_preset: Path | str) -> Calibration:
+    """Read a calibration file, or a preset by its name.
+
+    Parameters
+    ----------
+    path_or_preset : Path or str
+        A YAML file, or one of `PRESETS`. A file that is named like a preset is `./paper`.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or if anything in it cannot be trusted: one sentence says the
+        file, the place, what is wrong and what to do.
+
+    Examples
+    --------
+    >>> paper = load_calibration("paper")
+    >>> paper.joints["LF_hip"].actuator.stiffness_nm_per_rad.value
+    70.0
+    >>> paper.delayed_pd().batch
+    (12,)
+    """
+    if isinstance(path_or_preset, str) and path_or_preset in PRESETS:
+        folder = resources.files("pupper_sysid.servo_models") / "presets"
+        with resources.as_file(folder / f"{path_or_preset}.yaml") as file:
+            return _load(file)
+    path = Path(path_or_preset)
+    if not path.exists():
+        near = difflib.get_close_matches(path.name, PRESETS, n=1)
+        hint = f"Did you mean the preset {near[0]}?" if near else f"Presets: {', '.join(PRESETS)}."
+        raise InputError(f"{path} does not exist. Check the name. {hint}")
+    return _load(path)
+
+
+def _load(path: Path) -> Calibration:
+    data, lines = read(path)
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        raise InputError(
+            f"{path} is not a calibration: it does not say `schema: {SCHEMA}` at the top. "
+            "Give a file that `pupper-sysid calibrate` wrote."
+        )
+    version = data.get("schema_version")
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise InputError(
+            f"{path}: schema_version is {version}. Write `schema_version: {SCHEMA_VERSION}`."
+        )
+    if version > SCHEMA_VERSION:
+        raise InputError(
+            f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
+            f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
+        )
+    try:
+        return Calibration.model_validate(data)
+    except ValidationError as error:
+        raise InputError(explain(error, Calibration, path, lines)) from error

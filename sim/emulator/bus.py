@@ -1,0 +1,253 @@
+"""Twelve emulated servos behind the same interface as real ones, faults included.
+
+    bus = EmulatedBus(draw_robot(rng), rng)
+
+Commands are truncated to counts, as the robot's own library does it; readings are old (polled in
+turn, polls fail silently), noisy, rounded to counts and off by a constant. Nobody downstream can
+tell more than on the real robot; only `truth`, `truth_rows` and `write_truth` say what was so.
+The robot starts at its default pose with the torque on.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.common.files import refuse_overwrite, write_text
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.sim.emulator.clocks import Clock, RealClock, VirtualClock
+from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
+from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
+from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
+
+NOMINAL_SPEED_LIMIT_RAD_S = 7.5
+"""What a user would know of the servo before measuring it [rad/s]."""
+
+TRUTH_COLUMNS = ("read_time_s", "joint", "true_position_rad", "reading_time_s")
+
+_IN_USE_S = 5.0
+
+
+class EmulatedBus:
+    """A `hardware.ServoBus` of emulated servos.
+
+    Parameters
+    ----------
+    robot : EmulatedRobot
+        The truth.
+    rng : numpy.random.Generator
+        Decides lost polls, noise and timing.
+    real_time : bool
+        Live by the host's clock instead of virtual time.
+    plant : ServoPlant, optional
+        What moves; by default the robot's servos in free air.
+    keep_log : bool
+        Whether the truth of every read is remembered, for `truth_rows`; not for a robot that
+        walks for a day.
+    """
+
+    name = "emulated"
+
+    def __init__(
+        self,
+        robot: EmulatedRobot,
+        rng: np.random.Generator,
+        real_time: bool = False,
+        plant: ServoPlant | None = None,
+        keep_log: bool = True,
+    ):
+        self.robot, self._keep_log = robot, keep_log
+        self.joint_names = robot.joint_names
+        spec = robot.spec
+        polls, self._noise, clock = rng.spawn(3)
+        self._clock: Clock = (
+            RealClock() if real_time else VirtualClock(spec.sleep_overshoot_s, clock)
+        )
+        self._plant = plant or FreeAirServos(robot)
+        self._schedule = None
+        if spec.poll_period_s > 0:
+            phase = np.array([servo.poll_phase_s for servo in robot.servos])
+            self._schedule = PollSchedule(
+                spec.poll_period_s, phase, spec.loss, spec.poll_jitter_s, spec.poll_drift, polls
+            )
+        self._polls = polls
+        self._sign = np.array([float(servo.count_sign) for servo in robot.servos])
+        self._zero = np.array([servo.zero_rad for servo in robot.servos])
+        self._offset = np.array([servo.feedback.offset_rad for servo in robot.servos])
+        self._quantum = spec.quantum_rad
+        # the same travel in radians whatever the size of a count
+        self._centre = (
+            round(CENTRE_COUNT * RADIANS_PER_COUNT / spec.quantum_rad) if spec.quantum_rad else 0
+        )
+        joints = len(self.joint_names)
+        self._reading = np.full(joints, np.nan)
+        self._count = np.full(joints, -1)
+        self._measured_s = np.full(joints, -np.inf)
+        pose = robot.joint_map.rest_pose()
+        self._goal = pose.copy()
+        self._changes: list[list[float]] = [[] for _ in self.joint_names]
+        self._log: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
+        self._closed = False
+        self.limits = robot.joint_map.per_servo().position_limits()
+        self.metadata: dict[str, Any] = {
+            "kind": "emulated",
+            "coordinates": "servo",
+            "command_quantum_rad": {s.joint: spec.quantum_rad for s in robot.servos},
+            "command_rounding": {s.joint: s.command_rounding for s in robot.servos},
+            "count_zero_rad": {s.joint: s.zero_rad for s in robot.servos},
+            "joint_map": robot.joint_map.file.name,
+            "rest_pose_rad": dict(zip(self.joint_names, map(float, pose), strict=True)),
+            "speed_limit_rad_s": NOMINAL_SPEED_LIMIT_RAD_S,
+            "real_time": real_time,
+        }
+
+    def now(self) -> float:
+        """Time of the bus's clock [s], from 0 at construction."""
+        return self._clock.now()
+
+    def sleep_until(self, time_s: float) -> None:
+        """Return when `now()` has reached `time_s`; in virtual time this costs nothing."""
+        self._clock.sleep_until(time_s)
+
+    def write(self, position_rad: NDArray[np.float64]) -> Sent:
+        """Send goal positions [rad], shape (12,).
+
+        Raises
+        ------
+        BusError
+            If the bus is closed or a goal is not a number.
+        """
+        self._refuse_closed()
+        goal = np.asarray(position_rad, float)
+        if goal.shape != self._goal.shape or not np.isfinite(goal).all():
+            raise BusError(
+                f"emulated bus: goals must be {len(self.joint_names)} finite angles, got {goal}."
+            )
+        sent, asked = self._clock.now(), goal
+        goal = self._truncated(goal)
+        for i in np.flatnonzero(goal != self._goal).tolist():
+            self._plant.command(i, sent, goal[i])
+            if self._keep_log:
+                self._changes[i].append(sent)
+        self._goal = goal
+        self._clock.spend(self.robot.spec.write_duration_s)
+        return Sent(sent, asked)
+
+    def read(self) -> BusSample:
+        """Read all joints once: whatever the last successful poll of each has left.
+
+        Raises
+        ------
+        BusError
+            If the bus is closed.
+        """
+        self._refuse_closed()
+        before = self._clock.now()
+        self._clock.spend(self.robot.spec.read_duration_s)
+        time_s = round((before + self._clock.now()) / 2, 6)
+        measured = self._last_polls(time_s)
+        fresh = np.flatnonzero(measured > self._measured_s)
+        noise = self.robot.spec.reading_noise_rad * self._noise.standard_normal(len(fresh))
+        position = np.array([self._plant.angle(i, measured[i]) for i in fresh.tolist()])
+        self._reading[fresh], self._count[fresh] = self._quantised(position + noise, fresh)
+        self._measured_s = measured
+        if self._keep_log:
+            true = np.array([self._plant.angle(i, time_s) for i in range(len(self.joint_names))])
+            self._log.append((time_s, true, measured))
+        at = np.full(len(self.joint_names), time_s)
+        return BusSample(at, self._reading.copy(), self._count.copy())
+
+    def torque(self, on: bool) -> bool:
+        """Hold the present pose, or let every joint go limp."""
+        self._refuse_closed()
+        now = self._clock.now()
+        for i in range(len(self.joint_names)):
+            self._plant.torque(i, now, on)
+        # the next write must reach the servos even if it repeats the last one
+        self._goal = np.full(len(self.joint_names), np.nan)
+        return True
+
+    def close(self) -> None:
+        """Release the bus; what is known of the truth stays."""
+        self._closed = True
+
+    def truth(self) -> dict[str, Any]:
+        """Parameters of every servo, as plain numbers: what an identification should find."""
+        return self.robot.truth()
+
+    def truth_rows(self) -> Iterator[tuple[float, str, float, float]]:
+        """Rows of `TRUTH_COLUMNS`: each read, each joint in use.
+
+        `reading_time_s` is when the delivered value was measured. A joint is in use within 5 s of
+        a change of its command.
+        """
+        times = np.array([time_s for time_s, _, _ in self._log])
+        used = np.stack([_near(times, np.array(changes)) for changes in self._changes], axis=-1)
+        for (time_s, true, measured), row in zip(self._log, used, strict=True):
+            for i in np.flatnonzero(row):
+                yield time_s, self.joint_names[i], float(true[i]), float(measured[i])
+
+    def write_truth(self, stem: Path, force: bool = False) -> tuple[Path, Path]:
+        """Write `<stem>.truth.yaml` and `<stem>.truth.csv`; returns their paths.
+
+        Raises
+        ------
+        FileExistsRefusal
+            If one of them exists and `force` is not set.
+        """
+        numbers, rows = (stem.with_name(f"{stem.name}.truth.{end}") for end in ("yaml", "csv"))
+        for path in (numbers, rows):
+            refuse_overwrite(path, force)
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(TRUTH_COLUMNS)
+        for time_s, joint, true, measured in self.truth_rows():
+            table.writerow((f"{time_s:.6f}", joint, f"{true:.7f}", f"{measured:.6f}"))
+        write_text(numbers, yaml.safe_dump(self.truth(), sort_keys=False), force)
+        write_text(rows, text.getvalue(), force)
+        return numbers, rows
+
+    def _last_polls(self, time_s: float) -> NDArray[np.float64]:
+        """When each joint's present reading was measured [s]."""
+        if self._schedule is not None:
+            return self._schedule.advance(time_s)
+        succeeded = self._polls.random(len(self.joint_names)) >= self.robot.spec.loss
+        return np.where(succeeded, time_s, self._measured_s)
+
+    def _truncated(self, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The goal after `int()` of its count, which the servo's travel limits."""
+        if self._quantum == 0:
+            return goal
+        count = np.trunc(self._centre + self._sign * (goal - self._zero) / self._quantum)
+        count = np.clip(count, 0, 2 * self._centre - 1)
+        return self._zero + self._sign * (count - self._centre) * self._quantum
+
+    def _quantised(
+        self, position: NDArray[np.float64], joints: NDArray[np.intp]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """What the encoders of `joints` report of `position`: angle and count."""
+        sign, zero = self._sign[joints], self._zero[joints]
+        reported = position + self._offset[joints]
+        if self._quantum == 0:
+            return reported, np.full(len(joints), -1)
+        count = np.round(self._centre + sign * (reported - zero) / self._quantum)
+        count = np.clip(count, 0, 2 * self._centre - 1)
+        return zero + sign * (count - self._centre) * self._quantum, count.astype(int)
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise BusError("emulated bus: it is closed.")
+
+
+def _near(times: NDArray[np.float64], events: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each time is within `_IN_USE_S` of an event (sorted)."""
+    first = np.searchsorted(events, times - _IN_USE_S)
+    return np.searchsorted(events, times + _IN_USE_S) > first

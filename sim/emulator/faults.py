@@ -1,0 +1,128 @@
+"""Faults on request: what goes wrong on real buses, at chosen rates, repeatably.
+
+    faults = BusFaults.parse("lost=0.02,late=0.01", rng)
+
+Some faults happen to single answers (lost, late, truncated, corrupted, duplicated, foreign, wrong
+length), some to servos for a while (error bits, frozen; in a brown-out all are limp and deaf, and
+hold nothing afterwards until they are told to), some to the line itself (unplugged, a second
+writer). `counts` and `ended` keep account.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.feetech.frames import Frame
+
+ANSWER_KINDS = (
+    "lost", "late", "truncated", "corrupted", "duplicated", "foreign", "wrong-length",
+)  # fmt: skip
+STATE_KINDS = ("error-bits", "frozen", "brown-out", "unplugged", "second-writer")
+KINDS = (*ANSWER_KINDS, *STATE_KINDS)
+
+_LATE_S = (0.004, 0.06)
+
+
+@dataclass
+class BusFaults:
+    """Draws faults.
+
+    Attributes
+    ----------
+    rates : dict of str to float
+        Probability per answer, for each of `KINDS`.
+    rng : numpy.random.Generator
+    lasts_s : float
+        How long those last that are no single answer.
+    counts : dict of str to int
+        How many were injected.
+    ended : list of (str, float)
+        Kind and end of those that last, on the emulator's clock.
+    """
+
+    rates: dict[str, float]
+    rng: np.random.Generator
+    lasts_s: float = 0.2
+    counts: dict[str, int] = field(default_factory=dict)
+    ended: list[tuple[str, float]] = field(default_factory=list)
+
+    def __post_init__(self):
+        for kind, rate in self.rates.items():
+            if kind not in KINDS:
+                raise InputError(f"fault '{kind}' is not known; known are {', '.join(KINDS)}.")
+            if not 0 <= rate <= 1:
+                raise InputError(f"fault {kind}: {rate} is no probability; choose 0 to 1.")
+        if sum(self.rates.values()) > 1:
+            raise InputError("faults: the probabilities add up to more than 1.")
+        self._kinds = [k for k, r in self.rates.items() if r > 0]
+        self._edges = np.cumsum([self.rates[k] for k in self._kinds])
+
+    @classmethod
+    def parse(cls, text: str, rng: np.random.Generator) -> BusFaults:
+        """Faults from `kind=rate,kind=rate`; an empty text is none.
+
+        Raises
+        ------
+        InputError
+            If a kind is unknown or a rate is no probability.
+        """
+        rates = {}
+        for part in filter(None, (piece.strip() for piece in text.split(","))):
+            kind, _, rate = part.partition("=")
+            try:
+                rates[kind] = float(rate)
+            except ValueError:
+                raise InputError(
+                    f"--faults: '{part}' is not kind=probability, such as lost=0.02."
+                ) from None
+        return cls(rates, rng)
+
+    def draw(self) -> str | None:
+        """The fault of the next answer, if any; counted."""
+        if not self._kinds:
+            return None
+        k = int(np.searchsorted(self._edges, self.rng.random(), side="right"))
+        if k >= len(self._kinds):
+            return None
+        self.counts[self._kinds[k]] = self.counts.get(self._kinds[k], 0) + 1
+        return self._kinds[k]
+
+    def spoil(self, kind: str | None, answer: bytes, other: bytes) -> list[tuple[float, bytes]]:
+        """What arrives instead of `answer`: pieces, each with its delay [s].
+
+        `other` is an answer that belongs to somebody else.
+        """
+        rng = self.rng
+        if kind == "lost":
+            return []
+        if kind == "late":
+            return [(float(rng.uniform(*_LATE_S)), answer)]
+        if kind == "truncated":
+            return [(0.0, answer[: int(rng.integers(1, len(answer)))])]
+        if kind == "corrupted":
+            return [(0.0, corrupted(answer, rng))]
+        if kind == "duplicated":
+            return [(0.0, answer), (0.0, answer)]
+        if kind == "foreign":
+            return [(0.0, other)]
+        return [(0.0, answer)]
+
+
+def corrupted(answer: bytes, rng: np.random.Generator) -> bytes:
+    """One burst of noise on a line: some bits of one byte, or of two neighbours, flipped."""
+    spoiled = bytearray(answer)
+    at = int(rng.integers(len(spoiled)))
+    spoiled[at] ^= int(rng.integers(1, 256))
+    if rng.random() < 0.3 and at + 1 < len(spoiled):
+        spoiled[at + 1] ^= int(rng.integers(1, 256))
+    return bytes(spoiled)
+
+
+def with_wrong_length(frame: Frame, rng: np.random.Generator) -> bytes:
+    """A frame that is right in itself and has a parameter too few or too many."""
+    data = frame.data
+    data = data[:-1] if len(data) and rng.random() < 0.5 else data + bytes([int(rng.integers(256))])
+    return Frame(frame.id, frame.code, data).encode()

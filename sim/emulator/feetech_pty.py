@@ -1,0 +1,117 @@
+"""Emulated Feetech servos behind a pseudo-terminal: a serial device that any program can open.
+
+A pseudo-terminal has no baud rate of its own, so the server keeps the bytes back for as long as a
+real line would. It keeps one end open itself, or a client that closes would end it; an unplugged
+adapter is a terminal that goes away and comes back behind the same link.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import os
+import pty
+import select
+import termios
+import threading
+import time
+import tty
+from pathlib import Path
+
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+
+_SPEEDS = {
+    getattr(termios, f"B{rate}"): rate
+    for rate in (38_400, 57_600, 115_200, 230_400, 460_800, 500_000, 921_600, 1_000_000)
+}
+_IDLE_S = 0.05
+
+
+class FeetechPty:
+    """Serves an emulator; `device` is what a client opens.
+
+    Parameters
+    ----------
+    emulator : FeetechEmulator
+    link : Path, optional
+        A stable name for the device, which survives being unplugged.
+    """
+
+    def __init__(self, emulator: FeetechEmulator, link: Path | None = None):
+        self.emulator, self._link = emulator, link
+        self._stop = threading.Event()
+        self._start = time.monotonic()
+        self._due: list[tuple[float, int, bytes]] = []
+        self._count = 0
+        self._plug()
+
+    def now(self) -> float:
+        """Seconds of the emulator's time."""
+        return time.monotonic() - self._start
+
+    def serve(self) -> None:
+        """Answer until `stop`."""
+        while not self._stop.is_set():
+            self._deliver()
+            if self.emulator.unplug_for_s > 0:
+                self._unplug()
+            wait = self._due[0][0] - self.now() if self._due else _IDLE_S
+            ready, _, _ = select.select([self._host], [], [], max(min(wait, _IDLE_S), 0))
+            if not ready:
+                continue
+            with contextlib.suppress(OSError):
+                data = os.read(self._host, 4096)
+                for due, piece in self.emulator.receive(data, self.now(), self._baud()):
+                    self._count += 1
+                    heapq.heappush(self._due, (due, self._count, piece))
+
+    def stop(self) -> None:
+        """End `serve`; may be called from anywhere."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Remove the device."""
+        for descriptor in (self._host, self._servo):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+
+    def _deliver(self) -> None:
+        while self._due and self._due[0][0] <= self.now():
+            _, _, piece = heapq.heappop(self._due)
+            with contextlib.suppress(OSError):
+                os.write(self._host, piece)
+
+    def _plug(self) -> None:
+        self._host, self._servo = pty.openpty()
+        tty.setraw(self._servo)
+        os.set_blocking(self._host, False)
+        self.device = os.ttyname(self._servo)
+        if self._link is not None:
+            new = self._link.with_name(f".{self._link.name}.new")
+            new.unlink(missing_ok=True)
+            new.symlink_to(self.device)
+            new.replace(self._link)
+            self.device = str(self._link)
+
+    def _unplug(self) -> None:
+        self.close()
+        self._due.clear()
+        time.sleep(self.emulator.unplug_for_s)
+        self.emulator.unplug_for_s = 0.0
+        self._plug()
+        self.emulator.faults.ended.append(("unplugged", self.now()))
+
+    def _baud(self) -> int | None:
+        """Rate that the host has set; None if the terminal does not say.
+
+        A terminal cannot tell rates without a name from each other: such a one is the servos' if
+        theirs has no name either, and else 0, at which nobody listens.
+        """
+        with contextlib.suppress(termios.error):
+            named = _SPEEDS.get(termios.tcgetattr(self._host)[4])
+            if named is not None:
+                return named
+            return 0 if self.emulator.baud in _SPEEDS.values() else self.emulator.baud
+        return None

@@ -1,0 +1,148 @@
+"""One servo turning in free air, stepped by MuJoCo only as far, and as often, as someone asks.
+
+Commands come at any instant, not only on physics steps: the actuator gets the mean of the held
+command over the step before, and its delay is shortened by that one step, so that a command's
+timing is kept although MuJoCo reads one value per step. A position can be asked for at any
+instant. A servo that has come to rest is not stepped until it is told to move.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.servo_mjcf import free_air_xml, mujoco, rest_at
+
+PHYSICS_STEP_S = 0.001
+"""Half the step of fitting, so that the truth is not made by the model that is fitted."""
+
+_STILL_RAD_S = 1e-4  # MuJoCo's dry friction creeps at up to 3e-5 rad/s, which nobody can see
+_STILL_RAD_S2 = 1e-4
+_STEPS_BETWEEN_LOOKS = 50
+
+
+class FreeAirServo:
+    """A servo in free air; time starts at 0 and must not go backwards.
+
+    Parameters
+    ----------
+    parameters : DelayedPDParameters
+        Scalars; `delay_s` at least two physics steps.
+    position_rad : float
+        Where it rests at the start, commanded there for ever.
+    time_step_s : float
+        Physics step [s].
+
+    Raises
+    ------
+    InputError
+        If the delay is shorter than two physics steps.
+    """
+
+    def __init__(
+        self,
+        parameters: DelayedPDParameters,
+        position_rad: float,
+        time_step_s: float = PHYSICS_STEP_S,
+    ):
+        delay = float(np.asarray(parameters.delay_s))
+        # MuJoCo would take what is left of a shorter delay for a whole step
+        if not delay >= 2 * time_step_s:
+            raise InputError(
+                f"emulated servo: delay_s is {delay}; it must be at least two physics "
+                f"steps of {time_step_s} s."
+            )
+        native = replace(parameters, delay_s=delay - time_step_s)
+        self._model = mujoco.MjModel.from_xml_string(free_air_xml([native], time_step_s))
+        self._data = mujoco.MjData(self._model)
+        rest_at(self._model, self._data, [position_rad])
+        self._gains = self._model.actuator_biasprm.copy()
+        self._effort = float(np.asarray(parameters.effort_limit))
+        self._dt = time_step_s
+        self._settled_after = int(delay / time_step_s) + 3
+        self._step = 0
+        self._changed = -self._settled_after - 1
+        self._goal = float(position_rad)
+        self._queue: deque[tuple[float, float]] = deque()
+        self._limp = False
+        self._asleep = False
+
+    def command(self, time_s: float, position_rad: float) -> None:
+        """Set the goal from `time_s` on; times must not go backwards."""
+        latest = self._queue[-1][1] if self._queue else self._goal
+        if not self._limp and position_rad != latest:
+            self._queue.append((time_s, float(position_rad)))
+            self._asleep = False
+
+    def position_at(self, time_s: float) -> float:
+        """True position [rad] at `time_s`, at most one physics step before the latest asked."""
+        if time_s <= 0 or self._asleep:
+            return float(self._data.qpos[0])
+        self._advance(int(np.ceil(time_s / self._dt - 1e-9)))
+        # exact inside a step: MuJoCo moves the joint with the velocity at the step's end
+        ahead = self._step * self._dt - time_s
+        self._asleep = not self._queue and self._resting()
+        return float(self._data.qpos[0]) - float(self._data.qvel[0]) * ahead
+
+    @property
+    def load(self) -> float:
+        """Share of the effort limit at work, signed, at the time last asked for."""
+        if self._limp or self._asleep:
+            return 0.0
+        return float(self._data.actuator_force[0]) / self._effort
+
+    def torque(self, time_s: float, on: bool) -> None:
+        """Hold the present position, or go limp, from `time_s` on."""
+        position = self.position_at(time_s)
+        self._limp = not on
+        self._model.actuator_biasprm[:] = self._gains if on else 0.0
+        velocity = float(self._data.qvel[0])
+        rest_at(self._model, self._data, [position])
+        self._data.qvel[0] = velocity
+        self._goal = position
+        self._queue.clear()
+        self._changed = self._step
+        self._asleep = False
+
+    def _advance(self, last: int) -> None:
+        """Take physics steps until the state is that of the start of step `last`."""
+        while self._step < last:
+            # step k sees what was commanded during step k - 1
+            event = int(self._queue[0][0] / self._dt) + 1 if self._queue else last
+            if event > self._step:
+                steps = min(event, last) - self._step
+                if not self._resting():
+                    steps = min(steps, _STEPS_BETWEEN_LOOKS)
+                    self._data.ctrl[0] = self._goal
+                    mujoco.mj_step(self._model, self._data, nstep=steps)
+                self._step += steps
+            else:
+                self._data.ctrl[0] = self._mean_of_last_step()
+                mujoco.mj_step(self._model, self._data)
+                self._changed = self._step
+                self._step += 1
+
+    def _mean_of_last_step(self) -> float:
+        """Mean of the command over the step before the present one; takes it off the queue."""
+        since, stop = (self._step - 1) * self._dt, self._step * self._dt
+        mean = 0.0
+        while self._queue and self._queue[0][0] < stop:
+            at, goal = self._queue.popleft()
+            at = max(at, since)
+            mean += self._goal * (at - since)
+            since, self._goal = at, goal
+        return (mean + self._goal * (stop - since)) / self._dt
+
+    def _resting(self) -> bool:
+        """Whether another step would change nothing."""
+        data = self._data
+        return (
+            self._step - self._changed > self._settled_after
+            and abs(data.qvel[0]) < _STILL_RAD_S
+            and abs(data.qacc[0]) < _STILL_RAD_S2
+            and (self._limp or not len(data.act) or abs(data.act[0] - self._goal) < 1e-12)
+        )

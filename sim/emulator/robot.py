@@ -1,0 +1,237 @@
+"""A robot that is wrong in the ways the real one is: what its twelve servos are, as plain numbers.
+
+`RobotSpec` says how such robots are made: the mean servo, its spread from joint to joint, the
+feedback's faults, the host's timing. `draw_robot` makes one robot from it, whose numbers are then
+the truth that an identification should find; `random_spec` varies the mean servo and the feedback
+too, for benchmarks over many robots. Nothing here moves: `sim.emulator.bus` does.
+
+The defaults are published measurements of a Mini Pupper 2 (pooled fit of three joints, poll
+statistics of twelve recordings), not of any other copy of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.held_feedback import HeldFeedback
+
+RADIANS_PER_COUNT = np.pi / 550
+CENTRE_COUNT = 512
+SHORTEST_DELAY_S = 0.002
+"""What the emulator can do: two physics steps."""
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """How emulated robots are made. Times in s, angles in rad, torques in N·m."""
+
+    delay_s: float = 0.025
+    """Mean dead time of a servo, from the host's sending to the first torque. Its reading's way
+    back to the host (about 3 ms on the robot) is counted here: a poll is seen at once."""
+    stiffness_per_inertia: float = 12_700.0
+    """Mean stiffness / armature [1/s²]."""
+    damping_per_inertia: float = 103.0
+    """Mean damping / armature [1/s]."""
+    friction_per_inertia: float = 207.0
+    """Mean dry friction / armature [rad/s²]."""
+    effort_per_inertia: float = 433.0
+    """Effort limit / armature [rad/s²]; with `stall_torque_nm` it sets the armature."""
+    stall_torque_nm: float = 0.35
+    """Effort limit of every servo [N·m] (shop specification of 3.5 kg·cm)."""
+    velocity_limit_rad_s: float = 7.6
+    """Mean rate limit of the set-point [rad/s]."""
+    gain_spread: float = 0.10
+    """Standard deviation of the logarithm of each of the four ratios to inertia, per joint."""
+    velocity_spread: float = 0.05
+    """The same for the velocity limit."""
+    delay_sd_s: float = 0.0015
+    """Standard deviation of the dead time from joint to joint."""
+    offset_sd_rad: float = 0.005
+    """Standard deviation of each joint's constant reading error."""
+    poll_period_s: float = 0.02685
+    """Time between two polls of the same servo; 0 for a bus where every read is a fresh one."""
+    loss: float = 0.42
+    """Probability that a poll fails and leaves the old reading in place."""
+    poll_jitter_s: float = 0.0008
+    """Standard deviation of a poll instant about its lattice."""
+    poll_drift: float = 0.002
+    """Relative standard deviation of the poll period as it wanders over seconds: half of the
+    0.4 % between recordings of 3 s, of which estimation errors are a part."""
+    quantum_rad: float = RADIANS_PER_COUNT
+    """One count, of commands (truncated) and of readings (rounded); 0 for neither."""
+    reading_noise_rad: float = 0.003
+    """Standard deviation of a reading before rounding: half a count. The recordings leave 11 to
+    14 mrad unexplained, but that holds unmodelled friction too; flat tops flicker by a count."""
+    sleep_overshoot_s: float = 0.0001
+    """Mean of the (exponential) time by which the host wakes too late."""
+    write_duration_s: float = 0.0003
+    """Time the host spends in one write."""
+    read_duration_s: float = 0.0005
+    """Time the host spends in one read."""
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"RobotSpec: {field.name} is {value}; it must be a number ≥ 0.")
+        if not self.loss < 1:
+            raise InputError(f"RobotSpec: loss is {self.loss}; it must be below 1.")
+
+
+@dataclass(frozen=True)
+class EmulatedServo:
+    """The truth about one servo.
+
+    Attributes
+    ----------
+    joint : str
+    actuator : DelayedPDParameters
+        Scalars.
+    feedback : HeldFeedback
+    poll_phase_s : float
+        One poll instant of its lattice, before jitter and drift [s].
+    zero_rad : float
+        Angle of the centre count [rad].
+    count_sign : {1, -1}
+        Direction of the counts as the angle grows.
+    """
+
+    joint: str
+    actuator: DelayedPDParameters
+    feedback: HeldFeedback
+    poll_phase_s: float
+    zero_rad: float
+    count_sign: int
+
+    @property
+    def command_rounding(self) -> str:
+        """Which way the truncation of counts moves the commanded angle: "up" or "down"."""
+        return "down" if self.count_sign > 0 else "up"
+
+
+@dataclass(frozen=True)
+class EmulatedRobot:
+    """The truth about one robot: its spec, and its servos in the order of its joint map."""
+
+    spec: RobotSpec
+    servos: tuple[EmulatedServo, ...]
+    joint_map: JointMap
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Of the servos."""
+        return tuple(servo.joint for servo in self.servos)
+
+    def truth(self) -> dict:
+        """All of it as plain numbers and strings, ready for YAML."""
+        joints = {}
+        for servo in self.servos:
+            joints[servo.joint] = {
+                "actuator": {k: float(v) for k, v in asdict(servo.actuator).items()},
+                "feedback": {k: float(v) for k, v in asdict(servo.feedback).items()}
+                | {
+                    "mean_age_s": float(servo.feedback.mean_age_s),
+                    "phase_s": servo.poll_phase_s,
+                    "jitter_s": self.spec.poll_jitter_s,
+                },
+                "zero_rad": servo.zero_rad,
+                "command_rounding": servo.command_rounding,
+            }
+        return {"spec": asdict(self.spec), "joints": joints}
+
+
+def draw_robot(
+    rng: np.random.Generator, spec: RobotSpec | None = None, joint_map: JointMap | None = None
+) -> EmulatedRobot:
+    """One robot made to `spec` (default: like the published Mini Pupper 2).
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    spec : RobotSpec, optional
+    joint_map : JointMap, optional
+        Of another robot.
+    """
+    spec = spec or RobotSpec()
+    start = rng.uniform(0.0, spec.poll_period_s)
+    layout = (joint_map or load_joint_map("mini_pupper_2")).per_servo()
+    servos = []
+    for turn, (joint, sign, zero) in enumerate(
+        zip(layout.joint_names, layout.sign(), layout.zero_rad(), strict=True)
+    ):
+        kp, kd, friction, effort = np.exp(spec.gain_spread * rng.standard_normal(4))
+        speed = np.exp(spec.velocity_spread * rng.standard_normal())
+        delay = spec.delay_s + spec.delay_sd_s * rng.standard_normal()
+        armature = spec.stall_torque_nm / (spec.effort_per_inertia * effort)
+        actuator = DelayedPDParameters(
+            stiffness=float(spec.stiffness_per_inertia * kp * armature),
+            damping=float(spec.damping_per_inertia * kd * armature),
+            friction_loss=float(spec.friction_per_inertia * friction * armature),
+            armature=float(armature),
+            effort_limit=spec.stall_torque_nm,
+            velocity_limit=float(spec.velocity_limit_rad_s * speed),
+            delay_s=float(max(delay, SHORTEST_DELAY_S)),
+        )
+        feedback = HeldFeedback(
+            poll_period_s=spec.poll_period_s,
+            loss=spec.loss,
+            quantum_rad=spec.quantum_rad,
+            offset_rad=float(spec.offset_sd_rad * rng.standard_normal()),
+        )
+        # the firmware polls in the order of ids; another bus in that of the map
+        place = layout.ids[turn] - 1 if joint_map is None else turn
+        phase = float(start + place / len(layout.ids) * spec.poll_period_s)
+        servos.append(EmulatedServo(joint, actuator, feedback, phase, float(zero), int(sign)))
+    return EmulatedRobot(spec, tuple(servos), layout)
+
+
+def directly_read(joint_map: JointMap) -> RobotSpec:
+    """Servos of a map on a serial line: each answers for the very moment, nothing is lost."""
+    quantum = float(1 / joint_map.counts_per_rad().max())
+    return RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=quantum)
+
+
+def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
+    """A spec drawn at random, for benchmarks over many robots.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    **chosen : float
+        Fields of `RobotSpec` to fix instead of drawing (`loss=0.3`).
+
+    Raises
+    ------
+    InputError
+        If a name is no field of `RobotSpec`.
+    """
+    unknown = sorted(set(chosen) - {f.name for f in fields(RobotSpec)})
+    if unknown:
+        raise InputError(f"RobotSpec has no field {unknown[0]}.")
+    base = RobotSpec()
+
+    def around(value: float, spread: float) -> float:
+        return float(value * np.exp(rng.uniform(-spread, spread)))
+
+    drawn = {
+        "delay_s": float(rng.uniform(0.010, 0.040)),
+        "stiffness_per_inertia": around(base.stiffness_per_inertia, 0.4),
+        "damping_per_inertia": around(base.damping_per_inertia, 0.3),
+        "friction_per_inertia": around(base.friction_per_inertia, 0.5),
+        "effort_per_inertia": around(base.effort_per_inertia, 0.2),
+        "velocity_limit_rad_s": around(base.velocity_limit_rad_s, 0.15),
+        "poll_period_s": float(rng.uniform(0.020, 0.034)),
+        "loss": float(rng.uniform(0.0, 0.6)),
+        "poll_jitter_s": float(rng.uniform(0.0, 0.0012)),
+        "poll_drift": float(rng.uniform(0.0, 0.003)),
+        # Mini Pupper counts, 300° over 10 bits, 360° over 12 bits
+        "quantum_rad": float(rng.choice([np.pi / 550, np.radians(300) / 1024, 2 * np.pi / 4096])),
+        "reading_noise_rad": float(rng.uniform(0.001, 0.006)),
+        "sleep_overshoot_s": float(rng.uniform(0.0, 0.0005)),
+    }
+    return replace(base, **(drawn | chosen))

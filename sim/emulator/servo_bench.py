@@ -1,0 +1,111 @@
+"""Emulated servos as a protocol server sees them: goals and positions in counts, in real time.
+
+Behind the emulators of both buses stand the same servos as behind `EmulatedBus`, with the same
+truth, in free air or in a robot that walks (`sim.emulator.servo_plant`). Here they have what a
+register or a datagram can ask of them: counts of an encoder, share of duty, temperature, a supply
+that can sag, an encoder that can freeze, and a hand that moves a limp joint (`by_hand`), so that a
+calibration of the joints can be tried without a robot.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.hardware.imu import ImuSample
+from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.sim.emulator.robot import EmulatedRobot
+from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
+
+AMBIENT_C, SUPPLY_V = 27.0, 7.4
+_HAND_RAD, _HAND_PERIOD_S = 0.6, 6.0
+
+
+class ServoBench:
+    """The servos of a robot, by joint.
+
+    Parameters
+    ----------
+    robot : EmulatedRobot
+    joint_map : JointMap
+        What counts mean; used in servo coordinates, all joints of the robot.
+    rng : numpy.random.Generator
+        Reading noise.
+    by_hand : bool
+        Whether someone swings the joints while they are limp.
+    keep_log : bool
+        Whether goals and readings are remembered: for proofs, not for a robot that runs for days.
+    plant : ServoPlant, optional
+        What moves; by default the robot's servos in free air.
+    """
+
+    def __init__(
+        self,
+        robot: EmulatedRobot,
+        joint_map: JointMap,
+        rng: np.random.Generator,
+        by_hand: bool = False,
+        keep_log: bool = True,
+        plant: ServoPlant | None = None,
+    ):
+        self.robot, self.map = robot, joint_map.select(robot.joint_names).per_servo()
+        self._rng, self._by_hand = rng, by_hand
+        self.plant = plant or FreeAirServos(robot)
+        """What moves."""
+        self._offset = np.array([s.feedback.offset_rad for s in robot.servos])
+        self._noise = robot.spec.reading_noise_rad
+        self._limp_since = np.full(len(robot.servos), np.inf)
+        self._top = self.map.file.counts - 1
+        self._scale = self.map.sign() * self.map.counts_per_rad()
+        self._zero = self.map.to_counts(np.zeros(len(robot.servos)))
+        self.index_of_id = {i: k for k, i in enumerate(self.map.ids)}
+        self.supply_v, self.keep_log = SUPPLY_V, keep_log
+        self.commands: list[tuple[float, int, int]] = []
+        """Every change of a goal: time, index, count."""
+
+    def command(self, index: int, time_s: float, count: int) -> None:
+        """Goal of one servo from `time_s` on, which must not go backwards."""
+        self.plant.command(index, time_s, (count - self._zero[index]) / self._scale[index])
+        if self.keep_log:
+            self.commands.append((time_s, index, count))
+
+    def torque(self, index: int, time_s: float, on: bool) -> None:
+        """Hold the present position, or go limp."""
+        limp = np.isfinite(self._limp_since[index])
+        if on == (not limp):
+            return
+        self._limp_since[index] = np.inf if on else time_s
+        self.plant.torque(index, time_s, on)
+
+    def is_on(self, index: int) -> bool:
+        """Whether the servo holds."""
+        return not np.isfinite(self._limp_since[index])
+
+    def angle(self, index: int, time_s: float) -> float:
+        """Where the servo truly is [rad], servo coordinates."""
+        angle = self.plant.angle(index, time_s)
+        if self._by_hand and np.isfinite(self._limp_since[index]):
+            phase = 2 * np.pi * (time_s - self._limp_since[index]) / _HAND_PERIOD_S
+            angle += _HAND_RAD * np.sin(phase)
+        return angle
+
+    def count(self, index: int, time_s: float) -> int:
+        """What the encoder says."""
+        noise = self._noise * self._rng.standard_normal()
+        angle = self.angle(index, time_s) + self._offset[index] + noise
+        count = round(float(self._zero[index] + self._scale[index] * angle))
+        return min(max(count, 0), self._top)
+
+    def load(self, index: int) -> int:
+        """Signed duty in thousandths, in the direction of the counts."""
+        direction = 1 if self._scale[index] > 0 else -1
+        return round(1000 * direction * self.plant.load(index))
+
+    def imu(self, time_s: float) -> ImuSample | None:
+        """What the robot's IMU says."""
+        return self.plant.imu(time_s)
+
+    def truth(self, **transport: Any) -> dict[str, Any]:
+        """What an identification should find, with how the protocol delays commands."""
+        return self.robot.truth() | {"transport": transport}

@@ -1,0 +1,1 @@
+"""Calibrations for other simulators, one module per target."""

@@ -1,0 +1,1 @@
+"""The robot as a MuJoCo model, its ground and its reference trot."""

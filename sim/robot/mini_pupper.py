@@ -1,0 +1,255 @@
+"""Mini Pupper 2 as a MuJoCo model, written from published dimensions; primitives only.
+
+`robot_xml` gives the MJCF text of the robot on a piece of ground. Twelve hinges are named as
+everywhere in this project (`LF_hip` …), in its order. Masses, centres and inertias are those of the
+published URDF with the centres of mass of its meshes (several of the URDF's own are outside their
+bodies), and the trunk scaled so that the robot weighs its 0.465 kg.
+
+The real knee is a parallel linkage: servo 3 sits in the hip module and holds the calf's absolute
+angle, thigh + calf, through a push rod. `knee="linkage"` models it as a tendon with coefficients
+1, 1, which carries the servo's rotor inertia and friction; `knee="serial"` puts the servo at the
+knee, as the paper and the URDF do.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, LEGS
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.servo_mjcf import (
+    INTEGRATOR,
+    actuator_attributes,
+    attributes,
+    joint_attributes,
+)
+
+Knee = Literal["linkage", "serial"]
+
+MASS_KG = 0.465
+THIGH_M, CALF_M = 0.050, 0.056
+FOOT_RADIUS_M, FOOT_THICKNESS_M = 0.0085, 0.006
+STANDING_HEIGHT_M = 0.0835
+"""Of the trunk's origin above the ground, in the default pose."""
+
+HIP_X_M = {"LF": 0.05, "RF": 0.05, "LB": -0.066, "RB": -0.066}
+HIP_Y_M, THIGH_Y_M, CALF_Y_M = 0.0235, 0.0197, 0.00475
+THIGH_X_M = -0.00004
+SIDE = {"LF": 1, "RF": -1, "LB": 1, "RB": -1}
+"""+1 for left legs, -1 for right ones."""
+
+LIMITS_RAD = {
+    name: {
+        "hip": (-0.550, 0.425) if name.startswith("L") else (-0.425, 0.550),
+        "thigh": (0.55, 2.40),
+        "calf": (-2.18, -0.22),
+    }[name.split("_")[1]]
+    for name in JOINT_NAMES
+}
+
+# Mass [kg], centre [m], inertia xx yy zz xy xz yz [kg m²] of left legs (URDF masses and tensors,
+# centres of the meshes; hip plate, thigh shell and foot counted with their bodies).
+_HIP = (0.023343, (0.0068, 0.0052, 0.0066), (4.01e-6, 4.63e-6, 5.06e-6, -7.1e-7, -4.9e-8, -1.0e-7))
+_THIGH = (
+    0.004137, (-0.0012, 0.0041, -0.0170), (1.42e-6, 1.48e-6, 2.63e-7, 2.5e-8, -1.9e-7, -1.8e-8),
+)  # fmt: skip
+_CALF = (0.002549, (0.0003, -0.0001, -0.0379), (1.47e-6, 1.57e-6, 1.22e-7, 0.0, 2.1e-7, 0.0))
+_TRUNK_CENTRE = (-0.0016, 0.0003, -0.0020)
+_TRUNK_INERTIA = (8.24e-5, 3.61e-4, 3.64e-4, 1.2e-6, -1.0e-5, 2.9e-7)
+_TRUNK_URDF_KG = 0.125594
+TRUNK_KG = MASS_KG - 4 * (_HIP[0] + _THIGH[0] + _CALF[0])
+
+# trunk's box and the corner at its centre, from the extents of the published meshes
+_TRUNK_BOX, _TRUNK_BOX_AT = (0.0905, 0.030, 0.0266), (-0.0012, 0.0, -0.00015)
+_TRUNK_TOUCH = (0.1, 0.04, 0.04)
+
+CONTACT_BODIES = ("trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh")))
+"""Bodies that must not touch the ground; sensor `<body>_touch` measures with how many newtons."""
+
+FLAT_GROUND = (
+    '<geom name="ground" type="plane" size="0 0 0.05" material="grid" contype="0" conaffinity="1"/>'
+)
+
+
+def robot_xml(
+    servos: dict[str, DelayedPDParameters],
+    time_step_s: float,
+    knee: Knee = "linkage",
+    ground: str = FLAT_GROUND,
+    assets: str = "",
+) -> str:
+    """MJCF of the robot.
+
+    Parameters
+    ----------
+    servos : dict of str to DelayedPDParameters
+        One per joint, scalars; `<joint>` names the actuator too. The delay sets how much history
+        the model can hold.
+    time_step_s : float
+        Physics step [s].
+    knee : {"linkage", "serial"}
+    ground : str
+        MJCF of the ground; its geoms need `conaffinity="1"`.
+    assets : str
+        MJCF inside `<asset>` that the ground needs.
+    """
+    legs = "".join(_leg(leg, servos, time_step_s, knee) for leg in LEGS)
+    tendons = ""
+    if knee == "linkage":
+        tendons = "<tendon>" + "".join(_knee_tendon(leg, servos, time_step_s) for leg in LEGS)
+        tendons += "</tendon>"
+    actuators = []
+    for name in JOINT_NAMES:
+        at = "tendon" if knee == "linkage" and name.endswith("calf") else "joint"
+        own = {"name": name, at: name if at == "joint" else f"{name}_servo"}
+        actuators.append(
+            f"<pid {attributes(own | actuator_attributes(servos[name], time_step_s))}/>"
+        )
+    sensors = "".join(
+        [f'<touch name="{leg}_foot_touch" site="{leg}_foot"/>' for leg in LEGS]
+        + [f'<touch name="{body}_touch" site="{body}_touch"/>' for body in CONTACT_BODIES]
+        + ['<gyro name="gyro" site="imu"/><accelerometer name="accelerometer" site="imu"/>']
+    )
+    scale = TRUNK_KG / _TRUNK_URDF_KG
+    # PGS: ten iterations settle the servos' dry friction to 1 mrad/s, where Newton's first ten are
+    # off by hundreds, and cost a little less
+    trunk = _inertial(TRUNK_KG, _TRUNK_CENTRE, tuple(scale * x for x in _TRUNK_INERTIA))
+    box, at, touch = map(_numbers, (_TRUNK_BOX, _TRUNK_BOX_AT, _TRUNK_TOUCH))
+    return f"""<mujoco model="mini_pupper_2">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{time_step_s!r}" integrator="{INTEGRATOR}" cone="pyramidal"
+    solver="PGS" iterations="10"/>
+  <visual><global offwidth="1280" offheight="720"/><headlight ambient="0.4 0.4 0.4"/></visual>
+  <asset>
+    <texture name="grid" type="2d" builtin="checker" rgb1="0.85 0.87 0.90" rgb2="0.75 0.78 0.82"
+      width="300" height="300"/>
+    <material name="grid" texture="grid" texrepeat="20 20" texuniform="true"/>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="0.95 0.97 1" rgb2="0.7 0.8 0.95"
+      width="64" height="64"/>
+    {assets}
+  </asset>
+  <default>
+    <geom contype="1" conaffinity="0" friction="0.8 0.005 0.0001" priority="0"/>
+    <default class="visual"><geom contype="0" conaffinity="0" group="2" mass="0"/></default>
+  </default>
+  <worldbody>
+    <light pos="0 0 3" dir="0 0 -1" directional="true" castshadow="true"/>
+    {ground}
+    <body name="trunk" pos="0 0 {STANDING_HEIGHT_M}">
+      <freejoint name="root"/>
+      {trunk}
+      <geom name="trunk" type="box" size="{box}" pos="{at}" rgba="0.2 0.35 0.6 1"/>
+      <site name="trunk_touch" type="box" size="{touch}" group="4"/>
+      <site name="imu" pos="0 0 0" xyaxes="0 1 0 1 0 0" group="3"/>
+      <camera name="track" mode="trackcom" pos="0.1 -0.55 0.22" xyaxes="1 0.2 0 -0.06 0.3 1"/>
+      {legs}
+    </body>
+  </worldbody>
+  {tendons}
+  <actuator>{"".join(actuators)}</actuator>
+  <sensor>{sensors}</sensor>
+</mujoco>"""
+
+
+def foot_position(leg: str, hip: float, thigh: float, calf: float) -> np.ndarray:
+    """Centre of a foot in the trunk's frame [m], shape (..., 3), from its joint angles [rad]."""
+    side = SIDE[leg]
+    x = THIGH_X_M - THIGH_M * np.sin(thigh) - CALF_M * np.sin(np.add(thigh, calf))
+    down = -THIGH_M * np.cos(thigh) - CALF_M * np.cos(np.add(thigh, calf))
+    out = side * (THIGH_Y_M + CALF_Y_M)
+    y = out * np.cos(hip) - down * np.sin(hip)
+    z = out * np.sin(hip) + down * np.cos(hip)
+    return np.stack(np.broadcast_arrays(HIP_X_M[leg] + x, side * HIP_Y_M + y, z), axis=-1)
+
+
+def joint_angles(leg: str, foot: np.ndarray) -> np.ndarray:
+    """Joint angles of a leg [rad], shape (..., 3), for a foot in the trunk's frame [m].
+
+    Out of reach, the nearest straight or folded leg is taken. The knee bends backward.
+    """
+    side = SIDE[leg]
+    x = foot[..., 0] - HIP_X_M[leg] - THIGH_X_M
+    y, z = foot[..., 1] - side * HIP_Y_M, foot[..., 2]
+    out = side * (THIGH_Y_M + CALF_Y_M)
+    down = -np.sqrt(np.maximum(y**2 + z**2 - out**2, 1e-8))
+    hip = np.arctan2(out * z - down * y, out * y + down * z)
+    reach = np.clip(np.hypot(x, down), abs(THIGH_M - CALF_M) + 1e-6, THIGH_M + CALF_M - 1e-6)
+    bend = np.arccos(
+        np.clip((reach**2 - THIGH_M**2 - CALF_M**2) / (2 * THIGH_M * CALF_M), -1.0, 1.0)
+    )
+    calf = -bend
+    thigh = np.arctan2(-x, -down) + np.arctan2(
+        CALF_M * np.sin(bend), THIGH_M + CALF_M * np.cos(bend)
+    )
+    return np.stack(np.broadcast_arrays(hip, thigh, calf), axis=-1)
+
+
+def default_pose() -> np.ndarray:
+    """Standing joint angles [rad], shape (12,)."""
+    return np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
+
+
+def limits() -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper joint limits [rad], each (12,)."""
+    low, high = np.array([LIMITS_RAD[name] for name in JOINT_NAMES]).T
+    return low, high
+
+
+# ---------------------------------------------------------------------------------- pieces
+
+
+def _leg(leg: str, servos: dict[str, DelayedPDParameters], step: float, knee: Knee) -> str:
+    side = SIDE[leg]
+    joints = {
+        kind: f'<joint name="{leg}_{kind}" type="hinge" axis="{axis}" '
+        f'range="{_numbers(LIMITS_RAD[f"{leg}_{kind}"])}" '
+        + (
+            ""
+            if kind == "calf" and knee == "linkage"
+            else attributes(joint_attributes(servos[f"{leg}_{kind}"], step))
+        )
+        + "/>"
+        for kind, axis in (("hip", "1 0 0"), ("thigh", "0 1 0"), ("calf", "0 1 0"))
+    }
+    return f"""<body name="{leg}_hip" pos="{HIP_X_M[leg]} {side * HIP_Y_M} 0">
+        {joints["hip"]}{_mirrored(_HIP, side)}
+        <geom name="{leg}_hip" type="box" size="0.0215 0.0145 0.0155"
+          pos="0.0045 {side * 0.00335} 0.0065" rgba="0.25 0.25 0.28 1"/>
+        <site name="{leg}_hip_touch" type="sphere" size="0.05" group="4"/>
+        <body name="{leg}_thigh" pos="{THIGH_X_M} {side * THIGH_Y_M} 0">
+          {joints["thigh"]}{_mirrored(_THIGH, side)}
+          <geom name="{leg}_thigh" type="capsule" size="0.0045" fromto="0 0 0 0 0 {-THIGH_M}"
+            rgba="0.9 0.55 0.15 1"/>
+          <site name="{leg}_thigh_touch" type="sphere" size="0.08" group="4"/>
+          <body name="{leg}_calf" pos="0 {side * CALF_Y_M} {-THIGH_M}">
+            {joints["calf"]}{_mirrored(_CALF, side)}
+            <geom class="visual" type="capsule" size="0.0015" fromto="0 0 0 0 0 {-CALF_M}"/>
+            <geom name="{leg}_foot" type="cylinder" size="{FOOT_RADIUS_M} {FOOT_THICKNESS_M / 2}"
+              pos="0 0 {-CALF_M}" zaxis="0 1 0" priority="1" rgba="0.1 0.1 0.1 1"/>
+            <site name="{leg}_foot" type="sphere" size="0.013" pos="0 0 {-CALF_M}" group="4"/>
+          </body>
+        </body>
+      </body>"""
+
+
+def _knee_tendon(leg: str, servos: dict[str, DelayedPDParameters], step: float) -> str:
+    own = joint_attributes(servos[f"{leg}_calf"], step)
+    return (
+        f'<fixed name="{leg}_calf_servo" {attributes(own)}>'
+        f'<joint joint="{leg}_thigh" coef="1"/><joint joint="{leg}_calf" coef="1"/></fixed>'
+    )
+
+
+def _mirrored(body: tuple, side: int) -> str:
+    mass, (x, y, z), (xx, yy, zz, xy, xz, yz) = body
+    return _inertial(mass, (x, side * y, z), (xx, yy, zz, side * xy, xz, side * yz))
+
+
+def _inertial(mass: float, centre: tuple, inertia: tuple) -> str:
+    return f'<inertial mass="{mass!r}" pos="{_numbers(centre)}" fullinertia="{_numbers(inertia)}"/>'
+
+
+def _numbers(values) -> str:
+    return " ".join(repr(float(v)) for v in values)

@@ -1,0 +1,373 @@
+"""RobotBatch: many Mini Puppers in `mujoco.batch`, each with its own servos, friction and payload.
+
+The physics of `sim.walking.env` without its task: draw robots, put them somewhere, step them, look
+at them. Arrays are (environments, …) NumPy; joint angles are in the order of `JOINT_NAMES`,
+absolute. Servo delay, gains, limits and friction are MuJoCo's own, so a control step of ten physics
+steps is one call (`Batch.rollout`) and no Python runs inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES, LEGS
+from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
+from pupper_sysid.sim.robot.mini_pupper import (
+    CONTACT_BODIES,
+    FOOT_RADIUS_M,
+    STANDING_HEIGHT_M,
+    default_pose,
+    limits,
+    robot_xml,
+)
+from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.terrain import Ground
+from pupper_sysid.sim.walking.config import Randomisation, Walking
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+Array = NDArray[np.float64]
+
+FEET = len(LEGS)
+_TOUCHES = FEET + len(CONTACT_BODIES)
+_THIGHS, _CALVES = np.arange(1, 12, 3), np.arange(2, 12, 3)
+
+
+class RobotBatch:
+    """Robots on one piece of ground.
+
+    Parameters
+    ----------
+    config : Walking
+    servos : ServoRanges
+    ground : Ground
+    environments : int
+    threads : int
+        0 for all cores.
+    servo_model : JointArrays, optional
+        See `sim.walking.env.PupperEnv`.
+
+    Attributes
+    ----------
+    qpos, qvel : ndarray, shape (n, 19), (n, 18)
+        MuJoCo's, live: root first, then the joints.
+    drawn : dict of str to ndarray, shape (n, 12)
+        The servos of each robot, by field of `DelayedPDParameters`.
+    friction : ndarray, shape (n,)
+        Of the feet on the ground.
+
+    Raises
+    ------
+    InputError
+        If a servo is not stable in such physics steps, a delay does not fit its buffer, or the
+        servo model is of other joints or another rate.
+    """
+
+    def __init__(
+        self,
+        config: Walking,
+        servos: ServoRanges,
+        ground: Ground,
+        environments: int,
+        threads: int,
+        servo_model: JointArrays | None,
+    ):
+        servos = servos.in_steps_of(config.physics_step_s)
+        self.config, self.servos, self.ground = config, servos, ground
+        self.servo_model, self.environments = servo_model, environments
+        if servo_model is not None:
+            self._check_servo_model(servo_model)
+            servo_model.reset(np.zeros((environments, len(JOINT_NAMES))))
+        # every buffer holds the longest delay that can be drawn
+        longest = {
+            name: replace(own, delay_s=np.array(servos.longest_delay_s))
+            for name, own in servos.nominal().items()
+        }
+        self.model = mujoco.MjModel.from_xml_string(
+            robot_xml(longest, config.physics_step_s, config.knee, ground.xml, ground.assets)
+        )
+        ground.fill(self.model)
+        room = self.model.actuator_history[:, 0].min() * config.physics_step_s
+        if servos.longest_delay_s > room:
+            raise InputError(
+                f"A delay of {servos.longest_delay_s} s does not fit the buffer of {room} s."
+            )
+        from mujoco.batch import Batch  # needs mujoco 4; its message names the module
+
+        self.batch = Batch(self.model, environments, threads)
+        self._fields = {
+            name: self.batch.expand(name)
+            for name in (
+                "actuator_biasprm", "actuator_dynprm", "actuator_forcerange", "actuator_delay",
+                "dof_armature", "dof_frictionloss", "geom_friction", "body_mass",
+                *(("tendon_armature", "tendon_frictionloss") if config.knee == "linkage" else ()),
+            )
+        }  # fmt: skip
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._control, self._activation = self.batch.bind("ctrl"), self.batch.bind("act")
+        self._history = self.batch.bind("history")
+        self._site_position = self.batch.bind("site_xpos")
+        self._full_line = _full_delay_lines(self.model)
+        self._feet_geoms = np.array([self.model.geom(f"{leg}_foot").id for leg in LEGS])
+        self._feet_sites = np.array([self.model.site(f"{leg}_foot").id for leg in LEGS])
+        self._trunk = self.model.body("trunk").id
+        self._low, self._high = limits()
+        # a servo model was fitted to angles told as if the thighs stood at their neutral
+        # (pupper_sysid.hardware.joint_map, servo coordinates)
+        default = default_pose()
+        self._bend = self.to_servo(default) - default
+        self._warnings = self.batch.warning.copy()
+        self.drawn = {f: np.zeros((environments, len(JOINT_NAMES))) for f in servos.value}
+        self.friction = np.zeros(environments)
+
+    # ------------------------------------------------------------------------- looking
+
+    @property
+    def joints(self) -> Array:
+        """Joint angles [rad], live, shape (n, 12)."""
+        return self.qpos[:, 7:]
+
+    @property
+    def joint_velocity(self) -> Array:
+        """Joint velocities [rad/s], live, shape (n, 12)."""
+        return self.qvel[:, 6:]
+
+    @property
+    def rate(self) -> Array:
+        """Angular velocity of the trunk in its own frame [rad/s], live, shape (n, 3)."""
+        return self.qvel[:, 3:6]
+
+    @property
+    def gravity(self) -> Array:
+        """Direction of gravity in the trunk's frame, shape (n, 3)."""
+        w, x, y, z = self.qpos[:, 3:7].T
+        return -np.stack(
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1
+        )
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity of the trunk in its own frame [m/s], shape (n, 3)."""
+        w, x, y, z = self.qpos[:, 3:7].T
+        a, b, c = self.qvel[:, :3].T
+        # rotate by the inverse: v + w t + t × q with t = 2 (v × q), by hand: np.cross is slow
+        t, u, v = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+        return np.stack(
+            [a + w * t + u * z - v * y, b + w * u + v * x - t * z, c + w * v + t * y - u * x],
+            axis=1,
+        )
+
+    def feet(self) -> tuple[Array, Array]:
+        """Where the feet are along the ground, (n, 4, 2), and their soles' heights, (n, 4) [m].
+
+        As all that MuJoCo derives, one physics step old.
+        """
+        at = self._site_position[:, self._feet_sites]
+        height = at[..., 2] - FOOT_RADIUS_M - self.ground.height(at[..., 0], at[..., 1])
+        return at[..., :2].copy(), height
+
+    def to_servo(self, joints: Array) -> Array:
+        """Servo angles of joint angles (..., 12): servo 3 holds thigh + calf behind a linkage."""
+        if self.config.knee == "serial":
+            return joints
+        servo = joints.copy()
+        servo[..., _CALVES] += joints[..., _THIGHS]
+        return servo
+
+    def from_servo(self, servo: Array) -> Array:
+        """Joint angles of servo angles; the inverse of `to_servo`."""
+        if self.config.knee == "serial":
+            return servo
+        joints = servo.copy()
+        joints[..., _CALVES] -= servo[..., _THIGHS]
+        return joints
+
+    # ------------------------------------------------------------------------- stepping
+
+    def step(self, target: Array) -> tuple[Array, Array, Array]:
+        """Let one control step pass under joint targets [rad], shape (n, 12).
+
+        Returns
+        -------
+        position, load : ndarray, shape (n, physics steps + 1, 12)
+            Joint angles [rad] and servo torques [N·m] at the start and after each physics step.
+        touch : ndarray, shape (n, 3, feet + bodies)
+            Force on the feet and on what must not touch the ground, in the last three steps [N].
+        """
+        config = self.config
+        start = self.joints[:, None].copy()
+        control = None
+        if self.servo_model is None:
+            self._control[:] = self.to_servo(target)
+        else:
+            before = self._control.copy()
+            predicted = np.asarray(self.servo_model.step(self.to_servo(target) - self._bend), float)
+            joints = self.from_servo(predicted + self._bend)
+            after = self.to_servo(np.clip(joints, self._low, self._high))
+            share = np.arange(1, config.substeps + 1)[:, None] / config.substeps
+            control = before[:, None] + share * (after - before)[:, None]
+        found = self.batch.rollout(
+            config.substeps, control, record=("qpos", "actuator_force", "sensordata")
+        )
+        position = np.concatenate([start, found["qpos"][:, :, 7:]], axis=1)
+        force = found["actuator_force"]
+        load = np.concatenate([force[:, :1], force], axis=1)
+        return position, load, found["sensordata"][:, -3:, :_TOUCHES]
+
+    def broken(self) -> NDArray[np.bool_]:
+        """Robots that MuJoCo had to reset since the last call, because they became NaN."""
+        now = self.batch.warning
+        raised = (now != self._warnings).reshape(self.environments, -1).any(axis=1)
+        raised |= ~np.isfinite(self.batch.state).all(axis=1)
+        self._warnings = now.copy()
+        return raised
+
+    # ------------------------------------------------------------------------- a new robot
+
+    def draw(self, ids: NDArray[np.intp], delay_share: float, rng: np.random.Generator) -> None:
+        """New servos, friction and payload for some robots; `delay_share` of the drawn delays."""
+        random, f = self.config.randomisation, self._fields
+        drawn = self.servos.draw(len(ids), random.torque_scale, rng)
+        drawn["delay_s"] = drawn["delay_s"] * delay_share
+        for name, value in drawn.items():
+            self.drawn[name][ids] = value
+        f["actuator_biasprm"][ids, :, 1] = -drawn["stiffness"]
+        f["actuator_biasprm"][ids, :, 2] = -drawn["damping"]
+        f["actuator_dynprm"][ids, :, 1] = drawn["velocity_limit"]
+        effort = drawn["effort_limit"]
+        f["actuator_forcerange"][ids] = np.stack([-effort, effort], axis=-1)
+        f["actuator_delay"][ids] = drawn["delay_s"]
+        joints = np.arange(len(JOINT_NAMES))
+        if self.config.knee == "linkage":
+            f["tendon_armature"][ids] = drawn["armature"][:, _CALVES]
+            f["tendon_frictionloss"][ids] = drawn["friction_loss"][:, _CALVES]
+            joints = np.setdiff1d(joints, _CALVES)
+        rows = ids[:, None]
+        f["dof_armature"][rows, 6 + joints] = drawn["armature"][:, joints]
+        f["dof_frictionloss"][rows, 6 + joints] = drawn["friction_loss"][:, joints]
+        self.friction[ids] = rng.uniform(*random.friction, len(ids))
+        f["geom_friction"][rows, self._feet_geoms, 0] = self.friction[ids, None]
+        payload = rng.uniform(*random.payload_kg, len(ids))
+        f["body_mass"][ids, self._trunk] = self.model.body_mass[self._trunk] + payload
+        self.batch.set_const(ids)
+
+    def place(
+        self,
+        ids: NDArray[np.intp],
+        joints: Array,
+        joint_velocity: Array,
+        room_m: float,
+        rng: np.random.Generator,
+    ) -> None:
+        """Put some robots down at random places and headings, told for long to hold `joints`.
+
+        Parameters
+        ----------
+        ids : ndarray of int
+        joints, joint_velocity : ndarray, shape (len(ids), 12)
+        room_m : float
+            How far from the ground's edge they must stay.
+        rng : numpy.random.Generator
+        """
+        random: Randomisation = self.config.randomisation
+        n = len(ids)
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._warnings[ids] = self.batch.warning[ids]  # a reset clears the counters of warnings
+        reach = self.ground.half_size_m - room_m
+        place = rng.uniform(-1, 1, (n, 2)) * (reach if np.isfinite(reach) else 0.5)
+        yaw = rng.uniform(-np.pi, np.pi, n)
+        self.qpos[ids, :2] = place
+        self.qpos[ids, 2] = self._highest_under(place) + STANDING_HEIGHT_M + 0.002
+        self.qpos[ids, 3:7] = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
+        self.qpos[ids, 7:] = joints
+        linear = rng.uniform(-1, 1, (n, 3)) * random.base_velocity_m_s
+        # the root's velocity is in the world's frame, its rate in its own
+        c, s = np.cos(yaw), np.sin(yaw)
+        self.qvel[ids, 0] = c * linear[:, 0] - s * linear[:, 1]
+        self.qvel[ids, 1] = s * linear[:, 0] + c * linear[:, 1]
+        self.qvel[ids, 2] = linear[:, 2]
+        self.qvel[ids, 3:6] = rng.uniform(-1, 1, (n, 3)) * random.base_rate_rad_s
+        self.qvel[ids, 6:] = joint_velocity
+        told = self.to_servo(joints)
+        self._control[ids] = told
+        self._activation[ids] = told
+        # MuJoCo empties delay lines to zeros, which would throw the robot on its back
+        lines = np.repeat(self._full_line[None], n, axis=0)
+        values = (lines.shape[2] - 2) // 2
+        lines[:, :, -values:] = told[:, :, None]
+        self._history[ids] = lines.reshape(n, -1)
+        if self.servo_model is not None:
+            self.servo_model.reset_some(ids, told - self._bend)
+        self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)
+
+    def push(self, ids: NDArray[np.intp], velocity: Array) -> None:
+        """Give the trunks of some robots a horizontal velocity [m/s], shape (len(ids), 2)."""
+        self.qvel[ids, :2] = velocity
+
+    # ------------------------------------------------------------------------- state
+
+    @property
+    def state(self) -> dict[str, NDArray]:
+        """Everything that changes, as copies."""
+        found = {f"batch.{name}": np.array(v, copy=True) for name, v in self._fields.items()}
+        found |= {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
+        found |= {"batch.state": self.batch.state.copy(), "friction": self.friction.copy()}
+        if self.servo_model is not None:
+            found |= {f"servo.{k}": v.copy() for k, v in self.servo_model.memory.items()}
+        return found
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go back to a `state` exactly.
+
+        Raises
+        ------
+        InputError
+            If it is of another number of robots, or of another robot.
+        """
+        if state["batch.state"].shape != self.batch.state.shape:
+            raise InputError(
+                f"The saved environments have state {state['batch.state'].shape}, these "
+                f"{self.batch.state.shape}. Resume with the settings of the run."
+            )
+        for name, value in self._fields.items():
+            value[:] = state[f"batch.{name}"]
+        self.batch.set_const()
+        self.batch.state[:] = state["batch.state"]
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+        # forward leaves its mark on what warm-starts the solver
+        self.batch.state[:] = state["batch.state"]
+        for k, v in self.drawn.items():
+            v[:] = state[f"drawn.{k}"]
+        self.friction[:] = state["friction"]
+        if self.servo_model is not None:
+            for k, v in self.servo_model.memory.items():
+                v[:] = state[f"servo.{k}"]
+        self._warnings = self.batch.warning.copy()
+
+    def _check_servo_model(self, model: JointArrays) -> None:
+        if model.joints != JOINT_NAMES:
+            raise InputError("The servo model must have all twelve joints, in order.")
+        span = self.config.control_step_s
+        if not same_rate(model.time_step_s, span):
+            raise InputError(
+                f"The servo model steps every {model.time_step_s} s, the policy every {span} s. "
+                "Refit it at this rate, or set --task.control-step-s."
+            )
+
+    def _highest_under(self, place: Array) -> Array:
+        """Highest ground under a robot at `place`, shape (n,) [m]."""
+        x, y = np.meshgrid([-0.1, 0.0, 0.1], [-0.1, 0.0, 0.1])
+        return self.ground.height(place[:, :1] + x.ravel(), place[:, 1:] + y.ravel()).max(axis=1)
+
+
+def _full_delay_lines(model: Any) -> Array:
+    """Delay lines as they are when a command has been held for long, shape (actuators, length)."""
+    data = mujoco.MjData(model)
+    for i in range(model.nu):
+        samples = int(model.actuator_history[i][0])
+        mujoco.mj_initCtrlHistory(model, data, i, None, np.zeros((samples, 1)))
+    return data.history.reshape(model.nu, -1).copy()

@@ -1,0 +1,122 @@
+"""The ground: flat, rough, hills, troughs and steps, as MJCF and as a height anyone can look up.
+
+Simulations of a batch do not see each other, so one field of tiles serves all of them; a robot
+starts on a tile and its episode ends (as a time-out) before the field does. Sizes follow the
+paper's terrain: tiles of 8 m, 5 cm between heights, rough ground of 1 to 2 cm, slopes up to 8.5°.
+Steps (not in the paper) are 3 to 10 mm high and rise, as all of a field of heights, over 5 cm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sim.robot.mini_pupper import FLAT_GROUND
+
+Terrain = Literal["flat", "rough", "slopes", "troughs", "steps", "mixed"]
+
+TILE_M, SPACING_M = 8.0, 0.05
+_PLATFORM_M = 0.6
+_ROUGH_M = (0.01, 0.02)
+_STEEPEST = 0.15
+_TREAD_M, _RISER_M = 0.3, (0.003, 0.01)  # up to what a foot is lifted in the reference trot
+_TILES = {
+    "rough": ("rough",) * 4,
+    "slopes": ("slope",) * 4,
+    "troughs": ("trough",) * 4,
+    "steps": ("steps",) * 4,
+    "mixed": ("flat", "rough", "slope", "trough"),
+}
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A piece of ground, its middle at the origin.
+
+    Attributes
+    ----------
+    xml, assets : str
+        MJCF inside `<worldbody>` and `<asset>`.
+    heights : ndarray, shape (rows, columns) or None
+        Heights [m] at `SPACING_M`, row along y; None for a plane.
+    half_size_m : float
+        How far it reaches from the origin; infinite for a plane.
+    """
+
+    xml: str
+    assets: str
+    heights: NDArray[np.float64] | None
+    half_size_m: float
+
+    def height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Height [m] at positions [m], as MuJoCo sees it; at the edge beyond the edge.
+
+        Each square between four heights is two triangles, which meet where x and y grow together.
+        """
+        if self.heights is None:
+            return np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        most = len(self.heights) - 1
+        column = np.clip((x + self.half_size_m) / SPACING_M, 0, most - 1e-6)
+        row = np.clip((y + self.half_size_m) / SPACING_M, 0, most - 1e-6)
+        i, j = row.astype(int), column.astype(int)
+        u, v = row - i, column - j
+        h = self.heights
+        near, far = h[i, j], h[i + 1, j + 1]
+        beside = np.where(v >= u, h[i, j + 1], h[i + 1, j])
+        more, less = np.maximum(u, v), np.minimum(u, v)
+        return near + more * (beside - near) + less * (far - beside)
+
+    def fill(self, model: Any) -> None:
+        """Write the heights into a compiled `mujoco.MjModel`."""
+        if self.heights is not None:
+            model.hfield_data[:] = (
+                (self.heights - self.heights.min()) / _depth(self.heights)
+            ).ravel()
+
+
+def make_ground(kind: Terrain, rng: np.random.Generator) -> Ground:
+    """Ground of one kind, its random parts drawn from `rng`."""
+    if kind == "flat":
+        return Ground(FLAT_GROUND, "", None, np.inf)
+    count = round(TILE_M / SPACING_M)
+    tiles = [_tile(name, count, rng) for name in _TILES[kind]]
+    heights = np.block([[tiles[0], tiles[1]], [tiles[2], tiles[3]]])
+    heights = np.pad(heights, ((0, 1), (0, 1)), mode="edge")
+    half = SPACING_M * (len(heights) - 1) / 2
+    rows = len(heights)
+    assets = (
+        f'<hfield name="ground" nrow="{rows}" ncol="{rows}" '
+        f'size="{half} {half} {_depth(heights)} 0.1"/>'
+    )
+    xml = (
+        f'<geom name="ground" type="hfield" hfield="ground" pos="0 0 {heights.min()}" '
+        'material="grid" contype="0" conaffinity="1"/>'
+    )
+    return Ground(xml, assets, heights, half)
+
+
+def _depth(heights: NDArray[np.float64]) -> float:
+    return max(float(np.ptp(heights)), 1e-3)
+
+
+def _tile(name: str, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Heights of one tile, 0 at its edge."""
+    if name == "flat":
+        return np.zeros((count, count))
+    if name == "rough":
+        return rng.choice(_ROUGH_M, (count, count)) * _inside(count, 0.25)
+    x = (np.arange(count) + 0.5) * SPACING_M - TILE_M / 2
+    far = np.maximum(np.abs(x)[:, None], np.abs(x)[None, :])
+    pyramid = TILE_M / 2 - np.maximum(far, _PLATFORM_M / 2)
+    if name == "steps":
+        return np.floor(pyramid / _TREAD_M) * rng.uniform(*_RISER_M)
+    slope = rng.uniform(0.3, 1.0) * _STEEPEST
+    return pyramid * slope * (1 if name == "slope" else -1)
+
+
+def _inside(count: int, border_m: float) -> NDArray[np.bool_]:
+    near = np.minimum(np.arange(count), np.arange(count)[::-1]) * SPACING_M >= border_m
+    return near[:, None] & near[None, :]

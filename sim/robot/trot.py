@@ -1,0 +1,128 @@
+"""An open-loop trot: where the twelve joints go, given a phase and a commanded motion.
+
+Diagonal pairs of feet are half a cycle apart. A foot on the ground passes under the trunk at the
+commanded speed, so the trunk moves evenly; in the air it swings back and is lifted along a half
+sine. Feet stand for more than half of a cycle: while all four carry, the trunk is not left to turn
+on a diagonal. It is what `sim.walking.env` and `policies.train.imitation` call a reference.
+
+`phase_of` reads the phase off joint targets, so that the trot can be continued from any action by
+someone who does not see a clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import LEGS
+from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position, joint_angles
+
+_BEHIND = np.array([0.0, 0.5, 0.5, 0.0])[:, None]  # LF, RF, LB, RB: share of a cycle
+_GRID = np.linspace(0.0, 2 * np.pi, 96, endpoint=False)
+
+
+@dataclass(frozen=True)
+class Trot:
+    """A trot."""
+
+    frequency_hz: float = 3.25
+    """Strides per second."""
+    lift_m: float = 0.012
+    """Height of a swinging foot."""
+    duty: float = 0.65
+    """Share of a cycle for which a foot stands."""
+    gain: float = 1.0
+    """Speed of the feet over the commanded speed; above 1 makes up for slip."""
+    turn_gain: float = 0.9
+    """The same of turning: this robot turns farther than its feet while it trots."""
+
+    def __post_init__(self):
+        if not 0 < self.duty < 1 or not self.frequency_hz > 0:
+            raise InputError(
+                f"A trot of {self.frequency_hz} Hz in which feet stand for {self.duty} of a cycle "
+                "is impossible: trot.frequency_hz must be positive, trot.duty between 0 and 1."
+            )
+
+    def joints(
+        self, phase: NDArray[np.float64], command: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Joint targets [rad], shape (n, 12).
+
+        Parameters
+        ----------
+        phase : ndarray, shape (n,)
+            Of LF and RB [rad]; at 0 they touch down in front.
+        command : ndarray, shape (n, 3)
+            Forward and sideways speed [m/s], turn rate [rad/s]; 0, 0, 0 stands.
+        """
+        along, up = self._cycle(phase)
+        stroke = self._strokes(command)
+        moving = np.abs(command).max(axis=1) > 0
+        angles = []
+        for i, leg in enumerate(LEGS):
+            path = np.concatenate([stroke[:, i] * along[i][:, None], up[i][:, None]], axis=1)
+            angles.append(joint_angles(leg, _NEUTRAL[i] + path))
+        return np.where(moving[:, None], np.concatenate(angles, axis=1), default_pose())
+
+    def phase_of(
+        self,
+        joints: NDArray[np.float64],
+        earlier: NDArray[np.float64],
+        between_s: float,
+        command: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Phase [rad], shape (n,), of the point of the trot that is nearest to joint targets.
+
+        The targets before them tell feet that rise from feet that come down, which short strokes
+        alone do not.
+
+        Parameters
+        ----------
+        joints, earlier : ndarray, shape (n, 12)
+            Now and `between_s` before.
+        between_s : float
+        command : ndarray, shape (n, 3)
+            Not all 0: a standing robot has no phase.
+        """
+        stroke = self._strokes(command)
+        step = 2 * np.pi * self.frequency_hz * between_s
+        distance = np.zeros((len(joints), len(_GRID)))
+        for targets, phase in ((joints, _GRID), (earlier, _GRID - step)):
+            along, up = self._cycle(phase)
+            for i, leg in enumerate(LEGS):
+                away = foot_position(leg, *targets[:, 3 * i : 3 * i + 3].T) - _NEUTRAL[i]
+                # |away - path|² without the part that is the same at every phase
+                distance -= 2 * (away[:, :2] * stroke[:, i]).sum(axis=1)[:, None] * along[i]
+                distance += (stroke[:, i] ** 2).sum(axis=1)[:, None] * along[i] ** 2
+                distance += up[i] * (up[i] - 2 * away[:, 2:])
+        nearest = distance.argmin(axis=1)
+        rows = np.arange(len(joints))
+        before, at, after = (distance[rows, (nearest + k) % len(_GRID)] for k in (-1, 0, 1))
+        # the bottom of the parabola through the three lowest points
+        bend = np.maximum(before - 2 * at + after, 1e-15)
+        return _GRID[nearest] + _GRID[1] * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+
+    def _cycle(self, phase: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+        """Where feet are in their strokes, 1 to -1, and how high [m], each shape (4, n)."""
+        own = (phase / (2 * np.pi) + _BEHIND) % 1.0
+        stands = own < self.duty
+        swing = np.pi * (own - self.duty) / (1.0 - self.duty)
+        along = np.where(stands, 1.0 - 2.0 * own / self.duty, -np.cos(swing))
+        return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
+
+    def _strokes(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
+        x, y = _NEUTRAL[:, 0], _NEUTRAL[:, 1]
+        forward, left = self.gain * command[:, :1], self.gain * command[:, 1:2]
+        turn = self.turn_gain * command[:, 2:]
+        speed = np.stack([forward - turn * y, left + turn * x], axis=-1)
+        # from +A to -A while it stands
+        return speed * self.duty / (2 * self.frequency_hz)
+
+
+_NEUTRAL = np.array(
+    [foot_position(leg, *default_pose()[3 * i : 3 * i + 3]) for i, leg in enumerate(LEGS)]
+)

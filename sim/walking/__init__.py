@@ -1,0 +1,1 @@
+"""The vectorised walking environment, and one robot that walks behind a bus."""

@@ -1,0 +1,112 @@
+"""`--bus sim`: the robot that walks, as a controller of a real one would meet it.
+
+    bus = GuardedBus(WalkingBus(draw_robot(rng), rng))
+
+Commands and readings are in joint coordinates, as a controller's are (a calf relative to its
+thigh; `hardware.joint_map`), and pass through `EmulatedBus`: counts, polls in turn, lost ones, an
+offset, noise. The calf's reading is that of two servos, polled at different times. In virtual time
+it runs as fast as the machine can; `robot.trunk` tells where it really went.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.imu import ImuSample
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import EmulatedRobot
+from pupper_sysid.sim.walking.robot import WalkingRobot
+
+
+class WalkingBus:
+    """A `hardware.ServoBus` with an IMU (`hardware.imu.Imu`) of an emulated robot that walks.
+
+    Parameters
+    ----------
+    truth : EmulatedRobot
+        Its servos and their feedback.
+    rng : numpy.random.Generator
+        Decides lost polls, noise and timing.
+    real_time : bool
+        Live by the host's clock instead of virtual time.
+
+    Attributes
+    ----------
+    robot : WalkingRobot
+        What the bus is connected to.
+
+    Raises
+    ------
+    InputError
+        If a servo's delay is too short to emulate.
+    """
+
+    name = "sim"
+    joint_names: tuple[str, ...] = JOINT_NAMES
+
+    def __init__(self, truth: EmulatedRobot, rng: np.random.Generator, real_time: bool = False):
+        self.robot = WalkingRobot(truth, rng.spawn(1)[0])
+        self._bus = EmulatedBus(truth, rng, real_time, self.robot, keep_log=False)
+        self._map = load_joint_map("mini_pupper_2")
+        self._servo_map = self._map.per_servo()
+        self.limits = self._map.position_limits()
+        self.metadata: dict[str, Any] = self._bus.metadata | {
+            "kind": "emulated walking robot",
+            "coordinates": "joint",
+        }
+
+    def now(self) -> float:
+        """Time of the bus's clock [s], from 0 at construction."""
+        return self._bus.now()
+
+    def sleep_until(self, time_s: float) -> None:
+        """Return when `now()` has reached `time_s`; in virtual time only the physics costs."""
+        self._bus.sleep_until(time_s)
+
+    def write(self, position_rad: NDArray[np.float64]) -> Sent:
+        """Send goal positions of the joints [rad], shape (12,).
+
+        Raises
+        ------
+        BusError
+            If the bus is closed or a goal is not a number.
+        """
+        goal = np.asarray(position_rad, float)
+        if goal.shape != (len(JOINT_NAMES),):
+            raise BusError(f"sim: goals must be {len(JOINT_NAMES)} finite angles, got {goal}.")
+        sent = self._bus.write(self._servo_map.to_angles(self._map.to_counts(goal)))
+        return Sent(sent.time_s, goal)
+
+    def read(self) -> BusSample:
+        """Read all joints once: whatever the last successful poll of each servo has left.
+
+        Raises
+        ------
+        BusError
+            If the bus is closed.
+        """
+        sample = self._bus.read()
+        joints = self._map.to_angles(self._servo_map.to_counts(sample.position_rad))
+        return replace(sample, position_rad=joints)
+
+    def imu(self) -> ImuSample | None:
+        """The IMU's latest sample."""
+        now = self.now()
+        sample = self.robot.imu(now)
+        return None if sample is None else replace(sample, time_s=now)
+
+    def torque(self, on: bool) -> bool:
+        """Hold the present pose, or let every servo go limp."""
+        return self._bus.torque(on)
+
+    def close(self) -> None:
+        """Release the bus."""
+        self._bus.close()

@@ -1,0 +1,314 @@
+"""One emulated Mini Pupper 2 standing on flat ground, walking where its servos carry it.
+
+The same servos as `sim.emulator.free_air_servo`, under a robot: `WalkingRobot` is a `ServoPlant`,
+so every emulated bus can have it behind it, with an IMU. MuJoCo steps it only as far as someone
+asks; a robot that has come to rest is not stepped until it is told to move.
+
+Commands come at any instant, not only on physics steps: each actuator gets the mean of its held
+command over the step before, and its delay is shortened by that one step, so that a command's
+timing is kept although MuJoCo reads one value per step. The last two seconds are remembered,
+because servos are polled one after the other, each a little before what was asked last.
+
+`trunk` tells the truth about where the robot is and how it moves, for scoring; nothing on a real
+robot could.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from threading import RLock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.imu import GRAVITY_M_S2, SAMPLE_RATE_HZ, ImuSample, as_words, from_chip
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.robot import EmulatedRobot
+from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
+from pupper_sysid.sim.robot.servo_mjcf import mujoco
+
+PHYSICS_STEP_S = 0.001
+"""Half the step of training, so that a policy is not judged in the simulator that it learnt in."""
+
+ACCELERATION_NOISE_G, RATE_NOISE_DEG_S = 0.002, 0.15
+"""Standard deviations of a chip of this class over its whole bandwidth. This one was not measured;
+white, without bias."""
+
+_MEMORY_STEPS = 2048
+_SETTLING_S = 1.0
+_STILL_RAD_S, _STILL_RAD_S2 = 1e-3, 1e-2  # of the trunk m/s and m/s²; settled, 1e-5 are left
+_SERVOS = len(JOINT_NAMES)
+_CHIP_UNITS = np.repeat([GRAVITY_M_S2, np.pi / 180], 3)
+_NOISE = np.repeat([ACCELERATION_NOISE_G, RATE_NOISE_DEG_S], 3)
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """The truth about the trunk.
+
+    Attributes
+    ----------
+    time_s : float
+    position_m : ndarray, shape (3,)
+        Of its origin, from where the robot stood at time 0, above the ground.
+    heading_rad : float
+        Direction of its nose along the ground, to the left of where it was at time 0; ±pi.
+    velocity_m_s : ndarray, shape (3,)
+        In its own axes: forward, to the left, up.
+    yaw_rate_rad_s : float
+        About its own vertical axis, to the left.
+    upright : float
+        Cosine of its tilt: 1 standing level, 0 on its side, -1 on its back.
+    """
+
+    time_s: float
+    position_m: NDArray[np.float64]
+    heading_rad: float
+    velocity_m_s: NDArray[np.float64]
+    yaw_rate_rad_s: float
+    upright: float
+
+
+class WalkingRobot:
+    """A robot that walks: a `ServoPlant`. May be used by several threads.
+
+    Parameters
+    ----------
+    robot : EmulatedRobot
+        Its servos; every delay at least two physics steps.
+    rng : numpy.random.Generator
+        The IMU's noise.
+    time_step_s : float
+        Physics step [s].
+
+    Raises
+    ------
+    InputError
+        If a delay is shorter than two physics steps.
+    """
+
+    def __init__(
+        self,
+        robot: EmulatedRobot,
+        rng: np.random.Generator,
+        time_step_s: float = PHYSICS_STEP_S,
+    ):
+        self._rng, self._dt, self._lock = rng, time_step_s, RLock()
+        delays = {s.joint: float(np.asarray(s.actuator.delay_s)) for s in robot.servos}
+        for joint, delay in delays.items():
+            # MuJoCo would take what is left of a shorter delay for a whole step
+            if not delay >= 2 * time_step_s:
+                raise InputError(
+                    f"emulated {joint}: delay_s is {delay}; it must be at least two physics "
+                    f"steps of {time_step_s} s."
+                )
+        native = {
+            s.joint: replace(s.actuator, delay_s=delays[s.joint] - time_step_s)
+            for s in robot.servos
+        }
+        self._model = mujoco.MjModel.from_xml_string(robot_xml(native, time_step_s))
+        # training's few PGS iterations let a standing robot creep round by 0.2 °/s; for a single
+        # robot the exact solver costs no more
+        self._model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        self._model.opt.iterations = 100
+        self._data = mujoco.MjData(self._model)
+        self._gains = self._model.actuator_biasprm.copy()
+        self._effort = np.array([s.actuator.effort_limit for s in robot.servos], float)
+        self._force = self._data.actuator_force
+        self._acceleration, self._rate = (
+            self._data.sensor(name).data for name in ("accelerometer", "gyro")
+        )
+        layout = load_joint_map("mini_pupper_2")
+        # servo coordinates of absolute angles: a calf's is told as if its thigh stood at neutral
+        self._shift = layout.per_servo().to_angles(layout.to_counts(np.zeros(_SERVOS)))
+        self._settled_after = int(max(delays.values()) / time_step_s) + 3
+        self._goal = default_pose()
+        self._goal[2::3] += self._goal[1::3]  # a calf's servo holds thigh + calf
+        self._queue: deque[tuple[float, int, float]] = deque()
+        self._angles = np.zeros((_MEMORY_STEPS, _SERVOS))  # absolute
+        self._forces = np.zeros((_MEMORY_STEPS, _SERVOS))
+        self._chip = np.zeros((_MEMORY_STEPS, 6))  # m/s², rad/s, along the chip's axes
+        self._asked = np.zeros(_SERVOS, int)
+        self._conversion = -1
+        self._sample: ImuSample | None = None
+        self._step = self._changed = 0
+        self._stand()
+
+    def command(self, index: int, time_s: float, angle_rad: float) -> None:
+        """Goal of one servo [rad] from `time_s` on, which must not go backwards.
+
+        A limp servo ignores it.
+        """
+        with self._lock:
+            goal = float(angle_rad) - self._shift[index]
+            queued = [g for _, i, g in self._queue if i == index]
+            latest = queued[-1] if queued else self._goal[index]
+            if not self._is_limp(index) and goal != latest:
+                self._queue.append((time_s, index, goal))
+
+    def torque(self, index: int, time_s: float, on: bool) -> None:
+        """Hold the present position, or go limp, from `time_s` on."""
+        with self._lock:
+            held = self.angle(index, time_s) - self._shift[index]
+            self._model.actuator_biasprm[index] = self._gains[index] if on else 0.0
+            self._queue = deque(e for e in self._queue if e[1] != index)
+            self._hold(index, held)
+            self._changed = self._step
+
+    def angle(self, index: int, time_s: float) -> float:
+        """True angle of one servo [rad], at most two seconds before the latest asked."""
+        with self._lock:
+            before, after, share = self._moment(time_s)
+            self._asked[index] = after
+            first, second = self._angles[before, index], self._angles[after, index]
+            # exact inside a step: MuJoCo moves the joints with the velocity at the step's end
+            return float(first + share * (second - first) + self._shift[index])
+
+    def load(self, index: int) -> float:
+        """Share of a servo's effort limit at work, signed, when its angle was last asked for."""
+        with self._lock:
+            return float(self._forces[self._asked[index], index] / self._effort[index])
+
+    def imu(self, time_s: float) -> ImuSample | None:
+        """The chip's latest sample, of at most 1/235 s ago.
+
+        True rate and specific force with white noise, in whole counts, clipped as the chip clips.
+        """
+        with self._lock:
+            conversion = int(time_s * SAMPLE_RATE_HZ)
+            if conversion > self._conversion:
+                at = conversion / SAMPLE_RATE_HZ
+                raw = self._chip[self._moment(at)[1]] / _CHIP_UNITS
+                raw += _NOISE * self._rng.standard_normal(6)
+                self._conversion, self._sample = conversion, from_chip(at, as_words(raw))
+            return self._sample
+
+    def trunk(self, time_s: float) -> Trunk:
+        """Where the trunk is and how it moves, at `time_s` or the latest asked."""
+        with self._lock:
+            self._advance(self._steps(time_s))
+            position, velocity = self._data.qpos[:3].copy(), self._data.qvel[:3]
+            axes = np.empty(9)
+            mujoco.mju_quat2Mat(axes, self._data.qpos[3:7])
+            axes = axes.reshape(3, 3)  # columns: the trunk's axes in the world
+            return Trunk(
+                self._step * self._dt,
+                position,
+                float(np.arctan2(axes[1, 0], axes[0, 0])),
+                axes.T @ velocity,
+                float(self._data.qvel[5]),
+                float(axes[2, 2]),
+            )
+
+    def push(self, velocity_m_s: NDArray[np.float64]) -> None:
+        """Give the trunk a horizontal velocity, shape (2,), in the world's axes, now."""
+        with self._lock:
+            self._data.qvel[:2] = velocity_m_s
+            self._changed = self._step
+
+    # ------------------------------------------------------------------------- time
+
+    def _stand(self) -> None:
+        """Stand at the origin in the default pose, settled, with full delay lines."""
+        self._data.qpos[7:] = default_pose()
+        for index, held in enumerate(self._goal.copy()):
+            self._hold(index, held)
+        for _ in range(round(_SETTLING_S / self._dt)):
+            mujoco.mj_step(self._model, self._data)
+        w, _, _, z = self._data.qpos[3:7]
+        heading = np.arctan2(z, w)  # half of it
+        turn = np.array([np.cos(heading), 0.0, 0.0, -np.sin(heading)])
+        mujoco.mju_mulQuat(self._data.qpos[3:7], turn, self._data.qpos[3:7].copy())
+        self._data.qpos[:2] = 0.0
+        mujoco.mj_forward(self._model, self._data)
+        self._changed = -self._settled_after - 1
+        self._remember()
+
+    def _hold(self, index: int, held: float) -> None:
+        """Let a servo have been commanded to `held` [rad, absolute] for ever."""
+        self._goal[index] = self._data.ctrl[index] = held
+        if self._model.actuator_actnum[index]:
+            self._data.act[self._model.actuator_actadr[index]] = held
+        # what has been commanded before must not come out of the delay line
+        samples = int(self._model.actuator_history[index][0])
+        line = np.full((samples, 1), held)
+        mujoco.mj_initCtrlHistory(self._model, self._data, index, None, line)
+
+    def _steps(self, time_s: float) -> int:
+        """Physics steps after which `time_s` is reached."""
+        return int(np.ceil(time_s / self._dt - 1e-9))
+
+    def _moment(self, time_s: float) -> tuple[int, int, float]:
+        """Rows of the memory on both sides of a time, and where it lies between them."""
+        after = self._steps(time_s)
+        self._advance(after)
+        oldest = max(self._step - _MEMORY_STEPS + 1, 0)
+        after = min(max(after, oldest), self._step)
+        before = max(after - 1, oldest)
+        share = min(max(time_s / self._dt - before, 0.0), 1.0)
+        return before % _MEMORY_STEPS, after % _MEMORY_STEPS, share
+
+    def _advance(self, last: int) -> None:
+        """Take physics steps until the state is that of the start of step `last`."""
+        while self._step < last:
+            # step k sees what was commanded during step k - 1
+            event = int(self._queue[0][0] / self._dt) + 1 if self._queue else last
+            if event <= self._step:
+                self._data.ctrl[:] = self._mean_of_last_step()
+                self._changed = self._step
+                self._take_step()
+            elif self._resting():
+                self._stay(min(event, last))
+            else:
+                self._data.ctrl[:] = self._goal
+                self._take_step()
+
+    def _take_step(self) -> None:
+        mujoco.mj_step(self._model, self._data)
+        self._step += 1
+        self._remember()
+
+    def _remember(self) -> None:
+        """Write the present state into the memory.
+
+        Forces and sensors are those of one step before, as MuJoCo leaves them.
+        """
+        row = self._step % _MEMORY_STEPS
+        angles, chip = self._angles[row], self._chip[row]
+        angles[:] = self._data.qpos[7:]
+        angles[2::3] += angles[1::3]
+        self._forces[row] = self._force
+        chip[:3], chip[3:] = self._acceleration, self._rate
+
+    def _stay(self, until: int) -> None:
+        """Let time pass, and nothing else, until step `until`."""
+        now = self._step % _MEMORY_STEPS
+        rows = np.arange(max(self._step, until - _MEMORY_STEPS) + 1, until + 1) % _MEMORY_STEPS
+        for memory in (self._angles, self._forces, self._chip):
+            memory[rows] = memory[now].copy()
+        self._step = until
+
+    def _mean_of_last_step(self) -> NDArray[np.float64]:
+        """Mean of the commands over the step before the present one; takes them off the queue."""
+        since, stop = (self._step - 1) * self._dt, self._step * self._dt
+        mean = self._goal.copy()
+        while self._queue and self._queue[0][0] < stop:
+            at, index, goal = self._queue.popleft()
+            share = (stop - max(at, since)) / self._dt
+            mean[index] += share * (goal - self._goal[index])
+            self._goal[index] = goal
+        return mean
+
+    def _is_limp(self, index: int) -> bool:
+        return not self._model.actuator_biasprm[index].any()
+
+    def _resting(self) -> bool:
+        """Whether another step would change nothing that anyone could see."""
+        return (
+            self._step - self._changed > self._settled_after
+            and np.abs(self._data.qvel).max() < _STILL_RAD_S
+            and np.abs(self._data.qacc).max() < _STILL_RAD_S2
+        )

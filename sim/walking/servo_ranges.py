@@ -1,0 +1,221 @@
+"""What twelve servos may be, drawn anew for every episode from a calibration's intervals.
+
+`servo_ranges` turns what a user gives as `--actuator` (a calibration file or preset, or `ideal`)
+into arrays of twelve: the middle and the ends of every interval. Joints that the calibration does
+not have take the numbers of the same kind of joint on another leg, and the result says so. `draw`
+makes one set of servos per environment. The feedback comes along, apart from the actuator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
+from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration, Quantity
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.servo_models.joint_arrays import JointArrays
+from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.servo_models.step_size import delay_at_step
+
+IDEAL = "ideal"
+_NO_LIMIT_NM, _NO_LIMIT_RAD_S = 1e3, 1e3
+
+
+@dataclass(frozen=True)
+class ServoRanges:
+    """Ranges of twelve servos, in the order of `JOINT_NAMES`.
+
+    Attributes
+    ----------
+    source : str
+        What was given: a path, a preset's name or `ideal`.
+    low, value, high : dict of str to ndarray, shape (12,)
+        By field of `DelayedPDParameters`: ends of the interval, and its middle.
+    feedback : tuple of HeldFeedback
+        Of each servo.
+    borrowed : dict of str to str
+        Joints that were not calibrated, and whose numbers they took.
+    """
+
+    source: str
+    low: dict[str, NDArray[np.float64]]
+    value: dict[str, NDArray[np.float64]]
+    high: dict[str, NDArray[np.float64]]
+    feedback: tuple[HeldFeedback, ...]
+    borrowed: dict[str, str]
+
+    @property
+    def longest_delay_s(self) -> float:
+        """The longest delay that can be drawn [s]."""
+        return float(self.high["delay_s"].max())
+
+    def later(self, delay_s: ArrayLike) -> ServoRanges:
+        """The same servos with every delay longer by `delay_s` [s], one or twelve; none below 0."""
+        moved = {}
+        for name in ("low", "value", "high"):
+            own = getattr(self, name)
+            moved[name] = {**own, "delay_s": np.maximum(own["delay_s"] + delay_s, 0.0)}
+        return replace(self, **moved)
+
+    def in_steps_of(self, time_step_s: float) -> ServoRanges:
+        """The same servos for a simulation in other steps, with the lag they were measured with.
+
+        Raises
+        ------
+        InputError
+            If a servo is not stable in such steps.
+        """
+        middle = DelayedPDParameters(**self.value)
+        return self.later(delay_at_step(middle, time_step_s) - self.value["delay_s"])
+
+    def nominal(self) -> dict[str, DelayedPDParameters]:
+        """The middle of every interval, by joint."""
+        return {
+            name: DelayedPDParameters(**{f: self.value[f][i] for f in PARAMETER_KEYS})
+            for i, name in enumerate(JOINT_NAMES)
+        }
+
+    def draw(
+        self, count: int, torque_scale: tuple[float, float], rng: np.random.Generator
+    ) -> dict[str, NDArray[np.float64]]:
+        """Servos of `count` robots, each number uniform in its interval.
+
+        Parameters
+        ----------
+        count : int
+        torque_scale : (float, float)
+            Range of a factor on all torques and the armature of a robot: free-air recordings
+            leave their common scale open.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        dict of str to ndarray, shape (count, 12)
+            By field of `DelayedPDParameters`.
+        """
+        drawn = {
+            f: rng.uniform(self.low[f], self.high[f], (count, len(JOINT_NAMES)))
+            for f in PARAMETER_KEYS
+        }
+        scale = rng.uniform(*torque_scale, (count, 1))
+        for f in ("stiffness", "damping", "friction_loss", "armature", "effort_limit"):
+            drawn[f] *= scale
+        return drawn
+
+
+def servo_ranges(actuator: str | Path, feedback: str | Path = "held") -> ServoRanges:
+    """Ranges from what a user gave.
+
+    Parameters
+    ----------
+    actuator : str or Path
+        A calibration file, a preset, or `ideal`: at once, without friction, as strong as needed;
+        so is the folder of a learned servo model, which says itself where the servo will be.
+    feedback : str or Path
+        `held`: as the calibration measured it; `ideal`: every reading fresh and exact; or another
+        calibration whose feedback to take.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read.
+    """
+    if str(actuator) == IDEAL or is_servo_model(actuator):
+        found = _ideal(str(actuator))
+    else:
+        found = _from_calibration(load_calibration(actuator), str(actuator))
+    if str(feedback) == "held":
+        return found
+    if str(feedback) == "ideal":
+        held = (HeldFeedback(),) * len(JOINT_NAMES)
+    else:
+        held = _from_calibration(load_calibration(feedback), str(feedback)).feedback
+    return replace(found, feedback=held)
+
+
+def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
+    parts: list[JointCalibration] = []
+    borrowed = {}
+    for name in JOINT_NAMES:
+        lender = _lender(name, calibration)
+        if lender != name:
+            borrowed[name] = lender
+        parts.append(calibration.joint(lender))
+    low, value, high = {}, {}, {}
+    for field, key in PARAMETER_KEYS.items():
+        found: list[Quantity] = [getattr(p.actuator, key) for p in parts]
+        value[field] = np.array([q.value for q in found])
+        low[field] = np.array([q.value if q.low is None else q.low for q in found])
+        high[field] = np.array([q.value if q.high is None else q.high for q in found])
+    delays = np.array([p.actuator.delay_interval_s for p in parts])
+    low["delay_s"], high["delay_s"] = delays[:, 0], delays[:, 1]
+    # the armature is the torque's scale, drawn for the robot as a whole
+    low["armature"] = high["armature"] = value["armature"]
+    feedback = tuple(calibration.held_feedback(borrowed.get(n, n)) for n in JOINT_NAMES)
+    return ServoRanges(source, low, value, high, feedback, borrowed)
+
+
+def _lender(name: str, calibration: Calibration) -> str:
+    """The calibrated joint that is most like `name`: itself, its kind on another leg, any."""
+    leg, kind = name.split("_")
+    return min(
+        calibration.joint_names,
+        key=lambda j: (j != name, j.partition("_")[2] != kind, j.partition("_")[0] != leg),
+    )
+
+
+def _ideal(source: str) -> ServoRanges:
+    """Servos that are where they are told to be, as nearly as a 2 ms step can hold."""
+    own = {
+        "stiffness": 20.0, "damping": 0.25, "friction_loss": 0.0, "armature": 8e-4,
+        "effort_limit": _NO_LIMIT_NM, "velocity_limit": _NO_LIMIT_RAD_S, "delay_s": 0.0,
+    }  # fmt: skip
+    value = {f: np.full(len(JOINT_NAMES), x) for f, x in own.items()}
+    return ServoRanges(source, value, value, value, (HeldFeedback(),) * len(JOINT_NAMES), {})
+
+
+def is_servo_model(actuator: str | Path) -> bool:
+    """Whether this is the folder of a learned servo model."""
+    return Path(actuator).is_dir()
+
+
+def servo_model_of(actuator: str | Path, control_step_s: float) -> JointArrays | None:
+    """The learned servo model in a folder; None for anything that is not a folder.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, is not for all joints or this rate, or is no learned model.
+    """
+    if not is_servo_model(actuator):
+        return None
+    model = load_servo_model(Path(actuator), JOINT_NAMES, control_step_s).model
+    if not isinstance(model, JointArrays):
+        raise InputError(
+            f"{actuator} is not a learned model. Give `pupper-sysid calibrate`'s calibration "
+            "instead: MuJoCo simulates it natively."
+        )
+    return model
+
+
+def check_actuator(actuator: str) -> None:
+    """Refuse what is neither a preset, nor `ideal`, nor something that exists.
+
+    Raises
+    ------
+    InputError
+        With what can be given.
+    """
+    if actuator not in (*PRESETS, IDEAL) and not Path(actuator).exists():
+        raise InputError(
+            f"--actuator {actuator}: there is no such file. Give a calibration "
+            f"(`pupper-sysid calibrate` writes one), a servo model's folder, or one of "
+            f"{', '.join((*PRESETS, IDEAL))}."
+        )

@@ -1,0 +1,1 @@
+"""Is a recording usable, and what is wrong with it?"""

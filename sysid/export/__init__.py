@@ -1,0 +1,1 @@
+"""Recordings and servo models as tables, ONNX and TorchScript."""

@@ -1,0 +1,133 @@
+"""Export: a calibration or a recording as one tidy CSV table, for a spreadsheet or for pandas.
+
+Both tables open with comment lines (`# key: JSON value`) that say where the numbers come from;
+`pandas.read_csv(path, comment="#")` skips them. A calibration becomes one row per joint and
+quantity; a recording, whatever file it was read from, becomes this project's own recording form,
+with absolute angles and increasing times, and so can be used as one.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from pupper_sysid.common.files import versions, write_text
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import JointCalibration, Quantity, unit_of
+from pupper_sysid.sysid.recordings.recording import (
+    OPTIONAL_COLUMNS,
+    REQUIRED_COLUMNS,
+    SCHEMA_VERSION,
+    TITLE,
+    Recording,
+)
+
+CALIBRATION_COLUMNS = (
+    "joint",
+    "part",
+    "quantity",
+    "unit",
+    "value",
+    "low",
+    "high",
+    "identified",
+    "why",
+)
+
+
+def to_csv(source: Calibration | Recording, path: Path | None = None, force: bool = False) -> str:
+    """`source` as CSV text, written to `path` if one is given.
+
+    Parameters
+    ----------
+    source : Calibration or Recording
+        A calibration gives the columns `CALIBRATION_COLUMNS`: `part` is where the quantity stands
+        in the calibration file (`actuator`, `feedback`, `lag`, `scores`, …), `low` and `high` are
+        the ends of its 90 % interval, and a number that is not a measured quantity (a score, a
+        count of steps) leaves the last four empty. What the calibration does not hold has no row.
+        A recording gives its rows with the columns of `sysid.recordings.recording`.
+    path : Path, optional
+        Where to write; nothing is written without it.
+    force : bool
+        Replace `path` if it exists.
+
+    Raises
+    ------
+    InputError
+        If `path` exists and `force` is not given, or if it cannot be written.
+    """
+    text = _calibration(source) if isinstance(source, Calibration) else _recording(source)
+    if path is not None:
+        write_text(path, text, force)
+    return text
+
+
+def _calibration(calibration: Calibration) -> str:
+    header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
+    buffer = io.StringIO()
+    buffer.write(comments("pupper-sysid calibration table", header))
+    # text is quoted so that a '#' in a sentence is no comment to whoever reads the table
+    table = csv.writer(buffer, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
+    buffer.write(",".join(CALIBRATION_COLUMNS) + "\n")
+    for name, joint in calibration.joints.items():
+        table.writerows([name, *row] for row in _rows(joint))
+    return buffer.getvalue()
+
+
+def _rows(joint: JointCalibration) -> Iterator[list[Any]]:
+    """Part, quantity, unit, value, low, high, identified, why of all numbers of one joint."""
+    parts: dict[str, BaseModel] = {
+        "actuator": joint.actuator,
+        "ratios_to_armature": joint.actuator.ratios_to_armature,
+        "scale": joint.actuator.scale,
+        "feedback": joint.feedback,
+        "lag": joint.lag,
+        "scores": joint.scores,
+    }
+    for part, model in parts.items():
+        for name, entry in model:
+            if isinstance(entry, Quantity):
+                numbers = [_cell(number) for number in (entry.value, entry.low, entry.high)]
+                yield [part, name, unit_of(name), *numbers, entry.identified, entry.why or ""]
+            elif isinstance(entry, int | float):
+                yield [part, name, unit_of(name), entry, "", "", "", ""]
+
+
+def _cell(number: float | None) -> float | str:
+    return "" if number is None else number
+
+
+def _recording(recording: Recording) -> str:
+    columns = [c for c in (*REQUIRED_COLUMNS, *OPTIONAL_COLUMNS) if c in recording.table]
+    header = {"schema_version": SCHEMA_VERSION, "versions": versions()} | recording.metadata
+    completed = header.pop("completed", None)
+    if completed is None and "imported_from" in header:
+        # foreign layouts have no footer; without one the export would pass for a cut recording
+        completed = {"rows": len(recording.table)}
+    header["exported_from"] = {"name": recording.name, "sha256": recording.sha256}
+    if recording.warnings:
+        header["warnings_when_exported"] = list(recording.warnings)
+    text = comments(TITLE.removeprefix("# "), header)
+    table = recording.table.astype({"trial": int})
+    text += table.to_csv(columns=columns, index=False, lineterminator="\n")
+    return text + (f"# completed: {_json(completed)}\n" if completed is not None else "")
+
+
+def comments(title: str, entries: dict[str, Any]) -> str:
+    """Comment lines that open a table: a title, then `# key: JSON value` of each entry."""
+    return "\n".join([f"# {title}", *(f"# {k}: {_json(v)}" for k, v in entries.items()), ""])
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    """NumPy numbers and arrays as JSON holds them, anything else as text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)

@@ -1,0 +1,1 @@
+"""When was each reading measured? Poll lattice and its search."""

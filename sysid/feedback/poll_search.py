@@ -1,0 +1,249 @@
+"""Where do a poll's instants lie? Search for a lattice that explains when readings changed.
+
+A stretch of a few seconds says of each changed row between which two reads a poll must have
+succeeded, and of each row that stayed the same, although the servo must have moved, where no poll
+did. A lattice `phase + n * period` is good if its instants lie in many of the former intervals
+and few of the latter. For a trial period T, count for every phase how many changed rows'
+intervals contain an instant; the log-likelihood of the count, against intervals placed at random,
+is the score. Real polls drift by some 0.4 % from stretch to stretch, so stretches share T only
+through a Gaussian of that width (`best_period`). The score means something only beside that of
+rows whose gaps were shuffled (`shuffled`). `best_blur` and `refine` then say, of each stretch,
+how sharp the instants are and where.
+
+Nothing here knows of trials or servos: `sysid.feedback.poll_lattice` cuts recordings into
+stretches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+OUTLIERS = 0.03
+"""Share of changed rows that may contradict the lattice (a late reply, a missed row)."""
+
+BLURS_S = (0.0012, 0.0025, 0.005)
+"""Full widths of the uncertainty of one poll instant, to choose from [s]."""
+
+BLUR_S = BLURS_S[1]
+"""The width to assume before the rows have said which [s]."""
+
+_DRIFT = 0.0045  # relative sd of the period between stretches, measured on a Mini Pupper 2
+_BINS = 64
+_PEAKS = 12
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What one stretch of one trial says about when polls succeeded.
+
+    Attributes
+    ----------
+    trial : int
+        Number of the trial.
+    start_s, stop_s : float
+    begin, end : ndarray, shape (changed,)
+        Previous read and read of each changed row [s].
+    same_begin, same_end : ndarray, shape (same,)
+        The same of each row whose value did not change although the servo must have moved [s].
+    """
+
+    trial: int
+    start_s: float
+    stop_s: float
+    begin: NDArray[np.float64]
+    end: NDArray[np.float64]
+    same_begin: NDArray[np.float64]
+    same_end: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """The lattice in one stretch of one trial: instants at `phase_s + n * period_s`.
+
+    Attributes
+    ----------
+    trial : int
+        Number of the trial.
+    start_s, stop_s : float
+        The stretch.
+    period_s, phase_s, phase_sd_s : float
+        Period, an instant near the stretch's middle, and the standard error of that.
+    """
+
+    trial: int
+    start_s: float
+    stop_s: float
+    period_s: float
+    phase_s: float
+    phase_sd_s: float
+
+
+def best_period(stretches: Sequence[Stretch], grid: NDArray[np.float64]) -> tuple[float, float]:
+    """The common period and its score: a quick search, its best peaks scored with care.
+
+    Parameters
+    ----------
+    stretches : sequence of Stretch
+    grid : ndarray, shape (periods,)
+        Trial periods [s], evenly spaced in their logarithm.
+
+    Returns
+    -------
+    period_s : float
+        NaN if no period is possible.
+    score : float
+        Log-likelihood against intervals placed at random.
+    """
+    pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
+    best = (float("nan"), -np.inf)
+    for _ in range(_PEAKS):
+        peak = int(np.argmax(pooled))
+        if not np.isfinite(pooled[peak]):
+            break
+        best = max(
+            best,
+            (float(grid[peak]), _evidence(stretches, grid[peak], BLUR_S, None)),
+            key=lambda pair: pair[1],
+        )
+        pooled[np.abs(np.log(grid / grid[peak])) < 2 * _DRIFT] = -np.inf
+    return best
+
+
+def shuffled(stretch: Stretch, rng: np.random.Generator) -> Stretch:
+    """The same changes with the gaps between them in another order: no lattice is left."""
+    order = rng.permutation(len(stretch.end) - 1)
+    end = stretch.end[0] + np.concatenate([[0.0], np.cumsum(np.diff(stretch.end)[order])])
+    return replace(stretch, begin=end - (stretch.end - stretch.begin), end=end)
+
+
+def best_blur(stretches: Sequence[Stretch], period_s: float, loss: float) -> float:
+    """Which of `BLURS_S` explains best which rows changed and which did not [s].
+
+    Parameters
+    ----------
+    stretches : sequence of Stretch
+    period_s : float
+        Common period.
+    loss : float
+        Probability that a poll fails.
+    """
+    evidence = [_evidence(stretches, period_s, blur, loss) for blur in BLURS_S]
+    return BLURS_S[int(np.argmax(evidence))]
+
+
+def refine(stretch: Stretch, period_s: float, blur_s: float, loss: float | None) -> Phase:
+    """Posterior mean of a stretch's period and phase near the common period.
+
+    Parameters
+    ----------
+    stretch : Stretch
+    period_s : float
+        Common period.
+    blur_s : float
+        Full width of the uncertainty of one poll instant.
+    loss : float or None
+        Probability that a poll fails; with None only rows that changed count.
+    """
+    log_likelihood, periods, steps, _ = _posterior(stretch, period_s, blur_s, loss, 61, 128)
+    reference = 0.5 * (stretch.start_s + stretch.stop_s)
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    best_period = float(np.sum(weight.sum(axis=1) * periods))
+    # the phase is an angle: average around the peak, not across the seam
+    peak = steps[int(np.argmax(weight.sum(axis=0)))]
+    near = (steps - peak + 0.5) % 1.0 - 0.5
+    marginal = weight.sum(axis=0)
+    mean = float(np.sum(marginal * near))
+    sd = float(np.sqrt(np.sum(marginal * (near - mean) ** 2)))
+    return Phase(
+        stretch.trial,
+        stretch.start_s,
+        stretch.stop_s,
+        best_period,
+        reference + (peak + mean) * best_period,
+        sd * best_period,
+    )
+
+
+def contains(stretch: Stretch, phase: Phase) -> NDArray[np.bool_]:
+    """Which changed rows have a lattice instant in their interval, shape (changed,)."""
+    middle = 0.5 * (stretch.begin + stretch.end)
+    instant = phase.phase_s + phase.period_s * np.round((middle - phase.phase_s) / phase.period_s)
+    return np.abs(instant - middle) <= 0.5 * (stretch.end - stretch.begin) + 0.5 * BLUR_S
+
+
+def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64]:
+    """Best log-likelihood over phases for each period, against intervals placed at random."""
+    # No blur here: intervals meet end to end, so with one a poll on a common edge would explain
+    # every row at periods of two loops. Polls that jitter over an edge count as outliers.
+    chance = np.minimum(np.median(end - begin) / periods, 1.0)  # for an interval at random
+    low = begin[None, :] / periods[:, None]
+    length = np.minimum((end - begin)[None, :] / periods[:, None], 1.0)
+    first = np.floor((low % 1.0) * _BINS).astype(np.int64)
+    span = np.round(length * _BINS).astype(np.int64)
+    row = np.arange(len(periods))[:, None] * (2 * _BINS + 1)
+    size = len(periods) * (2 * _BINS + 1)
+    up = np.bincount((row + first).ravel(), minlength=size)
+    down = np.bincount((row + first + span).ravel(), minlength=size)
+    inside = np.cumsum((up - down).reshape(len(periods), -1), axis=1)[:, : 2 * _BINS]
+    hits = (inside[:, :_BINS] + inside[:, _BINS:]).max(axis=1)
+    hit = np.log((1 - OUTLIERS) + OUTLIERS * chance) - np.log(chance)
+    return hits * hit + (len(begin) - hits) * np.log(OUTLIERS)
+
+
+def _pool(profiles: list[NDArray], grid: NDArray) -> NDArray[np.float64]:
+    """Sum of the profiles, each free to sit a little beside the common period."""
+    log_period = np.log(grid)
+    reach = int(np.ceil(3 * _DRIFT / (log_period[1] - log_period[0])))
+    offsets = np.arange(-reach, reach + 1)
+    penalty = -0.5 * (offsets * (log_period[1] - log_period[0]) / _DRIFT) ** 2
+    total = np.zeros(len(grid))
+    for profile in profiles:
+        padded = np.pad(profile, reach, constant_values=-np.inf)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, len(offsets))
+        total += np.max(windows + penalty, axis=1)
+    return total
+
+
+def _evidence(
+    stretches: Sequence[Stretch], period: float, blur: float, loss: float | None
+) -> float:
+    """Score of a common period [s], summed over the stretches."""
+    return float(sum(_posterior(s, period, blur, loss, 25, 64)[3] for s in stretches))
+
+
+def _posterior(
+    stretch: Stretch,
+    period: float,
+    blur: float,
+    loss: float | None,
+    period_count: int,
+    phase_count: int,
+) -> tuple[NDArray, NDArray, NDArray, float]:
+    """Log-posterior over (period, phase) near `period`, the two axes, and the peak's score.
+
+    Without a `loss`, only rows that changed count. With one, a row that did not change although
+    the servo moved says that no poll, or a failed one, lies in its interval.
+    """
+    reference = 0.5 * (stretch.start_s + stretch.stop_s)
+    periods = period * np.exp(np.linspace(-2.5 * _DRIFT, 2.5 * _DRIFT, period_count))
+    steps = np.linspace(-0.5, 0.5, phase_count, endpoint=False)
+
+    def inside(begin: NDArray, end: NDArray) -> NDArray[np.float64]:
+        turns = (0.5 * (begin + end) - reference)[None, :] / periods[:, None]
+        away = (turns[:, None, :] - steps[None, :, None] + 0.5) % 1.0 - 0.5
+        distance = np.abs(away) * periods[:, None, None]
+        return np.clip((0.5 * (end - begin) - distance) / blur + 0.5, 0.0, 1.0)
+
+    chance = np.minimum((stretch.end - stretch.begin) / period, 1.0)
+    changed = (1 - OUTLIERS) * inside(stretch.begin, stretch.end) + OUTLIERS * chance
+    log_likelihood = np.log(changed).sum(axis=2)
+    if loss is not None and len(stretch.same_end):
+        seen = (1 - OUTLIERS) * (1 - loss) * inside(stretch.same_begin, stretch.same_end)
+        log_likelihood += np.log(1 - seen).sum(axis=2)
+    log_likelihood -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
+    return log_likelihood, periods, steps, float(log_likelihood.max() - np.log(chance).sum())

@@ -1,0 +1,1 @@
+"""Output-error identification of servo models; calibration of joints and fleets."""

@@ -1,0 +1,237 @@
+"""Turn what calibration found into the `Calibration` that simulators read, caveats included.
+
+Free-air positions give ratios to the armature. One torque sets the scale: the stall torque, which
+is the effort limit; so armature = stall torque / (effort limit per inertia), and the rest follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from pupper_sysid.common.files import versions
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.calibration.calibration import (
+    PRESETS,
+    Calibration,
+    InputFile,
+    load_calibration,
+    utc_now,
+)
+from pupper_sysid.servo_models.calibration.parts import (
+    Actuator,
+    Feedback,
+    JointCalibration,
+    LadderRow,
+    Lag,
+    Quantity,
+    RatiosToArmature,
+    Scale,
+    Scores,
+    Selection,
+)
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, RungResult
+from pupper_sysid.sysid.identify.search import PREFERRED
+from pupper_sysid.sysid.lag.lag_budget import Interval
+from pupper_sysid.sysid.recordings.recording import Recording
+
+STALL_TORQUE_NM = 0.35
+STALL_TORQUE_SOURCE = (
+    "data sheet of the Mini Pupper servo, 3.5 kg·cm; another data sheet of this servo class says "
+    "0.23 N·m at 6 V, so take torques as good to a factor of 1.5 at best"
+)
+_Z90 = 1.645
+
+
+def to_calibration(
+    results: dict[str, JointCalibrationResult],
+    recordings: Sequence[Recording],
+    seed: int,
+    stall_torque_nm: float = STALL_TORQUE_NM,
+    source: str = STALL_TORQUE_SOURCE,
+) -> Calibration:
+    """The calibration file of `results`.
+
+    Parameters
+    ----------
+    results : dict of joint to JointCalibrationResult
+    recordings : sequence of Recording
+        What they were computed from; names and hashes go into the file.
+    seed : int
+    stall_torque_nm : float
+        Torque anchor [N·m]: what the servo pulls at zero speed.
+    source : str
+        Where the anchor comes from.
+    """
+    buses = [r.metadata.get("bus") or {} for r in recordings]
+    kinds = {str(bus.get("kind", "unknown bus")) for bus in buses}
+    maps = {str(bus["joint_map"]) for bus in buses if bus.get("joint_map")}
+    pupper = set(results) <= set(JOINT_NAMES)
+    own = "Mini Pupper 2" if pupper else ", ".join(sorted(maps)) or "another robot"
+    return Calibration(
+        robot=f"{own} ({', '.join(sorted(kinds))})",
+        created=utc_now(),
+        inputs=tuple(
+            InputFile(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
+        ),
+        seed=seed,
+        versions=versions(),
+        notes=(
+            "Delay belongs to the actuator; poll period, loss and age belong to the observation.",
+            "Only ratios to the armature come from the recording; torques scale with the anchor.",
+        ),
+        joints={name: _joint(r, stall_torque_nm, source) for name, r in results.items()},
+    )
+
+
+def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCalibration:
+    pd, budget = result.rungs[PREFERRED], result.budget
+    low, high = result.delay_steps
+    armature = stall / pd.values["effort_rad_s2"]
+    ratio = {
+        "stiffness": "stiffness_per_s2",
+        "damping": "damping_per_s",
+        "friction_loss": "friction_rad_s2",
+        "effort_limit": "effort_rad_s2",
+    }
+    ratios = {ours: _ratio(pd, theirs, 1.0) for ours, theirs in ratio.items()}
+    torque = {ours: _ratio(pd, theirs, armature, "ratio only") for ours, theirs in ratio.items()}
+    actuator = Actuator(
+        model="delayed_pd",
+        stiffness_nm_per_rad=torque["stiffness"],
+        damping_nm_s_per_rad=torque["damping"],
+        friction_loss_nm=torque["friction_loss"],
+        armature_kg_m2=_anchored(pd, stall),
+        effort_limit_nm=Quantity(
+            value=stall, identified="no", why="the anchor itself: taken as known, see scale"
+        ),
+        velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
+        delay_s=_quantity(result.dead_time),
+        delay_steps_min=low,
+        delay_steps_max=high,
+        physics_step_s=TIME_STEP_S,
+        ratios_to_armature=RatiosToArmature(**ratios),
+        scale=Scale(anchor="stall torque", value_nm=stall, source=source),
+    )
+    s, chosen = pd.scores, result.rungs[result.chosen]
+    return JointCalibration(
+        actuator=actuator,
+        feedback=_feedback(budget.lattice, result),
+        lag=Lag(
+            lag_s=_quantity(budget.lag),
+            naive_lag_s=_quantity(budget.naive),
+            fresh_lag_s=_quantity(budget.fresh),
+        ),
+        selection=Selection(
+            model=chosen.name, ladder=tuple(_ladder_row(r) for r in result.rungs.values())
+        ),
+        scores=Scores(
+            rmse_one_step_rad=_finite(s.one_step),
+            rmse_free_run_naive_rad=_finite(s.naive),
+            rmse_free_run_fresh_rad=_finite(s.fresh),
+            rmse_free_run_held_rad=_finite(s.held),
+            rmse_leave_one_frequency_out_rad=_finite(s.leave_one_out),
+            fit_percent=_finite(s.fit_percent),
+        ),
+        warnings=result.warnings,
+    )
+
+
+def _ladder_row(rung: RungResult) -> LadderRow:
+    s = rung.scores
+    return LadderRow(
+        model=rung.name,
+        parameter_count=len(rung.values),
+        rmse_fresh_rad=_finite(s.fresh),
+        rmse_held_rad=_finite(s.held),
+        rmse_naive_rad=_finite(s.naive),
+        rmse_leave_one_frequency_out_rad=_finite(s.leave_one_out),
+        fit_percent=_finite(s.fit_percent),
+        parameters=rung.values,
+    )
+
+
+def _ratio(
+    pd: RungResult, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
+) -> Quantity:
+    """A fitted number times `factor`, with its interval and whether the data settled it."""
+    interval, why = pd.intervals[name], pd.undecided.get(name)
+    return Quantity(
+        value=interval.value * factor,
+        low=interval.low * factor,
+        high=interval.high * factor,
+        identified="no" if why else known,
+        why=why or ("scale from the torque anchor" if known == "ratio only" else None),
+    )
+
+
+def _anchored(pd: RungResult, stall: float) -> Quantity:
+    effort, why = pd.intervals["effort_rad_s2"], pd.undecided.get("effort_rad_s2")
+    return Quantity(
+        value=stall / effort.value,
+        low=stall / effort.high,
+        high=stall / effort.low,
+        identified="no" if why else "ratio only",
+        why=why or "scale from the torque anchor",
+    )
+
+
+def _feedback(lattice: PollLattice, result: JointCalibrationResult) -> Feedback:
+    offset, step = result.offset_rad, result.quantum_rad
+    quantum = Quantity(value=step, low=step, high=step, identified="yes")
+    if step == 0:
+        quantum = Quantity(value=0.0, identified="no", why="readings show no common step")
+    if lattice.kind == "lattice":
+        period = _spread(lattice.period_s, lattice.period_sd_s)
+        # the age grows with the loss; the period's share of its uncertainty is nothing beside it
+        losses = np.clip(lattice.loss + _Z90 * lattice.loss_sd * np.array([-1.0, 1.0]), 0, 0.99)
+        low, high = lattice.period_s * (0.5 + losses / (1 - losses))
+        loss = _quantity(Interval(lattice.loss, *map(float, losses)))
+        age = _quantity(Interval(lattice.mean_age_s, float(low), float(high)))
+    else:
+        found = result.budget.feedback_age_s
+        why = (
+            "every reading was new: no poll slower than the loop"
+            if lattice.kind == "every read"
+            else "readings are held, but no poll period is significant"
+        )
+        period = Quantity(value=0.0, identified="no", why=why)
+        loss = Quantity(value=0.0, identified="no", why=why)
+        age = Quantity(value=max(found, 0.0), identified="yes", why="from naive minus fresh lag")
+    return Feedback(
+        poll_period_s=period, loss=loss, quantum_rad=quantum, offset_rad=_quantity(offset),
+        mean_age_s=age,
+    )  # fmt: skip
+
+
+def _quantity(interval: Interval) -> Quantity:
+    """An interval as an identified quantity, its ends never inside of its value."""
+    return Quantity(
+        value=interval.value,
+        low=min(interval.low, interval.value),
+        high=max(interval.high, interval.value),
+        identified="yes",
+    )
+
+
+def _spread(value: float, sd: float) -> Quantity:
+    return _quantity(Interval(value, max(value - _Z90 * sd, 0.0), value + _Z90 * sd))
+
+
+def _finite(number: float) -> float | None:
+    return number if np.isfinite(number) else None
+
+
+def preset_parameters() -> dict[str, dict[str, DelayedPDParameters]]:
+    """The published settings per preset and joint, to be scored beside a fit."""
+    found = {}
+    for preset in PRESETS:
+        calibration = load_calibration(preset)
+        found[preset] = {
+            joint: calibration.delayed_pd([joint]).parameters for joint in calibration.joint_names
+        }
+    return found

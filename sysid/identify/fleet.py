@@ -1,0 +1,345 @@
+"""Calibrate the recordings of many robots at once, on some cores or on a Dask cluster.
+
+`run_fleet` does the same for whatever else is made of a robot's recording
+(`sysid.servo_fit.fleet`).
+
+    fleet = calibrate_fleet(Path("robots"), Path("fleet"), Settings(seed=0), jobs=2)
+    fleet.table                   # one row per robot and joint
+
+One recording is one robot. Each becomes a calibration file of its own, written when it is done, so
+that an interrupted run goes on where it stopped: a file that was made from the same bytes with the
+same settings is kept. A recording that cannot be used does not stop the others; its sentence stands
+in the table. Servos that are unlike their sisters on the other robots are named.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+from joblib import Parallel, delayed, parallel_config
+
+from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.files import sha256, write_text
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.identify.calibration_file import (
+    STALL_TORQUE_NM,
+    STALL_TORQUE_SOURCE,
+    to_calibration,
+)
+from pupper_sysid.sysid.recordings.recording import load
+
+TABLE = "fleet.csv"
+UNLIKE = 5.0
+"""A servo is named if it is so many robust standard deviations from the median of its sisters."""
+FEWEST = 5
+"""Robots that it takes to say what is usual."""
+
+QUANTITIES = {
+    "lag_ms": lambda joint: _ms(joint.lag.lag_s),
+    "delay_ms": lambda joint: _ms(joint.actuator.delay_s),
+    "stiffness_per_s2": lambda joint: joint.actuator.ratios_to_armature.stiffness.value,
+    "damping_per_s": lambda joint: joint.actuator.ratios_to_armature.damping.value,
+    "friction_rad_s2": lambda joint: joint.actuator.ratios_to_armature.friction_loss.value,
+    "speed_rad_s": lambda joint: joint.actuator.velocity_limit_rad_s.value,
+    "poll_period_ms": lambda joint: _ms(joint.feedback.poll_period_s),
+    "loss": lambda joint: joint.feedback.loss.value,
+    "offset_rad": lambda joint: joint.feedback.offset_rad.value,
+    "fit_percent": lambda joint: joint.scores.fit_percent,
+}
+"""What the table has of each joint."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every recording is calibrated."""
+
+    seed: int = 0
+    stall_torque_nm: float = STALL_TORQUE_NM
+    source: str = STALL_TORQUE_SOURCE
+
+
+@dataclass
+class Fleet:
+    """What became of the recordings.
+
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        One row per robot and joint: `robot`, `joint`, `QUANTITIES`, `unlike` (names of quantities,
+        with semicolons), `problem` (a sentence; then the numbers are empty).
+    kept, made, failed : list of str
+        Robots whose calibration was there already, was made, could not be made.
+    problems : dict of str to str
+        Why, by robot.
+    """
+
+    table: pd.DataFrame = field(default_factory=pd.DataFrame)
+    kept: list[str] = field(default_factory=list)
+    made: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+
+    def tabulate(
+        self, rows: Sequence[dict[str, Any]], quantities: Sequence[str], out: Path
+    ) -> None:
+        """Make the table of `rows` (`robot`, `joint`, `quantities`), and write it to `out`.
+
+        Outliers are named, and robots that failed stand at the end with their problem.
+        """
+        table = pd.DataFrame(rows, columns=["robot", "joint", *quantities])
+        table["unlike"] = _unlike(table, quantities)
+        table["problem"] = ""
+        lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(self.problems.items())])
+        self.table = pd.concat([table, lost], ignore_index=True) if len(lost) else table
+        # it says nothing that the robots' own files do not, so it is made anew with each run
+        text = self.table.to_csv(index=False, lineterminator="\n")
+        write_text(out / TABLE, text, force=True)
+
+    def summary(self, out: Path, elapsed_s: float) -> dict[str, Any]:
+        """Object of `--json`."""
+        return {
+            "table": str(out / TABLE), "made": self.made, "kept": self.kept,
+            "failed": self.failed, "elapsed_s": elapsed_s,
+        }  # fmt: skip
+
+
+def robots_in(root: Path) -> dict[Path, str]:
+    """Recordings in a folder and the folders in it, and what their robots are called.
+
+    Raises
+    ------
+    InputError
+        If there is none, or two would have the same name.
+    """
+    found = sorted(
+        path
+        for path in root.rglob("*.csv")
+        if not path.name.endswith(".truth.csv") and path.name != TABLE
+    )
+    if not found:
+        raise InputError(f"{root} holds no recording (.csv). Give the folder of your sweeps.")
+    # a robot is called as its file, after its folder where there are folders
+    names = ["_".join(path.relative_to(root).with_suffix("").parts) for path in found]
+    twice = {n for n in names if names.count(n) > 1}
+    if twice:
+        raise InputError(f"{root}: two recordings would be called {min(twice)}. Rename one.")
+    return dict(zip(found, names, strict=True))
+
+
+def calibrate_fleet(
+    root: Path,
+    out: Path,
+    settings: Settings,
+    jobs: int = 1,
+    cluster: str | None = None,
+    force: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Fleet:
+    """Calibrate every recording in `root`.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of recordings.
+    out : Path
+        Folder for `<robot>.yaml` and the table.
+    settings : Settings
+    jobs : int
+        Processes here; joints of one robot then run one after the other.
+    cluster : str, optional
+        Address of a Dask scheduler (`tcp://…`) whose workers see the same folders.
+    force : bool
+        Make calibrations anew that another recording or other settings made.
+    progress : callable, optional
+        Told each robot that is done.
+
+    Raises
+    ------
+    InputError
+        If there is no recording, or the cluster cannot be reached.
+    """
+    targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
+    return run_fleet(
+        targets, lambda target, path: _is_of(target, path, settings),
+        partial(_calibrated, settings=settings), _numbers, tuple(QUANTITIES), out,
+        jobs, cluster, force, progress,
+    )  # fmt: skip
+
+
+def run_fleet(
+    targets: Mapping[Path, Path],
+    is_of: Callable[[Path, Path], bool],
+    make: Callable[[Path, Path], None],
+    numbers: Callable[[Path], Mapping[str, dict[str, float]]],
+    quantities: Sequence[str],
+    out: Path,
+    jobs: int,
+    cluster: str | None,
+    force: bool,
+    progress: Callable[[str], None] | None,
+) -> Fleet:
+    """Make what is missing of `targets`, here or on a cluster, and the table of all.
+
+    Problems of single robots are told in it, not raised.
+
+    Parameters
+    ----------
+    targets : dict of Path to Path
+        By recording: what is made of it, called as its robot is.
+    is_of : callable
+        `(target, path) -> bool`: whether an existing target was made so from this recording.
+    make : callable
+        `(path, target) -> None`; must be picklable.
+    numbers : callable
+        By joint of a target: what the table has of it, by `quantities`.
+    quantities : sequence of str
+    out : Path
+        Folder for the table.
+    jobs, cluster, force, progress
+        As for `calibrate_fleet`.
+
+    Raises
+    ------
+    InputError
+        If `jobs` is not positive, a target exists that is of something else, or the cluster cannot
+        be reached.
+    """
+    if jobs < 1:
+        raise InputError(f"--jobs is {jobs}; it must be at least 1.")
+    fleet, todo = Fleet(), []
+    for path, target in targets.items():
+        if target.exists() and is_of(target, path):
+            fleet.kept.append(_called(target))
+        elif target.exists() and not force:
+            raise InputError(
+                f"{target} was made from another recording or with other settings. Choose another "
+                "--out, or add --force to replace it."
+            )
+        else:
+            todo.append((path, target))
+    with _backend(cluster) as parallel:
+        work = parallel(jobs)(delayed(_one)(make, path, target) for path, target in todo)
+        for name, problem in cast(Iterable[tuple[str, str]], work):
+            (fleet.failed if problem else fleet.made).append(name)
+            if problem:
+                fleet.problems[name] = problem
+            if progress:
+                progress(name)
+    # a robot that failed may have an older target: its numbers would not be this recording's
+    usable = [t for t in targets.values() if _called(t) in {*fleet.kept, *fleet.made}]
+    fleet.tabulate(
+        [
+            {"robot": _called(target), "joint": joint} | row
+            for target in usable
+            for joint, row in numbers(target).items()
+        ],
+        quantities,
+        out,
+    )
+    return fleet
+
+
+def _called(target: Path) -> str:
+    """The robot of a calibration file or of a folder, whose name may have dots."""
+    return target.stem if target.suffix == ".yaml" else target.name
+
+
+def _is_of(target: Path, path: Path, settings: Settings) -> bool:
+    """Whether a calibration was made from these bytes with these settings."""
+    try:
+        made = load_calibration(target)
+    except InputError:
+        return False
+    scales = {j.actuator.scale.value_nm for j in made.joints.values()}
+    return (
+        [i.sha256 for i in made.inputs] == [sha256(path)]
+        and made.seed == settings.seed
+        and scales == {settings.stall_torque_nm}
+    )
+
+
+def _numbers(target: Path) -> dict[str, dict[str, float]]:
+    """What the table has of each joint of a calibration."""
+    joints = load_calibration(target).joints
+    return {j: {k: value(joint) for k, value in QUANTITIES.items()} for j, joint in joints.items()}
+
+
+def _calibrated(path: Path, target: Path, settings: Settings) -> None:
+    """Calibrate one robot."""
+    recording = load(path)
+    results = calibrate([recording], None, settings.seed, workers=1)
+    made = to_calibration(
+        results, [recording], settings.seed, settings.stall_torque_nm, settings.source
+    )
+    made.save(target, force=True)
+
+
+def _one(make: Callable[[Path, Path], None], path: Path, target: Path) -> tuple[str, str]:
+    """Make one robot's; its name, and what went wrong or nothing."""
+    try:
+        make(path, target)
+    except PupperError as error:
+        return _called(target), str(error)
+    except Exception as error:  # a defect that one robot's log brings out must not cost the others
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        return _called(target), f"{type(error).__name__}: {error} ({Path(at.filename).name})"
+    return _called(target), ""
+
+
+@contextmanager
+def _backend(cluster: str | None) -> Iterator[Callable[[int], Parallel]]:
+    """How to run in parallel: processes here, or a cluster's workers."""
+
+    def here(jobs: int) -> Parallel:
+        return Parallel(n_jobs=jobs, return_as="generator_unordered")
+
+    if cluster is None:
+        yield here
+        return
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            "--cluster needs Dask, which is not installed: `pip install 'pupper-sysid[dask]'`."
+        ) from None
+    try:
+        client = Client(cluster, timeout=10)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--cluster {cluster}: no Dask scheduler answers there ({error}). Start one with "
+            "`dask scheduler`, and workers with `dask worker ADDRESS`."
+        ) from None
+    with client, parallel_config(backend="dask"):
+        yield lambda jobs: Parallel(n_jobs=-1)
+
+
+def _unlike(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
+    """Per row the quantities that are far from the same joint's on the other robots."""
+    found: list[list[str]] = [[] for _ in range(len(table))]
+    for _, rows in table.groupby("joint").groups.items():
+        if len(rows) < FEWEST:
+            continue
+        for key in quantities:
+            values = table.loc[rows, key].to_numpy(float)
+            middle = np.nanmedian(values)
+            # 1.4826 makes the median deviation that of a normal distribution
+            spread = 1.4826 * np.nanmedian(np.abs(values - middle))
+            if not spread > 1e-9 * max(abs(middle), 1e-12):
+                continue
+            for row, value in zip(rows, values, strict=True):
+                if abs(value - middle) > UNLIKE * spread:
+                    found[row].append(key)
+    return [";".join(names) for names in found]
+
+
+def _ms(quantity) -> float:
+    return float("nan") if quantity is None else 1e3 * quantity.value

@@ -1,0 +1,169 @@
+"""The ladder of servo models that calibration climbs, from a pure delay to a servo with backlash.
+
+Every rung is a function from parameters and commands to positions, vectorised over any number of
+simulations, plus what is known of its parameters beforehand. All work per unit of inertia (free-air
+positions say no more) and relative to the position at which the servo rested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, integrate
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a model, fitted as its logarithm unless it may be negative.
+
+    Attributes
+    ----------
+    name : str
+        Ends in its unit.
+    nominal, low, high : float
+        Where the search starts and the box it stays in.
+    prior_sd : float
+        Standard deviation of a Gaussian prior about `nominal`, of the logarithm where that is
+        what is fitted. Wide: it decides only what the data leave open, such as a speed limit
+        that was never reached.
+    """
+
+    name: str
+    nominal: float
+    low: float
+    high: float
+    prior_sd: float = float("inf")
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether the logarithm is fitted."""
+        return self.low > 0
+
+    def encode(self, value):
+        """Fitted coordinate of a value."""
+        return np.log(value) if self.logarithmic else np.asarray(value, float)
+
+    def decode(self, coordinate):
+        """Value of a fitted coordinate."""
+        return np.exp(coordinate) if self.logarithmic else np.asarray(coordinate, float)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A model of the ladder.
+
+    Attributes
+    ----------
+    name : str
+    parameters : tuple of Parameter
+        The delay [s] is the first and the offset [rad] the last, on every rung.
+    simulate : callable
+        `(values, track) -> None`: `values` (parameters, simulations) without delay and offset;
+        `track` (steps, simulations) holds delayed commands relative to rest and is overwritten
+        with positions [rad], each step lasting `TIME_STEP_S`.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    simulate: Callable[[NDArray, NDArray], None]
+
+    @property
+    def names(self) -> list[str]:
+        """Parameter names in order."""
+        return [p.name for p in self.parameters]
+
+
+def _pure_delay(values: NDArray, track: NDArray) -> None:
+    track *= values[0]
+
+
+def _first_order(values: NDArray, track: NDArray) -> None:
+    gain, time_constant = values
+    keep = np.exp(-TIME_STEP_S / time_constant)
+    y = np.zeros_like(gain)
+    for k in range(len(track)):
+        y = keep * y + (1 - keep) * track[k]
+        track[k] = y
+    track *= gain
+
+
+def _second_order(values: NDArray, track: NDArray) -> None:
+    gain, frequency, damping = values
+    h, w = TIME_STEP_S, frequency
+    y, v = np.zeros_like(gain), np.zeros_like(gain)
+    implicit = 1.0 / (1.0 + 2 * h * damping * w + (h * w) ** 2)
+    for k in range(len(track)):  # backward Euler: stable for any frequency in the box
+        v = (v + h * w * w * (track[k] - y)) * implicit
+        y = y + h * v
+        track[k] = y
+    track *= gain
+
+
+def _dc_servo(values: NDArray, track: NDArray) -> None:
+    """Duty-limited DC motor: acceleration = stall · duty - back-EMF · speed - friction."""
+    stiffness, friction, stall, no_load = values
+    h = TIME_STEP_S
+    y, v = np.zeros_like(stall), np.zeros_like(stall)
+    implicit = 1.0 / (1.0 + h * stall / no_load)
+    for k in range(len(track)):
+        drive = np.minimum(np.maximum(stiffness * (track[k] - y), -stall), stall)
+        free = (v + h * drive) * implicit
+        v = np.sign(free) * np.maximum(np.abs(free) - h * friction * implicit, 0.0)
+        y = y + h * v
+        track[k] = y
+
+
+def _delayed_pd(values: NDArray, track: NDArray) -> None:
+    stiffness, damping, friction, effort, speed = values
+    one = np.ones_like(stiffness)
+    parameters = {
+        "stiffness": stiffness, "damping": damping, "friction_loss": friction,
+        "effort_limit": effort, "velocity_limit": speed, "armature": one,
+    }  # fmt: skip
+    rest = np.zeros_like(stiffness)
+    integrate(track, (rest, rest, rest), parameters, TIME_STEP_S, out=track)
+
+
+def _delayed_pd_backlash(values: NDArray, track: NDArray) -> None:
+    half = 0.5 * values[-1]
+    _delayed_pd(values[:-1], track)
+    y = np.zeros_like(half)
+    for k in range(len(track)):  # play: the output moves only when the gap is taken up
+        y = np.minimum(np.maximum(y, track[k] - half), track[k] + half)
+        track[k] = y
+
+
+_DELAY = Parameter("delay_s", 0.02, 0.001, 0.12)
+_OFFSET = Parameter("offset_rad", 0.0, -2.0, 2.0)
+_GAIN = Parameter("gain", 1.0, 0.5, 1.5)
+# The priors cover hobby servos. Speed: data sheets say 0.08 to 0.2 s per 60 degrees, 13 to 5 rad/s,
+# about a geometric mean of 8.3. The rest: stiff enough to hold a leg, and torque enough to bring
+# it to that speed within a few hundredths of a second.
+_STIFFNESS = Parameter("stiffness_per_s2", 9000.0, 300.0, 120000.0, 1.0)
+_DAMPING = Parameter("damping_per_s", 90.0, 2.0, 1500.0, 1.0)
+_FRICTION = Parameter("friction_rad_s2", 120.0, 0.5, 2000.0, 1.2)
+_EFFORT = Parameter("effort_rad_s2", 450.0, 30.0, 8000.0, 0.6)
+_SPEED = Parameter("velocity_limit_rad_s", 8.3, 1.5, 30.0, 0.3)
+_PD = (_DELAY, _STIFFNESS, _DAMPING, _FRICTION, _EFFORT, _SPEED)
+
+LADDER: tuple[Rung, ...] = (
+    Rung("pure_delay", (_DELAY, _GAIN, _OFFSET), _pure_delay),
+    Rung("fopdt", (_DELAY, _GAIN, Parameter("time_constant_s", 0.02, 0.0005, 0.5), _OFFSET),
+         _first_order),
+    Rung("sopdt", (_DELAY, _GAIN, Parameter("natural_frequency_rad_s", 90.0, 8.0, 600.0),
+                   Parameter("damping_ratio", 0.8, 0.1, 4.0), _OFFSET), _second_order),
+    Rung("dc_servo", (_DELAY, _STIFFNESS, _FRICTION, _EFFORT,
+                      Parameter("no_load_speed_rad_s", 9.0, 1.5, 40.0, 0.4), _OFFSET), _dc_servo),
+    Rung("delayed_pd", (*_PD, _OFFSET), _delayed_pd),
+    Rung("delayed_pd_backlash", (*_PD, Parameter("backlash_rad", 0.01, 0.0005, 0.15, 1.0), _OFFSET),
+         _delayed_pd_backlash),
+)  # fmt: skip
+
+
+def rung(name: str) -> Rung:
+    """The rung called `name`."""
+    return next(r for r in LADDER if r.name == name)

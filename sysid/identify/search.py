@@ -1,0 +1,310 @@
+"""Fit one rung of the ladder to one joint: from global starts, per held-out frequency, in profile.
+
+A servo's cost has many local optima (delay trades against damping, friction against effort), so
+every fit here is the same search, `fit_problems`: many seeded candidates are simulated once, the
+best are improved a little, and the best of those are fitted to the end. `fit_with_folds` runs it
+for all trials and again for each left-out frequency, so that a model can be judged on motion it
+has not seen; the fit of DelayedPD to all trials, whose numbers are exported, evolves a population
+besides. `dead_time_profile` holds the delay elsewhere and fits the rest anew: how fast the
+cost rises says how well the dead time is known. It counts samples by what they tell
+(`integrated_autocorrelation_time`), because the residuals of a real servo are not white.
+
+`sysid.identify.calibrate` chooses among the rungs by these fits; `sysid.identify.sparse_equations`
+and `sysid.servo_fit.physics` fit their models with the same search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.identify.models import Rung
+from pupper_sysid.sysid.identify.output_error import (
+    DIFFERENCE,
+    Fit,
+    Problem,
+    TrialData,
+    evolve,
+    fit,
+    global_starts,
+    look_up,
+    positions,
+)
+from pupper_sysid.sysid.lag.lag_budget import LEVEL, Interval
+
+PREFERRED = "delayed_pd"
+"""The rung that simulators and training run."""
+
+STEPPING_SD_S = 0.5 * TIME_STEP_S
+"""How far off a dead time is, however many the readings, because the servo itself does not move in
+the model's steps: standard deviation over random emulated servos, which are stepped twice as finely
+(`benchmarks/dead_time_accuracy.py`)."""
+
+_MOST_FOLDS = 6
+_CANDIDATES = 512
+_SHORT, _FINAL = 8, 20  # iterations: enough to rank the starts, enough to converge
+_SEARCH_DIFFERENCE = 0.05
+_POPULATION, _GENERATIONS = 48, 50
+
+
+def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
+    """Which trials remain when each frequency is left out; by trial where there are no tones.
+
+    Returns
+    -------
+    dict of float to tuple of bool
+        By frequency [Hz] (a trial without a tone by -1 minus its number): which trials remain. Of
+        many frequencies some are picked, evenly; empty if there is only one.
+    """
+    labels = [
+        round(d.frequency_hz, 2) if d.frequency_hz > 0 else -1.0 - n for n, d in enumerate(data)
+    ]
+    names = sorted(set(labels))
+    if len(names) < 2:
+        return {}
+    picked = names
+    if len(names) > _MOST_FOLDS:  # a fine sweep: every n-th frequency says as much
+        index = np.unique(np.round(np.linspace(0, len(names) - 1, _MOST_FOLDS)).astype(int))
+        picked = [names[i] for i in index]
+    return {name: tuple(label != name for label in labels) for name in picked}
+
+
+def fit_with_folds(
+    model: Rung,
+    data: tuple[TrialData, ...],
+    folds: dict[float, tuple[bool, ...]],
+    noise: float,
+    rng: np.random.Generator,
+    lower: dict[str, list[Fit]],
+    more_starts: NDArray | None = None,
+) -> list[Fit]:
+    """Best fit to all trials, then to each fold, each from starts of its own.
+
+    A fold never starts from the fit to all trials: that would leave the optimum of the held-out
+    frequency within reach.
+
+    Parameters
+    ----------
+    model : Rung
+    data : tuple of TrialData
+    folds : dict of float to tuple of bool
+        From `leave_one_out_folds`; may be empty.
+    noise : float
+        Size of residuals beyond which one counts as an outlier [rad].
+    rng : numpy.random.Generator
+    lower : dict of str to list of Fit
+        Results for lower rungs, by name; a rung nested in `PREFERRED` starts from them.
+    more_starts : ndarray, shape (1 + folds, starts, parameters), optional
+        Join the global starts.
+
+    Returns
+    -------
+    list of Fit, 1 + folds of them
+
+    Raises
+    ------
+    KeyError
+        If the rung is nested in `PREFERRED` and `lower` lacks that.
+    """
+    everything = Problem(data, (True,) * len(data), noise, {})
+    problems = [everything, *(replace(everything, use=use) for use in folds.values())]
+    if model.name == f"{PREFERRED}_backlash":  # nested in DelayedPD: start from its solutions
+        starts = [
+            [np.insert(f.values, -1, gap) for gap in (0.002, 0.008, 0.025)]
+            for f in lower[PREFERRED]
+        ]
+        return best_of(model, problems, np.array(starts), 15)
+    # few tones leave many local optima: start from more places
+    keep, final = (24, 4) if len(problems) <= 5 else (8, 3)
+    fits = fit_problems(model, problems, rng, keep, final, more_starts)
+    if model.name == PREFERRED:  # its numbers are what people use: no dent will do
+        crowd = global_starts(model, [everything], rng, _CANDIDATES, _POPULATION)[0]
+        crowd[-1] = fits[0].values
+        fits[0] = min(
+            fits[0], evolve(model, everything, crowd, rng, _GENERATIONS), key=lambda f: f.cost
+        )
+    return fits
+
+
+def fit_problems(
+    model: Rung,
+    problems: Sequence[Problem],
+    rng: np.random.Generator,
+    keep: int,
+    final: int,
+    more_starts: NDArray | None = None,
+) -> list[Fit]:
+    """Best fit to each problem, searched for globally: simulate many, improve some, fit a few.
+
+    Parameters
+    ----------
+    model : Rung
+    problems : sequence of Problem
+    rng : numpy.random.Generator
+        Draws the candidates, the same for every problem.
+    keep : int
+        How many of a problem's candidates are improved a little.
+    final : int
+        How many of those are fitted to the end.
+    more_starts : ndarray, shape (problems, starts, parameters), optional
+        Improved together with the kept candidates.
+
+    Returns
+    -------
+    list of Fit, one per problem
+    """
+    starts = global_starts(model, problems, rng, _CANDIDATES, keep)
+    if more_starts is not None:
+        starts = np.concatenate([starts, more_starts], axis=1)
+    top = [
+        [f.values for f in sorted(early, key=lambda f: f.cost)[:final]]
+        for early in _fit_all(model, problems, starts, _SHORT, _SEARCH_DIFFERENCE)
+    ]
+    return best_of(model, problems, np.array(top), _FINAL)
+
+
+def best_of(
+    model: Rung, problems: Sequence[Problem], starts: NDArray, iterations: int
+) -> list[Fit]:
+    """The best fit to each problem from starts of its own.
+
+    Parameters
+    ----------
+    model : Rung
+    problems : sequence of Problem
+    starts : ndarray, shape (problems, starts, parameters)
+    iterations : int
+
+    Returns
+    -------
+    list of Fit, one per problem
+    """
+    return [
+        min(fits, key=lambda f: f.cost)
+        for fits in _fit_all(model, problems, starts, iterations, DIFFERENCE)
+    ]
+
+
+def _fit_all(
+    model: Rung,
+    problems: Sequence[Problem],
+    starts: NDArray,
+    iterations: int,
+    difference: float,
+) -> list[list[Fit]]:
+    """A fit from every start of every problem, all in one call."""
+    count = starts.shape[1]
+    flat = [p for p in problems for _ in range(count)]
+    fits = fit(model, flat, starts.reshape(-1, starts.shape[-1]), iterations, difference)
+    return [fits[i : i + count] for i in range(0, len(fits), count)]
+
+
+def dead_time_profile(
+    model: Rung, data: tuple[TrialData, ...], noise: float, best: Fit
+) -> tuple[Interval, Fit]:
+    """Dead time with its profile-likelihood interval, and the best fit met on the way.
+
+    Parameters
+    ----------
+    model : Rung
+        Its first parameter is `delay_s`.
+    data : tuple of TrialData
+    noise : float
+        Size of residuals beyond which one counts as an outlier [rad].
+    best : Fit
+        Where the profile starts.
+
+    Returns
+    -------
+    Interval
+        Dead time [s] at the confidence `sysid.lag.lag_budget.LEVEL`.
+    Fit
+        `best`, or a better one.
+    """
+    everything = Problem(data, (True,) * len(data), noise, {})
+    residual = fresh_residuals(model, best.values, data)
+    threshold = 0.5 * float(chi2.ppf(LEVEL, 1)) * integrated_autocorrelation_time(residual)
+    fits, lowest, delays = [best], best, np.array([best.values[0]])
+    for _ in range(3):
+        centre = best.values[0]
+        spread = np.array([0.001, 0.002, 0.0035, 0.005, 0.0075, 0.010, 0.014])
+        delays = np.concatenate([centre - spread[::-1], [centre], centre + spread])
+        delays = delays[(delays >= model.parameters[0].low) & (delays <= model.parameters[0].high)]
+        problems = [replace(everything, frozen={"delay_s": float(d)}) for d in delays]
+        fits = fit(model, problems, np.tile(best.values, (len(delays), 1)), 10)
+        # neighbours know better ways: pass each point's solution on, outward and back
+        for shift in (1, -1):
+            moved = fit(model, problems, np.roll([f.values for f in fits], shift, axis=0), 4)
+            fits = [min(pair, key=lambda f: f.cost) for pair in zip(fits, moved, strict=True)]
+        lowest = min(fits, key=lambda f: f.cost)
+        if lowest.cost > best.cost - 0.5:
+            break
+        best = min(*fit(model, [everything], lowest.values[None], 25), best, key=lambda f: f.cost)
+    cost = np.array([f.cost for f in fits]) - min(best.cost, lowest.cost)
+    low, high = _crossings(delays, cost, best.values[0], threshold)
+    centre, grain = float(best.values[0]), norm.ppf(0.5 + LEVEL / 2) * STEPPING_SD_S
+    ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
+    return Interval(centre, max(float(ends[0]), 0.0), float(ends[1])), best
+
+
+def _crossings(
+    delays: NDArray, cost: NDArray, centre: float, threshold: float
+) -> tuple[float, float]:
+    """Where the profile rises through the threshold on either side of `centre`."""
+    below = cost <= threshold
+    inside = np.flatnonzero(below)
+    if not len(inside):
+        return float(centre), float(centre)
+    ends = []
+    for edge, step in ((inside[0], -1), (inside[-1], 1)):
+        beyond = edge + step
+        if 0 <= beyond < len(delays):
+            part = (threshold - cost[edge]) / max(cost[beyond] - cost[edge], 1e-9)
+            ends.append(float(delays[edge] + part * (delays[beyond] - delays[edge])))
+        else:
+            ends.append(float(delays[edge]))
+    return min(ends[0], float(centre)), max(ends[1], float(centre))
+
+
+def fresh_residuals(model: Rung, values: NDArray, data: Sequence[TrialData]) -> list[NDArray]:
+    """Free run minus fresh readings of each trial, each of shape (samples,) [rad].
+
+    Parameters
+    ----------
+    model : Rung
+    values : ndarray, shape (parameters,)
+    data : sequence of TrialData
+    """
+    track = positions(model, [(values[None], data)])[0][:, 0]
+    return [look_up(track[:, n], t.sample_step) - t.sample_rad for n, t in enumerate(data)]
+
+
+def integrated_autocorrelation_time(residuals: Sequence[NDArray]) -> float:
+    """How many nominal samples carry the information of one, given their autocorrelation.
+
+    1 + 2 Σ ρ(k) over the lags k at which the autocorrelation ρ stands out of its own noise.
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray, each of shape (samples,)
+        Per trial; correlations do not reach from one to the next.
+
+    Returns
+    -------
+    float
+        In samples, at least 1.
+    """
+    total, correlation = 0.0, np.zeros(8)
+    for r in residuals:
+        r = r - r.mean()
+        total += float(r @ r)
+        for lag in range(1, 9):
+            correlation[lag - 1] += float(r[lag:] @ r[:-lag])
+    correlation /= max(total, 1e-18)
+    positive = np.cumprod(correlation > 0.1)  # up to where it fades into its own noise
+    return float(max(1.0, 1.0 + 2.0 * np.sum(correlation * positive)))

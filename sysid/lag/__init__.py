@@ -1,0 +1,1 @@
+"""Lag budget, tones and frequency response."""

@@ -1,0 +1,411 @@
+"""How late is this servo, and whose fault is it: the bus's, the sensor's, or its own?
+
+The naive lag between a command's row and the position's row is a sum:
+
+    naive lag = age of the feedback + half a loop of command hold + servo lag
+    servo lag = dead time + dynamics
+
+This module measures the left side and the first two terms of the right; the dead time needs a
+model and comes from `sysid.identify.calibrate`. Estimators, each on all rows and on fresh rows:
+
+* integer cross-correlation, the usual script: only whole loop periods can come out;
+* sub-sample cross-correlation, bounded to one period of the tone;
+* sine phase per trial; and the phase slope over all tones, where a lag common to all frequencies
+  has no whole-period ambiguity below half a second.
+
+The default, "hold-aware", is the phase slope of fresh rows at the times they were measured,
+against the command as it was held. Intervals are from a bootstrap over periods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    PollLattice,
+    Readings,
+    find_poll_lattice,
+    readings,
+)
+from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
+from pupper_sysid.sysid.recordings.recording import Trial
+
+LEVEL = 0.90
+"""Coverage of every interval."""
+
+LONGEST_LAG_S = 0.5
+
+_BLOCK_S = 0.5  # of the bootstrap where there are no periods
+_ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
+_MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
+_FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
+_USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 90 % interval, both in the same unit."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of_draws(cls, value: float, draws: NDArray[np.float64]) -> Interval:
+        """The interval that holds the middle 90 % of `draws`."""
+        low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        return cls(float(value), float(low), float(high))
+
+    def widened(self, by: float) -> Interval:
+        """The interval if all of it may be off by as much as `by`, to either side."""
+        return Interval(self.value, self.low - by, self.high + by)
+
+
+@dataclass(frozen=True)
+class FrequencyLag:
+    """Response of the joint to one tone."""
+
+    frequency_hz: float
+    gain: float
+    phase_deg: float
+    lag: Interval
+    naive_lag_s: float
+    naive_gain: float
+    trial: int
+
+
+@dataclass(frozen=True)
+class LagBudget:
+    """Where one joint's lag comes from. Times in seconds.
+
+    Attributes
+    ----------
+    naive : Interval
+        Command row to position row, all rows.
+    fresh : Interval
+        Command row to fresh rows at the times they were measured.
+    lag : Interval
+        Command edge to the motion the host sees: the servo's own lag.
+    feedback_age_s, command_hold_s : float
+        What the bus adds: `naive - fresh` and `fresh - lag`.
+    by_frequency : tuple of FrequencyLag
+        Empty if the recording has no tones.
+    estimators : dict of str to float
+        All estimators by name [s], for comparison; NaN where one does not apply.
+    lattice : PollLattice
+    noise_rad : float
+        RMS of fresh readings about their tones; NaN if there are none.
+    """
+
+    joint: str
+    naive: Interval
+    fresh: Interval
+    lag: Interval
+    feedback_age_s: float
+    command_hold_s: float
+    by_frequency: tuple[FrequencyLag, ...]
+    estimators: dict[str, float]
+    lattice: PollLattice
+    noise_rad: float
+    warnings: tuple[str, ...]
+
+
+def lag_budget(
+    joint: str,
+    trials: Sequence[Trial],
+    rng: np.random.Generator,
+    lattice: PollLattice | None = None,
+) -> LagBudget:
+    """Measure the lag of one joint and what the bus adds to it.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+        All of this joint.
+    rng : numpy.random.Generator
+        For the bootstrap.
+    lattice : PollLattice, optional
+        If it has been found already.
+
+    Raises
+    ------
+    InputError
+        If nothing moves, or there are too few fresh readings to say anything.
+    """
+    lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
+    read = [readings(t, lattice) for t in trials]
+    if sum(len(r.rows) for r in read) < 16:
+        raise InputError(
+            f"{joint}: only {sum(len(r.rows) for r in read)} readings differ from the one before, "
+            "too few to measure a lag. Was the joint moving and its torque on? "
+            "`pupper-sysid doctor` says more."
+        )
+    tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
+    tones = [t for t in tones if t is not None]
+    warnings: list[str] = []
+    if tones:
+        moved = max(abs(t.response) for t in tones)
+        if moved < _MOVES:
+            raise InputError(
+                f"{joint}: it moved by {100 * moved:.0f} % of what it was told at best, so there "
+                "is no lag to measure. Was its torque on, and does it turn freely?"
+            )
+        naive = _slope(tones, "naive_rows")
+        fresh = _slope(tones, "fresh_rows")
+        lag = _slope(tones, "fresh_held")
+        lost = [t for t, w in zip(tones, tone_weights(tones), strict=True) if w == 0]
+        if lost:
+            listed = ", ".join(f"{t.frequency_hz:.3g}" for t in lost)
+            warnings.append(
+                f"{joint}: at {listed} Hz it moves less than half as far as told, so these tones "
+                "are left out of the lag; record them with a smaller amplitude."
+            )
+        if len({round(t.frequency_hz, 2) for t in tones}) == 1:
+            warnings.append(
+                f"{joint}: one frequency only, so a lag of one period "
+                f"({1e3 / tones[0].frequency_hz:.0f} ms) more would look the same; record several."
+            )
+    else:
+        naive, fresh, lag = _shifts(trials, read, rng)
+        warnings.append(
+            f"{joint}: no tones in this recording, so the lag is one time shift over everything it "
+            "did. Record a sweep for a lag per frequency."
+        )
+    by_frequency = tuple(map(_at_frequency, tones, _servo_lags(tones)))
+    if lattice.kind == "unresolved":
+        # all readings may be as old as a read that was answered at once, or one loop older
+        loop = float(np.median(np.concatenate([np.diff(t.read_time_s) for t in trials])))
+        fresh, lag = fresh.widened(loop / 2), lag.widened(loop / 2)
+        by_frequency = tuple(replace(f, lag=f.lag.widened(loop / 2)) for f in by_frequency)
+        warnings.append(
+            f"{joint}: readings are held, but their poll period could not be found; fresh readings "
+            "are dated to the middle between two reads, which may put all lags off by half a loop "
+            f"({1e3 * loop / 2:.0f} ms). A longer sweep would settle it."
+        )
+    doubt = max(t.read_time_doubt_s for t in trials)
+    fresh, lag = fresh.widened(doubt), lag.widened(doubt)
+    by_frequency = tuple(replace(f, lag=f.lag.widened(doubt)) for f in by_frequency)
+    return LagBudget(
+        joint, naive, fresh, lag,
+        naive.value - fresh.value, fresh.value - lag.value,
+        by_frequency,
+        _estimators(trials, read, tones, lag.value),
+        lattice,
+        float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else float("nan"),
+        tuple(warnings),
+    )  # fmt: skip
+
+
+# --------------------------------------------------------------------------- phase slope
+
+_PAIRS = {
+    "naive_rows": ("naive", "command_rows"),
+    "fresh_rows": ("fresh", "command_rows"),
+    "fresh_held": ("fresh", "command_held"),
+}
+
+
+def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
+    """Lag common to all tones: the slope of the phase through the origin, with its interval."""
+    output, command = _PAIRS[pair]
+    frequency = np.array([t.frequency_hz for t in tones])
+    response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
+    draws = np.stack([getattr(t, f"{output}_draws") / getattr(t, command) for t in tones])
+    weight = tone_weights(tones)
+    lags = tone_lags(response, frequency)
+    drawn = _lag_near(draws, frequency[:, None], lags[:, None])
+    return Interval.of_draws(float(weight @ lags), weight @ drawn)
+
+
+def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
+    """Share of each tone in the joint's lag: inverse variance, nothing where it cannot follow.
+
+    A servo that moves less than half as far as it does at its best is cut short by its torque or
+    speed limit; when its motion comes then is no delay.
+    """
+    gain = np.array([abs(t.response) for t in tones])
+    weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
+    weight = np.where(gain >= _FOLLOWS * gain.max(), weight, 0.0)
+    return weight / weight.sum()
+
+
+def tone_lags(response: NDArray, frequency_hz: NDArray) -> NDArray[np.float64]:
+    """Lag of every tone [s], the right whole period of each included.
+
+    A phase leaves the lag open to whole periods. The lowest tone has the longest period and
+    settles itself below 2 Hz; above, the lag on which all tones agree best settles it. From there
+    each tone takes the period nearest to the lag of the tone below it, for a servo's lag changes
+    by far less than half a period from one tone to the next.
+
+    Parameters
+    ----------
+    response : ndarray of complex, shape (tones,)
+    frequency_hz : ndarray, shape (tones,)
+    """
+    order = np.argsort(frequency_hz, kind="stable")
+    lowest = frequency_hz[order[0]]
+    if lowest <= 2.0:
+        near = 0.4 / lowest  # from a tenth of a period early to nine tenths late
+    else:
+        near = _common_lag(response, frequency_hz)
+    lags = np.empty(len(order))
+    for i in order:
+        near = lags[i] = _lag_near(response[i], frequency_hz[i], near)
+    return lags
+
+
+def _common_lag(response: NDArray, frequency: NDArray) -> float:
+    """The lag on which all phases agree best."""
+    spacing = np.diff(np.unique(frequency))
+    # two trials of one tone differ by what their fits are off, and say nothing more
+    spacing = spacing[spacing > _ONE_TONE_HZ]
+    # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
+    repeat = 1.0 / (spacing.min() if len(spacing) else frequency[0])
+    lags = np.arange(0.0, min(LONGEST_LAG_S, 0.95 * repeat), 2e-4)
+    turned = np.angle(response)[:, None] + 2 * np.pi * frequency[:, None] * lags
+    return float(lags[int(np.argmax(np.cos(turned).sum(axis=0)))])
+
+
+def _lag_near(response, frequency, centre):
+    """Lag of a phase, in the period around `centre` [s]; arrays broadcast."""
+    turned = np.angle(response * np.exp(2j * np.pi * frequency * centre))
+    return centre - turned / (2 * np.pi * frequency)
+
+
+def _servo_lags(tones: Sequence[ToneResponse]) -> list[float]:
+    if not tones:
+        return []
+    frequency = np.array([t.frequency_hz for t in tones])
+    return tone_lags(np.array([t.response for t in tones]), frequency).tolist()
+
+
+def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
+    f, response = tone.frequency_hz, tone.response
+    draws = _lag_near(tone.response_draws, f, lag)
+    naive = tone.naive / tone.command_rows
+    return FrequencyLag(
+        f, abs(response), -360.0 * f * lag, Interval.of_draws(lag, draws),
+        float(_lag_near(naive, f, lag + _USUAL_AGE_S)), abs(naive), tone.trial,
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------- time shift, any excitation
+
+
+def _shifts(
+    trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator, draws: int = 400
+) -> tuple[Interval, Interval, Interval]:
+    """Naive, fresh and servo lag as the shift of the command that correlates best."""
+    lags = np.arange(0.0, LONGEST_LAG_S, 1e-3)
+    results = []
+    for kind in _PAIRS:
+        parts = [_shift_sums(t, r, kind, lags) for t, r in zip(trials, read, strict=True)]
+        sums = np.concatenate(parts)  # (blocks, 6, lags)
+        weights = rng.exponential(size=(draws, len(sums)))
+        value = _best_shift(sums.sum(axis=0), lags)
+        drawn = [_best_shift(np.tensordot(w, sums, axes=1), lags) for w in weights]
+        results.append(Interval.of_draws(value, np.array(drawn)))
+    return results[0], results[1], results[2]
+
+
+def _shift_sums(trial: Trial, read: Readings, kind: str, lags: NDArray) -> NDArray[np.float64]:
+    """Sums behind the correlation of position and shifted command, per block of half a second."""
+    if kind == "naive_rows":
+        rows = np.flatnonzero(np.isfinite(trial.position_rad))
+        time, position = trial.send_time_s[rows], trial.position_rad[rows]
+    else:
+        time, position = read.time_s, read.position_rad
+    block = np.floor((time - time[:1]) / _BLOCK_S)
+    edges = [0, *(np.flatnonzero(np.diff(block)) + 1), len(time)] if len(time) else []
+    sums = np.empty((max(len(edges) - 1, 0), 6, len(lags)))
+    # a block at a time: all lags of all rows would be gigabytes for a long walk
+    for n, (first, last) in enumerate(pairwise(edges)):
+        y, past = position[first:last], time[first:last, None] - lags
+        if kind == "fresh_held":
+            row = np.searchsorted(trial.send_time_s, past, side="right") - 1
+            c = np.where(row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)])
+        else:
+            c = np.interp(past, trial.send_time_s, trial.command_rad)
+        one = np.ones(len(lags))
+        sums[n] = (
+            len(y) * one, y.sum() * one, c.sum(axis=0), (y @ y) * one, y @ c, (c * c).sum(axis=0),
+        )  # fmt: skip
+    return sums
+
+
+def _best_shift(sums: NDArray, lags: NDArray) -> float:
+    n, y, c, yy, yc, cc = sums
+    covariance = yc - y * c / n
+    scale = np.sqrt(np.maximum((yy - y * y / n) * (cc - c * c / n), 1e-18))
+    return _parabolic_peak(covariance / scale, lags)
+
+
+def _parabolic_peak(score: NDArray, lags: NDArray) -> float:
+    """Position of the maximum of a sampled curve, refined by the parabola through its top."""
+    k = int(np.argmax(score))
+    if not 0 < k < len(score) - 1:
+        return float(lags[k])
+    left, top, right = score[k - 1 : k + 2]
+    bend = left - 2 * top + right
+    return float(lags[k] + (0.5 * (left - right) / bend if bend < 0 else 0.0) * (lags[1] - lags[0]))
+
+
+# ------------------------------------------------------------------------- for comparison
+
+
+def _estimators(
+    trials: Sequence[Trial], read: Sequence[Readings], tones: Sequence[ToneResponse], lag: float
+) -> dict[str, float]:
+    """All estimators side by side, each the mean over trials [s]."""
+    pairs = list(zip(trials, read, strict=True))
+    found = {
+        "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
+        "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
+        "sub-sample cross-correlation, all rows": [_bounded(t, r, "naive_rows") for t, r in pairs],
+        "sub-sample cross-correlation, fresh rows": [
+            _bounded(t, r, "fresh_rows") for t, r in pairs
+        ],
+    }
+    frequency = np.array([t.frequency_hz for t in tones])
+    for kind, name in (("naive_rows", "all rows"), ("fresh_rows", "fresh rows")):
+        output, command = _PAIRS[kind]
+        response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
+        found[f"sine phase, {name}"] = list(tone_lags(response, frequency)) if tones else []
+    result = {
+        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()
+    }
+    if tones:
+        result["phase slope, all rows"] = _slope(tones, "naive_rows").value
+        result["phase slope, fresh rows"] = _slope(tones, "fresh_rows").value
+        result["hold-aware (default)"] = lag
+    return result
+
+
+def _longest(trial: Trial) -> float:
+    return min(LONGEST_LAG_S, 1.0 / trial.frequency_hz if trial.frequency_hz > 0 else LONGEST_LAG_S)
+
+
+def _integer(trial: Trial, rows: NDArray | None) -> float:
+    """Lag in whole loop periods at which raw correlation peaks: the usual script [s]."""
+    c = trial.command_rad - trial.command_rad.mean()
+    loop = float(np.median(np.diff(trial.send_time_s)))
+    shifts = np.arange(0, max(2, int(_longest(trial) / loop)))
+    rows = np.flatnonzero(np.isfinite(trial.position_rad)) if rows is None else rows
+    rows = rows[rows >= shifts[-1]]
+    if len(rows) < 8:
+        return float("nan")
+    y = trial.position_rad[rows] - trial.position_rad[rows].mean()
+    return float(shifts[int(np.argmax([np.sum(y * c[rows - s]) for s in shifts]))] * loop)
+
+
+def _bounded(trial: Trial, read: Readings, kind: str) -> float:
+    lags = np.arange(0.0, _longest(trial), 1e-3)
+    sums = _shift_sums(trial, read, kind, lags)
+    return _best_shift(sums.sum(axis=0), lags) if len(sums) else float("nan")

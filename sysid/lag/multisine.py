@@ -1,0 +1,140 @@
+"""Many tones at once: the response at every line of a multisine, from one trial.
+
+The lines are read off the command itself: the strongest is fitted and taken out, again and again,
+until next to nothing is left. A chirp, steps or a walking robot leave too much: no multisine. All
+lines are then fitted to the fresh readings together, for readings at irregular times do not
+keep sines of different frequencies apart by themselves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.feedback.poll_lattice import Readings
+from pupper_sysid.sysid.lag.tone import ToneResponse
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_MOST_LINES = 24
+_LEFT_OVER = 0.005  # of the command's variance: quantisation, no signal
+_SETTLE_S = 0.5  # past the soft start: several times the servo's slowest pole
+_ROWS_PER_UNKNOWN = 3
+_BLOCK_S = 0.5
+
+
+def multisine_responses(
+    trial: Trial, reading: Readings, rng: np.random.Generator, draws: int = 400
+) -> list[ToneResponse]:
+    """Response at each line of the command of `trial`; empty if it is no multisine.
+
+    Parameters
+    ----------
+    trial : Trial
+    reading : Readings
+        Of the same trial: when its fresh rows were measured.
+    rng : numpy.random.Generator
+        Weights stretches of half a second for the draws.
+    draws : int
+    """
+    send = trial.send_time_s
+    if len(send) < 100 or np.ptp(trial.command_rad) < 1e-3:
+        return []
+    first = send[0] + 0.15 * (send[-1] - send[0])
+    lines = _lines(send[send >= first], trial.command_rad[send >= first])
+    if not len(lines):
+        return []
+    start = first + _SETTLE_S
+    rows = (send >= start) & np.isfinite(trial.position_rad)
+    fresh = (reading.time_s >= start) & (reading.time_s <= send[-1])
+    unknown = 1 + 2 * len(lines)
+    if min(fresh.sum(), rows.sum()) < _ROWS_PER_UNKNOWN * unknown:
+        return []
+    grid = np.arange(start, send[-1], 1e-3)
+    held = trial.command_rad[np.searchsorted(send, grid, side="right") - 1]
+    command_held = _phasors(_solve(grid, held, lines))
+    command_rows = _phasors(_solve(send[rows], trial.command_rad[rows], lines))
+    naive = _draw(send[rows], trial.position_rad[rows], lines, rng, draws)
+    measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
+    shift = rng.normal(0.0, reading.time_sd_s, draws)
+    return [
+        ToneResponse(
+            trial.number, float(f), complex(command_rows[k]), complex(command_held[k]),
+            complex(naive[0][k]), complex(measured[0][k]), naive[1][:, k],
+            measured[1][:, k] * np.exp(2j * np.pi * f * shift),
+            int(fresh.sum()), measured[2], reading.time_sd_s,
+        )
+        for k, f in enumerate(lines)
+    ]  # fmt: skip
+
+
+def _lines(time: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Frequencies of the command's lines [Hz], rising; empty if lines do not explain it."""
+    loop, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
+    even = np.arange(time[0], time[-1], loop)
+    spectrum_hz = np.fft.rfftfreq(8 * len(even), loop)
+    usable = spectrum_hz > 1.0 / span
+    variance = float(np.var(command))
+    lines, left = np.zeros(0), command - command.mean()
+    while np.var(left) > _LEFT_OVER * variance:
+        if len(lines) == _MOST_LINES:
+            return np.zeros(0)
+        strength = np.abs(np.fft.rfft(np.interp(even, time, left), 8 * len(even)))
+        lines = np.append(lines, spectrum_hz[int(np.argmax(strength * usable))])
+        lines, left = _sharpened(time, command, lines)
+        if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < 0.5 / span:
+            return np.zeros(0)
+    return np.sort(lines)
+
+
+def _sharpened(
+    time: NDArray[np.float64], command: NDArray[np.float64], lines: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lines after two Gauss-Newton steps on their frequencies, and what they leave."""
+    clock, farthest = time - time.mean(), 0.25 / float(np.ptp(time))
+    for _ in range(2):
+        phasor = _phasors(_solve(clock, command, lines))
+        turning = phasor * np.exp(2j * np.pi * np.outer(clock, lines))
+        slopes = (2j * np.pi * clock[:, None] * turning).real
+        design = np.hstack([_design(clock, lines), slopes])
+        step = np.linalg.lstsq(design, command, rcond=None)[0][1 + 2 * len(lines) :]
+        lines = lines + np.clip(step, -farthest, farthest)
+    return lines, command - _design(clock, lines) @ _solve(clock, command, lines)
+
+
+def _design(time: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
+    angle = 2 * np.pi * np.outer(time, lines)
+    return np.hstack([np.ones((len(time), 1)), np.cos(angle), np.sin(angle)])
+
+
+def _solve(time: NDArray, value: NDArray, lines: NDArray) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.lstsq(_design(time, lines), value, rcond=None)[0], np.float64)
+
+
+def _phasors(solution: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Phasors P of `Re(P exp(2πj f t))`, from offset, cosines and sines along the last axis."""
+    count = solution.shape[-1] // 2
+    return solution[..., 1 : 1 + count] - 1j * solution[..., 1 + count :]
+
+
+def _draw(
+    time: NDArray, value: NDArray, lines: NDArray, rng: np.random.Generator, draws: int
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128], float]:
+    """Phasors at all lines, draws of them, and the RMS of what they leave."""
+    design = _design(time, lines)
+    block = np.floor((time - time[0]) / _BLOCK_S).astype(int)
+    names, block = np.unique(block, return_inverse=True)
+    gram = np.zeros((len(names), design.shape[1], design.shape[1]))
+    moment = np.zeros((len(names), design.shape[1]))
+    np.add.at(gram, block, design[:, :, None] * design[:, None, :])
+    np.add.at(moment, block, design * value[:, None])
+    solution = np.linalg.solve(gram.sum(0), moment.sum(0))
+    weights = rng.exponential(size=(draws, len(names)))
+    drawn = np.linalg.solve(np.tensordot(weights, gram, axes=1), (weights @ moment)[..., None])
+    left = design @ solution - value
+    # what was fitted away from the residuals is missing from their spread
+    inflate = np.sqrt(len(value) / (len(value) - design.shape[1]))
+    return (
+        _phasors(solution),
+        _phasors(solution + inflate * (drawn[..., 0] - solution)),
+        float(inflate * np.sqrt(np.mean(left**2))),
+    )

@@ -1,0 +1,1 @@
+"""Recordings: the file format, its validation, and other layouts."""

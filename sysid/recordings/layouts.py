@@ -1,0 +1,129 @@
+"""Layouts of other people's logs, recognised by their columns and turned into tidy rows.
+
+* one joint, tones one after another, times restarting with each: `time_s, freq_hz, motor_idx,
+  command_rad, actual_rad`, angles relative to the standing pose (the SpotDMouse sweep script);
+* twelve joints played back: `time_s, loop`, then `<joint>_command_rad, <joint>_position_rad`.
+
+Both say when the loop turned, not when the position was read; reading is taken to follow sending
+by `READ_AFTER_SEND_S`, and the metadata say so.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sysid.recordings.table import Parsed, require
+
+READ_AFTER_SEND_S = 0.0005
+PAUSE_S = 0.5
+"""Return to the start pose between tones of the sweep script, not in its file."""
+
+_SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
+_PLAYBACK = ("time_s", "loop")
+_TIDY = (
+    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
+)  # fmt: skip
+
+
+def convert(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+    """Tidy table, metadata and warnings of a parsed file of any known layout.
+
+    Raises
+    ------
+    InputError
+        If the columns belong to no known layout.
+    """
+    columns = set(parsed.table.columns)
+    if "send_time_s" in columns or "read_time_s" in columns:
+        require(path, parsed.table, _TIDY)
+        return parsed.table, parsed.metadata, []
+    if {"actual_rad", "freq_hz"} & columns and "motor_idx" in columns:
+        require(path, parsed.table, _SWEEP)
+        return _sweep(path, parsed)
+    if any(f"{j}_command_rad" in columns or f"{j}_position_rad" in columns for j in JOINT_NAMES):
+        require(path, parsed.table, _PLAYBACK)
+        return _playback(path, parsed)
+    require(path, parsed.table, _TIDY)
+    raise AssertionError("a table with all tidy columns was taken above")
+
+
+def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:
+    servos = load_joint_map("mini_pupper_2").per_servo().select(joints)
+    # int() of the count: the angle goes up where counts fall as angles rise
+    moved = ["up" if sign < 0 else "down" for sign in servos.sign()]
+    metadata: dict[str, Any] = {
+        "imported_from": layout,
+        "read_after_send_s": READ_AFTER_SEND_S,
+        "joints": joints,
+        "bus": {
+            "kind": "esp32 proxy",
+            "command_quantum_rad": dict(zip(joints, 1 / servos.counts_per_rad(), strict=True)),
+            "command_rounding": dict(zip(joints, moved, strict=True)),
+            "count_zero_rad": dict(zip(joints, servos.zero_rad(), strict=True)),
+        },
+    }
+    if pose is not None:
+        metadata["start_pose_rad"] = pose
+    return metadata
+
+
+def _sweep(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+    table = parsed.table
+    index = table["motor_idx"].to_numpy()
+    if not np.isin(index, np.arange(len(JOINT_NAMES))).all():
+        raise InputError(f"{path}, column motor_idx: joints are numbered 0 to 11.")
+    names = np.array(JOINT_NAMES)[index.astype(int)]
+    time = table["time_s"].to_numpy()
+    # a new tone or another joint starts a trial, and the clock again
+    changed = (np.diff(table["freq_hz"].to_numpy()) != 0) | (np.diff(index) != 0)
+    restarted = changed | (np.diff(time) < -0.5)
+    trial = np.concatenate([[0], np.cumsum(restarted)])
+    shift, last = np.zeros(len(time)), 0.0
+    for n in np.unique(trial):
+        rows = trial == n
+        shift[rows] = last - np.nanmin(time[rows]) if n else 0.0
+        last = float(np.nanmax(time[rows]) + shift[rows][0]) + PAUSE_S
+    pose = np.array([DEFAULT_POSE[name] for name in names])
+    tidy = pd.DataFrame(
+        {
+            "send_time_s": time + shift,
+            "read_time_s": time + shift + READ_AFTER_SEND_S,
+            "trial": trial,
+            "joint": names,
+            "frequency_hz": table["freq_hz"].to_numpy(),
+            "command_rad": table["command_rad"].to_numpy() + pose,
+            "position_rad": table["actual_rad"].to_numpy() + pose,
+        }
+    )
+    joints = [j for j in JOINT_NAMES if j in names]
+    metadata = _metadata("single-joint sweep", joints, {j: DEFAULT_POSE[j] for j in joints})
+    return tidy, metadata, []
+
+
+def _playback(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+    table = parsed.table
+    joints = [j for j in JOINT_NAMES if f"{j}_command_rad" in table.columns]
+    parts = []
+    for joint in joints:
+        require(path, table, (f"{joint}_command_rad", f"{joint}_position_rad"))
+        parts.append(
+            pd.DataFrame(
+                {
+                    "send_time_s": table["time_s"],
+                    "read_time_s": table["time_s"] + READ_AFTER_SEND_S,
+                    "trial": table["loop"],
+                    "joint": joint,
+                    "frequency_hz": np.nan,
+                    "command_rad": table[f"{joint}_command_rad"],
+                    "position_rad": table[f"{joint}_position_rad"],
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True), _metadata("12-joint playback", joints, None), []

@@ -1,0 +1,286 @@
+"""Validation of recording files: text becomes a table of numbers, or a sentence about why not."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.sysid.recordings.recording import TITLE
+
+_LEAST_ROWS = 20
+_SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
+_LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
+_TEXT_COLUMNS = ("joint", "signal")
+
+
+class Bus(BaseModel):
+    """What numbers are computed from, of what a bus says of itself; other keys are kept."""
+
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+    kind: str | None = None
+    command_quantum_rad: float | dict[str, float | None] | None = None
+    command_rounding: dict[str, Literal["up", "down", "nearest"] | None] | None = None
+    count_zero_rad: dict[str, float | None] | None = None
+    speed_limit_rad_s: Annotated[float, Field(gt=0)] | None = None
+    read_time_doubt_s: Annotated[float, Field(ge=0, le=1)] | None = None
+
+
+class Header(BaseModel):
+    """What is known of a recording's header; other keys are kept as they are."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    schema_version: int = 1
+    bus: Bus = Bus()
+    joints: list[str] = []
+    start_pose_rad: dict[str, float] = {}
+    read_after_send_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """A file's header, column names and cells, before anyone knows which layout it is.
+
+    Attributes
+    ----------
+    metadata : dict
+    table : pandas.DataFrame
+        Numbers, but for the columns of text; empty cells are NaN.
+    warnings : list of str
+    """
+
+    metadata: dict[str, Any]
+    table: pd.DataFrame
+    warnings: list[str] = field(default_factory=list)
+
+
+def parse(path: Path, text: str) -> Parsed:
+    """Cells of a CSV file with a comment header, as numbers.
+
+    Raises
+    ------
+    InputError
+        For ragged rows, text where a number belongs, a broken or newer header.
+    """
+    lines = text.splitlines()
+    metadata = header(path, lines)
+    warnings: list[str] = []
+    rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
+    if not rows:
+        raise InputError(f"{path} has no rows: the recording never started. Record it again.")
+    columns = [c.strip() for c in next(csv.reader([rows[0][1]]))]
+    if len(columns) == 1 and ";" in columns[0]:
+        raise InputError(
+            f"{path}, line {rows[0][0]}: cells are separated by semicolons. Save it with commas "
+            "between cells and points in numbers."
+        )
+    if len(set(columns)) != len(columns):
+        raise InputError(f"{path}, line {rows[0][0]}: a column name stands twice. Rename one.")
+    ours = "send_time_s" in columns
+    body = rows[1:]
+    cancelled = _cancelled(lines, columns, body) if ours else []
+    for trial, first, last in cancelled:
+        warnings.append(
+            f"trial {trial} was interrupted and recorded again; the second one is used."
+        )
+        body = [(n, line) for n, line in body if not first <= n <= last]
+    # line by line: a stray quote must not swallow the lines behind it
+    cells = [_cells(path, n, line) for n, line in body]
+    numbers = [n for n, _ in body]
+    # killed in the middle of a line: the last one has no end, or too few cells
+    cut = bool(cells) and (len(cells[-1]) < len(columns) or (ours and not text.endswith("\n")))
+    if cut:
+        cells, numbers = cells[:-1], numbers[:-1]
+        warnings.append("its last line was cut short and has been left out.")
+    for n, row in zip(numbers, cells, strict=True):
+        if len(row) != len(columns):
+            raise InputError(
+                f"{path}, line {n}: {len(row)} cells where the header names {len(columns)} "
+                "columns; command and position must have the same number of values. Mend or "
+                "remove the line."
+            )
+    if lines[0].startswith(TITLE) and "completed" not in metadata:
+        warnings.append("it was not recorded to its end; what is there is used.")
+    if not cells:
+        raise InputError(f"{path} has column names but no rows. Record it again.")
+    data = {
+        name: _column(path, name, [row[k] for row in cells], numbers)
+        for k, name in enumerate(columns)
+    }
+    return Parsed(metadata, pd.DataFrame(data), warnings)
+
+
+def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Refuse or repair a tidy table; returns it in time order with what was repaired.
+
+    Raises
+    ------
+    InputError
+        If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
+    """
+    warnings: list[str] = []
+    if strange := strange_joint(table["joint"].to_list()):
+        raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
+    needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
+    lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
+    if lost.any():
+        warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
+        table = table.loc[~lost]
+    position = table["position_rad"].to_numpy(float)
+    missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
+    if missing == 1.0:
+        raise InputError(
+            f"{path}, column position_rad: no row has a position, so the bus never answered. "
+            "Check power and wiring, then record again."
+        )
+    if missing > 0:
+        warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
+    for column in ("command_rad", "position_rad"):
+        _refuse_degrees(path, column, table[column].to_numpy())
+    again = table.duplicated(["joint", "trial", "send_time_s"])
+    if again.any():
+        warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
+        table = table.loc[~again]
+    short: list[tuple[str, float]] = []
+    for _, rows in table.groupby(["joint", "trial"], sort=False):
+        joint, trial = rows["joint"].iloc[0], rows["trial"].iloc[0]
+        for column in ("send_time_s", "read_time_s"):
+            back = np.flatnonzero(np.diff(rows[column].to_numpy()) < 0)
+            if len(back):
+                raise InputError(
+                    f"{path}, column {column}: time runs backwards in trial {trial:g} of {joint}, "
+                    f"after {rows[column].iloc[back[0]]:.4f} s. Sort the rows, or give each pass "
+                    "its own trial number."
+                )
+        tones = rows["frequency_hz"].dropna().unique()
+        if len(tones) > 1:
+            raise InputError(
+                f"{path}, column frequency_hz: trial {trial:g} of {joint} has {tones[0]:g} and "
+                f"{tones[1]:g} Hz. Give each frequency its own trial number."
+            )
+        if len(rows) < _SHORTEST_TRIAL:
+            short.append((joint, trial))
+            warnings.append(f"trial {trial:g} of {joint} is too short to use and was left out.")
+        elif len(rows) < _LEAST_ROWS:
+            warnings.append(f"trial {trial:g} of {joint} has only {len(rows)} rows.")
+    usable = ~pd.MultiIndex.from_arrays([table["joint"], table["trial"]]).isin(short)
+    if usable.sum() < _LEAST_ROWS:
+        raise InputError(
+            f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed to say "
+            "anything. Record for longer."
+        )
+    return table.loc[usable].reset_index(drop=True), warnings
+
+
+def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
+    """Raise a sentence that names the columns `table` lacks, and what they may be called there."""
+    lacking = [c for c in columns if c not in table.columns]
+    if not lacking:
+        return
+    spare = [str(c) for c in table.columns if c not in columns]
+    near = difflib.get_close_matches(lacking[0], spare, n=1, cutoff=0.5)
+    hint = f" Was '{near[0]}' meant? Rename it." if near else ""
+    raise InputError(
+        f"{path}: column {', '.join(lacking)} is missing; it has "
+        f"{', '.join(map(str, table.columns))}.{hint} A recording needs {', '.join(columns)}."
+    )
+
+
+def header(path: Path, lines: list[str]) -> dict[str, Any]:
+    metadata: dict[str, Any] = {}
+    for n, line in enumerate(lines, 1):
+        if not line.startswith("# ") or ": " not in line:
+            continue
+        key, _, value = line[2:].partition(": ")
+        try:
+            metadata[key.strip()] = json.loads(value)
+        except (ValueError, RecursionError):
+            if lines[0].startswith(TITLE) and n < len(lines):
+                raise InputError(
+                    f"{path}, line {n}: the value of '{key}' is not JSON. Mend or remove the line."
+                ) from None
+    try:
+        header = Header.model_validate(metadata)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(
+            f"{path}, header, {where}: {first['msg']}. Mend it, or leave it out."
+        ) from None
+    if header.schema_version > 1:
+        raise InputError(
+            f"{path} has schema_version {header.schema_version}, written by a newer pupper-sysid; "
+            "this one reads up to 1. Upgrade."
+        )
+    return metadata
+
+
+def _cells(path: Path, number: int, line: str) -> list[str]:
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error:
+        raise InputError(
+            f"{path}, line {number}: a quotation mark is not closed. Mend or remove the line."
+        ) from None
+
+
+def _cancelled(
+    lines: list[str], columns: list[str], rows: list[tuple[int, str]]
+) -> list[tuple[int, int, int]]:
+    """Trial, first and last line of rows that a line `# resumed` below them says are void."""
+    found = []
+    at = columns.index("trial") if "trial" in columns else -1
+    for n, line in enumerate(lines, 1):
+        if at < 0 or not line.startswith("# resumed: "):
+            continue
+        try:
+            trial = int(json.loads(line.partition(": ")[2])["trial"])
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+        void = [
+            k for k, row in rows
+            if k < n and len(cells := row.split(",")) > at and cells[at] == str(trial)
+        ]  # fmt: skip
+        if void:
+            found.append((trial, void[0], void[-1]))
+    return found
+
+
+def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
+    if name in _TEXT_COLUMNS:
+        return [c.strip() for c in cells]
+    values = np.full(len(cells), np.nan)
+    for k, cell in enumerate(cells):
+        text = cell.strip()
+        if text == "":
+            continue
+        try:
+            values[k] = float(text)
+        except ValueError:
+            raise InputError(
+                f"{path}, line {numbers[k]}, column {name}: '{text[:40]}' is not a number. "
+                "Mend the cell, or leave it empty if there was no reading."
+            ) from None
+        if np.isinf(values[k]):
+            raise InputError(f"{path}, line {numbers[k]}, column {name}: the value is infinite.")
+    return values
+
+
+def _refuse_degrees(path: Path, column: str, values: np.ndarray) -> None:
+    largest = float(np.nanmax(np.abs(values)))
+    if largest > _LARGEST_RAD:
+        raise InputError(
+            f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
+            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533."
+        )

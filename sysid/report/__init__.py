@@ -1,0 +1,1 @@
+"""The HTML report: sections, tables and figures."""

@@ -1,0 +1,237 @@
+"""What the report's figures show, computed: curves and numbers, no drawing.
+
+`lag_parts` splits one joint's lag into the parts of the lag budget, in milliseconds; `tracks` runs
+the fitted model along every trial, beside what was commanded and read; `hold_runs` sets for how
+many rows each reading stayed the same beside what the poll lattice would make of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
+from pupper_sysid.sysid.identify.models import rung
+from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
+from pupper_sysid.sysid.identify.search import PREFERRED
+from pupper_sysid.sysid.lag.lag_budget import LEVEL, Interval
+
+if TYPE_CHECKING:  # the second brings python-control, which is not needed here
+    from pupper_sysid.sysid.doctor.examination import JointExamination
+    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+
+LONGEST_RUN = 12
+"""Hold runs of this many rows and more share the last bar."""
+
+
+@dataclass(frozen=True)
+class LagParts:
+    """The lag budget of one joint [ms], in the order in which the parts happen.
+
+    naive = command hold + dead time + dynamics + feedback age
+    """
+
+    joint: str
+    command_hold_ms: float
+    dead_time_ms: Interval
+    dynamics_ms: float
+    feedback_age_ms: float
+    lag_ms: Interval
+    naive_ms: Interval
+
+    def sentence(self) -> str:
+        """The finding in words."""
+        if abs(self.feedback_age_ms) < 1.0:
+            feedback = "next to nothing is stale feedback"
+        else:
+            feedback = f"{self.feedback_age_ms:.0f} ms is stale feedback"
+        return (
+            f"of the naive {self.naive_ms.value:.0f} ms, {feedback}, "
+            f"{self.command_hold_ms:.0f} ms command hold, {self.lag_ms.value:.0f} ms the servo: "
+            f"{self.dead_time_ms.value:.0f} ms dead time + {self.dynamics_ms:.0f} ms dynamics."
+        )
+
+
+def lag_parts(result: JointCalibrationResult) -> LagParts:
+    """Where the lag of `result`'s joint comes from."""
+    budget = result.budget
+    return LagParts(
+        result.joint,
+        1e3 * budget.command_hold_s,
+        _ms(result.dead_time),
+        1e3 * (budget.lag.value - result.dead_time.value),
+        1e3 * budget.feedback_age_s,
+        _ms(budget.lag),
+        _ms(budget.naive),
+    )
+
+
+def _ms(interval: Interval) -> Interval:
+    return Interval(1e3 * interval.value, 1e3 * interval.low, 1e3 * interval.high)
+
+
+@dataclass(frozen=True)
+class Track:
+    """One trial as it was commanded, simulated and read; angles from rest [rad], times [s].
+
+    Attributes
+    ----------
+    frequency_hz : float
+        NaN if the trial is no tone.
+    time_s, command_rad, model_rad : ndarray, shape (steps,)
+        On the physics clock, from the trial's start.
+    fresh_time_s, fresh_rad : ndarray, shape (fresh,)
+        Fresh readings at the time they were measured.
+    row_time_s, row_rad : ndarray, shape (rows,)
+        Every reading at the time of its row; NaN where missing.
+    fresh_error_rad, row_error_rad : ndarray
+        Reading minus model at those times.
+    fresh_speed_rad_s, row_speed_rad_s : ndarray
+        Speed of the model at those times.
+    """
+
+    frequency_hz: float
+    time_s: NDArray[np.float64]
+    command_rad: NDArray[np.float64]
+    model_rad: NDArray[np.float64]
+    fresh_time_s: NDArray[np.float64]
+    fresh_rad: NDArray[np.float64]
+    row_time_s: NDArray[np.float64]
+    row_rad: NDArray[np.float64]
+    fresh_error_rad: NDArray[np.float64]
+    row_error_rad: NDArray[np.float64]
+    fresh_speed_rad_s: NDArray[np.float64]
+    row_speed_rad_s: NDArray[np.float64]
+
+
+def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track]:
+    """Free run of a fitted model on every trial of its joint.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    model : str
+        Name of a rung of the ladder.
+    """
+    if not result.trials:
+        return []
+    fitted = rung(model)
+    values = np.array([[result.rungs[model].values[name] for name in fitted.names]])
+    simulated = positions(fitted, [(values, result.trials)])[0][:, 0]
+    return [_track(trial, simulated[:, n]) for n, trial in enumerate(result.trials)]
+
+
+def _track(trial: TrialData, simulated: NDArray) -> Track:
+    steps = len(trial.command)
+    # over a few steps: dry friction makes the speed of a single one jump
+    smooth = np.convolve(np.pad(simulated, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    speed = np.gradient(smooth, TIME_STEP_S)
+    return Track(
+        trial.frequency_hz,
+        np.arange(steps) * np.float64(TIME_STEP_S), trial.command, simulated[:steps],
+        TIME_STEP_S * trial.sample_step, trial.sample_rad,
+        TIME_STEP_S * trial.row_step, trial.row_rad,
+        trial.sample_rad - look_up(simulated, trial.sample_step),
+        trial.row_rad - look_up(simulated, trial.row_step),
+        look_up(speed, trial.sample_step), look_up(speed, trial.row_step),
+    )  # fmt: skip
+
+
+def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[float, float]:
+    """A stretch of `track` worth looking at [s]: steady tone, or the liveliest part."""
+    end = float(track.time_s[-1])
+    if track.frequency_hz > 0:
+        length = min(periods / track.frequency_hz, end)
+        start = min(0.5 * end, end - length)
+        return start, start + length
+    if end <= longest_s:
+        return 0.0, end
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(track.command_rad)))])
+    width = int(longest_s / TIME_STEP_S)
+    start = float(track.time_s[int(np.argmax(travel[width:] - travel[:-width]))])
+    return start, start + longest_s
+
+
+def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
+    """At most `count` of the tracks, spread over their frequencies, slowest first."""
+    order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
+    seen: dict[float, Track] = {}
+    for n, track in enumerate(order):
+        seen.setdefault(
+            round(track.frequency_hz, 2) if track.frequency_hz > 0 else -float(n), track
+        )
+    order = list(seen.values())
+    index = np.unique(np.round(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int))
+    return [order[i] for i in index]
+
+
+def response_errors(response: FrequencyResponse) -> tuple[NDArray, NDArray]:
+    """Half of the 90 % intervals of gain [dB] and phase [degrees], shape (tones,) each."""
+    along = response.response / np.abs(response.response)
+    sd = []
+    for direction in (along, 1j * along):
+        u = np.stack([direction.real, direction.imag], axis=-1)
+        sd.append(np.sqrt(np.einsum("ni,nij,nj->n", u, response.covariance, u)))
+    relative = norm.ppf((1 + LEVEL) / 2) * np.array(sd) / np.abs(response.response)
+    return 20 / np.log(10) * relative[0], np.degrees(relative[1])
+
+
+@dataclass(frozen=True)
+class HoldRuns:
+    """For how many rows a reading stays the same.
+
+    Attributes
+    ----------
+    lattice : PollLattice
+    count : ndarray of int, shape (LONGEST_RUN,)
+        Runs of 1, 2, … rows; the last holds all longer ones.
+    expected : ndarray, shape (LONGEST_RUN,), or None
+        What the poll period and the share of lost polls predict; None without a lattice.
+    """
+
+    lattice: PollLattice
+    count: NDArray[np.int64]
+    expected: NDArray[np.float64] | None
+
+
+def hold_runs(examined: Sequence[JointExamination], lattice: PollLattice) -> HoldRuns:
+    """The doctor's hold runs of one joint, and what its poll lattice predicts.
+
+    Parameters
+    ----------
+    examined : sequence of JointExamination
+        One per recording; their counts are added.
+    lattice : PollLattice
+    """
+    count = np.zeros(LONGEST_RUN, dtype=np.int64)
+    for found in examined:
+        length = np.clip(np.arange(len(found.hold_histogram)), 0, LONGEST_RUN - 1)
+        np.add.at(count, length, np.array(found.hold_histogram, dtype=np.int64))
+    if lattice.kind != "lattice" or not count.any():
+        return HoldRuns(lattice, count, None)
+    loop = float(np.median([found.loop_period_ms for found in examined]))
+    return HoldRuns(
+        lattice, count, count.sum() * _expected(1e3 * lattice.period_s / loop, lattice.loss)
+    )
+
+
+def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:
+    """Share of runs of 1, 2, … rows when each poll, `period_rows` apart, fails with `loss`.
+
+    Between two good polls lie k periods with probability (1 - loss) loss^(k-1). A gap of x rows,
+    at a random phase of the loop, is seen as floor(x) or ceil(x) rows, on average as x.
+    """
+    share = np.zeros(LONGEST_RUN + 1)
+    k = np.arange(1, 200)
+    weight = (1 - loss) * loss ** (k - 1)
+    gap = k * period_rows
+    for rows, chance in ((np.floor(gap), 1 - gap % 1), (np.floor(gap) + 1, gap % 1)):
+        np.add.at(share, np.clip(rows, 0, LONGEST_RUN).astype(int), weight * chance)
+    return share[1:] / max(share[1:].sum(), 1e-12)  # several polls within a row leave one run

@@ -1,0 +1,351 @@
+"""The report's figures: each function takes results and returns a matplotlib `Figure`.
+
+They only draw: curves come from `sysid.report.figure_data`, looks from `common.figure_style`. Every
+curve differs from the others in more than its colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+
+from pupper_sysid.common.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    JOINT_COLOURS,
+    MARKERS,
+    ORANGE,
+    RED,
+    SKY,
+    axes_column,
+    styled,
+)
+from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
+from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.report.figure_data import (
+    LONGEST_RUN,
+    HoldRuns,
+    LagParts,
+    Track,
+    lag_parts,
+    response_errors,
+    some_tracks,
+    tracks,
+    window,
+)
+
+if TYPE_CHECKING:  # it brings python-control, which is not needed to draw
+    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+
+
+@styled
+def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
+    """One stacked bar per joint: what happens between a command's row and its position's row.
+
+    Parameters
+    ----------
+    results : dict of joint to JointCalibrationResult
+    """
+    parts = [lag_parts(r) for r in results.values()]
+    figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(parts))
+    for row, part in enumerate(parts):
+        _lag_bar(axes, row, part)
+    axes.set_yticks(range(len(parts)), [p.joint for p in parts])
+    axes.set_ylim(len(parts) - 0.4, -0.6)
+    longest = max(max(p.naive_ms.value, _bar_length(p)) for p in parts)
+    axes.set_xlim(0, longest * 1.14)
+    axes.set_xlabel("time after the command's row [ms]")
+    axes.grid(axis="y", visible=False)
+    axes.tick_params(axis="y", length=0)
+    kinds = [
+        Patch(facecolor=c, hatch=h, edgecolor="white", lw=0, label=n) for n, c, h in _LAG_KINDS
+    ]
+    whisker = Line2D([], [], color=INK, marker="|", ms=8, markevery=[0, -1], lw=1.5)
+    whisker.set_label("90 % interval of the dead time")
+    naive = Line2D([], [], color=INK, lw=2.2, label="naive lag, the sum")
+    figure.legend(
+        handles=[*kinds, naive, whisker], loc="outside upper left", ncols=2, numpoints=2,
+        columnspacing=1.2,
+    )  # fmt: skip
+    return figure
+
+
+_LAG_KINDS = (
+    ("command hold", SKY, ""),
+    ("dead time", BLUE, ""),
+    ("dynamics", GREEN, ""),
+    ("feedback age (bus poll)", ORANGE, "///"),
+)
+
+
+def _bar_length(part: LagParts) -> float:
+    lengths = (
+        part.command_hold_ms,
+        part.dead_time_ms.value,
+        part.dynamics_ms,
+        part.feedback_age_ms,
+    )
+    return sum(max(x, 0.0) for x in lengths)
+
+
+def _lag_bar(axes: Axes, row: int, part: LagParts) -> None:
+    lengths = (
+        part.command_hold_ms,
+        part.dead_time_ms.value,
+        part.dynamics_ms,
+        part.feedback_age_ms,
+    )
+    left = 0.0
+    for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
+        shown = max(length, 0.0)
+        axes.barh(
+            row, shown, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0
+        )
+        if shown > 5.0:
+            # the feedback's hatching would run through its number
+            box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
+            axes.text(
+                left + 0.5 * shown, row - 0.13 * (name == "dead time"), f"{length:.0f}",
+                ha="center", va="center", color="white" if colour in (BLUE, GREEN) else "black",
+                bbox=box if hatch else None,
+            )  # fmt: skip
+        left += shown
+    end = part.command_hold_ms + part.dead_time_ms.value
+    below = max(part.dead_time_ms.value - part.dead_time_ms.low, 0.0)
+    above = max(part.dead_time_ms.high - part.dead_time_ms.value, 0.0)
+    axes.errorbar(
+        end, row + 0.17, xerr=[[below], [above]], color="white", capsize=4, lw=3.2, capthick=3.2
+    )
+    axes.errorbar(end, row + 0.17, xerr=[[below], [above]], color=INK, capsize=4, lw=1.5)
+    naive = part.naive_ms.value
+    axes.plot([naive, naive], [row - 0.4, row + 0.4], color=INK, lw=2.2)
+    axes.text(naive + 0.015 * max(naive, 1.0), row, f"{naive:.0f}", va="center", weight="bold")
+
+
+@styled
+def overlay_figure(
+    result: JointCalibrationResult, found: list[Track] | None = None, panels: int = 4
+) -> Figure:
+    """Command, model and readings, the fresh ones at the time they were measured.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    found : list of Track, optional
+        From `sysid.report.figure_data.tracks`, if they have been computed.
+    panels : int
+        At most so many frequencies.
+    """
+    shown = some_tracks(tracks(result) if found is None else found, panels)
+    figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
+    for axes, track in zip(grid, shown, strict=True):
+        start, stop = window(track)
+        fine, row = _inside(track.time_s, start, stop), _inside(track.row_time_s, start, stop)
+        fresh = _inside(track.fresh_time_s, start, stop)
+        axes.plot(
+            track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
+            label="command, as held",
+        )  # fmt: skip
+        axes.plot(
+            track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5,
+            drawstyle="steps-post", label="readings, row by row",
+        )  # fmt: skip
+        axes.plot(track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2, label="DelayedPD")
+        axes.plot(
+            track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5, mec="white",
+            mew=0.6, label="fresh readings, when measured",
+        )  # fmt: skip
+        axes.set_title(_trial_name(track, result.joint))
+        axes.set_xlim(start, stop)
+        axes.set_ylabel("from rest [rad]")
+    grid[-1].set_xlabel("time in the trial [s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+@styled
+def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
+    """For how many rows each reading stayed the same, beside what poll and loss predict.
+
+    Parameters
+    ----------
+    found : dict of joint to HoldRuns
+        From `sysid.report.figure_data.hold_runs`.
+    """
+    figure, grid = axes_column(len(found), 1.2 + 1.6 * len(found))
+    length = np.arange(1, LONGEST_RUN + 1)
+    for axes, (joint, runs) in zip(grid, found.items(), strict=True):
+        lattice = runs.lattice
+        axes.bar(length, runs.count, color=ORANGE, label="counted")
+        title = f"{joint}: {_LATTICE_WORDS.get(lattice.kind, lattice.kind)}"
+        if runs.expected is not None:
+            axes.plot(
+                length, runs.expected, "D", color=INK, ms=5, label="predicted by poll and loss"
+            )
+            title = (
+                f"{joint}: a poll every {1e3 * lattice.period_s:.2f} ms, "
+                f"{100 * lattice.loss:.0f} % of them lost"
+            )
+        axes.set_title(title)
+        axes.set_ylabel("runs")
+        axes.grid(axis="x", visible=False)
+        axes.set_xticks(length, [str(n) for n in length[:-1]] + [f"≥{LONGEST_RUN}"])
+    grid[-1].set_xlabel("rows with the same value")
+    names = {}
+    for axes in grid:
+        handles, labels = axes.get_legend_handles_labels()
+        names.update(zip(labels, handles, strict=True))
+    figure.legend(list(names.values()), list(names), loc="outside upper left", ncols=2)
+    return figure
+
+
+_LATTICE_WORDS = {
+    "every read": "every reading is new",
+    "unresolved": "held, but no poll period found",
+}
+
+
+@styled
+def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
+    """Gain and phase over frequency: measured, from all rows, and as a fitted transfer function.
+
+    Parameters
+    ----------
+    responses : dict of joint to FrequencyResponse
+    """
+    figure, (gain, phase) = axes_column(2, 6.4)
+    for n, (joint, response) in enumerate(responses.items()):
+        colour, mark = JOINT_COLOURS[n % len(JOINT_COLOURS)], MARKERS[n % len(MARKERS)]
+        frequency, (gain_error, phase_error) = response.frequency_hz, response_errors(response)
+        style = {"color": colour, "marker": mark, "ms": 5, "ls": "", "elinewidth": 1.2}
+        decibels = 20 * np.log10(response.gain)
+        gain.errorbar(frequency, decibels, yerr=gain_error, label=joint, **style)
+        phase.errorbar(frequency, response.phase_deg, yerr=phase_error, **style)
+        gain.plot(
+            frequency, 20 * np.log10(np.abs(response.naive_response)), color=colour, marker=mark,
+            ms=6, mfc="none", ls="",
+        )  # fmt: skip
+        for fit in response.fits[-1:]:
+            fine = np.geomspace(frequency[0], frequency[-1], 200)
+            fitted = fit.evaluate(fine)
+            gain.plot(fine, 20 * np.log10(np.abs(fitted)), color=colour, lw=1.2)
+            phase.plot(fine, np.degrees(np.unwrap(np.angle(fitted))), color=colour, lw=1.2)
+    gain.axhline(-3.01, color=INK, lw=1, ls=(0, (4, 2)))
+    gain.text(1.0, -3.01, "−3 dB ", transform=gain.get_yaxis_transform(), ha="right", va="bottom")
+    low, high = gain.get_ylim()
+    gain.set_ylim(min(low, -4.0), max(high, 1.0))
+    for axes in (gain, phase):
+        axes.set_xscale("log")
+        ticks = [f for f in _FREQUENCY_TICKS if axes.get_xlim()[0] <= f <= axes.get_xlim()[1]]
+        axes.set_xticks(ticks, [f"{f:g}" for f in ticks])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    gain.set_ylabel("gain [dB]")
+    phase.set_ylabel("phase [°]")
+    phase.set_xlabel("frequency [Hz]")
+    handles, _ = gain.get_legend_handles_labels()
+    hollow = Line2D([], [], color=INK, marker="o", mfc="none", ls="", label="naive: all rows")
+    line = Line2D([], [], color=INK, lw=1.2, label="fitted")
+    figure.legend(handles=[*handles, hollow, line], loc="outside upper left", ncols=3)
+    return figure
+
+
+_FREQUENCY_TICKS = (0.1, 0.2, 0.5, 1, 2, 3, 4, 5, 7, 10, 15, 20)
+
+
+@styled
+def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
+    """What the model leaves unexplained: over speed, fresh against naive; and over time.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    found : list of Track, optional
+        From `sysid.report.figure_data.tracks`, if they have been computed.
+    """
+    found = tracks(result) if found is None else found
+    figure, (over_speed, over_time) = axes_column(2, 6.0)
+    mrad = 1e3
+
+    def gathered(name: str) -> NDArray:
+        return np.concatenate([getattr(t, name) for t in found])
+
+    age = 1e3 * result.budget.feedback_age_s
+    over_speed.plot(
+        gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
+        label=f"all rows at their own time (dashed: speed × {age:.0f} ms)",
+        rasterized=True,
+    )  # fmt: skip
+    over_speed.plot(
+        gathered("fresh_speed_rad_s"), mrad * gathered("fresh_error_rad"), "o", color=RED, ms=3.5,
+        mec="white", mew=0.3, label="fresh rows when they were measured",
+    )  # fmt: skip
+    reach = np.array([-1.0, 1.0]) * np.max(np.abs(gathered("row_speed_rad_s")), initial=0.0)
+    over_speed.plot(reach, -age * reach, color=INK, lw=1.2, ls=(0, (4, 2)))
+    over_speed.set_xlabel("speed of the model [rad/s]")
+    over_speed.set_ylabel("reading − model [mrad]")
+    start = 0.0
+    for n, track in enumerate(found):
+        over_time.plot(
+            start + track.fresh_time_s, mrad * track.fresh_error_rad, ".", color=RED, ms=4
+        )
+        if track.frequency_hz > 0 and len(found) <= 12:
+            over_time.text(
+                start + 0.5 * track.time_s[-1], 0.97, f"{track.frequency_hz:.3g} Hz",
+                transform=over_time.get_xaxis_transform(), ha="center", va="top",
+                fontsize=9,
+            )  # fmt: skip
+        start += float(track.time_s[-1])
+        if n < len(found) - 1:
+            over_time.axvline(start, color=FAINT, lw=0.8)
+    over_time.axhline(0, color=INK, lw=0.8)
+    over_time.margins(x=0.01, y=0.2)
+    over_time.set_xlabel("time, trials end to end [s]")
+    over_time.set_ylabel("fresh − model [mrad]")
+    figure.legend(*over_speed.get_legend_handles_labels(), loc="outside upper left", ncols=1)
+    return figure
+
+
+@styled
+def sweep_figure(trials: Sequence[Trial], periods: float = 3.0) -> Figure:
+    """Commands and what the encoder said, a panel per frequency; old readings are faint.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        Tones of one joint.
+    periods : float
+        How many to show, from the middle of each trial.
+    """
+    figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
+    for axes, trial in zip(panels, trials, strict=True):
+        start = float(np.median(trial.send_time_s))
+        shown = _inside(trial.send_time_s, start, start + periods / trial.frequency_hz)
+        time = trial.send_time_s[shown] - start
+        reading = trial.position_rad[shown]
+        fresh = np.diff(reading, prepend=np.nan) != 0
+        axes.plot(time, trial.command_rad[shown], "--", color=BLUE, lw=1.2, label="command")
+        axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="old reading")
+        axes.plot(time[fresh], reading[fresh], "o", ms=3.0, color=RED, label="fresh reading")
+        axes.set_title(f"{trial.joint}, {trial.frequency_hz:g} Hz")
+        axes.set_ylabel("rad")
+    panels[0].legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    panels[-1].set_xlabel("time [s]")
+    return figure
+
+
+def _inside(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:
+    return (time >= start) & (time <= stop)
+
+
+def _trial_name(track: Track, joint: str) -> str:
+    return f"{joint}, {track.frequency_hz:.3g} Hz" if track.frequency_hz > 0 else joint

@@ -1,0 +1,1 @@
+"""Servo models fitted to recordings, scored on unseen data."""

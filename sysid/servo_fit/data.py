@@ -1,0 +1,324 @@
+"""What a servo model is fitted to: commands by control tick, readings at the time they were taken.
+
+A servo model steps once per command, so its clock is the tick: position `k` is where the servo is
+when command `k` is sent, having had commands up to `k - 1`. A reading was taken at some time, hence
+at a fractional tick, and models are looked up there (`look_up`), between ticks by a cubic: linear
+interpolation of a 4 Hz motion between ticks 19 ms apart would be off by several mrad.
+
+Which readings count: where the feedback is held (more than a fifth of the rows repeat the one
+before while the servo moves) only fresh ones, each at its own time; otherwise every row as it
+stands in the log.
+
+Trials that follow each other without a pause, like the loops of a playback, are one run: the servo
+did get those commands. Nothing is carried over a pause, and every reading knows its group (its
+loop, or its tone), so that whole groups can be held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    Readings,
+    find_poll_lattice,
+    fresh_rows,
+    readings,
+)
+from pupper_sysid.sysid.identify.calibrate import joint_rng, joint_trials
+from pupper_sysid.sysid.identify.output_error import TrialData, prepare, whole_counts
+from pupper_sysid.sysid.recordings.recording import Recording, Trial
+
+MODES = ("auto", "fresh", "all")
+_HELD_FRACTION = 0.2  # the doctor's own limit: beyond it, rows as they stand mislead
+_PAUSE = 1.5  # in ticks; a longer gap ends a run
+_SAME_RATE = 0.05
+
+
+@dataclass(frozen=True)
+class Run:
+    """Rows of one joint without a pause; arrays are over its rows unless said otherwise.
+
+    Attributes
+    ----------
+    trial : Trial
+        All rows, merged.
+    readings : Readings
+        Those that count, over `fresh` entries.
+    tick, position_rad : ndarray, shape (fresh,)
+        When each was taken, in ticks, and what it was [rad].
+    row_tick, held_tick : ndarray
+        When each row was read, and when the value it shows was taken (NaN if before the run).
+    number, group : ndarray of int
+        Trial number in its recording; index into `ServoData.groups`, -1 for rows that belong to
+        none.
+    elapsed_s : ndarray
+        Since the first command of the row's trial.
+    """
+
+    trial: Trial
+    readings: Readings
+    tick: NDArray[np.float64]
+    position_rad: NDArray[np.float64]
+    row_tick: NDArray[np.float64]
+    held_tick: NDArray[np.float64]
+    number: NDArray[np.int64]
+    group: NDArray[np.int64]
+    elapsed_s: NDArray[np.float64]
+
+    @property
+    def command_rad(self) -> NDArray[np.float64]:
+        """Commands [rad], one per tick."""
+        return self.trial.command_rad
+
+    @property
+    def initial_rad(self) -> float:
+        """The command before the first, as far as it is known [rad]."""
+        return self.trial.initial_command_rad
+
+    @property
+    def reading_elapsed_s(self) -> NDArray[np.float64]:
+        """When each counted reading was taken, since the start of its trial [s]."""
+        row = self.readings.rows
+        start = self.trial.send_time_s[row] - self.elapsed_s[row]
+        return self.readings.time_s - start
+
+    @property
+    def truncated_rad(self) -> NDArray[np.float64]:
+        """Commands as the bus sent them, in whole counts [rad]."""
+        return whole_counts(self.trial)
+
+    def trial_data(self, used: NDArray[np.bool_]) -> TrialData:
+        """The run on the clock of physics, with only the readings of `used`, shape (fresh,)."""
+        r = self.readings
+        kept = replace(
+            r, rows=r.rows[used], time_s=r.time_s[used], position_rad=r.position_rad[used]
+        )
+        return prepare(self.trial, kept)
+
+
+@dataclass(frozen=True)
+class ServoData:
+    """Runs of some joints, all at one rate.
+
+    Attributes
+    ----------
+    joints : tuple of str
+    period_s : float
+        Time between commands.
+    runs : dict of str to tuple of Run
+    groups : tuple of str
+        What can be held out: "loop 0", "3 Hz", …
+    modes : dict of str to str
+        "fresh" or "all": which readings of the joint count.
+    """
+
+    joints: tuple[str, ...]
+    period_s: float
+    runs: dict[str, tuple[Run, ...]]
+    groups: tuple[str, ...]
+    modes: dict[str, str]
+
+
+def servo_data(
+    recordings: Sequence[Recording], joints: Sequence[str], mode: str = "auto", seed: int = 0
+) -> ServoData:
+    """Arrange recordings for fitting or scoring servo models.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    joints : sequence of str
+    mode : {"auto", "fresh", "all"}
+        Which readings count; `auto` decides per joint, see the module's text.
+    seed : int
+        Of the search for the poll.
+
+    Raises
+    ------
+    InputError
+        If recordings differ in rate, or a joint has no readings.
+    """
+    period = _common_period(recordings)
+    labels: dict[str, int] = {}
+    runs: dict[str, tuple[Run, ...]] = {}
+    modes: dict[str, str] = {}
+    for joint in joints:
+        found, modes[joint] = _joint_runs(recordings, joint, mode, period, labels, seed)
+        if not sum(len(r.tick) for r in found):
+            raise InputError(f"{joint}: no reading ever changed; there is nothing to learn from.")
+        runs[joint] = tuple(found)
+    return ServoData(tuple(joints), period, runs, tuple(labels), modes)
+
+
+def look_up_weights(
+    tick: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Which ticks a value between ticks is made of, and how much of each (Catmull-Rom cubic).
+
+    Returns
+    -------
+    index : ndarray of int, shape (n,)
+        The tick before; the four are `index - 1` to `index + 2`.
+    weight : ndarray, shape (n, 4)
+    """
+    index = np.floor(tick).astype(int)
+    t = tick - index
+    weight = np.stack(
+        [
+            -0.5 * t**3 + t**2 - 0.5 * t,
+            1.5 * t**3 - 2.5 * t**2 + 1.0,
+            -1.5 * t**3 + 2.0 * t**2 + 0.5 * t,
+            0.5 * t**3 - 0.5 * t**2,
+        ],
+        axis=-1,
+    )
+    return index, weight
+
+
+def look_up(track: NDArray[np.floating], tick: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values of `track`, one per tick, at fractional ticks; NaN where the tick is NaN."""
+    index, weight = look_up_weights(np.nan_to_num(tick))
+    four = np.clip(index[:, None] + np.arange(-1, 3), 0, len(track) - 1)
+    return np.where(
+        np.isfinite(tick), np.sum(np.asarray(track, float)[four] * weight, axis=1), np.nan
+    )
+
+
+# ------------------------------------------------------------------------------- runs
+
+
+def _common_period(recordings: Sequence[Recording]) -> float:
+    periods = sorted((r.loop_period_s, r.name) for r in recordings)
+    (shortest, fast), (longest, slow) = periods[0], periods[-1]
+    if not longest / shortest - 1 < _SAME_RATE:
+        raise InputError(
+            f"Recordings of different rates cannot be pooled: {fast} has a command every "
+            f"{1e3 * shortest:.1f} ms, {slow} every {1e3 * longest:.1f} ms. Fit them one by one."
+        )
+    return float(np.median([p for p, _ in periods]))
+
+
+def _joint_runs(
+    recordings: Sequence[Recording],
+    joint: str,
+    mode: str,
+    period: float,
+    labels: dict[str, int],
+    seed: int,
+) -> tuple[list[Run], str]:
+    trials = joint_trials(recordings, joint)
+    if not trials:
+        raise InputError(f"{joint} was not recorded. Leave it out with --joints.")
+    lattice = find_poll_lattice(trials, joint_rng(seed, joint))
+    if mode == "auto":
+        held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION
+        mode = "fresh" if held and not all(t.direct for t in trials) else "all"
+    timed = iter([readings(t, lattice) for t in trials])
+    runs = []
+    for recording in recordings:
+        own = recording.trials(joint)
+        known = joint in (recording.metadata.get("start_pose_rad") or {})
+        prefix = f"{recording.name}, " if len(recordings) > 1 else ""
+        parts = []
+        for trial in own:
+            tone = np.isfinite(trial.frequency_hz) and trial.frequency_hz > 0
+            name = f"{trial.frequency_hz:g} Hz" if tone else f"{prefix}loop {trial.number}"
+            group = labels.setdefault(name, len(labels))
+            counted = next(timed) if mode == "fresh" else _all_rows(trial, next(timed))
+            if not known:
+                first = trial.position_rad[np.isfinite(trial.position_rad)][:1]
+                rest = float(first[0]) if len(first) else trial.initial_command_rad
+                trial = replace(trial, initial_command_rad=rest)
+            parts += _without_pauses(trial, counted, group, period)
+        runs += [_run(p, period) for p in _joined(parts, period)]
+    return runs, mode
+
+
+def _fresh_while_moving(trials: Sequence[Trial]) -> float:
+    """Share of rows whose value changed, among rows while the command moves."""
+    changed, moving = 0, 0
+    for t in trials:
+        move = np.abs(np.diff(t.command_rad, prepend=t.initial_command_rad)) > 0.005
+        move = np.convolve(move, np.ones(3))[1:-1] > 0
+        move &= np.isfinite(t.position_rad)
+        changed, moving = changed + int(move[fresh_rows(t)].sum()), moving + int(move.sum())
+    return changed / max(moving, 1)
+
+
+def _all_rows(trial: Trial, timed: Readings) -> Readings:
+    rows = np.flatnonzero(np.isfinite(trial.position_rad))
+    return replace(
+        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows],
+        held_time_s=trial.read_time_s,
+    )  # fmt: skip
+
+
+_ROWS = ("send_time_s", "read_time_s", "command_rad", "position_rad")
+_Part = tuple[Trial, Readings, int, float]
+
+
+def _without_pauses(trial: Trial, r: Readings, group: int, period: float) -> list[_Part]:
+    """A trial cut where rows are missing, each part with its group and its trial's start."""
+    gaps = np.flatnonzero(np.diff(trial.send_time_s) > _PAUSE * period) + 1
+    start = float(trial.send_time_s[0])
+    parts, rest = [], trial.initial_command_rad
+    for low, high in zip([0, *gaps], [*gaps, len(trial.send_time_s)], strict=True):
+        rows = {name: getattr(trial, name)[low:high] for name in _ROWS}
+        inside = (r.rows >= low) & (r.rows < high)
+        own = replace(
+            r, rows=r.rows[inside] - low, time_s=r.time_s[inside],
+            position_rad=r.position_rad[inside], held_time_s=r.held_time_s[low:high],
+        )  # fmt: skip
+        cut = replace(trial, **rows, position_count=None, initial_command_rad=rest)
+        parts.append((cut, own, group, start))
+        rest = float(trial.command_rad[high - 1])
+    return parts
+
+
+def _joined(parts: list[_Part], period: float) -> list[list[_Part]]:
+    joined: list[list[_Part]] = []
+    for part in parts:
+        gap = part[0].send_time_s[0] - joined[-1][-1][0].send_time_s[-1] if joined else np.inf
+        if 0 < gap < _PAUSE * period:
+            joined[-1].append(part)
+        else:
+            joined.append([part])
+    return joined
+
+
+def _run(parts: list[_Part], period: float) -> Run:
+    trials = [p[0] for p in parts]
+    sizes = [len(t.send_time_s) for t in trials]
+    merged = replace(
+        trials[0], **{n: np.concatenate([getattr(t, n) for t in trials]) for n in _ROWS}
+    )
+    shift = np.cumsum([0, *sizes[:-1]])
+    r = Readings(
+        np.concatenate([p[1].rows + s for p, s in zip(parts, shift, strict=True)]),
+        np.concatenate([p[1].time_s for p in parts]),
+        np.concatenate([p[1].position_rad for p in parts]),
+        np.concatenate([p[1].held_time_s for p in parts]),
+        parts[0][1].time_sd_s,
+    )
+    inside = r.time_s >= merged.send_time_s[0]
+    r = replace(
+        r, rows=r.rows[inside], time_s=r.time_s[inside], position_rad=r.position_rad[inside]
+    )
+    edges = np.append(merged.send_time_s, merged.send_time_s[-1] + period)
+    ticks = np.arange(len(edges), dtype=float)
+
+    def to_tick(time: NDArray) -> NDArray[np.float64]:
+        return np.where(np.isfinite(time), np.interp(time, edges, ticks), np.nan)
+
+    held = np.where(r.held_time_s >= edges[0], r.held_time_s, np.nan)
+    return Run(
+        merged, r, to_tick(r.time_s), r.position_rad,
+        to_tick(merged.read_time_s), to_tick(held),
+        np.repeat([t.number for t in trials], sizes), np.repeat([p[2] for p in parts], sizes),
+        merged.send_time_s - np.repeat([p[3] for p in parts], sizes),
+    )  # fmt: skip

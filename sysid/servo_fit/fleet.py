@@ -1,0 +1,102 @@
+"""Fit servo models to the recordings of many robots at once.
+
+One recording is one robot and becomes one model folder. Models that were fitted to the same bytes
+in the same way are kept; a recording that cannot be used does not stop the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sysid.identify.fleet import Fleet, robots_in, run_fleet
+from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.servo_fit.data import servo_data
+from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split, fit_servo
+from pupper_sysid.sysid.servo_fit.save import save_fit
+
+QUANTITIES = {
+    "free_run_mrad": "rmse_free_run_rad",
+    "held_mrad": "rmse_held_rad",
+    "linear_mrad": "linear_rmse_rad",
+    "delayed_pd_mrad": "delayed_pd_rmse_rad",
+    "persistence_mrad": "persistence_rmse_rad",
+}
+"""What the table has of each joint, by its name in the model's contract: errors on unseen data."""
+
+
+@dataclass(frozen=True)
+class ServoSettings:
+    """How every recording is fitted; fields are the parameters of `servo_fit.fit.fit_servo`."""
+
+    arch: str = "mlp"
+    preset: str = "default"
+    split: Split = EACH_GROUP_IN_TURN
+    readings: str = "auto"
+    seed: int = 0
+
+
+def fit_servo_fleet(
+    root: Path,
+    out: Path,
+    settings: ServoSettings,
+    jobs: int = 1,
+    cluster: str | None = None,
+    force: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Fleet:
+    """Fit a servo model to every recording in `root`; a folder per robot in `out`, and the table.
+
+    Parameters and errors as for `sysid.identify.fleet.calibrate_fleet`.
+    """
+    targets = {path: out / name for path, name in robots_in(root).items()}
+    return run_fleet(
+        targets, lambda target, path: _is_of(target, path, settings),
+        partial(_fitted, settings=settings), _numbers, tuple(QUANTITIES), out,
+        jobs, cluster, force, progress,
+    )  # fmt: skip
+
+
+def _numbers(target: Path) -> dict[str, dict[str, float]]:
+    """What the table has of each joint of a model; NaN where it has no such score."""
+    found = {}
+    for joint, known in load_servo_model(target).contract.joints.items():
+        errors = {name: known.scores.get(key) for name, key in QUANTITIES.items()}
+        found[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
+    return found
+
+
+def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
+    """Whether a model was fitted to these bytes in this way."""
+    try:
+        made = load_servo_model(target).contract
+    except InputError:
+        return False
+    return (
+        [r.sha256 for r in made.recordings] == [sha256(path)]
+        and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
+        and made.split == settings.split.name
+        and made.readings_counted == _modes(path, made.joints, settings)
+    )
+
+
+def _modes(path: Path, joints: Iterable[str], settings: ServoSettings) -> dict[str, str]:
+    """Which readings of a recording count, by joint."""
+    return servo_data([load(path)], list(joints), settings.readings, settings.seed).modes
+
+
+def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
+    """Fit one robot's model."""
+    recording = load(path)
+    fit = fit_servo(
+        [recording], recording.joints, settings.arch, settings.preset, settings.split,
+        settings.readings, settings.seed,
+    )  # fmt: skip
+    if fit.interrupted:  # one robot alone keeps what it has; a fleet makes it again
+        raise KeyboardInterrupt
+    save_fit(target, fit, [recording], settings.seed, force=True)

@@ -1,0 +1,209 @@
+"""Fit linear filters, MLPs and LSTMs of all joints, and decide by held-out groups which to keep.
+
+A fit gives one model for the whole training part and one per held-out group: the latter have never
+seen their group, so their errors on it are honest, both for choosing (ridge, weight decay,
+length of training) and for saying how sure the model is. With `nested`, even the weight decay and
+the length of training of a group's model were chosen without that group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.sysid.servo_fit.linear import RIDGES, LinearFits, fading, fit_linear, taps
+from pupper_sysid.sysid.servo_fit.training import LSTM, MLP, Checkpoint, train
+from pupper_sysid.sysid.servo_fit.windows import Samples, training_sets
+
+Learned = CommandNetwork | RecurrentNetwork
+_LSTM_MEMORY_S = 1.5
+_AS_GOOD = 0.01  # of the logarithm of the error: one percent
+
+
+@dataclass(frozen=True)
+class NetworkFit:
+    """Models of all joints.
+
+    Attributes
+    ----------
+    model : CommandNetwork or RecurrentNetwork
+        Fitted to the whole training part.
+    held_out : dict of int to model
+        Per group, the model that has not seen it.
+    choices : dict of str to float
+        What was decided by held-out groups.
+    interrupted : bool
+        Whether the user ended training; the best so far was kept.
+    """
+
+    model: Learned
+    held_out: dict[int, Learned]
+    choices: dict[str, float]
+    interrupted: bool
+
+
+def past_ticks(period_s: float) -> int:
+    """How many commands before a window the models of this module need."""
+    return max(taps(period_s), round(_LSTM_MEMORY_S / period_s))
+
+
+def fit_network(
+    kind: str,
+    joints: Sequence[str],
+    period_s: float,
+    data: Samples,
+    seed: int,
+    nested: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> NetworkFit:
+    """Fit one kind of model.
+
+    Parameters
+    ----------
+    kind : {"fir", "mlp", "lstm"}
+    joints : sequence of str
+    period_s : float
+        Time between commands [s].
+    data : Samples
+        With `past_ticks(period_s)` commands before each window.
+    seed : int
+    nested : bool
+        Make each held-out model's choices without its group, too.
+    progress : callable, optional
+        Called with steps done and steps in all.
+    """
+    groups = [int(g) for g in np.unique(data.group[data.used]) if g >= 0]
+    nested = nested and len(groups) > 2  # a pair of two would leave nothing to learn from
+    sets = training_sets(groups, nested and kind != "fir")
+    linear, ridge = _best_linear(data, groups, sets, period_s)
+    choices: dict[str, float] = {"ridge": ridge}
+    if kind == "fir":
+        built = [_build(joints, period_s, data, linear, n, {}) for n in range(len(groups) + 1)]
+        return NetworkFit(built[0], dict(zip(groups, built[1:], strict=True)), choices, False)
+
+    recipe = MLP if kind == "mlp" else LSTM
+    # what each purpose may look at: the final model all groups, a group's own model the others
+    purposes: dict[int | None, list[tuple[int, int]]] = {
+        None: [(n, g) for n, s in enumerate(sets) for g in s if len(s) == 1]
+    }
+    for outer in groups if nested else []:
+        purposes[outer] = [
+            (n, g)
+            for n, s in enumerate(sets)
+            for g in s
+            if len(s) == 2 and outer in s and g != outer
+        ]
+    checkpoints: list[dict[str, NDArray]] = []
+    steps_done: list[int] = []
+    judged: dict[int | None, list[NDArray]] = {purpose: [] for purpose in purposes}
+    held_back = 0
+
+    def watch(now: Checkpoint) -> bool:
+        nonlocal held_back
+        checkpoints.append(now.weights)
+        steps_done.append(now.step)
+        for purpose, looks in purposes.items():
+            ratios = [
+                np.log(
+                    _group_rms(now.error[..., n, :], data, g)
+                    / _group_rms(linear.residual[..., n, None], data, g)
+                )
+                for n, g in looks
+            ]
+            judged[purpose].append(np.nanmean(np.stack(ratios), axis=(0, 1)))  # per decay
+        lowest = [float(s.min()) for s in judged[None]]
+        held_back = 0 if lowest[-1] <= min(lowest) + _AS_GOOD else held_back + 1
+        return held_back >= recipe.patience
+
+    interrupted = train(
+        kind, recipe, period_s, data, linear, sets, seed, watch,
+        (lambda done: progress(done, recipe.steps)) if progress else None,
+    )  # fmt: skip
+    if not checkpoints:  # interrupted before the first comparison: the linear part is the best
+        return NetworkFit(
+            _build(joints, period_s, data, linear, 0, {}),
+            {g: _build(joints, period_s, data, linear, 1 + n, {}) for n, g in enumerate(groups)},
+            choices, True,
+        )  # fmt: skip
+
+    def kept(purpose: int | None, n: int) -> Learned:
+        when, decay = _choose(judged[purpose])
+        weights = {k: w[:, n, decay] for k, w in checkpoints[when].items()}
+        return _build(joints, period_s, data, linear, n, weights)
+
+    when, decay = _choose(judged[None])
+    choices |= {"weight_decay": recipe.decays[decay], "steps": steps_done[when]}
+    held_out = {g: kept(g if nested else None, 1 + n) for n, g in enumerate(groups)}
+    return NetworkFit(kept(None, 0), held_out, choices, interrupted)
+
+
+def _choose(judged: list[NDArray]) -> tuple[int, int]:
+    """Which comparison and which decay to keep: of those that are as good, the least regularised.
+
+    A fold's networks have less data than the final ones and often have to extrapolate; both ask
+    for more regularisation than the final fit needs.
+    """
+    table = np.stack(judged)
+    best = np.argwhere(table <= np.nanmin(table) + _AS_GOOD)
+    when, decay = min(best, key=lambda c: (c[1], -c[0]))
+    return int(when), int(decay)
+
+
+def _best_linear(
+    data: Samples, groups: list[int], sets: list[frozenset[int]], period_s: float
+) -> tuple[LinearFits, float]:
+    """Linear models with the ridge that predicts held-out groups best."""
+    singles = sets[: len(groups) + 1]
+    scored = []
+    for ridge in RIDGES:
+        fits = fit_linear(data, singles, period_s, ridge)
+        errors = [
+            np.log(_group_rms(fits.residual[..., n + 1, None], data, g))
+            for n, g in enumerate(groups)
+        ]
+        scored.append((float(np.nanmean(np.stack(errors))), ridge, fits))
+    _, ridge, fits = min(scored, key=lambda s: s[0])
+    return (fits if len(sets) == len(singles) else fit_linear(data, sets, period_s, ridge)), ridge
+
+
+def _group_rms(error: NDArray, data: Samples, group: int) -> NDArray[np.float64]:
+    """RMS over a group's readings, shape (joints, candidates); NaN where a joint has none."""
+    seen = data.used & (data.group == group)
+    count = seen.sum((1, 2)).astype(float)
+    total = np.sum(np.where(seen[..., None], error.astype(float) ** 2, 0.0), axis=(1, 2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(total / count[:, None])
+
+
+def _build(
+    joints: Sequence[str],
+    period_s: float,
+    data: Samples,
+    linear: LinearFits,
+    n: int,
+    weights: dict[str, NDArray],
+) -> Learned:
+    """The model that runs, from training set `n`; members of an MLP become one wide layer."""
+    parameters: dict[str, NDArray] = {
+        **data.normalisation, "fir": linear.fir[:, n], "fir_bias": linear.bias[:, n],
+        "bound": linear.scale[:, n],
+    }  # fmt: skip
+    if "weight_hidden" in weights:
+        parameters |= weights
+        return RecurrentNetwork(joints, period_s, parameters, warm_up=data.past + 1)
+    if weights:
+        members, units = weights["bias_0"].shape[1:]
+        count = linear.fir.shape[-1]
+        first = np.moveaxis(weights["weight_0"], 1, 2).reshape(len(joints), count, members * units)
+        parameters |= {
+            "weight_0": first * fading(count, period_s)[:, None],
+            "bias_0": weights["bias_0"].reshape(len(joints), members * units),
+            "weight_1": weights["weight_1"].reshape(len(joints), members * units, 1) / members,
+            "bias_1": weights["bias_1"].mean(1)[:, None],
+        }
+    return CommandNetwork(joints, period_s, parameters)

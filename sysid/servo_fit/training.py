@@ -1,0 +1,280 @@
+"""Train the networks of all joints, all held-out folds and all candidates in one computation.
+
+Every network corrects a linear filter (`sysid.servo_fit.linear`) fitted to the same readings, and
+is scored at the readings' own times in free run: it sees commands only, so its one-step and its
+free-run errors are the same thing and cannot come apart. Candidates differ in weight decay and in
+how long they were trained; which is kept is decided by groups that were held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pupper_sysid.common.memory import keep_freed_memory
+from pupper_sysid.sysid.servo_fit.linear import LinearFits, fading, learns_from
+from pupper_sysid.sysid.servo_fit.windows import WINDOW, Samples
+
+_BEND = 3.0  # robust standard deviations beyond which a reading pulls with constant force
+_ROWS_PER_STEP = 4096
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a kind of network is trained.
+
+    Attributes
+    ----------
+    units : int
+        Hidden units of one member.
+    members : int
+        Networks that are averaged.
+    decays : tuple of float
+        Weight decays to choose from, against the sum of squared errors: as in a posterior, twice
+        the data need half the decay per reading, so a choice made on folds fits the whole.
+    steps : int
+        Optimiser steps, with a learning rate that falls to zero as a cosine.
+    check_every, patience : int
+        Candidates are compared this often, and training stops when nothing improved for this
+        many comparisons.
+    """
+
+    units: int
+    members: int
+    decays: tuple[float, ...]
+    steps: int
+    learning_rate: float
+    check_every: int
+    patience: int
+
+
+MLP = Recipe(20, 4, (0.1, 0.3, 1.0, 3.0), 400, 5e-3, 100, 2)
+LSTM = Recipe(16, 2, (0.1, 1.0), 200, 5e-3, 50, 3)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """All networks at one moment of training.
+
+    Attributes
+    ----------
+    step : int
+    error : ndarray, shape (joints, windows, readings, sets, decays)
+        Model minus reading of the averaged members, normalised.
+    weights : dict of str to ndarray
+        Each (joints, sets, decays, members, …).
+    """
+
+    step: int
+    error: NDArray[np.float32]
+    weights: dict[str, NDArray[np.float32]]
+
+
+def train(
+    kind: str,
+    recipe: Recipe,
+    period_s: float,
+    data: Samples,
+    linear: LinearFits,
+    sets: Sequence[frozenset[int]],
+    seed: int,
+    watch: Callable[[Checkpoint], bool],
+    progress: Callable[[int], None] | None = None,
+) -> bool:
+    """Train until `watch` says stop, the steps are used up, or the user presses Ctrl-C.
+
+    Parameters
+    ----------
+    kind : {"mlp", "lstm"}
+    recipe : Recipe
+    period_s : float
+        Time between commands [s].
+    data : Samples
+    linear : LinearFits
+        Of the same training sets.
+    sets : sequence of frozenset of int
+        Groups that each network leaves out.
+    seed : int
+    watch : callable
+        Called with each `Checkpoint`; True stops.
+    progress : callable, optional
+        Called with the number of steps done.
+
+    Returns
+    -------
+    bool
+        Whether it was interrupted.
+    """
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    generator = torch.Generator().manual_seed(seed)
+    batches = np.random.default_rng(seed)
+    shape = (len(data.command), len(sets), len(recipe.decays), recipe.members)
+    fade = torch.from_numpy(fading(linear.fir.shape[-1], period_s).astype(np.float32))
+    make, forward = (_mlp, _mlp_forward) if kind == "mlp" else (_lstm, _lstm_forward)
+    # candidates and folds start from the same networks, so that luck does not choose among them
+    start = make((len(data.command), 1, 1, recipe.members), recipe.units, fade, generator)
+    weights = {
+        k: w.expand(*shape, *w.shape[4:]).clone().requires_grad_(True) for k, w in start.items()
+    }
+    optimiser = torch.optim.Adam(weights.values(), recipe.learning_rate)
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, recipe.steps)
+    every = _tensors(data, linear, sets)
+    readings = every["learns"].sum((-1, -2)).clamp(min=1)[:, :, None, None]  # per joint and set
+    decay = torch.tensor(recipe.decays)[:, None] / (recipe.units * readings)
+    per_step = max(1, _ROWS_PER_STEP // WINDOW)
+
+    def error_of(part: dict[str, torch.Tensor], averaged: bool = False) -> torch.Tensor:
+        """Model minus reading, shape (joints, sets, decays, members, windows, readings)."""
+        out = forward(weights, part["command"], fade, data.past)
+        bound = part["bound"][:, :, None, None, None, None]
+        if averaged and kind == "mlp":  # its members run as one wide layer within one bound
+            out = out.mean(3, keepdim=True)
+        out = bound * torch.tanh(out / bound)
+        out = out.mean(3, keepdim=True) if averaged else out
+        joints, *_, windows, outputs = out.shape
+        flat = out.reshape(joints, -1, windows, outputs)
+        index = part["index"][:, None].expand(-1, flat.shape[1], -1, -1)
+        four = torch.stack([torch.gather(flat, 3, index + k) for k in range(4)], dim=-1)
+        seen = (four * part["weight"][:, None]).sum(-1).reshape(*out.shape[:4], windows, -1)
+        return seen - part["residual"][:, :, None, None]
+
+    def checkpoint(step: int) -> Checkpoint:
+        parts = []
+        with torch.no_grad():
+            for low in range(0, data.windows, 4 * per_step):
+                found = error_of(_some(every, slice(low, low + 4 * per_step)), averaged=True)[
+                    :, :, :, 0
+                ]
+                parts.append(found.permute(0, 3, 4, 1, 2).numpy())
+            now = {k: w.detach().numpy().copy() for k, w in weights.items()}
+        return Checkpoint(step, np.concatenate(parts, axis=1), now)
+
+    try:
+        for step in range(recipe.steps + 1):
+            if step and (step % recipe.check_every == 0) and watch(checkpoint(step)):
+                break
+            if step == recipe.steps:
+                break
+            part = every
+            if data.windows > per_step:
+                chosen = batches.choice(data.windows, per_step, replace=False)
+                part = _some(every, torch.from_numpy(chosen))
+            optimiser.zero_grad()
+            bend = _BEND * part["spread"][:, :, None, None, None, None]
+            loss = bend**2 * (torch.sqrt(1 + (error_of(part) / bend) ** 2) - 1) * 2
+            counted = part["learns"][:, :, None, None]
+            # the mean over the readings a set may see, then the sum over independent networks
+            total = (loss * counted).sum((-1, -2)) / counted.sum((-1, -2)).clamp(min=1)
+            size = sum((w**2).flatten(4).sum(-1) for k, w in weights.items() if "weight" in k)
+            (total + decay * size).sum().backward()
+            torch.nn.utils.clip_grad_norm_(weights.values(), 10.0 * total.numel() ** 0.5)
+            optimiser.step()
+            falling.step()
+            if progress:
+                progress(step + 1)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def _tensors(
+    data: Samples, linear: LinearFits, sets: Sequence[frozenset[int]]
+) -> dict[str, torch.Tensor]:
+    learns = np.stack([learns_from(data, s) for s in sets], axis=1)
+    arrays = {
+        "command": data.command, "index": data.index, "weight": data.weight,
+        "residual": np.moveaxis(linear.residual, -1, 1), "learns": learns,
+        "bound": linear.scale, "spread": linear.spread,
+    }  # fmt: skip
+    return {
+        k: torch.from_numpy(np.ascontiguousarray(v, np.int64 if k == "index" else np.float32))
+        for k, v in arrays.items()
+    }
+
+
+def _some(every: dict[str, torch.Tensor], chosen) -> dict[str, torch.Tensor]:
+    """Some windows of every array that has them."""
+    found = dict(every)
+    for name in ("command", "index", "weight"):
+        found[name] = every[name][:, chosen]
+    for name in ("residual", "learns"):
+        found[name] = every[name][:, :, chosen]
+    return found
+
+
+# ------------------------------------------------------------------------------- networks
+
+
+def _mlp(
+    shape, units: int, fade: torch.Tensor, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
+    def normal(*size: int, sd: float) -> torch.Tensor:
+        return sd * torch.randn(*shape, *size, generator=generator)
+
+    return {
+        "weight_0": normal(len(fade), units, sd=float((fade**2).sum()) ** -0.5),
+        "bias_0": normal(units, sd=0.3),
+        "weight_1": normal(units, sd=0.1 * units**-0.5),
+        "bias_1": torch.zeros(*shape),
+    }
+
+
+def _mlp_forward(
+    w: dict[str, torch.Tensor], command: torch.Tensor, fade: torch.Tensor, past: int
+) -> torch.Tensor:
+    """Outputs (*shape, windows, WINDOW + 3) of commands (joints, windows, past + WINDOW + 2)."""
+    joints, sets, decays, members, taps, units = w["weight_0"].shape
+    history = command[..., past - taps :].unfold(-1, taps, 1).flip(-1)  # newest first
+    windows, outputs = history.shape[1:3]
+    x = (history * fade).reshape(joints, windows * outputs, taps)
+    # all networks of a joint see the same commands: one wide product serves them all
+    wide = w["weight_0"].permute(0, 4, 1, 2, 3, 5).reshape(joints, taps, -1)
+    h = torch.relu(torch.baddbmm(w["bias_0"].reshape(joints, 1, -1), x, wide))
+    h = h.reshape(joints, windows * outputs, -1, units)
+    out = torch.einsum("jnqu,jqu->jqn", h, w["weight_1"].reshape(joints, -1, units))
+    out = out + w["bias_1"].reshape(joints, -1, 1)
+    return out.reshape(joints, sets, decays, members, windows, outputs)
+
+
+def _lstm(
+    shape, units: int, fade: torch.Tensor, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
+    def uniform(*size: int) -> torch.Tensor:
+        return (2 * torch.rand(*shape, *size, generator=generator) - 1) * units**-0.5
+
+    return {
+        "weight_input": uniform(1, 4 * units),
+        "weight_hidden": uniform(units, 4 * units),
+        "bias": uniform(4 * units),
+        "weight_out": 0.1 * uniform(units),
+        "bias_out": torch.zeros(*shape),
+    }
+
+
+def _lstm_forward(
+    w: dict[str, torch.Tensor], command: torch.Tensor, fade: torch.Tensor, past: int
+) -> torch.Tensor:
+    """Outputs (*shape, windows, WINDOW + 3) of commands (joints, windows, past + WINDOW + 2)."""
+    joints, sets, decays, members, units, gates = w["weight_hidden"].shape
+    nets = joints * sets * decays * members
+    windows, steps = command.shape[1:]
+    recurrent = w["weight_hidden"].reshape(nets, units, gates)
+    x = command[:, None].expand(-1, nets // joints, -1, -1).reshape(nets, windows, steps)
+    drive = x.permute(2, 0, 1)[..., None] * w["weight_input"].reshape(nets, 1, gates)
+    drive = drive + w["bias"].reshape(nets, 1, gates)
+    hidden = cell = torch.zeros(nets, windows, units)
+    seen = []
+    for t in range(steps):
+        i, f, g, o = torch.baddbmm(drive[t], hidden, recurrent).chunk(4, -1)
+        cell = torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
+        hidden = torch.sigmoid(o) * torch.tanh(cell)
+        if t >= past - 1:
+            seen.append(hidden)
+    out = torch.einsum("tnwu,nu->nwt", torch.stack(seen), w["weight_out"].reshape(nets, units))
+    out = out + w["bias_out"].reshape(nets, 1, 1)
+    return out.reshape(joints, sets, decays, members, windows, -1)

@@ -1,0 +1,255 @@
+"""Arrays for fitting: windows of commands and the readings in them, all joints side by side.
+
+A window covers `WINDOW` ticks and is preceded by as many commands as a model remembers (`past`), so
+windows can be shuffled and computed in parallel, and none reaches over a pause. Joints with fewer
+windows or readings than others are padded; `used` says what counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up_weights
+
+WINDOW = 48
+
+_FEWEST = 10
+_STRETCHES = 3
+_MEMORY_S = 0.5
+
+Part = Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], NDArray[np.bool_]]
+"""What belongs to a part (training, test), by trial number, time in the trial [s] and group."""
+
+
+def everything(
+    number: NDArray[np.int64], elapsed_s: NDArray[np.float64], group: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """The part that has all there is."""
+    return np.ones(len(number), bool)
+
+
+def only(group: int) -> Part:
+    """The part that is one group."""
+    return lambda number, elapsed_s, groups: groups == group
+
+
+def without(group: int) -> Part:
+    """The part that is every group but one."""
+    return lambda number, elapsed_s, groups: (groups != group) & (groups >= 0)
+
+
+def chosen(run: Run, part: Part) -> NDArray[np.bool_]:
+    """Which counted readings of a run belong to a part, shape (fresh,)."""
+    row = run.readings.rows
+    return part(run.number[row], run.reading_elapsed_s, run.group[row])
+
+
+def chosen_rows(run: Run, part: Part) -> NDArray[np.bool_]:
+    """Which rows of a run belong to a part, shape (rows,)."""
+    return part(run.number, run.elapsed_s, run.group)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Windows of all joints.
+
+    Attributes
+    ----------
+    command : ndarray, shape (joints, windows, past + WINDOW + 2)
+        Normalised, oldest first. Output `k` of a window is the position after command
+        `past - 1 + k`; a window has `WINDOW + 3` outputs.
+    index : ndarray of int, shape (joints, windows, readings)
+        First of the four outputs that a reading is looked up in.
+    weight : ndarray, shape (joints, windows, readings, 4)
+    target : ndarray, shape (joints, windows, readings)
+        Normalised position.
+    group : ndarray of int, shape (joints, windows, readings)
+    used : ndarray of bool, shape (joints, windows, readings)
+    normalisation : dict of str to ndarray
+        `command_center`, `command_scale`, `position_center`, `position_scale`, each (joints,).
+    past : int
+    """
+
+    command: NDArray[np.float32]
+    index: NDArray[np.int64]
+    weight: NDArray[np.float32]
+    target: NDArray[np.float32]
+    group: NDArray[np.int64]
+    used: NDArray[np.bool_]
+    normalisation: dict[str, NDArray[np.float64]]
+    past: int
+
+    @property
+    def windows(self) -> int:
+        """How many there are, padding included."""
+        return self.command.shape[1]
+
+    def at_readings(self, taps: int) -> NDArray[np.float64]:
+        """Last `taps` commands, newest first, looked up at each reading.
+
+        Returns
+        -------
+        ndarray, shape (joints, windows, readings, taps)
+        """
+        view = np.lib.stride_tricks.sliding_window_view(self.command, taps, axis=-1)
+        # output k has newest command past - 1 + k: the window of taps that ends there
+        history = view[:, :, self.past - taps :, ::-1]
+        four = self.index[..., None] + np.arange(4)
+        joint = np.arange(len(history))[:, None, None, None]
+        window = np.arange(self.windows)[None, :, None, None]
+        out = np.zeros((*self.index.shape, taps))
+        for n in range(4):
+            out += self.weight[..., n, None] * history[joint, window, four[..., n, None]][..., 0, :]
+        return out
+
+
+def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
+    """Data whose part has groups to hold out, and a note if they had to be made.
+
+    Where the part has one group only, it is cut into stretches. The first rows after a boundary
+    belong to no stretch: a servo would remember the one before.
+    """
+    present = {
+        int(g)
+        for found in data.runs.values()
+        for run in found
+        for g in run.group[run.readings.rows][chosen(run, part)]
+    }
+    if len(present) > 1:
+        return data, None
+
+    def cut(run: Run) -> Run:
+        inside = np.flatnonzero(chosen_rows(run, part))
+        memory = int(np.ceil(_MEMORY_S / data.period_s))
+        group = np.full(len(run.number), -1)
+        for n, rows in enumerate(np.array_split(inside, _STRETCHES)):
+            group[rows[min(memory, len(rows) // 2) if n else 0 :]] = n
+        return replace(run, group=group)
+
+    runs = {j: tuple(cut(run) for run in found) for j, found in data.runs.items()}
+    names = tuple(f"stretch {n + 1}" for n in range(_STRETCHES))
+    group = data.groups[next(iter(present))] if present else "nothing"
+    return replace(data, runs=runs, groups=names), (
+        f"There is one group to learn from ({group}), so models are chosen by holding out "
+        "stretches of it. Record more loops or tones to know how they generalise."
+    )
+
+
+def merged_groups(data: ServoData, most: int = 5) -> ServoData:
+    """The same data with at most `most` groups to hold out; similar tones are kept apart."""
+    if len(data.groups) <= most:
+        return data
+    order = sorted(range(len(data.groups)), key=lambda g: _sort_key(data.groups[g]))
+    fold = np.empty(len(order) + 1, int)
+    fold[-1] = -1
+    for place, g in enumerate(order):
+        fold[g] = place % most
+    names = [", ".join(data.groups[g] for g in order[n::most]) for n in range(most)]
+    runs = {
+        j: tuple(replace(r, group=fold[r.group]) for r in found) for j, found in data.runs.items()
+    }
+    return replace(data, runs=runs, groups=tuple(names))
+
+
+def _sort_key(label: str) -> tuple[float, str]:
+    number = label.removesuffix(" Hz")
+    return (float(number) if number != label else 0.0), label
+
+
+def samples(data: ServoData, part: Part, past: int) -> Samples:
+    """Windows over all runs of all joints, with the readings of `part`.
+
+    Raises
+    ------
+    InputError
+        If a joint's commands do not move, or it has too few readings.
+    """
+    parts = {
+        j: [_windows(run, chosen(run, part), past) for run in data.runs[j]] for j in data.joints
+    }
+    norm = {k: np.zeros(len(data.joints)) for k in (
+        "command_center", "command_scale", "position_center", "position_scale")}  # fmt: skip
+    for n, joint in enumerate(data.joints):
+        uses = [chosen(run, part) for run in data.runs[joint]]
+        position = np.concatenate(
+            [r.position_rad[u] for r, u in zip(data.runs[joint], uses, strict=True)]
+        )
+        command = np.concatenate(
+            [r.command_rad for r, u in zip(data.runs[joint], uses, strict=True) if u.any()] or [[]]
+        )
+        _check(joint, command, position)
+        norm["command_center"][n], norm["command_scale"][n] = command.mean(), command.std()
+        norm["position_center"][n] = position.mean()
+        norm["position_scale"][n] = max(position.std(), 1e-4)
+    count = max(sum(len(p[0]) for p in parts[j]) for j in data.joints)
+    most = max(p[1].shape[1] for j in data.joints for p in parts[j])
+    shape = (len(data.joints), count, most)
+    command = np.zeros((len(data.joints), count, past + WINDOW + 2), np.float32)
+    index, group = np.zeros(shape, np.int64), np.full(shape, -1)
+    weight, target = np.zeros((*shape, 4), np.float32), np.zeros(shape, np.float32)
+    used = np.zeros(shape, bool)
+    for n, joint in enumerate(data.joints):
+        at = 0
+        for c, i, w, t, g, u in parts[joint]:
+            here, width = slice(at, at + len(c)), i.shape[1]
+            command[n, here] = (c - norm["command_center"][n]) / norm["command_scale"][n]
+            index[n, here, :width], weight[n, here, :width] = i, w
+            target[n, here, :width] = (t - norm["position_center"][n]) / norm["position_scale"][n]
+            group[n, here, :width], used[n, here, :width] = g, u
+            at += len(c)
+    return Samples(command, index, weight, target, group, used, norm, past)
+
+
+def _check(joint: str, command: NDArray, position: NDArray) -> None:
+    if len(position) < _FEWEST:
+        raise InputError(
+            f"{joint}: only {len(position)} readings to learn from; even a linear model needs "
+            f"{_FEWEST}. "
+            "Record longer, or train on more of it."
+        )
+    if np.std(command) < 1e-3:
+        raise InputError(
+            f"{joint}: its commands hardly change (by {1e3 * np.ptp(command):.1f} mrad), so they "
+            "say nothing about how it moves. Leave it out with --joints, or record a sweep."
+        )
+
+
+def _windows(run: Run, use: NDArray[np.bool_], past: int) -> tuple[NDArray, ...]:
+    """Commands, and per window the readings' index, weight, target, group and use."""
+    ticks = len(run.command_rad)
+    starts = np.arange(0, ticks + 1, WINDOW)
+    padded = np.concatenate(
+        [
+            np.full(past + 1, run.initial_rad),
+            run.command_rad,
+            np.full(WINDOW + 2, run.command_rad[-1]),
+        ]
+    )
+    command = np.stack([padded[s : s + past + WINDOW + 2] for s in starts])
+    floor, weight = look_up_weights(run.tick)
+    window = floor // WINDOW
+    most = max(int(np.bincount(window).max(initial=0)), 1)
+    shape = (len(starts), most)
+    index, group = np.zeros(shape, np.int64), np.full(shape, -1)
+    weights, target, used = np.zeros((*shape, 4)), np.zeros(shape), np.zeros(shape, bool)
+    for n in range(len(starts)):
+        inside = np.flatnonzero(window == n)
+        here = (n, slice(0, len(inside)))
+        index[here] = floor[inside] - starts[n]  # output 0 is the tick before the window
+        weights[here], target[here] = weight[inside], run.position_rad[inside]
+        group[here], used[here] = run.group[run.readings.rows[inside]], use[inside]
+    keep = used.any(axis=1)
+    return command[keep], index[keep], weights[keep], target[keep], group[keep], used[keep]
+
+
+def training_sets(groups: Sequence[int], nested: bool) -> list[frozenset[int]]:
+    """Which groups each fit leaves out: none, each, and, if nested, every pair."""
+    sets = [frozenset(), *(frozenset({g}) for g in groups)]
+    if nested:
+        sets += [frozenset({a, b}) for n, a in enumerate(groups) for b in groups[n + 1 :]]
+    return sets

@@ -1,0 +1,1 @@
+"""Excitations, the recorder, and resumption of a recording."""

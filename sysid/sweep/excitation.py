@@ -1,0 +1,387 @@
+"""What to command: the trials of a recording, each a smooth, bounded motion from rest.
+
+`plan` makes them from a kind ("sine", "chirp", "multisine", "steps", "square"); `playback` from a
+file of recorded commands; `parse_frequencies` reads what a user writes (`1-10`, `1-10:0.5`,
+`1,2,4`). A plan knows commands only: `sysid.sweep.recorder` carries it out.
+
+Every trial begins with a short rest at the start pose: the onset from rest is what tells a
+servo's dead time from its dynamics. Amplitudes are reduced where a servo could not follow, and
+tones are moved off the frequencies that the loop or the poll would sample at the same few phases
+again and again; both are said in `Plan.warnings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import gcd
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import DEFAULT_POSE
+from pupper_sysid.hardware.moves import raised_cosine
+
+KINDS = ("sine", "chirp", "multisine", "steps", "square")
+
+HIGHEST_HZ = 25.0
+"""Half of the usual 52 Hz command rate: a faster tone cannot be commanded."""
+
+LEAD_IN_S = 0.2
+"""Rest at the start pose, recorded at the head of every trial [s]."""
+
+SPEED_MARGIN = 0.9
+"""Share of the speed limit that an excitation may ask for."""
+
+POLL_RATE_HZ = 1 / 0.02685
+"""Feedback polls of a Mini Pupper 2, as far as is known before the recording [Hz]."""
+
+_RATIOS = 12
+_LEAST_ROOM_RAD = 0.03
+_NUDGE_STEP_HZ = 0.01
+
+
+@dataclass(frozen=True)
+class TrialPlan:
+    """One trial: which joints move, for how long, and where to.
+
+    Attributes
+    ----------
+    joints : tuple of str
+        All others rest at the start pose.
+    frequency_hz : float
+        NaN if the motion is not a tone.
+    duration_s : float
+        With the lead-in.
+    offset : callable
+        Command minus start pose [rad] at times since the trial's start [s]: shape (n,) to shape
+        (n,), or (n, joints) where joints move differently.
+    """
+
+    joints: tuple[str, ...]
+    frequency_hz: float
+    duration_s: float
+    offset: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+    def command(self, time_s: float, start_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Commands [rad], shape (joints,), for joints that start at `start_rad`."""
+        return start_rad + self.offset(np.array([time_s]))[0]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All trials of a recording, in order.
+
+    Attributes
+    ----------
+    trials : tuple of TrialPlan
+    start_pose_rad : dict of str to float
+        Every joint's pose before and between the trials, absolute [rad].
+    description : dict
+        What a reader of the recording should know of the excitation.
+    warnings : tuple of str
+        What was changed of what the user asked for.
+    """
+
+    trials: tuple[TrialPlan, ...]
+    start_pose_rad: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_POSE))
+    description: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """Recorded time of all trials [s]."""
+        return sum(trial.duration_s for trial in self.trials)
+
+
+def plan(
+    kind: str,
+    joints: Sequence[str],
+    frequencies_hz: Sequence[float] = (1.0, 2.0, 3.0, 4.0),
+    amplitude_rad: float = 0.3,
+    duration_s: float | None = None,
+    loop_period_s: float = 0.019,
+    speed_limit_rad_s: float = 7.5,
+    poll_rate_hz: float = POLL_RATE_HZ,
+    room_rad: Mapping[str, float] | None = None,
+    start_pose_rad: Mapping[str, float] | None = None,
+) -> Plan:
+    """The trials of an excitation, one joint after the other.
+
+    Parameters
+    ----------
+    kind : str
+        "sine": one trial per frequency; "chirp": one from the lowest to the highest frequency,
+        logarithmic; "multisine": one with all frequencies at once, Schroeder phases; "steps": one
+        with steps of a third, two thirds and all of the amplitude; "square": one per frequency.
+    joints : sequence of str
+    frequencies_hz : sequence of float
+        Ignored by "steps".
+    amplitude_rad : float
+        Largest excursion from the start pose. Steps and square waves keep it whatever the speed
+        limit: they are meant to reach it.
+    duration_s : float, optional
+        Of each trial without its lead-in. Default: for tones 5 s or 5 periods, whichever is
+        longer; 20 s for a chirp or multisine; one pass for steps.
+    loop_period_s : float
+        Period at which commands will be sent.
+    speed_limit_rad_s : float
+        What the servo can do.
+    poll_rate_hz : float
+        Feedback polls per second, 0 if there are none.
+    room_rad : mapping of joint to float, optional
+        How far each joint may swing to both sides of its start pose.
+    start_pose_rad : mapping of joint to float, optional
+        Default: the Mini Pupper's standing pose.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or the kind unknown.
+    """
+    if kind not in KINDS:
+        raise InputError(f"excitation '{kind}' is unknown; choose from {', '.join(KINDS)}.")
+    if not joints:
+        raise InputError("excitation: no joint was chosen; name at least one.")
+    for name, value in (
+        ("amplitude_rad", amplitude_rad),
+        ("loop_period_s", loop_period_s),
+        ("speed_limit_rad_s", speed_limit_rad_s),
+        ("duration_s", 1.0 if duration_s is None else duration_s),
+    ):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"excitation: {name} is {value}; it must be a positive number.")
+    highest = min(HIGHEST_HZ, 0.5 / loop_period_s)
+    frequencies = [_checked_frequency(f, highest) for f in frequencies_hz]
+    if not frequencies and kind != "steps":
+        raise InputError("excitation: no frequency was chosen; give at least one, such as 1-10.")
+    warnings: list[str] = []
+    amplitude_rad = _within(amplitude_rad, joints, room_rad or {}, warnings)
+    top_speed = SPEED_MARGIN * speed_limit_rad_s
+    if kind in ("sine", "square"):
+        shapes = []
+        for asked in frequencies:
+            time = duration_s or max(5.0, 5.0 / asked)
+            f = off_harmonics(asked, (1 / loop_period_s, poll_rate_hz), time)
+            if f != asked:
+                warnings.append(
+                    f"{asked:g} Hz became {f:g} Hz: the loop ({1 / loop_period_s:.1f} Hz) or the "
+                    f"poll ({poll_rate_hz:.1f} Hz) would see the asked one at a few phases only."
+                )
+            if kind == "sine":
+                amplitude = _bounded(amplitude_rad, 2 * np.pi * f, top_speed, f"{f:g} Hz", warnings)
+                shapes.append((f, time, _sine(f, amplitude)))
+            else:
+                shapes.append((np.nan, time, _square(f, amplitude_rad)))
+    elif kind == "chirp":
+        low, high, time = min(frequencies), max(frequencies), duration_s or 20.0
+        _bounded(amplitude_rad, 2 * np.pi * high, top_speed, f"chirp at {high:g} Hz", warnings)
+        shapes = [(np.nan, time, _chirp(low, high, time, amplitude_rad, top_speed))]
+    elif kind == "multisine":
+        shape = _multisine(frequencies)
+        peak, speed = _peaks(shape, min(frequencies))
+        amplitude = _bounded(amplitude_rad, speed / peak, top_speed, "multisine", warnings)
+        shapes = [(np.nan, duration_s or 20.0, _scaled(shape, amplitude / peak))]
+    else:
+        offset, one_pass = _steps(amplitude_rad)
+        shapes = [(np.nan, duration_s or one_pass, offset)]
+    trials = tuple(
+        TrialPlan((joint,), float(f), LEAD_IN_S + time, _after(LEAD_IN_S, offset))
+        for joint in joints
+        for f, time, offset in shapes
+    )
+    description = {
+        "kind": kind,
+        "amplitude_rad": amplitude_rad,
+        "frequencies_hz": [] if kind == "steps" else frequencies,
+        "lead_in_s": LEAD_IN_S,
+        "speed_limit_rad_s": speed_limit_rad_s,
+        "warnings": list(dict.fromkeys(warnings)),
+    }
+    pose = dict(DEFAULT_POSE if start_pose_rad is None else start_pose_rad)
+    return Plan(trials, pose, description, tuple(dict.fromkeys(warnings)))
+
+
+def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
+    """Frequencies [Hz] that `text` names: `1-10`, `1-10:0.5`, `1,2,4,6.5`, or a mix.
+
+    Raises
+    ------
+    InputError
+        If a part is no number, not positive, reversed, or above `highest_hz`.
+
+    Examples
+    --------
+    >>> parse_frequencies("1-3,4-5:0.5")
+    [1.0, 2.0, 3.0, 4.0, 4.5, 5.0]
+    """
+    found: list[float] = []
+    for part in (piece.strip() for piece in text.split(",")):
+        span, _, step_text = part.partition(":")
+        low_text, dash, high_text = span.partition("-")
+        try:
+            low = float(low_text)
+            high = float(high_text) if dash else low
+            step = float(step_text) if step_text else 1.0
+        except ValueError:
+            raise InputError(
+                f"--freqs: '{part}' is no frequency in Hz. Write 1-10, 1-10:0.5 or 1,2,4,6.5."
+            ) from None
+        for value in (low, high):
+            _checked_frequency(value, highest_hz)
+        if high < low:
+            raise InputError(f"--freqs: '{part}' runs backwards; write {high:g}-{low:g}.")
+        if not (np.isfinite(step) and step > 0) or (step_text and not dash):
+            raise InputError(f"--freqs: '{part}' has no usable step; write for example 1-10:0.5.")
+        if (high - low) / step > 1000:
+            raise InputError(f"--freqs: '{part}' is more than 1000 frequencies; use a larger step.")
+        count = int((high - low) / step + 1e-9) + 1
+        found += [round(low + i * step, 9) for i in range(count)]
+    return sorted(set(found))
+
+
+def off_harmonics(frequency_hz: float, rates_hz: Sequence[float], duration_s: float) -> float:
+    """The nearest frequency, in steps of 0.01 Hz, that is sampled all around its period.
+
+    A tone at `p/q` of a sampling rate is seen at `q` phases only. Within `duration_s` the phases
+    drift apart by `1/q` of a period, and so cover it, if the tone is `1 / (q * duration_s)` away.
+    Ratios with `q` up to 12 are avoided; more phases than that are as good as all.
+
+    Examples
+    --------
+    >>> off_harmonics(5.0, (50.0,), 5.0), off_harmonics(1.0, (50.0,), 5.0)
+    (5.02, 1.0)
+    """
+
+    def clear(f: float) -> bool:
+        return all(
+            abs(f - p / q * rate) >= 1 / (q * duration_s) - 1e-9
+            for rate in rates_hz
+            for q in range(1, _RATIOS + 1)
+            for p in range(1, q + 1)
+            if gcd(p, q) == 1
+        )
+
+    # further than a few tenths of a hertz would be another frequency than the one asked for
+    for k in range(round(0.5 / _NUDGE_STEP_HZ)):
+        for f in (frequency_hz + k * _NUDGE_STEP_HZ, frequency_hz - k * _NUDGE_STEP_HZ):
+            if f > 0 and clear(f):
+                return round(f, 6)
+    return frequency_hz
+
+
+Offset = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _checked_frequency(value: float, highest_hz: float) -> float:
+    if not (np.isfinite(value) and 0 < value <= highest_hz):
+        raise InputError(
+            f"frequency {value:g} Hz: it must be above 0 and at most {highest_hz:g} Hz, "
+            "half the rate at which commands are sent."
+        )
+    return float(value)
+
+
+def _within(
+    amplitude: float, joints: Sequence[str], room: Mapping[str, float], warnings: list[str]
+) -> float:
+    """`amplitude`, or less where a joint has no room for it; then with a warning."""
+    tight = min((j for j in joints if j in room), key=lambda j: room[j], default=None)
+    if tight is None or room[tight] >= amplitude:
+        return amplitude
+    if room[tight] < _LEAST_ROOM_RAD:
+        raise InputError(
+            f"excitation: {tight} has {room[tight]:.3f} rad of room on either side of its start "
+            "pose, too little to learn from. Check its limits in the joint map."
+        )
+    warnings.append(
+        f"amplitude reduced from {amplitude:g} to {room[tight]:.3f} rad, the room that the joint "
+        f"map's limits leave {tight}."
+    )
+    return room[tight]
+
+
+def _bounded(
+    amplitude: float, speed_per_rad: float, top_speed: float, what: str, warnings: list[str]
+) -> float:
+    """`amplitude`, or less where its speed would exceed `top_speed`; then with a warning."""
+    if amplitude * speed_per_rad <= top_speed:
+        return amplitude
+    reduced = top_speed / speed_per_rad
+    warnings.append(
+        f"{what}: amplitude reduced from {amplitude:g} to {reduced:.3f} rad, "
+        f"so that the speed stays at {top_speed:.2f} rad/s."
+    )
+    return reduced
+
+
+def _after(lead_in_s: float, offset: Offset) -> Offset:
+    """`offset` after a rest."""
+
+    def shifted(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        time_s = np.asarray(time_s, float) - lead_in_s
+        return np.where(time_s > 0, offset(np.maximum(time_s, 0.0)), 0.0)
+
+    return shifted
+
+
+def _scaled(offset: Offset, factor: float) -> Offset:
+    return lambda t: factor * offset(t)
+
+
+def _sine(frequency_hz: float, amplitude: float) -> Offset:
+    # full amplitude after half a period: smooth, and still an onset that excites the dynamics
+    return lambda t: (
+        amplitude * raised_cosine(2 * frequency_hz * t) * np.sin(2 * np.pi * frequency_hz * t)
+    )
+
+
+def _square(frequency_hz: float, amplitude: float) -> Offset:
+    return lambda t: amplitude * np.where((t * frequency_hz) % 1.0 < 0.5, 1.0, -1.0)
+
+
+def _chirp(low: float, high: float, duration_s: float, amplitude: float, top_speed: float):
+    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        rate = np.log(high / low) / duration_s
+        grown = np.exp(rate * t)
+        cycles = low * t if rate == 0 else low * (grown - 1) / rate
+        bounded = np.minimum(amplitude, top_speed / (2 * np.pi * low * grown))
+        return bounded * raised_cosine(2 * low * t) * np.sin(2 * np.pi * cycles)
+
+    return offset
+
+
+def _multisine(frequencies: Sequence[float]) -> Offset:
+    """Equal amplitudes, Schroeder phases (IEEE Trans. Inf. Theory 16, 1970): a low crest factor."""
+    f = np.array(frequencies)
+    k = np.arange(1, len(f) + 1)
+    phase = -np.pi * k * (k - 1) / len(f)
+
+    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        tones = np.sin(2 * np.pi * f * np.asarray(t)[:, None] + phase)
+        return raised_cosine(2 * f.min() * np.asarray(t)) * tones.sum(axis=-1)
+
+    return offset
+
+
+def _peaks(offset: Offset, lowest_hz: float) -> tuple[float, float]:
+    """Largest excursion and speed of `offset`, looked for over 20 of its longest periods."""
+    t = np.arange(0.0, 20.0 / lowest_hz, 0.001)
+    value = offset(t)
+    return float(np.abs(value).max()), float(np.abs(np.diff(value)).max() / 0.001)
+
+
+def _steps(amplitude: float) -> tuple[Offset, float]:
+    """Steps up and down in three sizes, and the duration of one pass [s]."""
+    levels = amplitude * np.array([1, 0, -1, 0, 2, 0, -2, 0, 3, 0, -3, 3, -3, 0]) / 3
+    # golden-ratio holds of 0.45 to 0.75 s: edges meet loop and poll at ever different phases
+    holds = 0.45 + 0.3 * ((np.arange(len(levels)) * (np.sqrt(5) - 1) / 2) % 1.0)
+    edges = np.concatenate([[0.0], np.cumsum(holds)])
+
+    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        index = np.searchsorted(edges, np.asarray(t) % edges[-1], side="right") - 1
+        return levels[index]
+
+    return offset, float(edges[-1])

@@ -1,0 +1,99 @@
+"""Play recorded commands again: a plan from a CSV of joint angles over time.
+
+The file has a column `time_s` and, for each joint that moves, `<joint>_command_rad` or `<joint>`,
+absolute angles in radians; other columns are ignored. Between its rows a command is held, as a
+policy's would be. A column `loop` (as in a recorded playback) makes each of its values a trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, TrialPlan
+
+_LARGEST_RAD = 2 * np.pi
+
+
+def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
+    """A plan that repeats the commands in `path`; each joint starts at its first command.
+
+    Parameters
+    ----------
+    path : Path
+    joints : sequence of str, optional
+        Joints to move (default: all that the file commands).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, lacks a column, or has values that are no angles or times.
+    """
+    try:
+        table = pd.read_csv(path, comment="#")
+    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{path} is no readable CSV file of commands: {error}.") from error
+    columns = {}
+    for joint in JOINT_NAMES:
+        for name in (f"{joint}_command_rad", joint):
+            if name in table and joint not in columns:
+                columns[joint] = name
+    moving = [j for j in JOINT_NAMES if j in (columns if joints is None else joints)]
+    missing = [j for j in moving if j not in columns]
+    if "time_s" not in table or not moving or missing or not len(table):
+        wanted = f"{(missing or ['LF_hip'])[0]}_command_rad"
+        raise InputError(
+            f"{path} is no file of commands: it needs rows with the columns time_s and {wanted}; "
+            f"it has {len(table)} rows of {', '.join(map(str, table.columns[:8]))}."
+        )
+    used = ["time_s", *(columns[j] for j in moving), *(["loop"] if "loop" in table else [])]
+    numbers = np.stack(
+        [np.asarray(pd.to_numeric(table[c], errors="coerce"), float) for c in used], axis=-1
+    )
+    bad = np.argwhere(~np.isfinite(numbers))
+    if len(bad):
+        row, column = bad[0]
+        raise InputError(
+            f"{path}: column {used[column]}, data row {row + 1} is no number; "
+            "every command and time must be one."
+        )
+    numbers, loops = numbers[:, : len(moving) + 1], numbers[:, len(moving) + 1 :]
+    largest = float(np.abs(numbers[:, 1:]).max())
+    if largest > _LARGEST_RAD:
+        raise InputError(
+            f"{path}: a command of {largest:g} is beyond a full turn; angles must be in radians."
+        )
+    loops = loops[:, 0] if loops.size else np.zeros(len(table))
+    first = numbers[0, 1:]
+    trials = []
+    for loop in pd.unique(loops):
+        part = numbers[loops == loop]
+        time, command = part[:, 0] - part[0, 0], part[:, 1:]
+        if len(time) < 2 or not (np.diff(time) > 0).all():
+            raise InputError(f"{path}: time_s must increase from row to row within a loop.")
+        # the last command is held as long as the others were
+        duration = LEAD_IN_S + float(time[-1] + np.median(np.diff(time)))
+        trials.append(
+            TrialPlan(tuple(moving), float("nan"), duration, _held(time, command - first))
+        )
+    pose = dict(DEFAULT_POSE) | {j: float(x) for j, x in zip(moving, first, strict=True)}
+    description = {"kind": "playback", "file": path.name, "sha256": sha256(path)}
+    return Plan(tuple(trials), pose, description | {"lead_in_s": LEAD_IN_S})
+
+
+def _held(time: NDArray[np.float64], value: NDArray[np.float64]):
+    """The value of the last row at or before each instant, after the lead-in at rest."""
+
+    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        t = np.asarray(t, float) - LEAD_IN_S
+        index = np.searchsorted(time, t + 1e-9, side="right") - 1
+        return np.where((index < 0)[:, None], 0.0, value[np.maximum(index, 0)])
+
+    return offset

@@ -1,0 +1,139 @@
+"""Continue a recording that was cut short: which trial comes next, and what time it is there.
+
+A trial is finished if its rows reach its end; the first unfinished one is recorded again from its
+start. Time goes on as it did on the wall: the file's last row was written when the file was last
+changed.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.recording import TITLE, as_text, read_bytes
+from pupper_sysid.sysid.recordings.table import header, parse
+from pupper_sysid.sysid.sweep.excitation import Plan
+
+_LEAST_PAUSE_S = 0.5
+
+
+class Request(BaseModel):
+    """What was asked for, as `sweep` writes it into the header."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    bus: str
+    joint_map: str | None
+    real_time: bool
+    seed: int
+    loop_period_s: float = Field(gt=0)
+    kind: str
+    joints: list[str]
+    frequencies_hz: list[float]
+    amplitude_rad: float
+    duration_s: float | None
+    playback: str | None
+    loops: int = Field(1, ge=1, le=1000)
+    """Of a playback; recordings of before this could be asked for do not say it."""
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Where an unfinished recording goes on.
+
+    Attributes
+    ----------
+    next_trial : int
+        Number of the first trial to record.
+    rows : int
+        Rows of the finished trials.
+    last_time_s : float
+        Of the file's last row, on the recording's clock.
+    written_at : float
+        `time.time()` of that row.
+    """
+
+    next_trial: int
+    rows: int
+    last_time_s: float
+    written_at: float
+
+    def now_s(self) -> float:
+        """The present time on the recording's clock [s]."""
+        return self.last_time_s + max(time.time() - self.written_at, _LEAST_PAUSE_S)
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    """Header of an unfinished recording, from which its plan can be made again.
+
+    Raises
+    ------
+    InputError
+        If it is no recording of ours, was finished, or does not say what was planned.
+    """
+    text = as_text(path, read_bytes(path))
+    if not text.startswith(TITLE):
+        raise InputError(f"{path} is no recording of pupper-sysid; only those can be continued.")
+    metadata = header(path, text.splitlines())
+    if "completed" in metadata:
+        raise InputError(f"{path} was recorded to its end; there is nothing to continue.")
+    request = metadata.get("sweep")
+    if request is None:
+        raise InputError(
+            f"{path} does not say what was planned (an older version wrote it). Record it again."
+        )
+    try:
+        Request.model_validate(request)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        where = ".".join(map(str, ("sweep", *fault["loc"])))
+        raise InputError(
+            f"{path}, header, {where}: {fault['msg']}; what was planned there is not what this "
+            "version plans. Record it again."
+        ) from error
+    return metadata
+
+
+def footer(path: Path) -> dict[str, Any]:
+    """What a finished recording says of how it went; empty if it was not finished."""
+    return header(path, as_text(path, read_bytes(path)).splitlines()).get("completed", {})
+
+
+def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
+    """Where `plan`, partly carried out in the recording at `path`, goes on.
+
+    Raises
+    ------
+    InputError
+        If the recording cannot be read, or was made with another plan.
+    """
+    written_at = path.stat().st_mtime
+    text = as_text(path, read_bytes(path))
+    planned = header(path, text.splitlines()).get("excitation")
+    if planned != json.loads(json.dumps(dict(plan.description))):
+        raise InputError(
+            f"{path} was recorded with another plan than its header gives today: the played file, "
+            "the joint map or the limits have changed since. Record it again."
+        )
+    whole = text[: text.rfind("\n") + 1]
+    if sum(bool(line.strip()) and line[0] != "#" for line in whole.splitlines()) < 2:
+        return Resume(0, 0, 0.0, written_at)
+    table = parse(path, whole).table
+    last = float(np.nanmax(table[["send_time_s", "read_time_s"]].to_numpy()))
+    rows = 0
+    for number, trial in enumerate(plan.trials):
+        times = table["send_time_s"].to_numpy()[table["trial"].to_numpy() == number]
+        if (
+            not len(times)
+            or np.nanmax(times) - np.nanmin(times) < trial.duration_s - 2.5 * period_s
+        ):
+            return Resume(number, rows, last, written_at)
+        rows += len(times)
+    return Resume(len(plan.trials), rows, last, written_at)

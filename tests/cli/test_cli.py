@@ -1,0 +1,255 @@
+"""The command line as a user meets it: JSON alone on stdout, sentences, exit codes."""
+
+import importlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.sysid.recordings.recording import load
+from support.command_line import refused, run, run_program
+
+ROOT = Path(__file__).resolve().parents[2]
+SWEEP = ROOT / "data" / "samples" / "sweep.csv"
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_delay_json_is_one_object_with_the_documented_keys(capsys):
+    code, out, _ = run(capsys, "delay", SWEEP, "--joints", "LF_hip", "--json")
+    joint = json.loads(out)["joints"]["LF_hip"]
+    assert code == 0
+    assert {
+        "naive_lag_ms", "fresh_lag_ms", "lag_ms", "lag_ci_ms", "dead_time_ms", "dead_time_ci_ms",
+        "feedback", "by_frequency",
+    } <= set(joint)  # fmt: skip
+    assert {"poll_period_ms", "loss", "mean_age_ms", "quantum_rad", "offset_rad"} <= set(
+        joint["feedback"]
+    )
+    assert {"frequency_hz", "gain", "phase_deg", "lag_ms"} <= set(joint["by_frequency"][0])
+    assert joint["naive_lag_ms"] > joint["fresh_lag_ms"] > joint["lag_ms"] > joint["dead_time_ms"]
+
+
+def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys):
+    arguments = ("calibrate", SWEEP, "--joints", "LF_hip", "--out", "c.yaml", "--json")
+    code, out, _ = run(capsys, *arguments)
+    found = json.loads(out)
+    joint = found["joints"]["LF_hip"]
+    assert code == 0 and found["elapsed_s"] > 0
+    assert {
+        "model", "parameters", "rmse_fresh_rad", "rmse_held_rad", "rmse_naive_rad",
+        "rmse_leave_one_frequency_out_rad", "delay_s", "delay_ci_s", "delay_steps",
+    } <= set(joint)  # fmt: skip
+    saved = load_calibration("c.yaml").joint("LF_hip")
+    assert saved.actuator.delay_s.value == pytest.approx(joint["delay_s"])
+    # the truth beside the sample
+    truth = (SWEEP.parent / "sweep.truth.yaml").read_text()
+    assert "delay_s" in truth
+    before = Path("c.yaml").read_bytes()
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and out == "" and "--force" in err
+    assert Path("c.yaml").read_bytes() == before
+
+
+def test_doctor_json_has_the_documented_keys(capsys):
+    code, out, _ = run(capsys, "doctor", SWEEP, "--json")
+    joint = json.loads(out)["joints"]["LF_thigh"]
+    assert code == 0 and joint["verdict"] == "use with care"
+    assert {
+        "verdict", "reasons", "loop_period_ms", "jitter_ms", "fresh_fraction", "poll_period_ms",
+        "loss", "quantum_rad", "offset_rad",
+    } <= set(joint)  # fmt: skip
+    assert joint["poll_period_ms"] == pytest.approx(26.85, abs=0.15)
+    assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)
+
+
+def test_bode_shows_that_the_servo_follows_where_raw_rows_say_it_does_not(capsys):
+    code, out, _ = run(capsys, "bode", SWEEP, "--joints", "LF_hip", "--json", "--plot", "b.png")
+    tones = json.loads(out)["joints"]["LF_hip"]["by_frequency"]
+    assert code == 0 and Path("b.png").stat().st_size > 10_000
+    assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["naive_gain"] < 0.75
+
+
+def test_sweep_records_calibrates_and_repeats_under_its_seed(capsys):
+    for name in ("a.csv", "b.csv"):
+        code, _, err = run(capsys, "sweep", "--freqs", "1,3", "--joints", "RB_calf", "--duration",
+                           "2", "--seed", "4", "--out", name)  # fmt: skip
+        assert code == 0 and "No robot: using the emulated one" in err
+    first, second = (load(Path(n)).table for n in ("a.csv", "b.csv"))
+    assert first.equals(second)
+    assert load(Path("a.csv")).joints == ["RB_calf"]
+
+
+def test_a_command_without_a_recording_takes_the_newest(capsys):
+    run(capsys, "sweep", "--freqs", "2", "--joints", "LF_hip", "--duration", "2")
+    code, out, err = run(capsys, "doctor", "--json")
+    assert code == 0 and "Taking the newest recording" in err and "LF_hip" in out
+
+
+def test_export_of_presets_calibrations_and_recordings(capsys):
+    for source, expected in (("paper", "paper.csv"), (SWEEP, "sweep.tidy.csv")):
+        code, out, _ = run(capsys, "export", source, "--to", "csv", "--json")
+        assert code == 0 and json.loads(out)["written"] == expected
+    assert len(load(Path("sweep.tidy.csv")).table) == len(load(SWEEP).table)
+    code, _, err = run(capsys, "export", "paper", "--to", "csv")
+    assert code == 2 and "--force" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("delay", "nothing.csv"), "does not exist"),
+        (("delay",), "no recording|none in recordings|No recording was named"),
+        (("delay", SWEEP, "--joints", "LF_hipp"), "Did you mean LF_hip"),
+        (("sweep", "--freqs", "10-1"), "10-1"),
+        (("sweep", "--freqs", "abc"), "abc"),
+        (("sweep", "--freqs", "0"), "0"),
+        (("sweep", "--amplitude", "-1"), "amplitude"),
+        (("sweep", "--out", "x.txt"), ".csv"),
+        (("calibrate", SWEEP, "--stall-torque", "0"), "--stall-torque"),
+        (("export", "x.docx"), "neither"),
+        (("export", "missing.yaml"), "missing.yaml"),
+        (("nonsense",), "nonsense"),
+    ],
+)
+def test_bad_input_ends_with_2_and_a_sentence(capsys, arguments, said):
+    import re
+
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and out == ""
+    assert re.search(said, err.replace("\n", " ")) and "Traceback" not in err
+
+
+def table_with(tmp_path, change):
+    """The sample's LF_hip rows, changed, as a file."""
+    table = load(SWEEP).table.query("joint == 'LF_hip' and trial < 3").copy()
+    table = change(table)
+    path = tmp_path / "changed.csv"
+    path.write_text('# pupper-sysid recording\n# completed: {"rows": 1}\n')
+    table.to_csv(path, mode="a", index=False)
+    return path
+
+
+def swap(table):
+    return table.assign(command_rad=table.position_rad, position_rad=table.command_rad)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t.assign(position_rad=0.1), "reading does not"),
+        (lambda t: t.assign(command_rad=0.1), "command never changes"),
+        (swap, "swapped"),
+    ],
+)
+def test_doctor_refuses_logs_that_cannot_be_used_and_says_why(capsys, tmp_path, change, said):
+    path = table_with(tmp_path, change)
+    code, out, _ = run(capsys, "doctor", path, "--json")
+    joint = json.loads(out)["joints"]["LF_hip"]
+    assert code == 0 and joint["verdict"] == "do not use"
+    assert any(said in reason for reason in joint["reasons"])
+
+
+def test_constant_feedback_is_answered_in_a_sentence_by_every_command(capsys, tmp_path):
+    path = table_with(tmp_path, lambda t: t.assign(position_rad=0.1))
+    for command in ("delay", "bode", "calibrate"):
+        code, _, err = run(capsys, command, path)
+        assert code == 2 and "LF_hip" in err and "defect" not in err
+
+
+def test_one_frequency_is_calibrated_with_a_warning(capsys, tmp_path):
+    path = table_with(tmp_path, lambda t: t[t.trial == 2])
+    code, out, _ = run(capsys, "calibrate", path, "--json")
+    joint = json.loads(out)["joints"]["LF_hip"]
+    assert code == 0 and joint["rmse_leave_one_frequency_out_rad"] is None
+    assert any("one frequency only" in w for w in joint["warnings"])
+
+
+def test_a_sweep_killed_half_way_leaves_a_file_that_every_command_reads(capsys, tmp_path):
+    path = tmp_path / "killed.csv"
+    sweep = subprocess.Popen(
+        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
+            "sweep", "--freqs", "4,5", "--joints", "LF_hip",
+         "--duration", "2", "--real-time", "--out", str(path)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    stop = time.monotonic() + 40
+    while time.monotonic() < stop and not (path.exists() and path.read_text().count("\n") > 190):
+        time.sleep(0.05)
+    sweep.send_signal(signal.SIGKILL)
+    sweep.wait()
+    assert len(load(path).table) > 150
+    for command in (["doctor"], ["delay"], ["bode"], ["export"]):
+        code, _, err = run(capsys, *command, path)
+        assert code == 0, err
+    assert any("not recorded to its end" in w for w in load(path).warnings)
+
+
+def test_a_number_in_a_table_that_is_too_wide_is_folded_not_cut():
+    table = terminal.table("Gait", "policy", "Hz", "sine fit")
+    table.add_row("lstm", "3.27 (3.26–3.28)", "0.641234567890")
+    written = io.StringIO()
+    Console(width=24, file=written).print(table)
+    shown = written.getvalue()
+    assert "…" not in shown
+    assert sorted(c for c in shown if c.isdigit()) == sorted("327326328" + "0641234567890")
+
+
+def test_help_of_every_command_has_an_example(capsys):
+    for command in ("sweep", "doctor", "delay", "bode", "calibrate", "export", "report"):
+        code, out, _ = run(capsys, command, "--help")
+        assert code == 0 and f"Example: pupper-sysid {command}" in " ".join(out.split())
+
+
+PROGRAMS = ("pupper_sysid", "pupper_train", "pupper_play", "pupper_eval", "pupper_deploy",
+            "pupper_analyze")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_every_program_says_its_version(capsys, name):
+    module = importlib.import_module(f"pupper_sysid.cli.programs.{name}")
+    code, out, _ = run_program(capsys, module, "--version")
+    assert code == 0
+    assert out.startswith(f"{name.replace('_', '-')} {version('pupper-sysid')} (numpy ")
+
+
+def test_completion_is_written_where_bash_looks_for_it(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("SHELL", "/bin/bash")
+    code, _, err = run_program(capsys, pupper_sysid, "--install-completion")
+    assert code == 0, err
+    script = tmp_path / ".local/share/bash-completion/completions/pupper-sysid"
+    assert "fit-servo" in script.read_text() and str(script) in err
+    monkeypatch.setenv("SHELL", "/usr/bin/fish")
+    assert "fish" in refused(capsys, pupper_sysid, "--install-completion")
+
+
+def test_a_report_opens_in_the_browser_that_there_is(capsys, tmp_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or False)
+    sweep = tmp_path / "s.csv"
+    code, _, err = run_program(
+        capsys, pupper_sysid, "sweep", "--freqs", "2,4", "--joints", "LF_hip",
+        "--duration", "2", "--out", sweep,
+    )  # fmt: skip
+    assert code == 0, err
+    page = tmp_path / "page"
+    code, _, err = run_program(capsys, pupper_sysid, "report", sweep, "--out", page, "--open")
+    assert code == 0 and "No browser could be started" in err
+    assert opened == [(page / "report.html").resolve().as_uri()]

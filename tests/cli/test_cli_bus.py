@@ -1,0 +1,193 @@
+"""The commands that talk to a bus, as a user meets them: the emulators behind real ports."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.feetech.registers import SCS0009
+from pupper_sysid.sysid.recordings.recording import load
+from support.command_line import run
+from support.servo_servers import moving_servos, on_a_port, still_servos, wait_until
+
+ROOT = Path(__file__).resolve().parents[2]
+SHORT = ("--freqs", "3", "--duration", "1")
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_scan_says_who_is_there_at_which_rate(capsys):
+    with on_a_port(still_servos(SCS0009, ids=[4, 7], baud=500_000)) as port:
+        code, out, _ = run(capsys, "scan", "--bus", f"feetech:{port.device}", "--json")
+    found = json.loads(out)
+    assert code == 0 and found["baud"] == 500_000
+    assert [s["id"] for s in found["servos"]] == [4, 7]
+    first = found["servos"][0]
+    assert (first["model"], first["firmware"], first["gains"]) == ("SCS0009", "0.16", [15, 15, 0])
+    assert (first["voltage_v"], first["limits"], first["errors"]) == (7.4, [20, 1003], "")
+
+
+def test_scan_of_a_silent_line_says_what_to_check(capsys):
+    with on_a_port(still_servos(ids=[])) as port:
+        code, _, err = run(capsys, "scan", "--bus", f"feetech:{port.device}@1000000")
+    assert code == 1 and "nobody answers at 1000000 baud" in err and "power" in err
+
+
+def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
+    with on_a_port(moving_servos(ids=[5])) as port:
+        bus = f"feetech:{port.device}"
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--joints", "LF_thigh", "--bus", bus, "--out", "a.csv"
+        )
+    assert code == 0, err
+    recording = load(Path("a.csv"))
+    bus = recording.metadata["bus"]
+    assert recording.joints == ["LF_thigh"] and bus["baud"] == 1_000_000
+    assert bus["servos"]["LF_thigh"]["p"] == 32 and bus["servos"]["LF_thigh"]["return_delay"] == 250
+    assert recording.metadata["completed"]["guard"]["clipped"] == 0
+    doubt = recording.trials("LF_thigh")[0].read_time_doubt_s
+    # half of a turn with a return delay of 500 µs, and what this host adds
+    assert 0.0003 < doubt < 0.02 and doubt == bus["read_time_doubt_s"]
+    assert {"voltage_v", "temperature_c", "load"} <= set(recording.table.columns)
+    # at 3 Hz and 0.3 rad the servo follows: it moved by most of what it was told (a loaded machine
+    # may miss a reading)
+    trial = recording.trials("LF_thigh")[0]
+    assert abs(trial.command_rad - 0.785).max() == pytest.approx(0.3, abs=0.01)
+    assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
+
+
+def test_a_calf_can_be_swept_without_its_thigh(capsys):
+    with on_a_port(moving_servos(ids=[6])) as port:
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--joints", "LF_calf", "--bus", f"feetech:{port.device}",
+            "--out", "a.csv",
+        )  # fmt: skip
+    assert code == 0, err
+    assert load(Path("a.csv")).metadata["bus"]["count_zero_rad"]["LF_calf"] == pytest.approx(
+        -1.5708, abs=1e-4
+    )
+
+
+def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
+    with on_a_port(still_servos(ids=[4])) as port:
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--joints", "LF", "--bus", f"feetech:{port.device}"
+        )
+    assert code == 1 and "LF_thigh (id 5), LF_calf (id 6) does not answer" in err
+    assert not list(Path().glob("recordings/*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("sweep", "--bus", "usb"), "write emulated, esp32"),
+        (("sweep", "--bus", "feetech:/dev/ttyUSB0@fast"), "'fast' is no baud rate"),
+        (("sweep", "--bus", "esp32", "--truth"), "only a new recording of the emulated robot"),
+        (("sweep", "--bus", "esp32", "--real-time"), "knows no other time"),
+        (("sweep", "--joint-map", "nowhere.yaml"), "does not exist"),
+        (("emulate", "feetech", "--joint-map", "sts3215", "--walking"), "only the Mini Pupper"),
+        (("sweep", "--resume", "nothing.csv"), "does not exist"),
+        (("emulate", "feetech", "--ids", "1-20"), "has the ids 1 to 12"),
+        (("emulate", "feetech", "--baud", "7"), "servos know 1000000"),
+        (("emulate", "esp32", "--walking", "--by-hand"), "leave out --walking"),
+        (("emulate", "esp32", "--faults", "gremlins=1"), "'gremlins' is not known"),
+        (("emulate", "esp32", "--faults", "lost=2"), "is no probability"),
+        (("emulate", "esp32", "--faults", "lost"), "is not kind=probability"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, says):
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and says in err and out == ""
+
+
+@pytest.mark.parametrize(
+    ("bus", "says"),
+    [
+        ("feetech:/dev/no-such-port", "There is no such device"),
+        ("esp32:/tmp/no-such-folder-here/socket", "cannot be opened"),
+        ("esp32:nobody.socket", "nobody answers there"),
+    ],
+)
+def test_a_bus_that_is_not_there_says_what_to_check(capsys, bus, says):
+    code, _, err = run(capsys, "sweep", *SHORT, "--bus", bus)
+    assert code == 1 and says in err
+
+
+def test_a_map_of_the_other_frame_is_refused(capsys):
+    with on_a_port(still_servos()) as port:
+        code, _, err = run(
+            capsys, "sweep", *SHORT, "--bus", f"feetech:{port.device}",
+            "--joint-map", "mini_pupper_2",
+        )  # fmt: skip
+    assert code == 2 and "a direct bus speaks raw ones" in err and "calibrate-joints" in err
+
+
+@pytest.mark.parametrize("kind", ["feetech", "esp32"])
+def test_an_emulator_says_what_to_type_and_ends_on_request(tmp_path, kind):
+    place = ("--link", "s") if kind == "feetech" else ("--socket", "s")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
+            "emulate", kind, *place, "--truth", "t.yaml"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    out = "".join(process.stdout.readline() for _ in range(5))
+    assert (tmp_path / "s").exists()
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=10)
+    assert "pupper-sysid sweep --freqs 1-10 --joints LF --bus" in out and "Ctrl-C" in out
+    assert process.returncode == 1 and "Stopped." in err and "Traceback" not in err
+    assert not (tmp_path / "s").exists(), "it leaves nothing behind"
+    truth = yaml.safe_load((tmp_path / "t.yaml").read_text())
+    assert truth["joints"]["LF_hip"]["actuator"]["delay_s"] > 0
+
+
+@pytest.mark.parametrize("kind", [("feetech", "--link"), ("esp32", "--socket")])
+def test_an_emulator_that_never_gets_to_serve_leaves_no_device(capsys, monkeypatch, kind):
+    Path("t.yaml").write_text("of another robot")
+    code, _, err = run(capsys, "emulate", *kind, "s", "--truth", "t.yaml")
+    assert code == 2 and "t.yaml exists" in err
+    assert list(Path().iterdir()) == [Path("t.yaml")]
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pupper_sysid.cli.terminal.out.print", interrupted)
+    code, _, err = run(capsys, "emulate", *kind, "s")
+    assert code == 1 and "Stopped." in err and list(Path().iterdir()) == [Path("t.yaml")]
+
+
+def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
+            "emulate", "feetech", "--walking",
+         "--link", "s", "--imu-socket", "i"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    said = "".join(process.stdout.readline() for _ in range(4))
+    try:
+        imu = Esp32Bus(tmp_path / "i")
+        samples: list = []
+        assert wait_until(lambda: bool(samples.append(imu.imu()) or samples[-1]))
+        imu.close()
+        np.testing.assert_allclose(samples[-1].acceleration_m_s2, [0, 0, 9.81], atol=0.15)
+    finally:
+        process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=10)
+    assert "IMU at i." in said and "monitor --bus feetech:s" in said and "Ctrl-C" in said
+    assert "sweep" not in said, "a sweep is for legs in free air"
+    assert "Traceback" not in err and not list(tmp_path.glob("[is]"))

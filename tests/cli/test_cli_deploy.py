@@ -1,0 +1,239 @@
+"""pupper-deploy and pupper-analyze as a user meets them, with the shipped policy."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy, pupper_eval, pupper_play
+from pupper_sysid.policies.deploy.walk_log import read_walk
+from pupper_sysid.sysid.recordings.recording import load
+from support.command_line import refused, run_program
+
+ROOT = Path(__file__).resolve().parents[2]
+POLICY = ROOT / "data/samples/policies/lstm"
+CALIBRATION = ROOT / "data/samples/calibrated.yaml"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def deploy(capsys, *arguments) -> dict:
+    code, out, err = run_program(
+        capsys,
+        pupper_deploy,
+        POLICY,
+        "--actuator",
+        CALIBRATION,
+        "--json",
+        *arguments,
+    )
+    assert code == 0, err
+    return json.loads(out)
+
+
+def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(capsys, here):
+    found = deploy(capsys, "--seconds", 6, "--name", "walk", "--command", 0.15, 0, 0)
+    assert found["stop_reason"] == "time is up" and found["fell"] is False
+    assert found["rate_hz"] == pytest.approx(50, rel=0.01) and found["deadline_misses"] == 0
+    assert found["mae_vx_m_s"] < 0.06 and found["mae_vy_m_s"] < 0.035
+    assert found["mae_yaw_rad_s"] < 0.15 and set(found["step_ms"]) == {"p50", "p99", "max"}
+    log = Path(found["log"])
+    code, out, _ = run_program(
+        capsys,
+        pupper_deploy,
+        POLICY,
+        "--replay",
+        log,
+        "--actuator",
+        CALIBRATION,
+    )
+    assert code == 0 and "300 ticks repeated" in out
+    assert len(read_walk(log).senses) == 300
+    # the servos' side of it is a recording like any other
+    recording = load(log.with_name("recording.csv"))
+    assert len(recording.joints) == 12 and recording.loop_period_s == pytest.approx(0.02, abs=1e-3)
+
+
+def test_a_script_is_followed(capsys, here):
+    Path("s.csv").write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0.1,0,0\n0.5,0,0,0\n")
+    found = deploy(capsys, "--script", "s.csv", "--name", "walk")
+    assert found["stop_reason"] == "told to stop"
+    assert found["seconds"] == pytest.approx(1.5, abs=0.05)
+
+
+def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
+    code, _, err = run_program(
+        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 1,
+        "--name", "slow",
+    )  # fmt: skip
+    assert code == 0 and "0.50 times as fast" in err
+
+
+def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(capsys, here):
+    code, _, err = run_program(
+        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--observer",
+        "published-pd", "--seconds", 1, "--name", "paper",
+    )  # fmt: skip
+    assert code == 0 and "warning" in err and "Hz" in err
+    # a row per kind of joint and whole hertz, rounded; the published resonance is in it
+    assert "hip 3.00 2.80 0.98 -276.31" in err and err.count("thigh ") == 6
+
+
+@pytest.fixture
+def late(here) -> Path:
+    """The calibration of a robot whose servos answer 60 ms later."""
+    found = yaml.safe_load(CALIBRATION.read_text())
+    for joint in found["joints"].values():
+        for end in ("value", "low", "high"):
+            joint["actuator"]["delay_s"][end] += 0.06
+        for end in ("delay_steps_min", "delay_steps_max"):
+            joint["actuator"][end] += 30
+    Path("late.yaml").write_text(yaml.safe_dump(found))
+    return Path("late.yaml")
+
+
+@pytest.mark.parametrize("stack", ["closed-loop", "mlp-observer"])
+def test_a_robot_unlike_the_one_of_the_training_is_told_before_the_start(capsys, late, stack):
+    code, _, err = run_program(
+        capsys, pupper_deploy, POLICY, "--actuator", late, "--stack", stack, "--seconds", 0.1,
+        "--name", "late",
+    )  # fmt: skip
+    assert code == 0 and "60 ms later than the trained actuator" in err
+
+
+def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys, late):
+    alone = Path("alone")
+    shutil.copytree(POLICY, alone)
+    late.rename("calibrated.yaml")
+    run_file = alone / "run.yaml"
+    run_file.write_text(run_file.read_text().replace("data/samples/calibrated", "calibrated"))
+    code, _, err = run_program(
+        capsys, pupper_deploy, alone, "--stack", "mlp-observer", "--seconds", 0.1,
+        "--name", "swapped",
+    )  # fmt: skip
+    assert code == 0 and "calibrated.yaml is not the file with which alone was trained" in err
+    assert "was not checked" in err and "moves like the trained" not in err
+
+
+def test_the_shipped_policies_are_tried_from_any_folder(capsys, here):
+    code, _, err = run_program(capsys, pupper_deploy, POLICY, "--seconds", 0.1, "--name", "walk")
+    assert code == 0 and "warning" not in err and "the servos' own readings" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((), "No policy was named"),
+        (("nowhere",), "neither a run nor a policy"),
+        ((POLICY, "--actuator", "nowhere.yaml"), "no such file"),
+        ((POLICY, "--actuator", CALIBRATION, "--bus", "feetech:/dev/none"), "no IMU"),
+        ((POLICY, "--actuator", CALIBRATION, "--bus", "serial"), "--bus serial"),
+        ((POLICY, "--actuator", CALIBRATION, "--stack", "lstm-servo"), "--servo"),
+        ((POLICY, "--actuator", CALIBRATION, "--command", "9", "0", "0"), "--command"),
+        ((POLICY, "--actuator", CALIBRATION, "--lowpass-hz", "40"), "half the rate"),
+        ((POLICY, "--actuator", CALIBRATION, "--keyboard"), "terminal"),
+        ((POLICY, "--replay", "nowhere.csv"), "cannot be read"),
+        ((POLICY, "--seconds", "-1"), "--seconds"),
+        ((POLICY, "--seed", "-1"), "--seed is -1"),
+    ],
+)
+def test_bad_input_is_answered_in_a_sentence(capsys, here, arguments, says):
+    assert says in refused(capsys, pupper_deploy, *arguments)
+
+
+# ------------------------------------------------------------------------------ pupper-analyze
+
+
+def analyze(capsys, what, *arguments) -> dict:
+    code, out, err = run_program(
+        capsys, pupper_analyze, what, POLICY, "--actuator", CALIBRATION, "--json",
+        "--robots", 2, "--seconds", 8, *arguments,
+    )  # fmt: skip
+    assert code == 0, err
+    found = json.loads(out)
+    assert Path(found["picture"]).stat().st_size > 5_000
+    return found
+
+
+def test_the_gait_of_the_shipped_policy_is_a_trot(capsys, here):
+    gait = analyze(capsys, "gait")["gaits"]["lstm"]
+    assert gait["frequency_hz"][0] == pytest.approx(3.25, abs=0.15)
+    assert gait["diagonal"][0] > 0.6 and gait["rhythmic"] == 1.0
+
+
+def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
+    capsys, here, monkeypatch
+):
+    monkeypatch.setattr("pupper_sysid.policies.analysis.phase_reset._PUSHES", 1)
+    monkeypatch.setattr("pupper_sysid.policies.analysis.phase_reset.RATES_HZ", (50.0,))
+    found = analyze(capsys, "autonomy")["autonomy"]["lstm"]
+    rows = {r["test"]: r for r in found["frozen"]}
+    assert rows["nothing frozen"]["share"] == pytest.approx(1.0, abs=0.1)
+    assert rows["senses frozen, its own last action"]["share"] > 0.5
+    assert rows["senses and last action frozen"]["share"] < 0.2
+
+
+def test_orbits_close(capsys, here):
+    orbits = analyze(capsys, "attractor")["orbits"]["lstm"]
+    assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
+
+
+@pytest.mark.parametrize("what", ["terrain", "compliance"])
+def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what):
+    rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
+    assert len(rows) == 6 and all(0 <= r["survival"] <= 1 for r in rows)
+
+
+def test_two_policies_of_one_name_are_not_merged(capsys, here):
+    run = here / "runs/A"
+    for name in ("policy_best", "policy_last"):
+        shutil.copytree(POLICY, run / name)
+    both = (run / "policy_best", run / "policy_last")
+    said = refused(capsys, pupper_analyze, "gait", *both, "--actuator", CALIBRATION)
+    assert "Two policies are called A" in said
+
+
+def test_a_walk_too_short_for_a_gait_or_an_orbit_is_told_so(capsys, here):
+    for what, says in (("gait", "No robot walked for 7 s"), ("attractor", "there is no orbit")):
+        arguments = (what, POLICY, "--robots", 1, "--seconds", 3)
+        assert says in refused(capsys, pupper_analyze, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("module", "program"),
+    [(pupper_deploy, "deploy"), (pupper_analyze, "analyze"), (pupper_eval, "eval"),
+     (pupper_play, "play")],
+)  # fmt: skip
+def test_help_shows_an_example(capsys, module, program):
+    code, out, _ = run_program(capsys, module, "--help")
+    assert code == 0 and f"Example: pupper-{program} " in " ".join(out.split())
+
+
+def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):
+    assert "one recording or policy" in refused(
+        capsys,
+        pupper_analyze,
+        "servo",
+        POLICY,
+        POLICY,
+        "--actuator",
+        CALIBRATION,
+    )
+
+
+def test_pictures_are_not_written_over(capsys, here):
+    analyze(capsys, "gait")
+    again = refused(capsys, pupper_analyze, "gait", POLICY, "--actuator", CALIBRATION)
+    assert "exists already" in again
+
+
+def test_an_analysis_of_nothing_is_refused(capsys, here):
+    assert "nowhere" in refused(capsys, pupper_analyze, "gait", "nowhere")

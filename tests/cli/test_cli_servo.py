@@ -1,0 +1,193 @@
+"""`fit-servo`, `compare` and what they answer to data and files that cannot be used."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.servo_fit import networks
+from pupper_sysid.sysid.servo_fit.training import Recipe
+from support.command_line import run
+
+SAMPLE = Path(__file__).parents[2] / "data" / "samples"
+REAL = Path(os.environ.get("PUPPER_REAL_DATA", Path(__file__).parents[3] / "shared" / "real"))
+PLAYBACK = REAL / "playback_lstm_25hz.csv"
+
+needs_real = pytest.mark.skipif(not PLAYBACK.exists(), reason="the real recordings are not here")
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Networks small and briefly trained: what is tested is not how good they are."""
+    small = Recipe(4, 2, (0.3, 3.0), 40, 1e-2, 20, 2)
+    monkeypatch.setattr(networks, "MLP", small)
+    monkeypatch.setattr(networks, "LSTM", small)
+
+
+def playback(path: str, loops: int = 3, rows: int = 60, step_s: float = 0.04, still=False) -> str:
+    """A 25 Hz log of one joint that follows its command two ticks late."""
+    t = step_s * np.arange(loops * rows)
+    wave = 0.2 * np.sin(2 * np.pi * 0.9 * t) + 0.1 * np.sin(2 * np.pi * 2.3 * t + 1)
+    command = np.zeros_like(t) if still else wave
+    noise = np.random.default_rng(0).normal(0, 0.003, len(t))
+    position = np.concatenate([[0.0, 0.0], command[:-2]]) + noise
+    pd.DataFrame(
+        {
+            "time_s": t, "loop": np.repeat(np.arange(loops), rows),
+            "LF_hip_command_rad": command, "LF_hip_position_rad": position,
+        }
+    ).to_csv(path, index=False)  # fmt: skip
+    return path
+
+
+@needs_real
+def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys):
+    code, out, err = run(
+        capsys, "fit-servo", PLAYBACK, "--train-loops", "0,1", "--test-loops", "2", "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    found = json.loads(out)
+    mean, joints = found["mean"], found["joints"]
+    assert mean["rmse_free_run_rad"] <= 0.0275 and len(joints) == 12
+    assert max(j["rmse_free_run_rad"] for j in joints.values()) <= 0.037
+    assert mean["delayed_pd_rmse_rad"] <= 0.040
+    # two facts of the recording that need no model
+    assert mean["repeatability_rad"] == pytest.approx(0.0227, abs=1e-4)
+    assert mean["persistence_rmse_rad"] == pytest.approx(0.0594, abs=1e-3)
+    low, high = mean["rmse_free_run_interval_rad"]
+    assert low < mean["rmse_free_run_rad"] < high
+    assert "better than the linear model" in found["verdict"]
+    saved = load_servo_model(Path("servo"))
+    assert saved.contract.recordings[0].name == "playback_lstm_25hz"
+    assert saved.contract.inputs[0] == "command_rad[t]" and not saved.contract.feedback
+
+
+@needs_real
+def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys):
+    code, out, err = run(
+        capsys, "fit-servo", *sorted(REAL.glob("real_motor*.csv")), "--train-before", "2",
+        "--test-after", "2", "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    mean = json.loads(out)["mean"]
+    assert mean["rmse_free_run_rad"] <= 0.0155 and mean["rmse_held_rad"] <= 0.0175
+    # stale rows at their own time: the error that says nothing about the model
+    assert mean["rmse_raw_rad"] > 0.1
+
+
+@pytest.mark.parametrize("arch", ["fir", "mlp", "lstm", "delayed-pd"])
+def test_what_was_fitted_is_saved_and_compared_with_a_calibration(capsys, quick, arch):
+    sample = SAMPLE / "playback.csv"
+    code, _, err = run(capsys, "fit-servo", sample, "--arch", arch, "--joints", "LF_hip,LF_calf")
+    assert code == 0, err
+    code, out, err = run(
+        capsys, "compare", sample, "--joints", "LF_hip,LF_calf", "--json",
+        "--models", "servo", SAMPLE / "calibrated.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    found = json.loads(out)
+    assert len(found["models"]) == 3 and Path("compare.png").exists()
+    assert "flatter" in err or "flatter" in " ".join(found["notes"])
+    own = next(iter(found["models"].values()))["mean"]
+    assert own["rmse_free_run_rad"] < 0.03  # the emulated robot's noise is 8 to 14 mrad
+
+
+def test_a_second_model_takes_a_free_name_and_an_old_one_is_never_replaced(capsys, quick):
+    log = playback("log.csv")
+    for _ in range(2):
+        assert run(capsys, "fit-servo", log, "--arch", "fir")[0] == 0
+    assert Path("servo/contract.json").exists() and Path("servo-2/contract.json").exists()
+    code, _, err = run(capsys, "fit-servo", log, "--arch", "fir", "--out", "servo")
+    assert code == 2 and "--force" in err
+
+
+def test_a_fit_repeats_under_its_seed_and_sees_nothing_of_the_test_loop(capsys, quick):
+    log = playback("log.csv")
+    split = ("--train-loops", "0,1", "--test-loops", "2", "--arch", "mlp", "--json")
+    run(capsys, "fit-servo", log, *split, "--out", "a")
+    run(capsys, "fit-servo", log, *split, "--out", "b")
+    table = pd.read_csv(log)
+    table.loc[table["loop"] == 2, "LF_hip_position_rad"] += 0.5
+    table.to_csv("other.csv", index=False)
+    run(capsys, "fit-servo", "other.csv", *split, "--out", "c")
+    a, b, c = (load_servo_model(Path(name)).parameters for name in "abc")
+    for name in a:
+        assert np.array_equal(a[name], b[name]) and np.array_equal(a[name], c[name])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--train-loops", "0,1"), "go together"),
+        (("--train-loops", "0,1", "--test-loops", "1"), "Loop 1 is in"),
+        (("--train-loops", "zero", "--test-loops", "1"), "'zero'"),
+        (("--train-loops", "0", "--test-loops", "7"), "nothing to test on"),
+        (("--train-before", "2", "--test-after", "1"), "before testing begins"),
+        (("--train-before", "1", "--test-after", "1", "--leave-one-frequency-out"), "one way"),
+        (("--train-before", "0.2", "--test-after", "1", "--train-loops", "0"), "one way"),
+        (("--preset", "paper", "--arch", "fir"), "no published fir"),
+    ],
+)
+def test_a_split_that_makes_no_sense_is_answered_in_a_sentence(capsys, arguments, said):
+    code, _, err = run(capsys, "fit-servo", playback("log.csv"), *arguments)
+    assert code == 2 and said in err
+
+
+def test_data_that_cannot_teach_is_answered_in_a_sentence(capsys, quick):
+    code, _, err = run(capsys, "fit-servo", playback("still.csv", still=True))
+    assert code == 2 and "commands hardly change" in err
+    code, _, err = run(capsys, "fit-servo", playback("short.csv", loops=1, rows=30),
+                       "--train-before", "0.3", "--test-after", "0.5")  # fmt: skip
+    assert code == 2 and "readings to learn from" in err
+    slow = playback("slow.csv", step_s=0.08)
+    code, _, err = run(capsys, "fit-servo", playback("log.csv"), slow)
+    assert code == 2 and "different rates" in err
+    code, _, err = run(capsys, "fit-servo", playback("one.csv", loops=1, rows=200), "--arch", "fir")
+    assert code == 0 and "one group to learn from" in err
+
+
+def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(capsys, quick):
+    assert run(capsys, "fit-servo", playback("log.csv"), "--arch", "fir")[0] == 0
+    slow = playback("slow.csv", step_s=0.08)
+    code, _, err = run(capsys, "compare", slow, "--models", "servo")
+    assert code == 2 and "every 40.0 ms" in err and "fit-servo" in err
+    code, _, err = run(capsys, "compare", SAMPLE / "playback.csv", "--models", "servo")
+    assert code == 2
+    code, _, err = run(capsys, "compare", "log.csv", "--models", "log.csv")
+    assert code == 2 and "neither a servo model" in err
+    code, _, err = run(capsys, "compare", "log.csv")
+    assert code == 2 and "--models" in err
+
+
+def cut_sweep(path: Path, trial: int, rows: int) -> Path:
+    """The sample sweep as it is if it was interrupted so many rows into a trial."""
+    lines = (SAMPLE / "sweep.csv").read_text().splitlines()
+    first = next(n for n, line in enumerate(lines) if f",{trial},LF_" in line)
+    path.write_text("\n".join([*lines[: first + rows], ""]))
+    return path
+
+
+def test_a_sweep_that_was_interrupted_is_used_up_to_there(capsys, tmp_path):
+    tones = {int(n) for n in load(SAMPLE / "sweep.csv").table.query("joint == 'LF_hip'")["trial"]}
+    torn = cut_sweep(tmp_path / "torn.csv", max(tones), 8)
+    code, _, err = run(capsys, "fit-servo", torn, "--arch", "fir")
+    assert code == 0, err
+    assert load_servo_model(tmp_path / "servo").contract.split == "each group left out in turn"
+    # of the next joint there is one tone: nothing to test on
+    torn = cut_sweep(tmp_path / "later.csv", max(tones) + 2, 1)
+    code, _, err = run(capsys, "fit-servo", torn, "--arch", "fir")
+    assert code == 2 and "LF_thigh" in err and "--joints" in err
+    code, _, err = run(capsys, "delay", torn)
+    assert code == 0, err

@@ -1,0 +1,368 @@
+"""pupper-train, pupper-play and pupper-eval as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
+from pupper_sysid.policies.train.learner import read_checkpoint
+from pupper_sysid.policies.train.run_file import load_run, plain, preset
+from support.browser import looks_right
+from support.command_line import refused
+from support.command_line import run_program as run
+from support.tiny_training import CALIBRATION
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = (
+    "--actuator", CALIBRATION, "--environments", "4", "--threads", "1", "--iterations", "2",
+    "--imitation.iterations", "2", "--imitation.epochs", "1", "--task.episode-s", "0.5",
+    "--learner.steps-per-environment", "6", "--learner.minibatches", "2", "--learner.epochs", "1",
+    "--architecture.hidden", "16", "--architecture.critic-hidden", "16",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder in which `pupper-train --name tiny` ran to its end."""
+    folder = tmp_path_factory.mktemp("work")
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        pupper_train.main([*TINY, "--name", "tiny"])
+    finally:
+        os.chdir(before)
+    return folder / "runs" / "tiny"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# ------------------------------------------------------------------------------ pupper-train
+
+
+def test_training_leaves_a_run_with_settings_curves_checkpoint_and_policy(trained):
+    assert {p.name for p in trained.iterdir()} >= {
+        "run.yaml", "progress.csv", "imitation.csv", "tensorboard", "last.pt", "policy_last",
+    }  # fmt: skip
+    settings = load_run(trained)
+    assert settings.environments == 4 and settings.architecture.hidden == (16,)
+    assert settings.actuator == CALIBRATION
+    found = read_checkpoint(trained / "last.pt")
+    assert found["iteration"] == 2 and found["more"]["imitated"] == 2
+
+
+@pytest.mark.parametrize("name", ["fast", "paper", "release"])
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_all_settings_can_be_printed_and_are_those_of_the_preset(capsys, name, kind):
+    arguments = ("--print-config", "--preset", name, f"--policy={kind}", "--seed", "7")
+    code, out, err = run(capsys, pupper_train, *arguments)
+    assert (code, err) == (0, "")
+    assert yaml.safe_load(out) == plain(preset(name, kind)) | {"seed": 7}
+
+
+def test_printed_settings_are_not_wrapped_or_coloured(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    name = "a/very/long/path/[red]with/brackets/" * 4 + "calibrated.yaml"
+    _, out, _ = run(capsys, pupper_train, "--print-config", "--actuator", name)
+    assert yaml.safe_load(out)["actuator"] == name
+
+
+def test_a_calibration_that_is_not_there_is_refused_before_anything_is_made(capsys, here):
+    said = refused(capsys, pupper_train, "--actuator", "missing.yaml")
+    assert "missing.yaml: there is no such file" in said and "pupper-sysid calibrate" in said
+    assert not list(here.iterdir())
+
+
+def test_a_calibration_with_an_unknown_joint_is_refused_by_name(capsys, here):
+    text = Path(CALIBRATION).read_text().replace("LF_hip:", "LF_wing:")
+    (here / "wing.yaml").write_text(text)
+    said = refused(
+        capsys,
+        pupper_train,
+        "--actuator",
+        "wing.yaml",
+        "--environments",
+        "2",
+    )
+    assert "wing.yaml" in said and "LF_wing" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--policy", "perceptron"), "perceptron"), (("--policy=perceptron",), "perceptron"),
+        (("--policy",), "policy"), (("--preset", "quick"), "quick"),
+        (("--environment-count", "3"), "--environment-count"), (("--environments", "x"), "x"),
+    ],
+)  # fmt: skip
+def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here, arguments, word):
+    assert word in refused(capsys, pupper_train, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--environments", "0"), "at least 1 is needed"),
+        (("--learner.minibatches", "0"), "minibatches is 0"),
+        (("--architecture.hidden", "0"), "at least 1"),
+        (("--task.control-step-s", "0.003"), "whole multiple"),
+        (("--policy", "lstm", "--environments", "1"), "1 environments cannot be split"),
+        (("--threads", "-1"), "threads is -1; it must be 0 or more"),
+        (("--seed", "-1"), "seed is -1; it must be 0 or more"),
+        (("--imitation.minibatches", "0"), "imitation.minibatches is 0"),
+        (("--architecture.hidden", "--seed", "1"), "architecture.hidden is empty"),
+        (("--task.randomisation.friction", "1", "0.3"), "randomisation.friction is 1 to 0.3"),
+        (("--task.randomisation.friction", "-1", "0.3"), "from 0 on"),
+        (("--task.commands.yaw-rad-s", "0.5", "-0.5"), "commands.yaw_rad_s is 0.5 to -0.5"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(capsys, here, arguments, words):
+    assert words in refused(capsys, pupper_train, *TINY, *arguments)
+
+
+def test_a_run_is_not_begun_in_the_folder_of_another(capsys, trained, monkeypatch):
+    monkeypatch.chdir(trained.parents[1])
+    before = (trained / "last.pt").read_bytes()
+    said = refused(capsys, pupper_train, *TINY, "--name", "tiny")
+    assert "holds a run already" in said and "--resume" in said
+    assert (trained / "last.pt").read_bytes() == before
+
+
+def test_an_empty_folder_or_none_cannot_be_resumed(capsys, here):
+    (here / "empty").mkdir()
+    said = refused(capsys, pupper_train, "--resume", "empty")
+    assert "empty holds no run: there is no run.yaml in it" in said
+    assert "does not exist" in refused(capsys, pupper_train, "--resume", "nowhere")
+
+
+def test_a_finished_run_can_be_resumed_and_stays_as_it_is(capsys, trained):
+    code, _, err = run(capsys, pupper_train, "--resume", trained)
+    assert code == 0 and f"Going on with {trained}".replace(" ", "") in err.replace(" ", "")
+    assert read_checkpoint(trained / "last.pt")["iteration"] == 2
+
+
+def test_ctrl_c_saves_and_ends_well(tmp_path):
+    """A real process, a real signal: exit 0, a checkpoint, and the way to go on."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_train",
+            *TINY, "--iterations", "100000",
+         "--name", "stopped"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        said = []
+        for line in process.stderr:
+            said.append(line)
+            if "PPO 1/" in line:
+                break
+        process.send_signal(signal.SIGINT)
+        _, rest = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    whole = "".join(said) + rest
+    assert process.returncode == 0 and "Traceback" not in whole, whole
+    assert "pupper-train --resume" in " ".join(whole.split())
+    folder = tmp_path / "runs" / "stopped"
+    assert 1 <= read_checkpoint(folder / "last.pt")["iteration"] < 100000
+    assert (folder / "policy_last" / "contract.json").is_file()
+
+
+# ------------------------------------------------------------------------------ pupper-eval
+
+
+def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
+    code, out, _ = run(
+        capsys, pupper_eval, trained, "--json", "--episodes", "5", "--threads", "1",
+        "--terrain", "flat", "--extra-delay-ms", "0", "20",
+    )  # fmt: skip
+    assert code == 0
+    found = json.loads(out)
+    errors = {"fall_rate", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s"}
+    assert found.keys() >= errors | {"episodes", "actuator", "feedback", "by_command"}
+    assert found["episodes"] == 5
+    assert found["actuator"] == CALIBRATION and found["feedback"] == "held"
+    for row in found["by_command"]:
+        assert row.keys() >= errors | {"command"} and len(row["command"]) == 3
+    for row in (found, *found["by_command"]):
+        assert 0 <= row["fall_rate"] <= 1 and row["mae_vx_m_s"] > 0
+    assert [r["extra_delay_ms"] for r in found["by_extra_delay"]] == [0, 20]
+    assert [r["terrain"] for r in found["by_terrain"]] == ["flat"]
+    # the row without extra delay on flat ground is the same walk as that ground's
+    late, ground = found["by_extra_delay"][0], found["by_terrain"][0]
+    assert late["mae_vx_m_s"] == ground["mae_vx_m_s"] != found["by_extra_delay"][1]["mae_vx_m_s"]
+
+
+def test_an_evaluation_elsewhere_says_where(capsys, trained):
+    code, out, _ = run(
+        capsys, pupper_eval, trained / "policy_last", "--json", "--episodes", "1",
+        "--actuator", "ideal", "--feedback", "ideal", "--terrain", "flat", "--extra-delay-ms", "0",
+        "--threads", "1",
+    )  # fmt: skip
+    found = json.loads(out)
+    assert code == 0 and (found["actuator"], found["feedback"]) == ("ideal", "ideal")
+
+
+def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
+    arguments = (
+        trained, "--episodes", "1", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+        "--report", tmp_path / "report",
+    )  # fmt: skip
+    code, out, err = run(capsys, pupper_eval, *arguments)
+    assert code == 0, err
+    page = tmp_path / "report" / "walking.html"
+    text = page.read_text()
+    for name in ("random commands", "forward", "turn right", "ground: flat"):
+        assert name in out and name in text
+    assert "a robot that stands" in out and "How it was trained" in text
+    assert "learner.epochs" in text and CALIBRATION in text
+    assert (tmp_path / "report" / "figures" / "training.png").stat().st_size > 2000
+    if shutil.which("chromium"):
+        looks_right(page, tmp_path, 375, dark=True)
+    assert "walking.html exists already" in refused(capsys, pupper_eval, *arguments)
+
+
+@pytest.mark.parametrize("extra", ["-40", "nan"])
+def test_servos_cannot_be_made_quicker_than_they_are(capsys, trained, extra):
+    said = refused(capsys, pupper_eval, trained, "--extra-delay-ms", "0", extra)
+    assert f"--extra-delay-ms is {extra}" in said
+
+
+def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
+    capsys, trained, tmp_path
+):
+    alone = tmp_path / "alone"
+    shutil.copytree(trained / "policy_last", alone)
+    contract = alone / "contract.json"
+    contract.write_text(contract.read_text().replace('"feedback": "held"', '"feedback": "ideal"'))
+    code, out, _ = run(
+        capsys, pupper_eval, alone, "--json", "--episodes", "1", "--actuator", CALIBRATION,
+        "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+    )  # fmt: skip
+    assert code == 0 and json.loads(out)["feedback"] == "ideal"
+
+
+def test_no_episodes_are_refused(capsys, trained):
+    said = refused(capsys, pupper_eval, trained, "--episodes", "0")
+    assert "--episodes is 0; it must be at least 1" in said
+
+
+@pytest.mark.parametrize("module", [pupper_eval, pupper_play])
+def test_a_folder_without_a_policy_is_refused(capsys, here, module):
+    assert "neither a run nor a policy" in refused(capsys, module, here)
+    (here / "run.yaml").write_text("")
+    assert "has no policy yet" in refused(capsys, module, here)
+
+
+@pytest.mark.parametrize("module", [pupper_eval, pupper_play])
+def test_an_actuator_that_is_not_there_is_refused(capsys, trained, module):
+    assert "no such file" in refused(capsys, module, trained, "--actuator", "missing.yaml")
+
+
+# ------------------------------------------------------------------------------ pupper-play
+
+
+def test_a_walk_is_told_in_numbers(capsys, trained):
+    arguments = ("--seconds", "0.2", "--command", "0.1", "0", "0.3")
+    code, out, _ = run(capsys, pupper_play, trained, *arguments)
+    assert code == 0
+    assert "asked 0.10 m/s forward, 0.00 m/s left, 0.30 rad/s" in " ".join(out.split())
+
+
+def test_a_fall_is_told_with_its_time(capsys, trained, monkeypatch):
+    """Folding all legs, the trunk falls 9 cm: within 0.5 s, not at once."""
+    import numpy as np
+
+    from pupper_sysid.policies.network.policy_file import Policy
+
+    monkeypatch.setattr(Policy, "act", lambda *_: np.array([[0.0, 4.0, -4.0] * 4]))
+    code, out, _ = run(capsys, pupper_play, trained, "--seconds", "2")
+    assert code == 0
+    time = float(out.split("Fell after ")[1].split(" s.")[0])
+    assert 0.02 < time < 0.6
+
+
+def test_where_nothing_can_be_drawn_the_walk_goes_on_without_a_video(
+    capsys, trained, here, monkeypatch
+):
+    import mujoco
+
+    def no_gl(*_, **__):
+        raise RuntimeError("no EGL display")
+
+    monkeypatch.setattr(mujoco, "Renderer", no_gl)
+    arguments = ("--seconds", "0.2", "--video", here / "walk.mp4")
+    code, out, err = run(capsys, pupper_play, trained, *arguments)
+    assert code == 0 and "asked 0.15 m/s" in out
+    assert "No frames can be drawn here (RuntimeError: no EGL display)" in err
+    assert not (here / "walk.mp4").exists()
+
+
+def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, here, monkeypatch):
+    import mujoco
+
+    imageio = pytest.importorskip("imageio.v2")
+
+    class Screen:
+        def __init__(self, *_): ...
+        def update_scene(self, *_, **__): ...
+        def render(self): ...
+
+    told = {}
+
+    class Film:
+        def __init__(self, path, **how):
+            told.update(how)
+
+        def append_data(self, picture):
+            told["pictures"] = told.get("pictures", 0) + 1
+
+        def close(self): ...
+
+    settings = trained / "run.yaml"
+    slow = settings.read_text().replace("control_step_s: 0.02", "control_step_s: 0.04")
+    shutil.copytree(trained, here / "slow")
+    (here / "slow/run.yaml").write_text(slow)
+    monkeypatch.setattr(mujoco, "Renderer", Screen)
+    monkeypatch.setattr(imageio, "get_writer", Film)
+    arguments = ("--seconds", "0.4", "--video", here / "walk.mp4")
+    code, _, err = run(capsys, pupper_play, here / "slow", *arguments)
+    assert code == 0, err
+    assert told["fps"] == pytest.approx(25) and told["pictures"] == 10
+
+
+def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):
+    import mujoco.viewer
+
+    def no_display(*_, **__):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", no_display)
+    said = refused(capsys, pupper_play, trained, "--viewer")
+    assert "No window could be opened (no display)" in said and "--video" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--seconds", "0"), "--seconds is 0.0; it must be a positive number"),
+        (("--seconds", "nan"), "must be a positive number"),
+        (("--video", "walk.gif"), "ends in .mp4"),
+        (("--video", "there.mp4"), "exists already"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(capsys, trained, here, arguments, words):
+    (here / "there.mp4").write_text("kept")
+    assert words in refused(capsys, pupper_play, trained, *arguments)
+    assert (here / "there.mp4").read_text() == "kept"

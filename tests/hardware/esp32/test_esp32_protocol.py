@@ -1,0 +1,458 @@
+"""The robot's proxy: layouts of its datagrams, its emulator's quirks, and a bus that bears both."""
+
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.esp32 import bus as esp32_bus
+from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.joint_map import joint_map_from, load_joint_map
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.faults import BusFaults
+from support.servo_servers import ScriptedProxy, StillBench, bench_of, on_a_socket, wait_until
+
+IDS = [4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
+"""Servo ids in the order of the joints (facts/hardware.md D1)."""
+
+
+@pytest.fixture
+def path() -> Iterator[Path]:
+    # a socket's path must be short
+    with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
+        yield Path(folder) / "s"
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """The proxy shares this process and a busy machine; tests of time do without."""
+    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)
+
+
+def still_proxy() -> ProxyEmulator:
+    return ProxyEmulator(StillBench("mini_pupper_2"), np.random.default_rng(0))
+
+
+def counts_reply(counts) -> bytes:
+    return bytes([26, 2]) + b"".join(int(c).to_bytes(2, "little") for c in counts)
+
+
+def setpoint(torque: list[int], counts: list[int]) -> bytes:
+    return bytes([38, 1, *torque]) + b"".join(c.to_bytes(2, "little") for c in counts)
+
+
+def answers(request: bytes) -> bytes:
+    """A proxy whose servos stand at 501 to 512."""
+    return {
+        1: b"\x02\x01",
+        2: counts_reply(range(501, 513)),
+        3: bytes([26, 3]) + b"\x0a\x00" * 12,
+        5: bytes.fromhex("0a 05 00 00 ec 40 00 00 00 3f"),
+    }[request[1]]
+
+
+# ---- layouts ----
+
+
+def test_a_setpoint_is_38_bytes_torque_then_little_endian_counts_by_id():
+    on = np.array([True, False] * 6)
+    packed = datagrams.set_position(on, np.arange(12) + 256)
+    assert packed[:2].hex() == "2601" and len(packed) == 38
+    assert packed[2:14] == bytes([1, 0] * 6)
+    assert packed[14:].hex() == "".join(f"{k:02x}01" for k in range(12))
+
+
+def test_the_other_requests_are_two_bytes():
+    assert [datagrams.request(op).hex() for op in (2, 3, 4, 5)] == ["0202", "0203", "0204", "0205"]
+
+
+def test_replies_have_26_26_and_10_bytes_and_are_little_endian():
+    counts = datagrams.parse_counts(bytes.fromhex("1a02" + "0102" * 12))
+    assert counts is not None and counts.tolist() == [0x0201] * 12
+    load = datagrams.parse_load(bytes.fromhex("1a03" + "18fc" * 6 + "e803" * 6))
+    assert load is not None and load.tolist() == [-1.0] * 6 + [1.0] * 6
+    # 7.375 and 0.5 as IEEE 754 single, low byte first
+    power = datagrams.parse_power(bytes.fromhex("0a05" + "0000ec40" + "0000003f"))
+    assert power == datagrams.Power(7.375, 0.5)
+
+
+@pytest.mark.parametrize("wrong", ["", "1a", "1a02", "1a03" + "0102" * 12, "1b02" + "0102" * 12,
+                                   "1a02" + "0102" * 11, "1a02" + "0102" * 12 + "00"])  # fmt: skip
+def test_a_reply_of_another_size_or_kind_is_none(wrong):
+    assert datagrams.parse_counts(bytes.fromhex(wrong)) is None
+
+
+def test_zeros_and_counts_beyond_1023_are_missing():
+    given = [0, 1, 512, 1023, 1024, 65_535, 0, 0, 2, 3, 4, 5]
+    counts = datagrams.parse_counts(counts_reply(given))
+    assert counts is not None
+    assert counts.tolist() == [-1, 1, 512, 1023, -1, -1, -1, -1, 2, 3, 4, 5]
+
+
+def test_an_impossible_load_is_missing():
+    words = b"".join(x.to_bytes(2, "little", signed=True) for x in [1000, -1000, 1031, -32_768] * 3)
+    load = datagrams.parse_load(bytes([26, 3]) + words)
+    assert load is not None
+    assert load[:2].tolist() == [1.0, -1.0] and np.isnan(load[2:4]).all()
+
+
+@pytest.mark.parametrize("volts", ["0000c07f", "0000807f", "00003041", "000080bf"])
+def test_a_voltage_that_is_none_or_beyond_the_divider_is_missing(volts):
+    # NaN, infinity, 11.0 (the largest that passes), -1
+    power = datagrams.parse_power(bytes.fromhex("0a05" + volts + "0000003f"))
+    assert (power is not None) == (volts == "00003041")
+
+
+@pytest.mark.parametrize("counts", [np.full(12, -1), np.full(12, 1024), np.full(11, 512)])
+def test_counts_that_do_not_fit_are_not_packed(counts):
+    with pytest.raises(ValueError, match="set_position"):
+        datagrams.set_position(np.ones(12, bool), counts)
+
+
+@pytest.mark.parametrize("count", [0, 99, 256 * 99 % 1024, 355, 1023])
+def test_the_byte_that_stores_a_calibration_is_never_packed(count):
+    tries = [np.full(12, value) for value in range(-1, 257)]
+    tries += [np.full(12, 99, kind) for kind in ("u1", "i8", "f4", "f8", "O")]
+    tries += [np.full(12, 99.0), np.full(12, np.nan), np.full(12, np.inf), np.ones(12, bool)]
+    tries += [np.array(["99"] * 12), np.eye(12, dtype=int)[0] * 99]
+    for on in tries:
+        packed = datagrams.set_position(on, np.full(12, count))
+        assert len(packed) == 38 and set(packed[2:14]) <= {0, 1}
+    assert datagrams.SAVE_CALIBRATION == 99
+
+
+# ---- the bus ----
+
+
+def test_goals_reach_the_servo_of_their_joint(path, patient):
+    proxy = still_proxy()
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        goal = np.array([0.0, 0.785, -1.57] * 4, float) + 0.01 * np.arange(12.0)
+        assert np.isfinite(bus.write(goal).time_s)
+        bus.close()
+    expected = np.rint(load_joint_map("mini_pupper_2").per_servo().to_counts(goal))
+    assert dict(bench_of(proxy).goals) == dict(zip(IDS, expected.astype(int).tolist(), strict=True))
+
+
+def test_readings_are_those_of_their_joint(path, patient):
+    with on_a_socket(ScriptedProxy(answers), path):
+        bus = Esp32Bus(path)
+        sample = bus.read()
+        bus.close()
+    assert sample.position_count.tolist() == [500 + i for i in IDS]
+    assert sample.load is not None and sample.load.tolist() == [0.01] * 12
+    assert sample.voltage_v is not None and sample.voltage_v.tolist() == [7.375] * 12
+    # a left hip turns against its counts, 550 / pi counts to the radian
+    assert sample.position_rad[0] == pytest.approx((512 - 504) * np.pi / 550)
+
+
+def test_before_the_first_feedback_everything_is_missing(path, patient):
+    def asleep(request: bytes) -> bytes:
+        return counts_reply([0] * 12) if request[1] == 2 else answers(request)
+
+    with on_a_socket(ScriptedProxy(asleep), path):
+        bus = Esp32Bus(path)
+        sample = bus.read()
+        bus.close()
+    assert np.isnan(sample.position_rad).all()
+    assert sample.position_count.tolist() == [-1] * 12
+
+
+def test_a_count_on_which_no_two_answers_agree_is_missing(path, patient):
+    third = iter(range(100, 10_000))
+
+    def torn(request: bytes) -> bytes:
+        counts = [*range(501, 512), next(third) % 900] if request[1] == 2 else []
+        return counts_reply(counts) if counts else answers(request)
+
+    with on_a_socket(ScriptedProxy(torn), path):
+        bus = Esp32Bus(path)
+        count = dict(zip(IDS, bus.read().position_count.tolist(), strict=True))
+        bus.close()
+    assert count == {i: 500 + i for i in range(1, 12)} | {12: -1}
+
+
+def test_no_write_or_torque_of_the_bus_sends_the_byte_that_stores_a_calibration(path, patient):
+    proxy = ScriptedProxy(answers)
+    rng = np.random.default_rng(3)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        for scale in (0.1, 1.0, 10.0, 99.0, 1e9):
+            bus.write(scale * rng.standard_normal(12))
+            bus.torque(bool(rng.random() < 0.5))
+        bus.close()
+    sent = [r for r in proxy.requests if r[1] == 1]
+    assert len(sent) >= 10
+    assert all(len(r) == 38 and set(r[2:14]) <= {0, 1} for r in sent)
+    words = np.array([np.frombuffer(r[14:], "<u2") for r in sent])
+    assert words.max() <= 1023
+
+
+@pytest.mark.parametrize("bad", [np.full(12, np.nan), np.full(12, -np.inf), np.zeros(3)])
+def test_goals_that_are_no_twelve_numbers_are_refused(path, bad, patient):
+    proxy = ScriptedProxy(answers)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        with pytest.raises(BusError, match="must be 12 finite angles"):
+            bus.write(bad)
+        bus.close()
+    assert all(r[1] != 1 for r in proxy.requests)
+
+
+def test_torque_on_holds_where_the_servos_are_and_off_lets_all_go(path, patient):
+    proxy = ScriptedProxy(answers)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        assert bus.torque(False) and bus.torque(True)
+        bus.close()
+    off, on = [r for r in proxy.requests if r[1] == 1][:2]
+    assert set(off[2:14]) == {0} and set(on[2:14]) == {1}
+    assert np.frombuffer(on[14:], "<u2").tolist() == list(range(501, 513))
+
+
+def test_an_unanswered_question_does_not_make_the_servos_jump_when_they_go_on(path, patient):
+    lost: list[bytes | None] = [None]
+
+    def answer(request: bytes) -> bytes | None:
+        return lost.pop() if request[1] == 2 and lost else answers(request)
+
+    proxy = ScriptedProxy(answer)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        assert bus.torque(True)
+        bus.close()
+    on = next(r for r in proxy.requests if r[1] == 1)
+    assert np.frombuffer(on[14:], "<u2").tolist() == list(range(501, 513))
+
+
+def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
+    def without_the_last(request: bytes) -> bytes:
+        return counts_reply([*range(501, 512), 0]) if request[1] == 2 else answers(request)
+
+    proxy = ScriptedProxy(without_the_last)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        assert not bus.torque(True)
+        bus.close()
+    assert all(r[1] != 1 for r in proxy.requests)
+
+
+def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
+    hung = False
+    proxy = ScriptedProxy(lambda request: None if hung else answers(request))
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        hung = True
+        took = []
+        for _ in range(5):
+            start = time.perf_counter()
+            sample = bus.read()
+            sent = bus.write(np.array([0.0, 0.785, -1.57] * 4))
+            took.append(time.perf_counter() - start)
+            assert np.isnan(sample.position_rad).all() and np.isnan(sent.time_s)
+        hung = False
+        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+        bus.close()
+    # position, load, supply, goals: one time-out each
+    assert np.median(took) < 4 * esp32_bus.TIMEOUT_S + 0.05
+
+
+def test_a_restart_of_the_server_is_survived(path):
+    with on_a_socket(ScriptedProxy(answers), path):
+        bus = Esp32Bus(path)
+        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+    assert np.isnan(bus.read().position_rad).all()
+    assert np.isnan(bus.write(np.array([0.0, 0.785, -1.57] * 4)).time_s)
+    with on_a_socket(ScriptedProxy(answers), path):
+        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+        assert wait_until(lambda: bool(np.isfinite(bus.write(np.zeros(12)).time_s)))
+    bus.close()
+    bus.close()
+    assert np.isnan(bus.read().position_rad).all()
+
+
+def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkeypatch):
+    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.05)
+
+    class Late(ScriptedProxy):
+        slow = False
+
+        def spoil(self, kind, reply):
+            return [(0.1, reply)] if self.slow else [(0.0, reply)]
+
+    proxy = Late(answers)
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        proxy.slow = True
+        assert np.isnan(bus.read().position_rad).all()
+        proxy.slow = False
+        time.sleep(0.15)
+        proxy.answers = lambda r: counts_reply([700] * 12) if r[1] == 2 else answers(r)
+        assert wait_until(lambda: bus.read().position_count.tolist() == [700] * 12)
+        bus.close()
+
+
+def test_a_second_owner_is_refused_until_the_first_lets_go(path, patient):
+    with on_a_socket(ScriptedProxy(answers), path):
+        bus = Esp32Bus(path)
+        with pytest.raises(BusError, match="another pupper-sysid is driving this robot"):
+            Esp32Bus(path)
+        bus.close()
+        Esp32Bus(path).close()
+
+
+@pytest.mark.parametrize("readable", [True, False])
+def test_a_lock_that_another_user_left_keeps_nobody_out_if_it_can_be_read(
+    path, monkeypatch, readable
+):
+    lock = path.with_name("s.lock")
+    lock.touch()
+    opened = os.open
+
+    def as_another_user(name, flags, *mode):
+        if not readable or flags & (os.O_RDWR | os.O_CREAT):
+            raise PermissionError(13, "Permission denied")
+        return opened(name, flags, *mode)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", as_another_user)
+        if readable:
+            os.close(esp32_bus._own(path))
+        else:
+            with pytest.raises(BusError, match=f"as its owner, or, .* `sudo rm {lock}`"):
+                esp32_bus._own(path)
+
+
+def test_a_missing_socket_gives_a_sentence_and_keeps_no_lock(path, patient):
+    for _ in range(2):
+        with pytest.raises(BusError, match="nobody answers there. On the robot, check"):
+            Esp32Bus(path)
+
+
+def test_a_map_of_raw_counts_of_another_encoder_or_of_fewer_servos_is_refused(path):
+    with pytest.raises(InputError, match="holds raw counts, and the proxy speaks calibrated ones"):
+        Esp32Bus(path, load_joint_map("mini_pupper_2_direct"))
+    data = load_joint_map("mini_pupper_2").file.model_dump(by_alias=True)
+    fine = load_joint_map("sts3215").file.model_dump(by_alias=True) | {"frame": "proxy"}
+    with pytest.raises(InputError, match="is for servos of 4096 counts; the proxy's have 1024"):
+        Esp32Bus(path, joint_map_from(fine, "mine"))
+    data["joints"]["RB_hip"]["id"] = 13
+    with pytest.raises(InputError, match="the proxy drives the servos 1 to 12 together"):
+        Esp32Bus(path, joint_map_from(data, "mine"))
+
+
+def test_the_emulator_refuses_a_path_where_a_proxy_lives_or_another_file_stands(path, tmp_path):
+    with on_a_socket(still_proxy(), path), pytest.raises(InputError, match="already running"):
+        ProxySocket(still_proxy(), path)
+    assert not path.exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="exists and is no socket"):
+        ProxySocket(still_proxy(), tmp_path / "file")
+
+
+# ---- quirks of the real proxy that the emulator has ----
+
+
+def connect(path: Path) -> socket.socket:
+    client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    client.settimeout(3.0)
+    client.connect(str(path))
+    return client
+
+
+@pytest.mark.parametrize("unknown", ["0209", "0303", "02", "26010101", "0b02" + "00" * 9])
+def test_an_unknown_request_is_answered_with_the_previous_reply(path, unknown):
+    with on_a_socket(still_proxy(), path), connect(path) as client:
+        client.send(bytes.fromhex("0205"))
+        power = client.recv(64)
+        client.send(bytes.fromhex(unknown))
+        assert client.recv(64) == power and len(power) == 10
+
+
+def test_an_unknown_first_request_is_answered_with_garbage():
+    assert len(still_proxy().answer(b"\x02\x09", b"", 1.0)) == 2
+
+
+def test_the_last_request_is_carried_out_once_more_when_a_client_leaves(path):
+    proxy = still_proxy()
+    goals = bench_of(proxy).goals
+    with on_a_socket(proxy, path):
+        with connect(path) as client:
+            client.send(setpoint([1] * 12, [500] * 12))
+            assert client.recv(64) == b"\x02\x01"
+            assert len(goals) == 12
+        assert wait_until(lambda: len(goals) == 24)
+    assert set(goals) == {(i, 500) for i in range(1, 13)}
+
+
+def test_torque_byte_1_drives_0_lets_go_and_others_leave_a_servo_alone():
+    proxy = still_proxy()
+    bench = bench_of(proxy)
+    reply = proxy.answer(setpoint([1, 0, 2, 255] * 3, [500] * 12), b"", 1.0)
+    assert reply == b"\x02\x01"
+    assert bench.goals == [(i, 500) for i in (1, 5, 9)]
+    assert sorted(bench.torques) == sorted(
+        [(i, True) for i in (1, 5, 9)] + [(i, False) for i in (2, 6, 10)]
+    )
+
+
+def test_a_count_beyond_the_encoder_is_clamped_by_the_firmware():
+    proxy = still_proxy()
+    proxy.answer(setpoint([1] * 12, [1024, 65_535] * 6), b"", 1.0)
+    assert {count for _, count in bench_of(proxy).goals} == {1023}
+
+
+def test_99_as_first_torque_byte_stores_a_calibration_and_makes_it_deaf_for_four_seconds():
+    proxy = still_proxy()
+    bench = bench_of(proxy)
+    # elsewhere than first it is just another byte that leaves a servo alone
+    proxy.answer(setpoint([2, *[99] * 11], [500] * 12), b"", 0.5)
+    assert bench.torques == [] and bench.goals == []
+    assert proxy.answer(setpoint([99] * 12, [500] * 12), b"", 1.0) == b"\x02\x01"
+    assert bench.torques == [(i, False) for i in range(1, 13)]
+    bench.torques.clear()
+    # it acknowledges all the same
+    assert proxy.answer(setpoint([1] * 12, [500] * 12), b"", 4.9) == b"\x02\x01"
+    assert bench.goals == [] and bench.torques == []
+    proxy.answer(setpoint([1] * 12, [500] * 12), b"", 5.1)
+    assert len(bench.goals) == 12
+
+
+def test_two_clients_share_one_block_and_the_last_writer_wins(path):
+    proxy = still_proxy()
+    with on_a_socket(proxy, path), connect(path) as one, connect(path) as other:
+        for client, count in ((one, 400), (other, 600)):
+            client.send(setpoint([1] * 12, [count] * 12))
+            assert client.recv(64) == b"\x02\x01"
+        assert bench_of(proxy).goals[-1] == (12, 600)
+
+
+def test_servos_come_limp_out_of_a_brown_out_and_then_get_the_last_order_as_the_proxy_resends_it():
+    proxy = still_proxy()
+    proxy.faults = BusFaults({"brown-out": 1.0}, np.random.default_rng(0))
+    bench = bench_of(proxy)
+    proxy.answer(setpoint([1] * 12, [500] * 12), b"", 0.5)
+    bench.goals.clear()
+    bench.torques.clear()
+    proxy.strike(1.0)
+    assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
+    # let go, asked for once, while nobody could hear it
+    assert proxy.answer(setpoint([0] * 12, [500] * 12), b"", 1.05) == b"\x02\x01"
+    bench.torques.clear()
+    proxy.resend(1.1)
+    assert bench.torques == []
+    proxy.resend(1.0 + proxy.faults.lasts_s)
+    assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
+    assert bench.goals == []
+    bench.torques.clear()
+    proxy.resend(2.0)
+    assert bench.torques == []

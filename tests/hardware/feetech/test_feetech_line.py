@@ -1,0 +1,545 @@
+"""Our line and bus have none of the SDK's faults (facts/hardware.md B5, one test per row)."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scservo_sdk
+import serial
+from scservo_sdk import scservo_def
+
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.feetech import line as feetech_line
+from pupper_sysid.hardware.feetech import scan
+from pupper_sysid.hardware.feetech.bus import FeetechBus, open_line
+from pupper_sysid.hardware.feetech.frames import Frame
+from pupper_sysid.hardware.feetech.line import FeetechLine
+from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from support.servo_servers import (
+    Scripted,
+    StillBench,
+    bench_of,
+    moving_servos,
+    on_a_port,
+    still_servos,
+    wait_until,
+)
+
+POSITION = 56
+PATIENT_S = 0.4
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """The servos share this process and a busy machine; tests of time put the true one back."""
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", PATIENT_S)
+
+
+def position(line: FeetechLine, servo: int, series=STS3215) -> int | None:
+    reply = line.read(servo, POSITION, 2)
+    return series.decode("position", reply.frame.data, POSITION) if reply else None
+
+
+def raw(servo: int, data: bytes, code: int = 0) -> bytes:
+    return Frame(servo, code, data).encode()
+
+
+# ---- one per row of table B5 ----
+
+
+def test_b5_1_both_series_in_one_process_are_read_right():
+    sts, scs = still_servos(STS3215), still_servos(SCS0009)
+    bench_of(sts).counts[1], bench_of(scs).counts[1] = 900, 900
+    before = scservo_def.SCS_GETEND()
+    try:
+        with on_a_port(sts) as little, on_a_port(scs) as big:
+            one, other = FeetechLine(little.device, 1_000_000), FeetechLine(big.device, 1_000_000)
+            for end in (0, 1):
+                scservo_sdk.PacketHandler(end)  # whatever others set in the SDK's global
+                assert position(one, 1, STS3215) == 900
+                assert position(other, 1, SCS0009) == 900
+            one.close()
+            other.close()
+    finally:
+        scservo_def.SCS_SETEND(before)
+
+
+def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
+    monkeypatch.undo()
+    assert feetech_line.REPLY_TIMEOUT_S == 0.003
+    with on_a_port(still_servos(ids=[1])) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        took = []
+        for _ in range(20):
+            start = time.perf_counter()
+            assert line.read(2, POSITION, 2) is None
+            took.append(time.perf_counter() - start)
+        line.close()
+    assert np.median(took) < 0.010
+
+
+def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
+    late = iter([0.2])
+
+    def answer(request: Frame) -> list[tuple[float, bytes]]:
+        delay = next(late, 0.0)
+        return [(delay, raw(1, STS3215.word(900 if delay else 123)))]
+
+    with on_a_port(Scripted(answer)) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        line.patience_s = 0.02
+        assert position(line, 1) is None
+        time.sleep(0.25)
+        line.patience_s = PATIENT_S
+        assert position(line, 1) == 123
+        line.close()
+
+
+def test_b5_3_a_late_reply_that_comes_during_the_next_read_has_another_length():
+    counts = iter([900, 123])
+
+    def answer(request: Frame) -> list[tuple[float, bytes]]:
+        return [(0.1, raw(1, STS3215.word(next(counts)) + bytes(request.data[1] - 2)))]
+
+    with on_a_port(Scripted(answer)) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        line.patience_s = 0.02
+        assert line.read(1, POSITION, 8) is None
+        line.patience_s = 0.5
+        reply = line.read(1, POSITION, 9)
+        assert reply and STS3215.decode("position", reply.frame.data, POSITION) == 123
+        line.close()
+
+
+def test_b5_3_successive_readings_of_the_bus_ask_for_different_lengths():
+    servos = still_servos(ids=[4])
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
+        servos.heard = b""
+        for _ in range(7):
+            bus.read()
+        bus.close()
+    requests = [servos.heard[k : k + 9] for k in range(0, len(servos.heard), 9)]
+    # a sync read of one id: FF FF FE LEN 82 address size id CHK
+    assert [r[6] for r in requests] == [6, 7, 8, 9, 10, 11, 6]
+
+
+@pytest.mark.parametrize("size", [0, 1, 3, 8])
+def test_b5_4_a_reply_of_another_length_is_no_answer(size):
+    with on_a_port(Scripted(lambda request: [(0.0, raw(1, bytes([1] * size)))])) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        assert line.read(1, POSITION, 2) is None
+        line.close()
+
+
+def test_b5_5_a_silent_servo_in_a_sync_read_is_missing_and_hides_nobody():
+    servos = still_servos(ids=[1, 2, 3])
+    with on_a_port(servos) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        assert set(line.sync_read([1, 2, 3], POSITION, 2)) == {1, 2, 3}
+        del servos.servos[1]
+        bench_of(servos).counts |= {2: 1111, 3: 2222}
+        replies = line.sync_read([1, 2, 3], POSITION, 2)
+        line.close()
+    counts = {i: STS3215.decode("position", r.frame.data, POSITION) for i, r in replies.items()}
+    assert counts == {2: 1111, 3: 2222}
+
+
+def test_b5_5_a_servo_that_falls_silent_has_no_reading_instead_of_its_last_one():
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        assert np.isfinite(bus.read().position_rad).all()
+        del servos.servos[5]
+        sample = bus.read()
+        bus.close()
+    silent = np.array([j == "LF_thigh" for j in bus.joint_names])
+    assert (
+        np.isnan(sample.position_rad[silent]).all() and (sample.position_count[silent] == -1).all()
+    )
+    assert np.isfinite(sample.position_rad[~silent]).all()
+
+
+def test_b5_6_after_an_error_in_the_port_the_next_calls_work(monkeypatch):
+    with on_a_port(still_servos()) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        first = line._port.ser
+
+        def fails(data):
+            raise serial.SerialException("write failed: unplugged")
+
+        monkeypatch.setattr(first, "write", fails)
+        assert line.read(1, POSITION, 2) is None
+        assert not line._port.is_using
+        assert wait_until(lambda: position(line, 1) == 2048)
+        assert line._port.ser is not first
+        line.close()
+
+
+def test_b5_6_an_adapter_that_was_pulled_and_plugged_in_again_is_found_again():
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        bus.line.patience_s = 0.01
+        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+        servos.unplug_for_s = 0.3
+        assert wait_until(lambda: bool(np.isnan(bus.read().position_rad).all()))
+        assert np.isnan(bus.write(np.array([0, 0.8, -0.8] * 4)).time_s)
+        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()), 5.0)
+        assert np.isfinite(bus.write(np.array([0, 0.8, -0.8] * 4)).time_s)
+        bus.close()
+
+
+def test_b5_7_uneven_sync_write_data_is_refused_and_the_line_goes_on_working():
+    with on_a_port(still_servos()) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        with pytest.raises(ValueError, match=r"1, 2\] bytes; all must be as long"):
+            line.sync_write(42, {1: b"\x00\x08", 2: b"\x08"})
+        assert position(line, 1) == 2048
+        line.close()
+
+
+@pytest.mark.parametrize("angle", [100.0, -100.0])
+def test_b5_8_goals_out_of_range_are_clamped_to_the_servos_limits(angle):
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        bus.write(np.full(12, angle))
+        assert wait_until(lambda: len(bench_of(servos).goals) == 12)
+        bus.close()
+    entries = load_joint_map("sts3215").file.joints.values()
+    limits = {e.id: (e.limits_counts[int(e.sign * angle > 0)]) for e in entries}
+    assert dict(bench_of(servos).goals) == limits
+
+
+@pytest.mark.parametrize("bad", [np.full(12, np.nan), np.full(12, np.inf), np.zeros(11)])
+def test_b5_8_goals_that_are_no_numbers_or_not_twelve_are_refused(bad):
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        with pytest.raises(BusError, match="must be 12 finite angles"):
+            bus.write(bad)
+        bus.close()
+    assert bench_of(servos).goals == []
+
+
+def test_b5_9_a_missing_port_gives_a_sentence(tmp_path):
+    with pytest.raises(BusError, match="nothing cannot be opened. There is no such device: check"):
+        FeetechLine(str(tmp_path / "nothing"), 1_000_000)
+
+
+def test_b5_9_only_the_asked_baud_rate_is_ever_used_and_closing_twice_is_fine():
+    servos = still_servos(baud=500_000)
+    with on_a_port(servos) as server:
+        line = FeetechLine(server.device, 500_000)
+        assert line.ping(1) is not None
+        line.close()
+        line.close()
+        assert line.ping(1) is None
+    assert servos.bauds == {500_000}
+
+
+def test_b5_9_a_baud_rate_the_sdk_refuses_gives_a_sentence(tmp_path):
+    with pytest.raises(BusError, match="76800 baud is not possible with this SDK. Use 1000000"):
+        FeetechLine(str(tmp_path / "nothing"), 76_800)
+
+
+@pytest.mark.parametrize("series", [STS3215, SCS0009])
+def test_b5_10_an_echoing_adapter_is_recognised_and_its_echo_is_no_answer(series):
+    servos = still_servos(series, ids=range(1, 13), echo=True)
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        assert bus.metadata["echo"] is True
+        for count in (500, 510):
+            bench_of(servos).counts = dict.fromkeys(range(1, 13), count)
+            assert bus.write(bus.read().position_rad).time_s > 0
+            assert bus.read().position_count.tolist() == [count] * 12
+        assert bus.line.ping(1) == Frame(1, 0, b"")
+        assert bus.line.ping(99) is None
+        bus.close()
+
+
+def test_b5_10_an_adapter_without_echo_is_not_taken_for_one():
+    with on_a_port(still_servos()) as server:
+        line, found = open_line(server.device, 1_000_000, [1])
+        assert found == {1: STS3215} and not line.echoes
+        line.close()
+
+
+def test_b5_11_an_error_byte_above_7f_is_read():
+    answer = raw(1, STS3215.word(123), code=0xA1)
+    with on_a_port(Scripted(lambda request: [(0.0, answer)])) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        reply = line.read(1, POSITION, 2)
+        line.close()
+    assert reply and reply.frame.code == 0xA1
+
+
+def test_b5_12_a_ping_is_one_question_of_six_bytes():
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        assert line.ping(3) == Frame(3, 0, b"")
+        line.close()
+    assert servos.heard == Frame(3, 1, b"").encode()
+
+
+def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.15)
+    monkeypatch.setattr(scan, "HIGHEST_ID", 8)
+    servos = still_servos(SCS0009, ids=[3, 7])
+    with on_a_port(servos) as server:
+        rate, reports = scan.scan_line(server.device, 1_000_000)
+    assert rate == 1_000_000
+    assert [(r.id, r.model, r.gains, r.limits) for r in reports] == [
+        (3, "SCS0009", (15, 15, 0), (20, 1003)),
+        (7, "SCS0009", (15, 15, 0), (20, 1003)),
+    ]
+
+
+def test_b5_13_waiting_does_not_keep_the_processor_busy():
+    with on_a_port(still_servos(ids=[1])) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        line.patience_s = 0.5
+        wall, cpu = time.perf_counter(), time.thread_time()
+        assert line.read(2, POSITION, 2) is None
+        wall, cpu = time.perf_counter() - wall, time.thread_time() - cpu
+        line.close()
+    assert wall > 0.45 and cpu < 0.3 * wall
+
+
+def test_b5_14_a_second_program_on_the_port_is_refused_with_a_sentence():
+    with on_a_port(still_servos()) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        with pytest.raises(BusError, match="Another program has it open; stop that first"):
+            FeetechLine(server.device, 1_000_000)
+        assert position(line, 1) == 2048
+        line.close()
+        again = FeetechLine(server.device, 1_000_000)
+        assert position(again, 1) == 2048
+        again.close()
+
+
+# ---- the line beyond the table ----
+
+
+def test_the_other_sdk_of_the_same_name_is_recognised(monkeypatch, tmp_path):
+    monkeypatch.delattr(scservo_sdk, "PacketHandler")
+    with pytest.raises(BusError, match="pip uninstall ftservo-python-sdk"):
+        FeetechLine(str(tmp_path / "nothing"), 1_000_000)
+
+
+def test_two_different_answers_of_one_servo_in_a_sync_read_are_none():
+    def answer(request: Frame) -> list[tuple[float, bytes]]:
+        return [(0.0, raw(1, b"\x01\x02") + raw(1, b"\x03\x04") + raw(2, b"\x05\x06"))]
+
+    with on_a_port(Scripted(answer)) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        replies = line.sync_read([1, 2], POSITION, 2)
+        line.close()
+    assert {i: r.frame.data for i, r in replies.items()} == {2: b"\x05\x06"}
+
+
+def test_an_answer_of_a_servo_that_was_not_asked_is_no_answer():
+    with on_a_port(Scripted(lambda request: [(0.0, raw(7, b"\x01\x02"))])) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        assert line.read(1, POSITION, 2) is None
+        line.close()
+
+
+def test_the_time_of_a_reply_lies_within_its_exchange():
+    with on_a_port(still_servos()) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        before = time.monotonic()
+        replies = line.sync_read([1, 2, 3], POSITION, 2)
+        after = time.monotonic()
+        line.close()
+    edges = [t for i in (1, 2, 3) for t in (replies[i].before_s, replies[i].after_s)]
+    assert before <= edges[0] and edges[-1] <= after + 1e-9 and edges == sorted(edges)
+
+
+def test_a_500000_baud_scs_line_is_found_without_naming_the_rate(monkeypatch):
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)
+    with on_a_port(still_servos(SCS0009, baud=500_000)) as server:
+        bus = FeetechBus(server.device)
+        assert bus.metadata["baud"] == 500_000
+        assert bus.metadata["servos"]["LF_hip"]["model"] == "SCS0009"
+        assert bus.metadata["joint_map"] == "mini_pupper_2_direct"
+        assert len(bus.joint_names) == 12
+        bus.close()
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate", "hears"),
+    [(57_600, 250_000, False), (57_600, 57_600, True), (250_000, 250_000, True)],
+)
+def test_emulated_servos_hear_a_rate_without_a_name_only_if_theirs_has_none(baud, rate, hears):
+    with on_a_port(still_servos(baud=baud)) as server:
+        line = FeetechLine(server.device, rate)
+        assert (line.ping(1) is not None) is hears
+        line.close()
+
+
+def test_nobody_on_the_line_gives_a_sentence(monkeypatch):
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.003)
+    with (
+        on_a_port(still_servos(ids=[])) as server,
+        pytest.raises(BusError, match="no servo answers at 1000000 baud .asked for ids 1 to 12."),
+    ):
+        FeetechBus(server.device, 1_000_000)
+
+
+def test_an_asked_joint_that_does_not_answer_is_named():
+    with (
+        on_a_port(still_servos(ids=[4])) as server,
+        pytest.raises(BusError, match="LF_thigh .id 5. does not answer"),
+    ):
+        FeetechBus(server.device, 1_000_000, joints=["LF_hip", "LF_thigh"])
+
+
+def test_a_servo_of_an_unknown_model_is_left_alone_with_a_sentence():
+    servos = still_servos()
+    servos.servos[2].memory[3:5] = bytes([0x39, 0x05])
+    with (
+        on_a_port(servos) as server,
+        pytest.raises(BusError, match="servo 2 says model number 1337, which is not known"),
+    ):
+        FeetechBus(server.device, 1_000_000)
+    assert bench_of(servos).goals == []
+
+
+def test_two_series_on_one_line_are_refused():
+    servos = still_servos()
+    servos.servos[2].memory[3:5] = bytes([5, 4])
+    with (
+        on_a_port(servos) as server,
+        pytest.raises(BusError, match="SCS0009, STS3215. share the line"),
+    ):
+        FeetechBus(server.device, 1_000_000)
+
+
+@pytest.mark.parametrize(
+    ("preset", "sentence"),
+    [
+        ("mini_pupper_2", "holds counts as the robot's proxy speaks them"),
+        ("mini_pupper_2_direct", "is for servos of 1024 counts; these STS3215 have 4096"),
+    ],
+)
+def test_a_joint_map_of_the_wrong_frame_or_counts_is_refused(preset, sentence):
+    with on_a_port(still_servos()) as server:
+        with pytest.raises(InputError, match=sentence):
+            FeetechBus(server.device, 1_000_000, load_joint_map(preset))
+        # and the port is free again
+        FeetechBus(server.device, 1_000_000).close()
+
+
+def test_a_map_may_give_a_servo_any_id():
+    servos = still_servos()
+    data = load_joint_map("sts3215").file.model_dump(by_alias=True)
+    data["joints"] = {"LF_hip": data["joints"]["LF_hip"] | {"id": 9}}
+    chosen: JointMap = joint_map_from(data, "mine")
+    bench_of(servos).counts[9] = 1948
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000, chosen)
+        sample = bus.read()
+        bus.close()
+    # the sign of a left hip is -1, and 4096 counts are a turn
+    assert sample.position_rad == pytest.approx([100 * 2 * np.pi / 4096])
+
+
+@pytest.mark.parametrize("series", [STS3215, SCS0009])
+def test_what_is_written_is_read_back_within_friction_and_rounding(series):
+    servos = moving_servos(series)
+    bench = servos.bench
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        start = bus.read().position_rad
+        goal = bus.limits.clip(start + 0.1)
+        sent = bus.write(goal)
+        assert np.isfinite(sent.time_s)
+        bus.sleep_until(sent.time_s + 0.7)
+        sample = bus.read()
+        bus.close()
+    assert isinstance(bench, ServoBench)
+    # dry friction holds a servo at most friction / stiffness off its goal
+    truth = [s.actuator for s in bench.robot.servos]
+    off = np.array([float(np.divide(t.friction_loss, t.stiffness)) for t in truth])
+    assert (np.abs(goal - start) > 0.05).all()
+    assert (np.abs(sample.position_rad - goal) <= off + 1.01 / bench.map.counts_per_rad()).all()
+    assert sample.voltage_v is not None and sample.voltage_v.tolist() == [7.4] * 12
+
+
+def test_torque_off_lets_all_go_and_on_holds_them_where_they_are():
+    servos = still_servos()
+    bench = bench_of(servos)
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        assert bus.torque(False)
+        assert dict(bench.torques) == dict.fromkeys(range(1, 13), False)
+        # somebody moves the robot while it is limp
+        bench.counts = {i: 2000 + i for i in range(1, 13)}
+        bench.torques.clear()
+        assert bus.torque(True)
+        bus.close()
+    assert dict(bench.goals) == bench.counts
+    assert dict(bench.torques) == dict.fromkeys(range(1, 13), True)
+
+
+def test_torque_says_so_when_one_servo_did_not_confirm():
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        bus.line.patience_s = 0.1
+        del servos.servos[5]
+        assert not bus.torque(False)
+        bus.close()
+    assert {i for i, _ in bench_of(servos).torques} == set(range(1, 13)) - {5}
+
+
+def test_the_goals_that_stand_in_the_servos_can_be_read():
+    servos = still_servos()
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000)
+        goal = bus.limits.clip(bus.read().position_rad + 0.05)
+        bus.write(goal)
+        stand = bus.goals()
+        bus.close()
+    assert np.abs(stand - goal).max() <= 0.5001 * 2 * np.pi / 4096
+
+
+def test_a_count_no_servo_can_have_reached_is_no_reading_unless_it_is_told_twice():
+    servos = still_servos(ids=[4])
+    bench: StillBench = bench_of(servos)
+    bench.counts[4] = 10
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
+        assert bus.read().position_count.tolist() == [10]
+        bench.counts[4] = 4090
+        counts = [int(bus.read().position_count[0]) for _ in range(2)]
+        bus.close()
+    # 4080 counts are 6.3 rad, and no servo turns them within the milliseconds between two reads
+    assert counts == [-1, 4090]
+
+
+def test_error_bits_come_with_the_reading():
+    servos = still_servos(ids=[4])
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
+        servos.servos[4].error, servos.servos[4].faulty_until = 33, np.inf
+        sample = bus.read()
+        bus.close()
+    assert sample.status is not None and sample.status.tolist() == [33]
+    assert np.isfinite(sample.position_rad).all()
+
+
+def test_the_emulated_port_can_be_opened_again_after_a_client_left():
+    with on_a_port(still_servos()) as server:
+        assert Path(server.device).exists()
+        for _ in range(3):
+            line = FeetechLine(server.device, 1_000_000)
+            assert line.ping(1) is not None
+            line.close()
+    assert not Path(server.device).exists()

@@ -1,0 +1,361 @@
+"""The vendor's SDK, the emulator and our frames agree on every byte of facts/hardware.md B1."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scservo_sdk
+from scservo_sdk import scservo_def
+
+from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
+from pupper_sysid.hardware.feetech.line import FeetechLine
+from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series, series_of_model_bytes
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from support.servo_servers import (
+    Listening,
+    bench_of,
+    moving_servos,
+    on_a_port,
+    still_servos,
+    wait_until,
+)
+
+GOLDEN = {
+    "ping 1": ("FF FF 01 02 01 FB", 1, 1, ""),
+    "ping answer 1": ("FF FF 01 02 00 FC", 1, 0, ""),
+    "read model 1": ("FF FF 01 04 02 03 02 F3", 1, 2, "03 02"),
+    "STS model answer": ("FF FF 01 04 00 09 03 EE", 1, 0, "09 03"),
+    "SCS model answer": ("FF FF 03 04 00 05 04 EF", 3, 0, "05 04"),
+    "read position 1": ("FF FF 01 04 02 38 02 BE", 1, 2, "38 02"),
+    "STS position answer": ("FF FF 01 04 00 05 08 ED", 1, 0, "05 08"),
+    "SCS position answer": ("FF FF 03 04 00 01 F6 01", 3, 0, "01 F6"),
+    "firmware read 3": ("FF FF 03 04 02 38 06 B8", 3, 2, "38 06"),
+    "firmware answer 3": ("FF FF 03 08 00 01 F6 80 14 04 37 2E", 3, 0, "01 F6 80 14 04 37"),
+    "write goal 1": ("FF FF 01 05 03 2A 00 08 C4", 1, 3, "2A 00 08"),
+    "STS sync write": (
+        "FF FF FE 0A 83 2A 02 01 00 08 02 23 01 19", 254, 0x83, "2A 02 01 00 08 02 23 01",
+    ),
+    "SCS sync write of twelve": (
+        "FF FF FE 28 83 2A 02 01 02 00 02 02 00 03 02 00 04 02 00 05 02 00 06 02 00 "
+        "07 02 00 08 02 00 09 02 00 0A 02 00 0B 02 00 0C 02 00 C4",
+        254, 0x83,
+        "2A 02 01 02 00 02 02 00 03 02 00 04 02 00 05 02 00 06 02 00 "
+        "07 02 00 08 02 00 09 02 00 0A 02 00 0B 02 00 0C 02 00",
+    ),
+    "SCS position, time, speed": (
+        "FF FF FE 0B 83 2A 06 01 02 00 00 00 03 E8 55", 254, 0x83, "2A 06 01 02 00 00 00 03 E8",
+    ),
+    "STS sync read": ("FF FF FE 06 82 38 06 01 02 38", 254, 0x82, "38 06 01 02"),
+    "broadcast action": ("FF FF FE 02 05 FA", 254, 5, ""),
+}  # fmt: skip
+
+
+def golden(name: str) -> bytes:
+    return bytes.fromhex(GOLDEN[name][0])
+
+
+class SdkClient:
+    """The vendor's SDK as its manual uses it, with nothing of ours."""
+
+    def __init__(self, device: str, end: int, monkeypatch: pytest.MonkeyPatch):
+        # the SDK's 34 ms are too few on a busy machine that plays the servos too
+        monkeypatch.setattr(scservo_sdk.port_handler, "LATENCY_TIMER", 200)
+        self.port = scservo_sdk.PortHandler(device)
+        self.handler = scservo_sdk.PacketHandler(end)
+        assert self.port.openPort() and self.port.setBaudRate(1_000_000)
+
+
+@pytest.fixture(autouse=True)
+def byte_order_is_put_back() -> Iterator[None]:
+    before = scservo_def.SCS_GETEND()
+    yield
+    scservo_def.SCS_SETEND(before)
+
+
+@pytest.fixture
+def sts(monkeypatch) -> Iterator[tuple[Listening, SdkClient]]:
+    yield from talking(STS3215, 0, monkeypatch)
+
+
+@pytest.fixture
+def scs(monkeypatch) -> Iterator[tuple[Listening, SdkClient]]:
+    yield from talking(SCS0009, 1, monkeypatch)
+
+
+def talking(
+    series: Series, end: int, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Listening, SdkClient]]:
+    servos = still_servos(series)
+    bench_of(servos).counts |= {1: 2053, 2: 1000} if series is STS3215 else {3: 502}
+    bench_of(servos).loads[3] = -55
+    servos.servos[3].memory[58:60] = series.encode("speed", -20)
+    with on_a_port(servos) as server:
+        client = SdkClient(server.device, end, monkeypatch)
+        yield servos, client
+        client.port.closePort()
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_our_frames_encode_and_parse_the_golden_bytes(name):
+    text, frame_id, code, data = GOLDEN[name]
+    frame = Frame(frame_id, code, bytes.fromhex(data))
+    assert frame.encode() == bytes.fromhex(text)
+    assert FrameReader().feed(bytes.fromhex(text)) == [frame]
+
+
+def test_sdk_ping_of_an_sts_is_golden_in_both_directions_and_gives_777(sts):
+    servos, sdk = sts
+    assert sdk.handler.ping(sdk.port, 1) == (777, scservo_sdk.COMM_SUCCESS, 0)
+    assert servos.heard == golden("ping 1") + golden("read model 1")
+    assert servos.said == golden("ping answer 1") + golden("STS model answer")
+
+
+def test_sdk_ping_of_an_scs_is_golden_in_both_directions_and_gives_1284(scs):
+    servos, sdk = scs
+    assert sdk.handler.ping(sdk.port, 3) == (1284, scservo_sdk.COMM_SUCCESS, 0)
+    assert servos.said.endswith(golden("SCS model answer"))
+
+
+def test_sdk_reads_2053_of_an_sts(sts):
+    servos, sdk = sts
+    assert sdk.handler.read2ByteTxRx(sdk.port, 1, 56) == (2053, scservo_sdk.COMM_SUCCESS, 0)
+    assert servos.heard == golden("read position 1")
+    assert servos.said == golden("STS position answer")
+
+
+def test_sdk_reads_502_of_an_scs(scs):
+    servos, sdk = scs
+    assert sdk.handler.read2ByteTxRx(sdk.port, 3, 56) == (502, scservo_sdk.COMM_SUCCESS, 0)
+    assert servos.said == golden("SCS position answer")
+
+
+def test_firmware_style_read_of_six_bytes_is_golden_and_means_position_speed_load(scs):
+    servos, sdk = scs
+    data, result, error = sdk.handler.readTxRx(sdk.port, 3, 56, 6)
+    assert (result, error) == (scservo_sdk.COMM_SUCCESS, 0)
+    assert servos.heard == golden("firmware read 3")
+    assert servos.said == golden("firmware answer 3")
+    words = [SCS0009.decode(name, bytes(data), 56) for name in ("position", "speed", "load")]
+    assert words == [502, -20, -55]
+
+
+def test_sdk_write_of_goal_2048_is_golden_acknowledged_and_obeyed(sts):
+    servos, sdk = sts
+    assert sdk.handler.write2ByteTxRx(sdk.port, 1, 42, 2048) == (scservo_sdk.COMM_SUCCESS, 0)
+    assert servos.heard == golden("write goal 1")
+    assert servos.said == golden("ping answer 1")
+    assert bench_of(servos).goals == [(1, 2048)]
+
+
+def sync_write(sdk: SdkClient, address: int, values: dict[int, list[int]]) -> None:
+    size = len(next(iter(values.values())))
+    group = scservo_sdk.GroupSyncWrite(sdk.port, sdk.handler, address, size)
+    for servo, data in values.items():
+        assert group.addParam(servo, data)
+    assert group.txPacket() == scservo_sdk.COMM_SUCCESS
+
+
+def word(value: int) -> list[int]:
+    return [scservo_def.SCS_LOBYTE(value), scservo_def.SCS_HIBYTE(value)]
+
+
+def test_sdk_sync_write_to_two_sts_is_golden_unanswered_and_obeyed(sts):
+    servos, sdk = sts
+    sync_write(sdk, 42, {1: word(2048), 2: word(291)})
+    assert wait_until(lambda: servos.heard == golden("STS sync write"))
+    assert bench_of(servos).goals == [(1, 2048), (2, 291)]
+    assert servos.said == b""
+
+
+def test_sdk_sync_write_to_twelve_scs_is_golden_unanswered_and_obeyed(scs):
+    servos, sdk = scs
+    sync_write(sdk, 42, {i: word(512) for i in range(1, 13)})
+    assert wait_until(lambda: servos.heard == golden("SCS sync write of twelve"))
+    assert bench_of(servos).goals == [(i, 512) for i in range(1, 13)]
+    assert servos.said == b""
+
+
+def test_sdk_sync_write_of_position_time_speed_is_golden_and_stored(scs):
+    servos, sdk = scs
+    sync_write(sdk, 42, {1: word(512) + word(0) + word(1000)})
+    assert wait_until(lambda: servos.heard == golden("SCS position, time, speed"))
+    memory = bytes(servos.servos[1].memory)
+    names = ("goal", "goal_time", "goal_speed")
+    assert [SCS0009.decode(name, memory) for name in names] == [512, 0, 1000]
+
+
+def test_sdk_sync_read_of_two_sts_is_golden_and_both_answer_in_order(sts):
+    servos, sdk = sts
+    group = scservo_sdk.GroupSyncRead(sdk.port, sdk.handler, 56, 6)
+    assert group.addParam(1) and group.addParam(2)
+    assert group.txRxPacket() == scservo_sdk.COMM_SUCCESS
+    assert [group.getData(i, 56, 2) for i in (1, 2)] == [2053, 1000]
+    assert servos.heard == golden("STS sync read")
+    assert [f.id for f in FrameReader().feed(servos.said)] == [1, 2]
+
+
+def test_scs_servos_do_not_know_the_sync_read(scs):
+    servos, sdk = scs
+    group = scservo_sdk.GroupSyncRead(sdk.port, sdk.handler, 56, 6)
+    assert group.addParam(1) and group.addParam(2)
+    assert group.txRxPacket() == scservo_sdk.COMM_RX_TIMEOUT
+    assert servos.heard == golden("STS sync read") and servos.said == b""
+
+
+def test_sdk_broadcast_action_is_golden_and_nobody_answers(sts):
+    servos, sdk = sts
+    assert sdk.handler.action(sdk.port, 254) == scservo_sdk.COMM_SUCCESS
+    assert wait_until(lambda: servos.heard == golden("broadcast action"))
+    assert servos.said == b""
+
+
+@pytest.mark.parametrize(("series", "end"), [(STS3215, 0), (SCS0009, 1)])
+def test_our_line_sends_the_golden_bytes(series, end):
+    servos = still_servos(series)
+    with on_a_port(servos) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        line.patience_s = 0.4  # the servos share this process and a busy machine
+        asked = {
+            "ping 1": lambda: line.ping(1),
+            "read model 1": lambda: line.model(1),
+            "read position 1": lambda: line.read(1, 56, 2),
+            "firmware read 3": lambda: line.read(3, 56, 6),
+        }
+        asked |= (
+            {
+                "write goal 1": lambda: line.write(1, 42, bytes([0, 8])),
+                "STS sync write": lambda: line.sync_write(42, {1: b"\x00\x08", 2: b"\x23\x01"}),
+                "STS sync read": lambda: line.sync_read([1, 2], 56, 6),
+            }
+            if end == 0
+            else {
+                "SCS sync write of twelve": lambda: line.sync_write(
+                    42, {i: b"\x02\x00" for i in range(1, 13)}
+                ),
+                "SCS position, time, speed": lambda: line.sync_write(
+                    42, {1: b"\x02\x00\x00\x00\x03\xe8"}
+                ),
+            }
+        )
+        for name, ask in asked.items():
+            servos.heard = b""
+            assert ask() is not None
+            assert wait_until(lambda name=name: servos.heard == golden(name)), name
+        line.close()
+
+
+def test_model_numbers_tell_the_series_in_its_own_byte_order():
+    assert series_of_model_bytes(golden("STS model answer")[5:7]) is STS3215
+    assert series_of_model_bytes(golden("SCS model answer")[5:7]) is SCS0009
+    # 777 in the order of the other series, and 1284 likewise, are nobody's
+    assert series_of_model_bytes(b"\x03\x09") is series_of_model_bytes(b"\x04\x05") is None
+
+
+@pytest.mark.parametrize("series", [STS3215, SCS0009])
+@pytest.mark.parametrize(
+    ("name", "value", "magnitude_bit"), [("speed", -300, 0x8000), ("load", -55, 0x0400)]
+)
+def test_negative_registers_are_sign_and_magnitude(series, name, value, magnitude_bit):
+    encoded = series.encode(name, value)
+    order = "big" if series.big_endian else "little"
+    assert int.from_bytes(encoded, order) == magnitude_bit + abs(value)
+    assert series.decode(name, encoded, series.registers[name].address) == value
+
+
+@pytest.mark.parametrize("value", [-1, 65_536])
+def test_a_value_that_does_not_fit_its_register_is_not_packed(value):
+    with pytest.raises(OverflowError):
+        SCS0009.encode("goal", value)
+
+
+def test_frames_are_found_between_garbage_and_garbage_is_counted():
+    reader = FrameReader()
+    first, second = golden("ping 1"), golden("STS position answer")
+    noise = bytes([0, 0xFF, 7, 0xFF])
+    found = reader.feed(noise + first + noise + second)
+    assert [f.encode() for f in found] == [first, second]
+    assert reader.rejected_bytes == 2 * len(noise)
+
+
+def test_a_frame_may_come_byte_by_byte():
+    reader, frame = FrameReader(), golden("firmware answer 3")
+    found = [reader.feed(bytes([byte])) for byte in frame]
+    assert found[:-1] == [[]] * (len(frame) - 1)
+    assert [f.encode() for f in found[-1]] == [frame]
+
+
+@pytest.mark.parametrize("at", range(2, 8))
+@pytest.mark.parametrize("bit", range(8))
+def test_no_frame_with_one_flipped_bit_is_accepted(at, bit):
+    # the sum over a frame changes by 2**bit, which no other byte makes up for
+    spoiled = bytearray(golden("STS position answer"))
+    spoiled[at] ^= 1 << bit
+    assert FrameReader().feed(bytes(spoiled)) == []
+
+
+def test_header_bytes_before_a_header_do_not_hide_the_frame():
+    frame = golden("ping answer 1")
+    assert [f.encode() for f in FrameReader().feed(b"\xff" + frame)] == [frame]
+
+
+def test_a_claimed_length_that_was_not_asked_for_does_not_hide_the_true_frame():
+    frame = golden("STS position answer")
+    fake = bytes([0xFF, 0xFF, 1, 200])
+    asked = FrameReader(lambda frame_id, length: frame_id == 1 and length == 4)
+    assert [f.encode() for f in asked.feed(fake + frame)] == [frame]
+
+
+def test_servos_hear_only_noise_at_another_baud_rate():
+    servos = still_servos(STS3215)
+    assert servos.receive(golden("ping 1"), 0.0, baud=500_000) == []
+    assert [p for _, p in servos.receive(golden("ping 1"), 0.1, 1_000_000)] == [
+        golden("ping answer 1")
+    ]
+
+
+def test_an_answer_comes_after_the_wire_time_and_the_return_delay():
+    servos = still_servos(STS3215)
+    [(at, answer)] = servos.receive(golden("read position 1"), 1.0)
+    # 8 bytes out and 8 back at 10 us, and 250 units of 2 us in between
+    assert len(answer) == 8
+    assert at == pytest.approx(1.0 + 80e-6 + 500e-6 + 80e-6, abs=1e-9)
+
+
+def test_the_factory_reset_is_not_obeyed():
+    servos = still_servos(STS3215)
+    before = bytes(servos.servos[1].memory)
+    assert servos.receive(Frame(1, 6, b"").encode(), 0.0) == []
+    assert bytes(servos.servos[1].memory) == before
+
+
+def test_a_goal_outside_the_servos_own_limits_clips_there():
+    servos = still_servos(SCS0009)
+    servos.receive(Frame(1, 3, bytes([42, 0, 5])).encode(), 0.0)
+    servos.receive(Frame(1, 3, bytes([42, 3, 0xFF])).encode(), 0.1)
+    assert bench_of(servos).goals == [(1, 20), (1, 1003)]
+
+
+def test_a_real_servo_of_the_bench_is_where_its_goal_was_after_a_second():
+    servos = moving_servos(STS3215)
+    bench = servos.bench
+    assert isinstance(bench, ServoBench)
+    servos.receive(Frame(4, 3, bytes([42]) + STS3215.encode("goal", 2148)).encode(), 0.0)
+    [(_, answer)] = servos.receive(Frame(4, 2, bytes([56, 2])).encode(), 1.0)
+    there = STS3215.decode("position", FrameReader().feed(answer)[0].data, 56)
+    truth = bench.robot.servos[bench.index_of_id[4]].actuator
+    # dry friction holds the servo at most friction / stiffness off its goal
+    off = np.divide(truth.friction_loss, truth.stiffness) * bench.map.counts_per_rad()[0] + 1
+    assert abs(there - 2148) <= float(np.asarray(off))
+
+
+def test_no_parser_trips_over_two_thousand_mutated_frames():
+    script = Path(__file__).resolve().parents[3] / "benchmarks" / "fuzz_parsers.py"
+    ran = subprocess.run(
+        [sys.executable, str(script), "--frames", "2000", "--seed", "1", "--hang-s", "5"],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert ran.stdout.count("\n| FeetechEmulator.receive") == 3

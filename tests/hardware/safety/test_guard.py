@@ -1,0 +1,451 @@
+"""The guard keeps commands inside their bounds, and stops a robot that does not do as told."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import BusError, SafetyStop
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits, guarded
+from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
+from pupper_sysid.hardware.safety.watchdog import Watchdog
+
+PERIOD = 0.02
+TWO = ("LF_thigh", "LF_calf")
+
+
+class PlainBus:
+    """Two servos that follow at once, until told to misbehave."""
+
+    name = "plain"
+    joint_names = TWO
+
+    def __init__(self, low=-2.0, high=2.0):
+        self.limits = PositionLimits(np.full(2, low), np.full(2, high))
+        self.metadata = {"voltage_band_v": [4.2, 8.7]}
+        self.time, self.goal, self.log = 0.0, np.zeros(2), []
+        self.written: list[np.ndarray] = []
+        self.frozen = self.blocked = self.deaf = False
+        self.silent = np.zeros(2, bool)
+        self.load, self.volts, self.heat, self.status = np.zeros(2), 7.4, 30.0, np.zeros(2, int)
+        self.ticks = 0
+
+    def now(self):
+        return self.time
+
+    def sleep_until(self, time_s):
+        self.time = max(self.time, time_s)
+
+    def write(self, position_rad):
+        if self.deaf:
+            return Sent(float("nan"), position_rad)
+        self.goal = position_rad.copy()
+        self.written.append(self.goal)
+        return Sent(self.time, self.goal)
+
+    def read(self):
+        self.ticks += 1
+        # an encoder flickers by a count; a frozen one does not
+        position = self.goal + 0.0015 * (self.ticks % 2)
+        if self.frozen or self.blocked:
+            position = np.zeros(2) + (0.0015 * (self.ticks % 2) if self.blocked else 0.0)
+        position = np.where(self.silent, np.nan, position)
+        full = np.ones(2)
+        return BusSample(
+            np.full(2, self.time), position, np.where(self.silent, -1, 500),
+            self.volts * full, self.heat * full, self.load, self.status,
+        )  # fmt: skip
+
+    def torque(self, on):
+        self.log.append(f"torque {on}")
+        return True
+
+    def close(self):
+        self.log.append("close")
+
+
+class Told(Watchdog):
+    """A watchdog that writes what it is told into the bus's log."""
+
+    def __init__(self, bus: PlainBus):
+        self.log = bus.log
+
+    def _say(self, message):
+        self.log += [f"watchdog {word}" for word in message]
+
+    def beat(self):
+        pass
+
+    def close(self):
+        self._say({"bye": True})
+
+    def leave_limp(self):
+        self._say({"leave": True})
+
+
+def linked(bus: PlainBus) -> PlainBus:
+    """The same servos, the second of which turns its joint by a push rod, as on the Mini Pupper."""
+    one = np.array([0])
+    rod = Coupling(one + 1, one, 1, np.array([-3.0]), np.array([3.0]))
+    bus.limits = PositionLimits(np.full(2, -2.0), np.full(2, 2.0), rod)
+    return bus
+
+
+def ready(bus: PlainBus, limits: GuardLimits | None = None) -> GuardedBus:
+    """A guarded bus with the torque on and the first command sent."""
+    guard = GuardedBus(bus, limits)
+    guard.read()
+    guard.torque(True)
+    guard.write(np.zeros(2))
+    return guard
+
+
+def drive(guard: GuardedBus, seconds: float, goal=lambda t: np.zeros(2)) -> None:
+    """Command `goal(t)` at the loop's rate."""
+    start = guard.now()
+    for k in range(round(seconds / PERIOD)):
+        guard.sleep_until(start + (k + 1) * PERIOD)
+        guard.write(goal(guard.now() - start))
+        guard.read()
+
+
+def swing(t: float) -> np.ndarray:
+    """One joint at 1 Hz and 0.3 rad, the other at rest."""
+    return np.array([0.3 * np.sin(2 * np.pi * t), 0.0])
+
+
+def test_a_goal_outside_the_limits_is_sent_as_the_limit_and_said_to_be():
+    bus = PlainBus(high=0.1)
+    guard = ready(bus)
+    drive(guard, 0.5, lambda t: np.array([0.5, -0.05]))
+    np.testing.assert_allclose(bus.goal, [0.1, -0.05])
+    assert guard.report.clipped == 25
+
+
+def test_a_calf_is_kept_from_its_thigh_by_the_bound_they_share():
+    # calf + thigh may not leave ±0.5: with the thigh at 0.4 the calf may go to 0.1
+    both = Coupling(np.array([1]), np.array([0]), 1, np.array([-0.5]), np.array([0.5]))
+    limits = PositionLimits(np.full(2, -1.0), np.full(2, 1.0), both)
+    np.testing.assert_allclose(limits.clip(np.array([0.4, 0.3])), [0.4, 0.1])
+    np.testing.assert_allclose(limits.clip(np.array([0.4, -1.2])), [0.4, -0.9])
+    # room to both sides: the thigh's is its own; the calf's ends where the sum does
+    np.testing.assert_allclose(limits.room(np.array([0.4, 0.0])), [0.6, 0.1])
+
+
+def test_a_step_becomes_a_ramp_at_the_speed_limit():
+    bus = PlainBus()
+    guard = ready(bus, GuardLimits(speed_rad_s=5.0, acceleration_rad_s2=1e6))
+    drive(guard, 0.2, lambda t: np.array([0.35, 0.0]))
+    # 5 rad/s in ticks of 20 ms: 0.1 rad each
+    np.testing.assert_allclose([g[0] for g in bus.written[1:6]], [0.1, 0.2, 0.3, 0.35, 0.35])
+    assert guard.report.slowed == 3
+
+
+def test_speed_is_gained_at_the_acceleration_limit_and_lost_at_once():
+    bus = PlainBus()
+    guard = ready(bus, GuardLimits(speed_rad_s=100.0, acceleration_rad_s2=100.0))
+    drive(guard, 0.2, lambda t: np.array([0.3, 0.0]))
+    # 100 rad/s²: 2 rad/s more every 20 ms tick, so 0.04, 0.08, 0.12 rad, then what is left
+    np.testing.assert_allclose([g[0] for g in bus.written[1:6]], [0.04, 0.12, 0.24, 0.3, 0.3])
+
+
+def test_the_goal_does_not_jump_after_a_pause():
+    bus = PlainBus()
+    guard = ready(bus)
+    guard.sleep_until(guard.now() + 5.0)
+    guard.write(np.array([1.5, 0.0]))
+    assert bus.goal[0] <= 8.0 * 0.06 + 1e-9
+
+
+def test_a_first_command_far_from_the_robot_is_refused_and_nothing_is_sent():
+    bus = PlainBus()
+    guard = GuardedBus(bus)
+    guard.read()
+    guard.torque(True)
+    with pytest.raises(SafetyStop, match=r"LF_calf 0\.40 rad away"):
+        guard.write(np.array([0.0, 0.4]))
+    assert bus.written == []
+
+
+def test_a_robot_found_outside_its_limits_is_not_made_to_jump_into_them():
+    bus = PlainBus(high=1.0)
+    bus.goal = np.array([1.8, 0.0])
+    guard = GuardedBus(bus)
+    guard.torque(True)
+    with pytest.raises(SafetyStop, match=r"LF_thigh was found at 1\.80 rad, 0\.80 rad outside"):
+        guard.write(np.array([1.8, 0.0]))
+    guard.close()
+    assert bus.written == [] and bus.log[-2:] == ["torque False", "close"]
+
+
+def test_a_robot_that_was_moved_by_hand_while_limp_is_found_anew():
+    bus = PlainBus()
+    guard = ready(bus)
+    guard.park()
+    bus.goal = by_hand = np.array([-0.9, 0.0])
+    guard.sleep_until(guard.now() + 1.0)
+    guard.torque(True)
+    guard.write(by_hand)
+    drive(guard, 0.5, lambda t: np.array([-0.5, 0.0]))
+    guard.park()
+    np.testing.assert_allclose(bus.goal, by_hand, atol=0.002)
+
+
+def test_the_torque_stays_off_while_a_joint_does_not_say_where_it_is():
+    bus = PlainBus()
+    bus.silent = np.array([False, True])
+    with pytest.raises(BusError, match="LF_calf"):
+        GuardedBus(bus).torque(True)
+    assert bus.log == []
+
+
+def test_a_lost_reading_does_not_keep_the_torque_off():
+    bus = PlainBus()
+    bus.silent[1] = True
+    reads = bus.read
+
+    def once_silent():
+        sample = reads()
+        bus.silent[1] = False
+        return sample
+
+    bus.read = once_silent
+    assert GuardedBus(bus).torque(True)
+
+
+def test_who_takes_over_goes_home_although_a_servo_does_not_confirm():
+    bus = PlainBus()
+    bus.goal = np.array([0.3, -0.2])
+    told = bus.torque
+
+    def unsure(on):
+        told(on)
+        return not on
+
+    bus.torque = unsure
+    guard = GuardedBus(bus, GuardLimits(park_within_s=0.5))
+    with pytest.raises(BusError, match="confirm"):
+        guard.torque(True)
+    guard.take_over()
+    guard.park(np.zeros(2))
+    np.testing.assert_allclose(bus.goal, 0.0, atol=1e-6)
+    assert bus.log[-1] == "torque False"
+
+
+def test_the_watchdog_stands_by_before_the_first_servo_is_on():
+    bus = PlainBus()
+    GuardedBus(bus, watchdog=Told(bus)).torque(True)
+    assert bus.log == ["watchdog arm", "torque True"]
+
+
+def test_servos_that_did_not_all_go_on_are_told_to_go_limp_until_they_are():
+    bus = PlainBus()
+    told, answers = bus.torque, [False, False, False, True]
+    bus.torque = lambda on: told(on) and answers.pop(0)
+    with pytest.raises(BusError, match="confirm"):
+        GuardedBus(bus, watchdog=Told(bus)).torque(True)
+    off = ["torque False"] * 3
+    assert bus.log == ["watchdog arm", "torque True", "watchdog limp", *off, "watchdog disarm"]
+
+
+def test_servos_that_do_not_confirm_that_they_are_limp_are_left_to_the_watchdog():
+    bus = PlainBus()
+    guard = GuardedBus(bus, watchdog=Told(bus))
+    guard.torque(True)
+    bus.torque = lambda on: False
+    assert not guard.torque(False)
+    guard.close()
+    assert bus.log == ["watchdog arm", "torque True", "watchdog limp", "close", "watchdog leave"]
+
+
+@pytest.mark.parametrize("trouble", [KeyboardInterrupt(), ValueError("counts"), OSError("gone")])
+def test_torque_off_is_asked_for_again_whatever_comes_between(trouble):
+    bus = PlainBus()
+    guard = GuardedBus(bus, watchdog=Told(bus))
+    guard.torque(True)
+    told, troubles = bus.torque, [trouble]
+
+    def troubled(on):
+        if troubles:
+            raise troubles.pop()
+        return told(on)
+
+    bus.torque = troubled
+    pressed = isinstance(trouble, KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt) if pressed else nullcontext():
+        guard.park()
+    guard.close()
+    assert bus.log[-4:] == ["torque False", "watchdog disarm", "close", "watchdog bye"]
+
+
+def test_a_healthy_robot_is_left_alone_for_a_minute():
+    guard = ready(PlainBus())
+    drive(guard, 60.0, swing)
+    assert guard.report.clipped == guard.report.slowed == 0
+
+
+@pytest.mark.parametrize(
+    ("trouble", "says"),
+    [
+        ({"frozen": True}, "did not change once"),
+        ({"load": np.array([0.95, 0.0])}, "95 % of full duty"),
+        ({"heat": 70.0}, "70 °C"),
+        ({"volts": 3.9}, r"3\.9 V"),
+        ({"volts": 9.5}, r"9\.5 V"),
+        ({"status": np.array([0, 32])}, "LF_calf reports an error: overload"),
+        ({"silent": np.ones(2, bool)}, "bus has been silent"),
+        ({"silent": np.array([True, False])}, "LF_thigh has not answered"),
+    ],
+)
+def test_trouble_ends_in_a_stop_that_says_what_it_is(trouble, says):
+    bus = PlainBus()
+    guard = ready(bus)
+    drive(guard, 2.0, swing)
+    for name, value in trouble.items():
+        setattr(bus, name, value)
+    with pytest.raises(SafetyStop, match=says):
+        drive(guard, 3.0, swing)
+    guard.close()
+    # torque off, and no way back for a robot that may be jammed
+    assert bus.log[-2:] == ["torque False", "close"]
+
+
+def test_a_joint_that_is_held_away_from_its_goal_stops_the_robot():
+    bus = PlainBus()
+    guard = ready(bus)
+    bus.blocked = True
+    with pytest.raises(SafetyStop, match=r"LF_thigh is held at 0\.50 rad and stays"):
+        drive(guard, 3.0, lambda t: np.array([0.5, 0.0]))
+
+
+def test_a_stuck_calf_servo_is_seen_though_the_angle_of_its_joint_changes_with_the_thigh():
+    bus = linked(PlainBus())
+    guard = ready(bus)
+    read = bus.read
+
+    def stuck():
+        sample = read()
+        # a joint's angle is what its servo stands at less the thigh
+        sample.position_rad[1] = 0.3 - sample.position_rad[0]
+        return sample
+
+    bus.read = stuck
+    with pytest.raises(SafetyStop, match=r"LF_calf was told to move .* did not change once"):
+        drive(guard, 3.0, lambda t: np.full(2, 0.2 * np.sin(2 * np.pi * t)))
+
+
+def test_a_calf_servo_away_from_its_goal_is_not_hidden_by_a_thigh_that_is_away_too():
+    bus = linked(PlainBus())
+    guard = ready(bus)
+    read = bus.read
+    # each joint is 0.2 rad away, and so the calf's servo 0.4
+    bus.read = lambda: replace(read(), position_rad=np.full(2, 0.2))
+    with pytest.raises(SafetyStop, match=r"LF_calf is held at 0\.00 rad and stays 0\.40 rad away"):
+        drive(guard, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("trouble", "says"),
+    [
+        ({"heat": 70.0}, "70 °C"),
+        ({"volts": 3.9}, r"3\.9 V"),
+        ({"status": np.array([0, 32])}, "LF_calf reports an error: overload"),
+    ],
+)
+def test_a_reading_lost_now_and_then_does_not_hide_trouble_that_lasts(trouble, says):
+    bus = PlainBus()
+    guard = ready(bus)
+    for name, value in trouble.items():
+        setattr(bus, name, value)
+    read, none = bus.read, np.full(2, np.nan)
+
+    def every_fifth_lost():
+        sample = read()
+        if bus.ticks % 5:
+            return sample
+        return replace(
+            sample, position_rad=none, voltage_v=none, temperature_c=none, status=np.zeros(2, int)
+        )
+
+    bus.read = every_fifth_lost
+    with pytest.raises(SafetyStop, match=says):
+        drive(guard, 2.0, swing)
+
+
+@pytest.mark.parametrize(
+    "trouble",
+    [{"volts": 3.9}, {"heat": 80.0}, {"status": np.array([1, 0])}, {"silent": np.ones(2, bool)}],
+)
+def test_trouble_that_passes_in_a_moment_does_not_stop_the_robot(trouble):
+    bus = PlainBus()
+    guard = ready(bus)
+    drive(guard, 1.0, swing)
+    healthy = {name: getattr(bus, name) for name in trouble}
+    for name, value in trouble.items():
+        setattr(bus, name, value)
+    drive(guard, 0.2, swing)
+    for name, value in healthy.items():
+        setattr(bus, name, value)
+    drive(guard, 2.0, swing)
+
+
+def test_parking_stops_returns_to_where_the_robot_was_found_and_lets_go():
+    bus = PlainBus()
+    guard = ready(bus)
+    drive(guard, 1.25, swing)
+    assert bus.goal[0] == pytest.approx(0.3, abs=0.01)
+    before = guard.now()
+    guard.close()
+    np.testing.assert_allclose(bus.goal, [0.0, 0.0], atol=0.002)
+    assert bus.log == ["torque True", "torque False", "close"]
+    # 0.3 rad at no more than 1 rad/s on a raised cosine
+    assert guard.now() - before == pytest.approx(0.3 * np.pi / 2, abs=0.05)
+
+
+def test_parking_a_bus_that_is_lost_is_over_soon_and_still_asks_for_torque_off():
+    bus = PlainBus()
+    guard = ready(bus)
+    drive(guard, 1.25, swing)
+    bus.deaf, bus.silent = True, np.ones(2, bool)
+    bus.torque = lambda on: bus.log.append("asked") or False
+    before = guard.now()
+    guard.close()
+    assert guard.now() - before < 3.5
+    assert bus.log.count("asked") == 10 and bus.log[-1] == "close"
+
+
+def test_an_unsent_command_is_counted_and_the_next_one_starts_from_the_last_sent():
+    bus = PlainBus()
+    guard = ready(bus)
+    bus.deaf = True
+    sent = guard.write(np.array([0.1, 0.0]))
+    assert np.isnan(sent.time_s) and guard.report.unsent == 1
+
+
+def test_a_guard_is_not_guarded_twice():
+    guard = GuardedBus(PlainBus())
+    assert guarded(guard) is guard
+
+
+def test_speed_is_bounded_where_the_servo_turns_not_where_the_joint_bends():
+    """The calf's servo turns by thigh + calf: a calf that folds as its thigh rises stands still."""
+
+    def moved(goal: np.ndarray) -> np.ndarray:
+        bus = linked(PlainBus())
+        guard = GuardedBus(bus, GuardLimits(speed_rad_s=8.0, acceleration_rad_s2=1e6))
+        guard.read()
+        guard.torque(True)
+        guard.write(np.zeros(2))
+        bus.time += PERIOD
+        guard.write(goal)
+        return bus.written[-1]
+
+    # thigh at its limit of 0.16 rad per tick, calf's servo at rest
+    np.testing.assert_allclose(moved(np.array([0.15, -0.15])), [0.15, -0.15])
+    # both forward: the calf's servo would turn by twice as much
+    thigh, calf = moved(np.array([0.15, 0.15]))
+    assert thigh == pytest.approx(0.15) and thigh + calf == pytest.approx(0.16)

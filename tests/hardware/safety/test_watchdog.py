@@ -1,0 +1,233 @@
+"""A robot whose driver dies or hangs is parked by the watchdog; one that is left well is let be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import SafetyStop
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware import connect
+from pupper_sysid.hardware.connect import BusAddress, open_guarded, parse_address
+from pupper_sysid.hardware.feetech import line as feetech_line
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety import watchdog
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.watchdog import Watchdog
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sysid.recordings.recording import load
+from support.servo_servers import bench_of, moving_servos, on_a_port, on_a_socket, still_servos
+
+ROOT = Path(__file__).resolve().parents[3]
+
+DRIVER = """
+import sys, time
+import numpy as np
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.connect import open_guarded, parse_address
+bus = open_guarded(parse_address(sys.argv[1]))
+pose = bus.read().position_rad
+while not np.isfinite(pose).all():
+    pose = bus.read().position_rad
+for _ in range(20):  # servos that share a busy machine with their driver answer too late
+    try:
+        bus.torque(True)
+        break
+    except BusError:
+        pass
+start = bus.now()
+print("driving", flush=True)
+while True:
+    goal = pose + 0.3 * np.sin(2 * np.pi * 0.5 * (bus.now() - start))
+    bus.write(goal)
+    bus.read()
+    bus.sleep_until(bus.now() + 0.02)
+    if len(sys.argv) > 2 and bus.now() - start > 0.5:  # farthest out
+        bus.bus.torque = lambda on: time.sleep(100)
+        bus.limp()
+"""
+
+
+@pytest.fixture(params=["feetech", "esp32"])
+def robot(request):
+    """A served emulated robot: server and address."""
+    if request.param == "feetech":
+        with on_a_port(moving_servos()) as server:
+            yield server, f"feetech:{server.device}"
+        return
+    rng = np.random.default_rng(3)
+    bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
+    with tempfile.TemporaryDirectory(prefix="w") as name:
+        path = Path(name) / "s"
+        with on_a_socket(ProxyEmulator(bench, rng), path) as server:
+            yield server, f"esp32:{path}"
+
+
+def limp(server) -> bool:
+    bench = server.emulator.bench
+    return not any(bench.is_on(k) for k in range(len(JOINT_NAMES)))
+
+
+def angles(server) -> np.ndarray:
+    bench, now = server.emulator.bench, server.now()
+    return np.array([bench.angle(k, now) for k in range(len(JOINT_NAMES))])
+
+
+def wait_for(condition, seconds: float) -> float:
+    """How long it took until `condition()` held."""
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < seconds, "it never happened"
+        time.sleep(0.005)
+    return time.monotonic() - start
+
+
+def drive(address: str, *hang: str) -> subprocess.Popen:
+    process = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, address, *hang], stdout=subprocess.PIPE, cwd=ROOT
+    )
+    assert process.stdout is not None and process.stdout.readline() == b"driving\n"
+    return process
+
+
+def switched_on(address: str) -> GuardedBus:
+    """A bus whose servos hold where they stand."""
+    bus = open_guarded(parse_address(address))
+    while not np.isfinite(bus.read().position_rad).all():
+        time.sleep(0.02)
+    bus.torque(True)
+    return bus
+
+
+def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second(robot):
+    server, address = robot
+    found = angles(server)
+    process = drive(address)
+    time.sleep(0.5)  # a quarter of its swing: farthest out
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    took = wait_for(lambda: limp(server), 5.0)
+    assert took < 1.5  # a second on an idle machine; tests share theirs
+    np.testing.assert_allclose(angles(server), found, atol=0.06)
+
+
+def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_back(robot):
+    server, address = robot
+    bus = switched_on(address)
+    server.emulator.unplug_for_s = 2.0
+    time.sleep(0.1)
+    bus.limp()
+    bus.close()
+    wait_for(lambda: limp(server), 8.0)
+
+
+def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
+    server, address = robot
+    process = drive(address)
+    os.kill(process.pid, signal.SIGSTOP)
+    took = wait_for(lambda: limp(server), 6.0)
+    assert 0.9 < took < 3.5
+    assert process.wait(2.0) == -signal.SIGKILL
+
+
+def test_a_driver_that_hangs_after_a_stop_for_safety_leaves_its_robot_limp_where_it_is(robot):
+    server, address = robot
+    found = angles(server)
+    process = drive(address, "hang when it should go limp")
+    wait_for(lambda: limp(server), 6.0)
+    assert np.abs(angles(server) - found).max() > 0.15
+    assert process.wait(2.0) == -signal.SIGKILL
+
+
+def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
+    server, address = robot
+    bus = switched_on(address)
+    bus.close()
+    assert limp(server)
+    commands = len(server.emulator.bench.commands)
+    time.sleep(0.3)
+    assert len(server.emulator.bench.commands) == commands
+
+
+def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monkeypatch):
+    # the servos share this process and a busy machine
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(watchdog, "_GIVE_UP_S", 3.0)
+    layout = load_joint_map("sts3215")
+    there = [i for i in layout.ids if i != 5]  # LF_thigh, on which LF_calf hangs
+    servos = still_servos(ids=there)
+    with on_a_port(servos) as server:
+        orders = {
+            "kind": "feetech", "where": server.device, "baud": 1_000_000,
+            "map": layout.file.model_dump(mode="json", by_alias=True), "coordinates": "joint",
+        }  # fmt: skip
+        watchdog.park(orders, dict.fromkeys(layout.joint_names, 0.0))
+    assert dict(bench_of(servos).torques) == dict.fromkeys(there, False)
+    assert bench_of(servos).goals == []
+
+
+def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monkeypatch):
+    asked: list[bool] = []
+
+    class Deaf(EmulatedBus):
+        def torque(self, on: bool) -> bool:
+            asked.append(on)
+            return super().torque(on) and (on or len(asked) > 45)
+
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(connect, "open_bus", lambda *of: Deaf(draw_robot(rng), rng))
+    orders = {"kind": "esp32", "where": "", "baud": None, "map": None, "coordinates": "servo"}
+    watchdog.park(orders, DEFAULT_POSE)
+    assert len(asked) > 45 and not asked[-1]
+
+
+def test_a_driver_without_its_watchdog_does_not_go_on():
+    lost = Watchdog(BusAddress("esp32", "/tmp/none"), None)
+    lost._process.kill()
+    lost._process.wait()
+    with pytest.raises(SafetyStop, match="the watchdog process has ended"):
+        lost.beat()
+    lost.close()
+
+
+def test_files_in_the_users_folder_do_not_stand_in_for_the_watchdogs_modules(tmp_path, monkeypatch):
+    for name in ("json.py", "common.py"):
+        (tmp_path / name).write_text("raise SystemExit\n")
+    monkeypatch.chdir(tmp_path)
+    Watchdog(BusAddress("esp32", "/tmp/none"), None).close()
+
+
+def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp_path):
+    server, address = robot
+    path = tmp_path / "a.csv"
+    command = [
+        sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
+            "sweep", "--joints", "LF_hip", "--freqs", "3",
+        "--duration", "2",
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        [*command, "--bus", address, "--out", str(path)], cwd=ROOT, stderr=subprocess.PIPE
+    )
+    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 40, 30.0)
+    process.terminate()
+    said = process.communicate(timeout=10)[1].decode()
+    assert process.returncode == 1 and "Stopped." in said and "Traceback" not in said
+    # on a serial line only the named joint is driven, and so only it is let go
+    assert not server.emulator.bench.is_on(JOINT_NAMES.index("LF_hip"))
+    assert "completed" not in load(path).metadata
+    done = subprocess.run(
+        [*command, "--resume", str(path)], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert "completed" in load(path).metadata

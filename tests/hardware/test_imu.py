@@ -1,0 +1,194 @@
+"""The IMU: the trunk's axes and units from the chip's, and a reading that can be missing."""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.esp32 import bus as esp32_bus
+from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.imu import ImuSample, as_words, from_chip, to_chip
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
+from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
+from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from support.servo_servers import ScriptedProxy, StillBench, on_a_socket
+
+G = 9.80665
+LEVEL = (0.0, 0.0, -1.0)
+"""What the chip says at rest: it hangs upside down (facts/hardware.md E)."""
+
+
+def sample_of(acceleration_g=LEVEL, rate_deg_s=(0.0, 0.0, 0.0)) -> ImuSample:
+    sample = from_chip(1.5, np.array([*acceleration_g, *rate_deg_s]))
+    assert sample is not None
+    return sample
+
+
+# ---- axes and units ----
+
+
+def test_at_rest_and_level_the_specific_force_is_one_g_up():
+    sample = sample_of()
+    np.testing.assert_array_equal(sample.acceleration_m_s2, [0.0, 0.0, G])
+    np.testing.assert_array_equal(sample.rate_rad_s, [0.0, 0.0, 0.0])
+    assert sample.time_s == 1.5 and not sample.clipped
+
+
+def test_rates_about_the_chips_axes_are_rates_about_the_trunks():
+    # chip's y points forward, its x to the left, its z down
+    np.testing.assert_allclose(sample_of(rate_deg_s=(0, 90, 0)).rate_rad_s, [np.pi / 2, 0, 0])
+    np.testing.assert_allclose(sample_of(rate_deg_s=(90, 0, 0)).rate_rad_s, [0, np.pi / 2, 0])
+    np.testing.assert_allclose(sample_of(rate_deg_s=(0, 0, 90)).rate_rad_s, [0, 0, -np.pi / 2])
+
+
+@pytest.mark.parametrize(
+    ("axis", "up"),
+    [
+        ((0, 1, 0), (-np.sin(0.5), 0, np.cos(0.5))),  # nose down: forward points down
+        ((-1, 0, 0), (0, -np.sin(0.5), np.cos(0.5))),  # rolled to the left: left points down
+        ((0, 0, 1), (0, 0, 1)),  # turned to the left: still level
+    ],
+    ids=["nose down", "roll left", "yaw left"],
+)
+def test_a_chip_on_the_simulated_trunk_tells_tilt_and_turn_with_the_right_signs(axis, up):
+    servo = DelayedPDParameters(0.0, 0.0, 0.0, 1e-3, 1.0, 1.0, 0.0)
+    xml = robot_xml(dict.fromkeys(JOINT_NAMES, servo), 0.002)
+    # held up in the air, at rest but for its turning
+    model = mujoco.MjModel.from_xml_string(xml.replace("<body ", '<body gravcomp="1" '))
+    data = mujoco.MjData(model)
+    mujoco.mju_axisAngle2Quat(data.qpos[3:7], np.array(axis, float), 0.5)
+    data.qpos[2], data.qpos[7:] = 1.0, default_pose()
+    data.qvel[3:6] = 0.3 * np.array(axis)
+    mujoco.mj_forward(model, data)
+    read = [data.sensor(name).data for name in ("accelerometer", "gyro")]
+    sample = from_chip(0.0, np.concatenate([read[0] / G, np.degrees(read[1])]))
+    assert sample is not None
+    # the site turns with the trunk about its own origin: no acceleration, but gravity's reaction
+    np.testing.assert_allclose(sample.acceleration_m_s2 / 9.81, up, atol=0.02)
+    np.testing.assert_allclose(sample.rate_rad_s, 0.3 * np.array(axis), atol=1e-12)
+
+
+def test_the_chips_numbers_come_back_from_a_sample():
+    raw = np.array([0.25, -0.5, -1.25, 30.0, -60.0, 7.5])
+    sample = from_chip(0.0, raw)
+    assert sample is not None
+    np.testing.assert_allclose(to_chip(sample), raw, rtol=1e-15)
+
+
+def test_words_are_sixteenths_of_a_degree_and_16384ths_of_a_g():
+    words = as_words(np.array([0.4 / 16384, 0.6 / 16384, -1.0, 0.03, 0.04, -0.1]))
+    np.testing.assert_array_equal(words, [0, 1 / 16384, -1, 0, 1 / 16, -2 / 16])
+
+
+@pytest.mark.parametrize(
+    ("g", "clipped"), [(1.99, False), (-1.99, False), (2.3, True), (-2.3, True)]
+)
+def test_a_number_at_the_end_of_its_range_is_marked(g, clipped):
+    sample = from_chip(0.0, as_words(np.array([0.0, g, -1.0, 0.0, 0.0, 0.0])))
+    assert sample is not None and sample.clipped is clipped
+    # 16 bits end at +32767/16384 g and -2 g
+    assert abs(sample.acceleration_m_s2[0]) <= 2 * G
+
+
+def test_six_zeros_are_a_read_that_failed():
+    assert from_chip(0.0, np.zeros(6)) is None
+
+
+# ---- the proxy's datagram ----
+
+
+def imu_reply(*values: float) -> bytes:
+    return bytes([26, 4]) + struct.pack("<6f", *values)
+
+
+def test_the_reply_is_26_bytes_of_little_endian_floats():
+    # 1.0, -2.0, 0.5 as IEEE 754 single, low byte first
+    data = bytes.fromhex("1a04" + "0000803f" + "000000c0" + "0000003f" + "00000000" * 3)
+    raw = datagrams.parse_imu(data)
+    assert raw is not None and raw.tolist() == [1.0, -2.0, 0.5, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        b"",
+        imu_reply(*[0.0] * 6)[:-1],
+        bytes([26, 3]) + bytes(24),
+        imu_reply(float("nan"), 0, 0, 0, 0, 0),
+        imu_reply(0, 0, float("inf"), 0, 0, 0),
+        imu_reply(0, 2.1, 0, 0, 0, 0),
+        imu_reply(0, 0, -1, 0, -2049, 0),
+    ],
+)
+def test_a_reply_that_no_chip_could_have_given_is_none(wrong):
+    assert datagrams.parse_imu(wrong) is None
+
+
+# ---- the bus ----
+
+
+@pytest.fixture
+def path(monkeypatch):
+    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)  # the proxy shares this process
+    with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
+        yield Path(folder) / "s"
+
+
+def read_imu(path: Path, *replies: bytes | None) -> ImuSample | None:
+    """What the bus makes of successive answers."""
+    # a client that leaves has its last request carried out once more
+    given = iter([*replies, None])
+    with on_a_socket(ScriptedProxy(lambda request: next(given)), path):
+        bus = Esp32Bus(path)
+        sample = bus.imu()
+        bus.close()
+    return sample
+
+
+GOOD, OTHER, THIRD = (imu_reply(0, 0, -1, x, 0, 0) for x in (1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    "replies",
+    [(GOOD, GOOD), (OTHER, GOOD, GOOD), (GOOD, OTHER, GOOD)],
+    ids=["two agree", "the block was refreshed", "one was spoilt"],
+)
+def test_a_reading_counts_when_two_answers_agree(path, replies):
+    sample = read_imu(path, *replies)
+    assert sample is not None
+    np.testing.assert_allclose(sample.rate_rad_s, [0.0, np.radians(1.0), 0.0])
+    np.testing.assert_allclose(sample.acceleration_m_s2, [0.0, 0.0, G])
+    assert 0 <= sample.time_s < 5
+
+
+@pytest.mark.parametrize(
+    "replies",
+    [(GOOD, OTHER, THIRD), (imu_reply(*[0.0] * 6),) * 2, (None,), (GOOD, b"\x1a\x04\x00")],
+    ids=["no two agree", "the chip's read failed", "silence", "cut short"],
+)
+def test_otherwise_there_is_none(path, replies):
+    assert read_imu(path, *replies) is None
+
+
+def test_a_robot_on_a_stand_reports_gravity_and_nothing_else():
+    still = StillBench("mini_pupper_2")
+    for proxy in (ProxyEmulator, ImuProxy):
+        emulator = proxy(still, np.random.default_rng(0))
+        reply = emulator.answer(datagrams.request(datagrams.GET_IMU), b"", 1.0)
+        assert struct.unpack("<BB6f", reply) == (26, 4, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
+
+
+def test_a_proxy_for_the_imu_alone_does_not_move_the_servos_or_tell_of_them():
+    still = StillBench("mini_pupper_2")
+    proxy = ImuProxy(still, np.random.default_rng(0))
+    setpoint = datagrams.set_position(np.zeros(12, bool), np.full(12, 400))
+    for request in (setpoint, datagrams.request(datagrams.GET_POSITION)):
+        assert proxy.answer(request, b"before", 1.0) == b"before"
+    assert still.goals == [] and still.torques == []

@@ -1,0 +1,172 @@
+"""The arithmetic of calibrating joints, worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware import joint_calibration as jc
+from pupper_sysid.hardware.joint_map import joint_map_from, load_joint_map
+
+DATE = "2026-11-21"
+PRESET = load_joint_map("mini_pupper_2")
+
+
+def travel_of(*counts, encoder=1024):
+    """The travel of one joint that was read at these counts, each twice."""
+    travel = jc.Travel(1, encoder)
+    for count in np.repeat(counts, 2):
+        travel.add(np.array([count]))
+    return travel
+
+
+def refusal(travel):
+    return travel.refusals(("LF_hip",)).get("LF_hip", "")
+
+
+def test_an_offset_is_the_middle_pose_less_the_centre_of_the_encoder():
+    assert jc.offset_counts(500.0, 1024) == -12 and jc.offset_counts(2148.4, 4096) == 100
+
+
+def test_limits_stay_two_percent_of_the_travel_inside_both_ends():
+    assert jc.limits_within(200, 800) == (212, 788)
+    # 2 % of 333 counts are 6.66: rounded to the inside
+    assert jc.limits_within(300, 633) == (307, 626)
+
+
+def test_a_right_angle_in_275_counts_is_the_vendors_scale_whichever_way_it_was_turned():
+    vendor = 550 / np.pi
+    assert jc.counts_per_rad(400, 675, 90) == pytest.approx(vendor)
+    assert jc.counts_per_rad(675, 400, 90) == pytest.approx(vendor)
+
+
+def test_the_two_published_scales_do_not_agree_but_two_degrees_of_error_do():
+    vendor, data_sheet = 550 / np.pi, 1024 / np.radians(300)
+    assert not jc.scales_agree(data_sheet, vendor)  # 11.7 % apart
+    assert jc.scales_agree(vendor * 92 / 90, vendor)
+    assert "300 degrees" in (jc.known_scale_near(data_sheet * 0.99, 1024) or "")
+    assert "550/pi" in (jc.known_scale_near(vendor * 1.01, 1024) or "")
+    assert jc.known_scale_near(240.0, 1024) is None
+
+
+def test_a_scale_is_plausible_if_the_whole_range_is_an_angle_that_servos_have():
+    assert jc.is_plausible_scale(326.0, 1024)  # 180 degrees
+    assert jc.is_plausible_scale(4096 / (2 * np.pi), 4096)
+    assert not jc.is_plausible_scale(20.0, 1024) and not jc.is_plausible_scale(0.0, 1024)
+
+
+def test_one_reading_alone_is_no_end_of_the_travel():
+    travel = jc.Travel(1, 1024)
+    for count in (500, 400, 400, 900, 410, 600, 600, 0, 590):
+        travel.add(np.array([count]))
+    assert (travel.low[0], travel.high[0]) == (400, 600)
+    assert not travel.wrapped[0]
+
+
+def test_missing_readings_leave_the_travel_as_it_is():
+    travel = travel_of(400, -1, 600)
+    assert (travel.low[0], travel.high[0], travel.now[0]) == (400, 600, 600)
+    assert refusal(travel_of(-1, -1)) == "did not answer"
+
+
+@pytest.mark.parametrize("encoder", [1024, 4096])
+def test_too_small_a_travel_is_refused_in_proportion_to_the_encoder(encoder):
+    least = 40 * encoder // 1024
+    middle = encoder // 2
+    assert "did not move from count" in refusal(travel_of(middle, encoder=encoder))
+    assert f"{least} are the least" in refusal(travel_of(middle, middle + least - 1,
+                                                         encoder=encoder))  # fmt: skip
+    assert not refusal(travel_of(middle, middle + least, encoder=encoder))
+
+
+def test_a_travel_over_the_end_of_the_encoder_is_refused_until_it_is_forgotten():
+    travel = travel_of(3900, 4080, 20, 300, encoder=4096)
+    assert "horn must be mounted nearer to the middle" in refusal(travel)
+    travel.forget(0)
+    for count in (300, 300, 900, 900):
+        travel.add(np.array([count]))
+    assert not refusal(travel) and (travel.low[0], travel.high[0]) == (300, 900)
+
+
+def test_a_travel_that_ends_with_the_encoder_was_not_seen_whole():
+    assert travel_of(0, 500).cut_off(("LF_hip",)) == ["LF_hip"]
+    assert travel_of(500, 1023).cut_off(("LF_hip",)) == ["LF_hip"]
+    assert travel_of(1, 1022).cut_off(("LF_hip",)) == []
+
+
+def test_a_mean_leaves_out_what_is_missing_and_tells_how_far_a_joint_strayed():
+    mean, strayed = jc.mean_counts(np.array([[510, -1], [-1, -1], [514, -1]]))
+    assert (mean[0], strayed[0]) == (512.0, 4.0) and np.isnan(mean[1])
+
+
+def test_a_new_map_keeps_what_was_not_measured_and_says_who_says_what():
+    measured = jc.Measured({"LF_hip": 20, "RF_hip": -7}, {"LF_hip": (430, 620)}, "LF_hip", 180.0)
+    new = jc.calibrated(PRESET.file, measured, DATE).file
+    hip, other, calf = (new.joints[j] for j in ("LF_hip", "RF_hip", "LB_calf"))
+    before = PRESET.file.joints
+    assert (hip.offset_counts, hip.limits_counts) == (20, (430, 620))
+    assert hip.limits_rad == before["LF_hip"].limits_rad and hip.sign == before["LF_hip"].sign
+    assert f"calibrate-joints {DATE}, offset measured, limits measured" in hip.source
+    assert "counts_per_rad of mini_pupper_2 (measured on LF_hip: 180.0)" in hip.source
+    # ends of a leg are where they were as seen from its middle: 416..586, 7 counts lower
+    assert other.limits_counts == (409, 579) and "moved by the offset" in other.source
+    assert calf == before["LB_calf"]
+    assert new.name == f"mini_pupper_2, calibrated {DATE}"
+
+
+def test_a_measured_scale_is_taken_by_all_joints_and_limits_stay_in_counts():
+    measured = jc.Measured({"LF_hip": 0}, {}, "LF_hip", 195.0, use_scale=True)
+    new = jc.calibrated(PRESET.file, measured, DATE).file
+    assert {e.counts_per_rad for e in new.joints.values()} == {195.0}
+    for joint, entry in new.joints.items():
+        assert entry.limits_counts == PRESET.file.joints[joint].limits_counts
+        assert "counts_per_rad measured on LF_hip" in entry.source
+
+
+def test_calibrating_twice_does_not_pile_up_words():
+    measured = jc.Measured({"LF_hip": 3}, {}, "LF_hip", 195.0, use_scale=True)
+    once = jc.calibrated(PRESET.file, measured, DATE)
+    twice = jc.calibrated(once.file, measured, "2026-12-01").file
+    assert twice.name == "mini_pupper_2, calibrated 2026-12-01"
+    assert twice.source.count("calibrate-joints") == 1
+    assert twice.joints["LB_calf"].source.count("calibrate-joints") == 1
+
+
+def test_limits_that_would_leave_the_encoder_are_refused():
+    with pytest.raises(InputError, match="LF_hip: with its middle at count 1212"):
+        jc.calibrated(PRESET.file, jc.Measured({"LF_hip": 700}), DATE)
+
+
+def test_a_middle_outside_the_travel_and_a_far_horn_are_doubted():
+    # 100 counts are 33 degrees at 550/pi
+    measured = jc.Measured({"LF_hip": 100, "LF_thigh": 0}, {"LF_hip": (300, 600)})
+    outside, far = jc.doubts(jc.calibrated(PRESET.file, measured, DATE), measured.offset_counts)
+    assert "LF_hip +100 (33°):" in far
+    assert "its middle (count 612) lies outside its limits 300 to 600" in outside
+    assert jc.doubts(PRESET, {"LF_hip": 0}) == []
+
+
+def test_a_travel_on_the_wrong_side_of_the_middle_makes_no_map():
+    # 612 - 300 counts are 1.78 rad, and a left hip ends at 0.425
+    measured = jc.Measured({"LF_hip": 100}, {"LF_hip": (100, 300)})
+    with pytest.raises(InputError, match="LF_hip: its limits in counts and its limits_rad have no"):
+        jc.calibrated(PRESET.file, measured, DATE)
+
+
+def test_the_middle_pose_of_another_robot_is_told_joint_by_joint_in_degrees():
+    data = PRESET.file.model_dump(by_alias=True) | {"linkage": "none"}
+    given = data["joints"]
+    data["joints"] = {"elbow": given["LF_thigh"], "left_hip": given["LF_hip"]}
+    words = jc.middle_pose_in_words(joint_map_from(data, "arm").file, ("elbow", "left_hip"))
+    assert "elbow: 45 degrees\n" in words and "left_hip: 0 degrees\n" in words
+    assert "the robot's model" in words and "straight down" not in words
+
+
+@pytest.mark.parametrize("preset", ["mini_pupper_2", "sts3215"])
+def test_the_middle_pose_is_told_as_the_map_has_it(preset):
+    words = jc.middle_pose_in_words(load_joint_map(preset).file, JOINT_NAMES)
+    assert "every hip: straight down" in words
+    assert "every thigh: 45 degrees from straight down, knee behind the hip" in words
+    assert "every calf: 45 degrees from straight down, foot ahead of the knee" in words

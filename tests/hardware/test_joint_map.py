@@ -1,0 +1,358 @@
+"""Counts and angles: hand-worked numbers, the knee's push rod, limits, and files nobody trusts."""
+
+import re
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.joint_map import PRESETS, JointMap, joint_map_from, load_joint_map
+from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
+
+K = 550 / np.pi
+QUARTER = np.pi / 4
+MULT = {
+    "hip": {"RF": 1, "LF": 1, "RB": -1, "LB": -1},
+    "thigh": {"RF": -1, "LF": 1, "RB": -1, "LB": 1},
+    "calf": {"RF": -1, "LF": 1, "RB": -1, "LB": 1},
+}
+"""Of pos = 512 - k * mult * (angle - neutral), facts/hardware.md D2 (F R there is RF here)."""
+
+
+@pytest.fixture(scope="module")
+def pupper() -> JointMap:
+    return load_joint_map("mini_pupper_2")
+
+
+def standing() -> np.ndarray:
+    return np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
+
+
+def at(joint: str) -> int:
+    return JOINT_NAMES.index(joint)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_has_the_twelve_joints_and_the_ids_of_the_robot(preset):
+    loaded = load_joint_map(preset)
+    assert loaded.joint_names == JOINT_NAMES
+    assert loaded.ids == (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9)
+    assert loaded.frame == ("proxy" if preset in PRESETS[:2] else "raw")
+    assert loaded.file.counts == (4096 if preset == "sts3215" else 1024)
+
+
+@pytest.mark.parametrize(
+    ("preset", "scale"),
+    [
+        ("mini_pupper_2", 550 / np.pi),
+        ("mini_pupper_2_300deg", 1024 / np.radians(300)),
+        ("mini_pupper_2_direct", 1024 / np.radians(300)),
+        ("sts3215", 4096 / (2 * np.pi)),
+    ],
+)
+def test_every_preset_has_its_documented_scale(preset, scale):
+    assert load_joint_map(preset).counts_per_rad() == pytest.approx(np.full(12, scale), rel=1e-12)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("coordinates", ["joint", "servo"])
+def test_the_standing_pose_is_the_centre_count_of_every_servo(preset, coordinates):
+    loaded = load_joint_map(preset)
+    loaded = loaded if coordinates == "joint" else loaded.per_servo()
+    # the pose says 0.785 and 1.57 for 45 and 90 degrees: up to 0.0008 rad less
+    off = loaded.to_counts(standing()) - loaded.file.counts / 2
+    assert (np.abs(off) <= 0.0008 * loaded.counts_per_rad()).all()
+
+
+@pytest.mark.parametrize("preset", PRESETS[:3])
+def test_the_standing_pose_is_512_twelve_times(preset):
+    loaded = load_joint_map(preset)
+    assert loaded.clip_counts(loaded.to_counts(standing())).tolist() == [512] * 12
+
+
+# worked out by hand with k = 175.0704: 0.2 k = 35.0141, 0.3 k = 52.5211, 0.1 k = 17.5070
+@pytest.mark.parametrize(
+    ("joint", "count"),
+    [
+        ("LF_hip", 476.9859), ("RF_hip", 476.9859), ("LB_hip", 547.0141), ("RB_hip", 547.0141),
+        ("LF_thigh", 459.4789), ("RF_thigh", 564.5211),
+        ("LB_thigh", 459.4789), ("RB_thigh", 564.5211),
+        ("LF_calf", 494.4930), ("RF_calf", 529.5070),
+        ("LB_calf", 494.4930), ("RB_calf", 529.5070),
+    ],
+)  # fmt: skip
+def test_counts_are_those_of_the_vendors_formula(pupper, joint, count):
+    # hips 0.2; thighs 0.3 beyond neutral; calves so that thigh + calf is 0.1 beyond neutral
+    pose = np.tile([0.2, QUARTER + 0.3, -2 * QUARTER - 0.2], 4)
+    leg, kind = joint.split("_")
+    beyond = {"hip": 0.2, "thigh": 0.3, "calf": 0.1}[kind]
+    assert count == pytest.approx(512 - K * MULT[kind][leg] * beyond, abs=1e-4)
+    assert pupper.to_counts(pose)[at(joint)] == pytest.approx(count, abs=1e-4)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("coordinates", ["joint", "servo"])
+def test_counts_and_angles_are_inverse_to_each_other(preset, coordinates):
+    loaded = load_joint_map(preset)
+    loaded = loaded if coordinates == "joint" else loaded.per_servo()
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-2, 2, (50, 12))
+    assert loaded.to_angles(loaded.to_counts(angles)) == pytest.approx(angles, abs=1e-12)
+    counts = rng.uniform(0, loaded.file.counts - 1, (50, 12))
+    assert loaded.to_counts(loaded.to_angles(counts)) == pytest.approx(counts, abs=1e-9)
+
+
+def test_moving_a_thigh_moves_the_calfs_servo_too_in_joint_coordinates(pupper):
+    pose = standing()
+    moved = pose.copy()
+    moved[at("LF_thigh")] += 0.1
+    change = pupper.to_counts(moved) - pupper.to_counts(pose)
+    # the calf keeps its angle to the thigh, so its absolute angle turns by 0.1 as well
+    assert change[at("LF_thigh")] == pytest.approx(-0.1 * K)
+    assert change[at("LF_calf")] == pytest.approx(-0.1 * K)
+    assert np.flatnonzero(np.abs(change) > 1e-9).tolist() == [at("LF_thigh"), at("LF_calf")]
+
+
+def test_moving_a_thigh_leaves_the_calfs_servo_alone_in_servo_coordinates(pupper):
+    pose = standing()
+    moved = pose.copy()
+    moved[at("RB_thigh")] += 0.1
+    change = pupper.per_servo().to_counts(moved) - pupper.per_servo().to_counts(pose)
+    assert change[at("RB_thigh")] == pytest.approx(0.1 * K)
+    assert np.flatnonzero(np.abs(change) > 1e-9).tolist() == [at("RB_thigh")]
+
+
+def test_both_coordinates_agree_while_the_thigh_stands_at_its_neutral(pupper):
+    pose = np.tile([0.1, QUARTER, -1.2], 4)
+    assert pupper.to_counts(pose) == pytest.approx(pupper.per_servo().to_counts(pose))
+
+
+def test_a_missing_thigh_makes_its_calf_missing_and_no_other_joint(pupper):
+    counts = np.full(12, 512.0)
+    counts[at("LF_thigh")] = np.nan
+    missing = np.isnan(pupper.to_angles(counts))
+    assert np.flatnonzero(missing).tolist() == [at("LF_thigh"), at("LF_calf")]
+    only = np.isnan(pupper.per_servo().to_angles(counts))
+    assert np.flatnonzero(only).tolist() == [at("LF_thigh")]
+
+
+def test_a_calf_is_not_selected_without_its_thigh_unless_in_servo_coordinates(pupper):
+    with pytest.raises(InputError, match="LF_calf hangs on LF_thigh by a push rod"):
+        pupper.select(["LF_calf"])
+    alone = pupper.per_servo().select(["LF_calf"])
+    assert alone.ids == (6,)
+    # the thigh is taken to stand at 45 degrees, so -90 degrees is the calf servo's centre
+    assert alone.to_counts(np.array([-2 * QUARTER])) == pytest.approx([512.0])
+
+
+def test_a_joint_that_is_not_in_the_map_is_named(pupper):
+    some = joint_map_from(edited(lambda d: d["joints"].pop("RB_hip")), "mine")
+    with pytest.raises(InputError, match="has no RB_hip; it has LF_hip"):
+        some.select(["RB_hip"])
+
+
+def test_counts_are_rounded_to_the_nearest_and_held_within_the_servos_limits(pupper):
+    counts = np.full(12, 512.0)
+    counts[:4] = [511.6, 1e9, -1e9, 512.4]
+    entry = pupper.file.joints
+    assert pupper.clip_counts(counts)[:4].tolist() == [
+        512, entry["LF_thigh"].limits_counts[1], entry["LF_calf"].limits_counts[0], 512,
+    ]  # fmt: skip
+
+
+# ---- limits ----
+
+
+def test_a_box_clips_and_leaves_room_to_the_nearer_side():
+    limits = PositionLimits(np.array([-1.0, 0.0]), np.array([2.0, 0.5]))
+    assert limits.clip(np.array([-3.0, 0.7])).tolist() == [-1.0, 0.5]
+    assert limits.room(np.array([0.5, 0.4])) == pytest.approx([1.5, 0.1])
+    assert limits.room(np.array([5.0, 0.25])) == pytest.approx([0.0, 0.25])
+
+
+@pytest.mark.parametrize(
+    ("sign", "pose", "clipped"),
+    [
+        (+1, [1.0, 1.0], [1.0, 0.5]),  # calf + thigh at most 1.5
+        (+1, [-2.0, 0.0], [-2.0, 0.5]),  # and at least -1.5
+        (-1, [1.0, -1.0], [1.0, -0.5]),  # calf - thigh at least -1.5
+        (-1, [-1.0, 1.0], [-1.0, 0.5]),
+        (+1, [5.0, 0.0], [3.0, -1.5]),  # the thigh clips first, then its calf
+        (+1, [0.2, 0.3], [0.2, 0.3]),
+    ],
+)
+def test_coupling_moves_the_calf_and_never_the_thigh(sign, pose, clipped):
+    bounds = Coupling(np.array([1]), np.array([0]), sign, np.array([-1.5]), np.array([1.5]))
+    limits = PositionLimits(np.array([-3.0, -2.0]), np.array([3.0, 2.0]), bounds)
+    assert limits.clip(np.array(pose)) == pytest.approx(clipped)
+
+
+def test_where_the_two_bounds_of_a_calf_contradict_the_box_wins():
+    bounds = Coupling(np.array([1]), np.array([0]), 1, np.array([-1.0]), np.array([1.0]))
+    limits = PositionLimits(np.array([-3.0, -0.5]), np.array([3.0, 0.5]), bounds)
+    assert limits.clip(np.array([3.0, 0.0])) == pytest.approx([3.0, -0.5])
+
+
+def test_joint_limits_of_the_preset_are_the_narrower_of_counts_and_angles(pupper):
+    limits = pupper.position_limits()
+    # hip counts 438..608 are +74 and -96 from 512, against the angle's sign; angles -0.55..0.425
+    assert limits.low_rad[at("LF_hip")] == pytest.approx(-96 / K)
+    assert limits.high_rad[at("LF_hip")] == pytest.approx(74 / K)
+    # thigh counts 230..586: +282 and -74 from 512; angles 0.36..2.4
+    assert limits.low_rad[at("LF_thigh")] == pytest.approx(QUARTER - 74 / K)
+    assert limits.high_rad[at("LF_thigh")] == pytest.approx(QUARTER + 282 / K)
+    assert limits.low_rad[at("LF_calf")] == -2.18 and limits.high_rad[at("LF_calf")] == -0.22
+
+
+def test_a_thigh_far_forward_makes_its_calf_fold(pupper):
+    limits = pupper.position_limits()
+    pose = standing()
+    pose[at("LF_thigh")], pose[at("LF_calf")] = 2.3, -0.3
+    # the calf servo's count 206 is 306 from 512: absolute angle -45 degrees + 306 / k = 0.9625
+    assert limits.clip(pose)[at("LF_calf")] == pytest.approx(-QUARTER + 306 / K - 2.3)
+    assert limits.clip(pose)[at("LF_thigh")] == 2.3
+    pose[at("LF_thigh")], pose[at("LF_calf")] = 2.0, -1.2
+    assert limits.room(pose)[at("LF_calf")] == pytest.approx(-QUARTER + 306 / K - 0.8)
+
+
+def test_in_servo_coordinates_the_angle_between_thigh_and_calf_is_bounded(pupper):
+    limits = pupper.per_servo().position_limits()
+    pose = standing()
+    pose[at("RF_thigh")], pose[at("RF_calf")] = 1.7, -2.0
+    # absolute angle = coordinate + 45 degrees; minus the thigh it must be at least -2.18
+    assert limits.clip(pose)[at("RF_calf")] == pytest.approx(-2.18 - QUARTER + 1.7)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("coordinates", ["joint", "servo"])
+def test_clipped_goals_keep_to_the_servos_counts_whatever_is_asked(preset, coordinates):
+    loaded = load_joint_map(preset)
+    loaded = loaded if coordinates == "joint" else loaded.per_servo()
+    limits, rng = loaded.position_limits(), np.random.default_rng(2)
+    assert limits.clip(standing()) == pytest.approx(standing())
+    ends = np.array([loaded.file.joints[j].limits_counts for j in JOINT_NAMES])
+    for wild in rng.uniform(-4, 4, (300, 12)):
+        counts = loaded.to_counts(limits.clip(wild))
+        assert (counts >= ends[:, 0] - 1e-6).all() and (counts <= ends[:, 1] + 1e-6).all()
+
+
+@pytest.mark.parametrize("joints", [["LF_calf"], ["LF_calf", "RF_thigh", "RF_calf"]])
+def test_a_calf_without_its_thigh_has_the_bounds_it_has_while_the_thigh_rests(pupper, joints):
+    some = pupper.per_servo().select(joints)
+    # servo: -45 - 45 degrees, -272 / k and +306 / k, i.e. -3.12..0.18; angle to the thigh: as given
+    assert some.position_limits().low_rad[0] == -2.18
+    assert some.position_limits().high_rad[0] == -0.22
+    assert some.zero_rad()[0] == pytest.approx(-2 * QUARTER)
+    assert some.to_angles(np.full(len(joints), 512.0))[0] == pytest.approx(-2 * QUARTER)
+
+
+def test_the_zero_of_a_map_is_the_angle_of_its_centre_counts(pupper):
+    assert pupper.zero_rad() == pytest.approx(np.tile([0.0, QUARTER, -2 * QUARTER], 4))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_mini_pupper_rests_as_it_stands(preset):
+    assert load_joint_map(preset).rest_pose() == pytest.approx(standing())
+
+
+def test_another_robot_with_the_same_names_rests_within_its_own_limits():
+    def other(data: dict) -> None:
+        data["linkage"] = "none"
+        for entry in data["joints"].values():
+            entry |= {"neutral_rad": 0.0, "limits_counts": (402, 622), "limits_rad": (-0.7, 0.7)}
+
+    # ±110 counts are ±0.63 rad: neither 0.785 nor -1.57 is one of its angles
+    assert joint_map_from(edited(other), "mine").rest_pose() == pytest.approx(np.zeros(12))
+
+
+# ---- files ----
+
+
+def edited(change) -> dict:
+    data = load_joint_map("mini_pupper_2").file.model_dump(by_alias=True)
+    change(data)
+    return data
+
+
+def put(joint: str, **fields):
+    return lambda data: data["joints"][joint].update(fields)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda d: d["joints"].update(LF_knee=d["joints"].pop("LF_calf")),
+         r"LF_knee is no joint; known are LF_hip"),
+        (put("LF_hip", id=5), r"LF_thigh and LF_hip have the same id 5"),
+        (put("LF_hip", limits_counts=(608, 438)), r"LF_hip: limits_counts is \[608, 438\]: the"),
+        (put("LF_hip", limits_rad=(0.5, 0.5)), r"LF_hip: limits_rad is \[0.5, 0.5\]: the first"),
+        (put("LF_hip", offset_counts=300), r"LF_hip: its limits in counts and its limits_rad have"),
+        (put("LF_hip", limits_counts=(438, 1024)), r"LF_hip: limits_counts \[438, 1024\] leave 0"),
+        (put("LF_hip", neutral_rad=np.nan), r"joints.LF_hip.neutral_rad: input should be a finite"),
+        (put("LF_hip", limits_rad=(-np.inf, 1.0)), r"joints.LF_hip.limits_rad\[0\]: input should"),
+        (put("LF_hip", counts_per_rad=0.0), r"joints.LF_hip.counts_per_rad: input should be great"),
+        (put("LF_hip", counts_per_rad="175"), r"joints.LF_hip.counts_per_rad: input should be a"),
+        (put("LF_hip", sign=0), r"joints.LF_hip.sign: input should be 1 or -1"),
+        (put("LF_hip", id=254), r"joints.LF_hip.id: input should be less than or equal to 253"),
+        (put("LF_hip", id=True), r"joints.LF_hip.id: input should be a valid integer"),
+        (put("LF_hip", colour="red"), r"joints.LF_hip.colour: extra inputs are not permitted"),
+        (lambda d: d.update(colour="red"), r"colour: extra inputs are not permitted"),
+        (lambda d: d["joints"]["LF_hip"].pop("sign"), r"joints.LF_hip.sign: field required"),
+        (lambda d: d.update(joints={}), r"joints: dictionary should have at least 1 item"),
+        (lambda d: d.update(frame="both"), r"frame: input should be 'proxy' or 'raw'"),
+        (lambda d: d.update(counts=2048), r"counts: input should be 1024 or 4096"),
+        (lambda d: d.update(linkage="belt"), r"linkage: input should be 'parallel knee' or 'none'"),
+        (lambda d: d.update(schema="pupper-sysid calibration"), r"mine is no joint map: it does"),
+        (lambda d: d.pop("schema"), r"mine is no joint map: it does"),
+        (lambda d: d.update(schema_version=2), r"newer version of pupper-sysid .schema_version 2"),
+        (lambda d: d.update(schema_version=0), r"schema_version: input should be 1"),
+    ],
+)  # fmt: skip
+def test_a_bad_map_is_refused_with_a_sentence_that_names_the_place(change, sentence):
+    with pytest.raises(InputError, match=sentence) as refusal:
+        joint_map_from(edited(change), "mine")
+    assert re.fullmatch(r"mine\b.*\.", str(refusal.value), re.DOTALL)
+
+
+@pytest.mark.parametrize("data", [None, [], "text", 3])
+def test_what_is_no_mapping_is_no_joint_map(data):
+    with pytest.raises(InputError, match="is no joint map"):
+        joint_map_from(data, "mine")
+
+
+def test_a_bad_line_in_a_file_is_named_with_its_number(tmp_path, pupper):
+    path = tmp_path / "joints.yaml"
+    pupper.save(path)
+    lines = path.read_text().splitlines()
+    number = next(n for n, line in enumerate(lines) if "neutral_rad" in line and n > 12)
+    lines[number] = lines[number].replace(lines[number].split("neutral_rad: ")[1], ".nan")
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=rf"joints.yaml, line {number + 1}: joints\.\w+\.neutral"):
+        load_joint_map(path)
+
+
+def test_a_missing_file_gives_a_sentence_with_the_presets(tmp_path):
+    with pytest.raises(InputError, match="does not exist. Presets of joint maps: mini_pupper_2,"):
+        load_joint_map(tmp_path / "joints.yaml")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_saved_map_is_read_back_the_same(tmp_path, preset):
+    loaded = load_joint_map(preset)
+    loaded.save(tmp_path / "joints.yaml")
+    again = load_joint_map(tmp_path / "joints.yaml")
+    assert again == loaded
+    pose = standing() + 0.05
+    assert (again.to_counts(pose) == loaded.to_counts(pose)).all()
+    with pytest.raises(FileExistsRefusal):
+        loaded.save(tmp_path / "joints.yaml")
+    loaded.save(tmp_path / "joints.yaml", force=True)
+
+
+def test_offsets_shift_the_counts_and_the_limits_stay():
+    shifted = joint_map_from(edited(put("LF_hip", offset_counts=30)), "mine")
+    assert shifted.to_counts(standing())[at("LF_hip")] == pytest.approx(542.0)
+    # counts 438..608 are now -104 and +66 from the zero at 542
+    assert shifted.position_limits().low_rad[at("LF_hip")] == pytest.approx(-66 / K)
+    assert shifted.position_limits().high_rad[at("LF_hip")] == pytest.approx(0.425)

@@ -1,0 +1,86 @@
+"""The loop keeps its rate, says when it does not, and gives up when nobody is in control."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.hardware.loop import FixedRateLoop, real_time_priority
+
+
+class FakeTime:
+    """Time that passes when told."""
+
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, time_s: float) -> None:
+        self.time = max(self.time, time_s)
+
+
+def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes():
+    clock, starts = FakeTime(), []
+    loop = FixedRateLoop(clock, 0.02)
+    for elapsed in loop.ticks(1.0):
+        starts.append(elapsed)
+        clock.time += 0.013
+    np.testing.assert_allclose(starts, 0.02 * np.arange(50), atol=1e-12)
+    assert loop.summary()["missed_deadlines"] == 0
+    assert loop.summary()["jitter_p99_s"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_slow_tick_is_counted_and_the_schedule_does_not_drift():
+    clock, starts = FakeTime(), []
+    loop = FixedRateLoop(clock, 0.02)
+    for tick, elapsed in enumerate(loop.ticks(0.5)):
+        starts.append(elapsed)
+        clock.time += 0.05 if tick == 3 else 0.001
+    # tick 3 runs from 60 to 110 ms: it takes the places of two others, the next starts late,
+    # and the one after that is back on the grid
+    assert loop.missed_deadlines == 1
+    np.testing.assert_allclose(starts[3:6], [0.06, 0.11, 0.12])
+
+
+def test_ten_misses_in_a_row_end_it_in_a_sentence():
+    clock = FakeTime()
+    loop = FixedRateLoop(clock, 0.02)
+    with pytest.raises(SafetyStop, match="too slow or too busy"):
+        for _ in loop.ticks(10.0):
+            clock.time += 0.05
+    assert clock.time < 1.0
+
+
+def test_misses_that_are_not_in_a_row_do_not_end_it():
+    clock = FakeTime()
+    loop = FixedRateLoop(clock, 0.02)
+    for tick, _ in enumerate(loop.ticks(10.0)):
+        clock.time += 0.05 if tick % 3 == 0 else 0.001
+    assert loop.missed_deadlines > 50
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_period_that_is_none_is_refused(period):
+    with pytest.raises(InputError, match="loop_period_s"):
+        FixedRateLoop(FakeTime(), period)
+
+
+def test_asking_for_priority_says_what_came_of_it_and_gives_it_back(monkeypatch):
+    asked = []
+    monkeypatch.setattr("os.sched_setscheduler", lambda pid, policy, _: asked.append(policy))
+    before = os.sched_getscheduler(0)
+    with real_time_priority() as said:
+        assert said.startswith("real-time") and asked[0] & os.SCHED_FIFO
+    assert asked[1:] == [before]
+
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr("os.sched_setscheduler", refuse)
+    with real_time_priority() as said:
+        assert "not allowed" in said

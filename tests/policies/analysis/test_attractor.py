@@ -1,0 +1,136 @@
+"""Orbits: circles, ellipses, bands and noise, whose shapes are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.analysis.attractor import (
+    closure,
+    collapse,
+    ellipse,
+    principal_components,
+)
+
+STEP_S, HZ = 0.02, 3.25
+
+
+def loop(major: float, minor: float, steps: int = 600) -> np.ndarray:
+    """An ellipse in the plane, run through at 3.25 Hz; 600 steps are 39 whole periods."""
+    angle = 2 * np.pi * HZ * STEP_S * np.arange(steps)
+    return np.stack([major * np.cos(angle), minor * np.sin(angle)], axis=1)
+
+
+def somewhere(plane: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """A plane orbit put at a random place and attitude of `size` dimensions."""
+    frame = np.linalg.qr(rng.standard_normal((size, plane.shape[-1])))[0]
+    return plane @ frame.T + rng.standard_normal(size)
+
+
+def test_a_circle_in_twelve_dimensions_has_two_components_of_equal_variance():
+    found = principal_components([somewhere(loop(0.3, 0.3), 12, np.random.default_rng(0))], 2)
+    assert found.participation_ratio == pytest.approx(2.0)
+    np.testing.assert_allclose(found.explained, [0.5, 0.5])
+    np.testing.assert_allclose(found.variance[:2], 0.3**2 / 2)
+    np.testing.assert_allclose(found.axes @ found.axes.T, np.eye(2), atol=1e-12)
+
+
+def test_noise_of_twelve_dimensions_is_spread_over_twelve():
+    states = np.random.default_rng(1).standard_normal((50_000, 12))
+    found = principal_components([states], 3)
+    assert found.participation_ratio == pytest.approx(12.0, abs=0.05)
+    np.testing.assert_allclose(found.explained, 1 / 12, atol=0.005)
+
+
+def test_components_are_those_of_an_svd_of_all_states_about_their_common_mean():
+    rng = np.random.default_rng(2)
+    parts = [rng.standard_normal((30, 2, 5)) @ rng.standard_normal((5, 5)), np.ones((20, 5))]
+    found = principal_components(parts, 3)
+    states = np.concatenate([p.reshape(-1, 5) for p in parts])
+    _, singular, axes = np.linalg.svd(states - states.mean(axis=0))
+    np.testing.assert_allclose(found.variance, singular**2 / len(states), atol=1e-12)
+    np.testing.assert_allclose(np.abs((found.axes * axes[:3]).sum(axis=1)), 1.0)
+
+
+def test_a_joint_with_larger_numbers_counts_more():
+    """Standardised, both joints would explain one half."""
+    angle = np.linspace(0, 2 * np.pi, 100, endpoint=False)
+    found = principal_components([np.stack([3 * np.cos(angle), np.sin(angle)], axis=1)], 1)
+    np.testing.assert_allclose(found.explained, [0.9])
+    np.testing.assert_allclose(found.axes, [[1.0, 0.0]], atol=1e-12)
+
+
+def test_conditions_share_their_axes_so_orbits_keep_size_and_place():
+    rng = np.random.default_rng(3)
+    large = somewhere(loop(0.4, 0.2), 12, rng)
+    small = 0.5 * (large - large.mean(axis=0)) + large.mean(axis=0)
+    found = principal_components([large, small], 2)
+    np.testing.assert_allclose(
+        np.ptp(found.orbit(large), axis=0), 2 * np.ptp(found.orbit(small), axis=0)
+    )
+    # robots keep their dimension
+    robots = np.stack([large, small], axis=1)
+    assert found.orbit(robots).shape == (600, 2, 2)
+    np.testing.assert_allclose(found.orbit(robots)[:, 1], found.orbit(small))
+    left = collapse(found.orbit(small), found.orbit(large))
+    assert left.area == pytest.approx(0.25) and left.roundness == pytest.approx(1.0)
+
+
+def test_what_does_not_vary_or_is_too_short_has_no_components():
+    with pytest.raises(InputError, match="Nothing varies"):
+        principal_components([np.ones((50, 12))], 2)
+    with pytest.raises(InputError, match="3 principal components need more than 3 states"):
+        principal_components([np.eye(3)], 3)
+
+
+@pytest.mark.parametrize("size", [2, 12])
+def test_a_circle_closes_though_a_period_is_no_whole_number_of_steps(size):
+    orbit = somewhere(loop(0.3, 0.3), size, np.random.default_rng(4))
+    assert 1 / (HZ * STEP_S) % 1 > 0.3
+    assert closure(orbit, STEP_S, HZ) < 1e-3
+    # half a period off, every point is opposite: a diameter over √2 radii
+    assert closure(orbit, STEP_S, 2 * HZ) == pytest.approx(np.sqrt(2), rel=0.01)
+
+
+def test_noise_is_as_far_from_itself_as_unrelated_points():
+    # eight whole steps, where the spline goes through the points
+    noise = np.random.default_rng(5).standard_normal((20_000, 3))
+    assert closure(noise, STEP_S, 1 / (8 * STEP_S)) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_closure_of_a_noisy_orbit_is_the_share_of_noise():
+    """Points a period apart differ by the noise of both: closure² = noise / whole variance."""
+    rng = np.random.default_rng(6)
+    angle = 2 * np.pi / 8 * np.arange(20_000)
+    orbit = np.stack([np.cos(angle), np.sin(angle)], axis=1) + 0.5 * rng.standard_normal(
+        (20_000, 2)
+    )
+    share = 2 * 0.25 / (1 + 2 * 0.25)
+    assert closure(orbit, STEP_S, 1 / (8 * STEP_S)) == pytest.approx(np.sqrt(share), abs=0.01)
+
+
+def test_an_orbit_that_is_short_or_stands_still_is_refused():
+    with pytest.raises(InputError, match="too short for two periods"):
+        closure(loop(1, 1, 30), STEP_S, HZ)
+    with pytest.raises(InputError, match="stays at one point"):
+        closure(np.ones((100, 2)), STEP_S, HZ)
+
+
+def test_an_ellipse_has_its_half_axes_wherever_it_lies():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    found = ellipse(loop(0.4, 0.1) @ turn.T + [3.0, -1.0])
+    assert found == pytest.approx((0.4, 0.1))
+    assert found.area == pytest.approx(np.pi * 0.04) and found.roundness == pytest.approx(0.25)
+    # robots with centres of their own are no wider for it
+    apart = np.stack([loop(0.4, 0.1), loop(0.4, 0.1) + 5.0], axis=1)
+    assert ellipse(apart) == pytest.approx((0.4, 0.1))
+
+
+def test_a_band_is_what_is_left_of_a_collapsed_orbit():
+    round_, band = loop(0.3, 0.3), loop(0.3, 0.003)
+    assert collapse(band, round_) == pytest.approx((0.01, 0.01))
+    assert collapse(round_, round_) == pytest.approx((1.0, 1.0))
+    assert collapse(np.zeros((100, 2)), round_) == (0.0, 0.0)
+    with pytest.raises(InputError, match="encloses no area"):
+        collapse(round_, np.zeros((100, 2)))

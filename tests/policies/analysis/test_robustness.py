@@ -1,0 +1,186 @@
+"""Altered observations, and what a walking policy makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.policies.analysis import figures, perturbations
+from pupper_sysid.policies.analysis.perturbations import JOINTS
+from pupper_sysid.policies.analysis.phase_reset import push_response
+from pupper_sysid.policies.analysis.robustness import (
+    Trial,
+    _rate,
+    ablation,
+    delay_curve,
+    frozen,
+    orbits,
+)
+from pupper_sysid.policies.analysis.rollouts import Rollout
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.env import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+
+ROOT = Path(__file__).resolve().parents[3]
+STEPS, ROBOTS = 60, 3
+
+
+def counting() -> np.ndarray:
+    """Every number of step k is k."""
+    seen = np.repeat(np.arange(STEPS, dtype=np.float32), ROBOTS * 60)
+    return seen.reshape(STEPS, ROBOTS, 60)
+
+
+def test_the_parts_of_the_observation_are_where_the_paper_says():
+    assert JOINTS == slice(12, 48) and PARTS["last_action"] == slice(48, 60)
+
+
+def test_a_delay_shows_what_was_and_leaves_the_rest_alone():
+    seen = perturbations.applied(perturbations.delayed(JOINTS, 8), counting())
+    expected = np.maximum(np.arange(STEPS) - 8, 0)
+    np.testing.assert_array_equal(seen[:, 0, 12], expected)
+    np.testing.assert_array_equal(seen[:, 1, 47], expected)
+    np.testing.assert_array_equal(seen[:, 0, 11], np.arange(STEPS))
+    np.testing.assert_array_equal(seen[:, 0, 48], np.arange(STEPS))
+
+
+def test_a_jittered_delay_never_goes_back_in_time_and_keeps_its_bounds():
+    rng = np.random.default_rng(0)
+    seen = perturbations.applied(perturbations.jittered(JOINTS, 4, rng), counting())[:, :, 12]
+    lag = np.arange(STEPS)[:, None] - seen
+    assert (np.diff(seen, axis=0) >= 0).all()
+    assert lag.min() >= 0 and lag.max() <= 8
+    assert len(np.unique(lag[10:])) > 3 and (lag[:, 0] != lag[:, 1]).any()
+
+
+def test_held_values_are_refreshed_on_a_lattice():
+    seen = perturbations.applied(perturbations.held(JOINTS, 5), counting())[:, 0, 20]
+    np.testing.assert_array_equal(seen, 5 * (np.arange(STEPS) // 5))
+
+
+def test_noise_has_the_size_that_was_asked_for_per_number():
+    sigma = np.linspace(0.1, 2.0, 36)
+    change = perturbations.noisy(JOINTS, sigma, np.random.default_rng(0))
+    added = perturbations.applied(change, np.zeros((4000, 1, 60), np.float32))
+    np.testing.assert_allclose(added[:, 0, JOINTS].std(axis=0), sigma, rtol=0.06)
+    assert not added[..., :12].any() and not added[..., 48:].any()
+
+
+def test_zeros_are_zeros():
+    seen = perturbations.applied(perturbations.zeroed(JOINTS), counting())
+    assert not seen[..., JOINTS].any() and seen[5, 0, 0] == 5
+
+
+def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker):
+    rows = delay_curve(*walker, extra_ms=(0, 80))
+    assert [(r["extra_delay_ms"], r["mode"]) for r in rows] == [
+        (ms, mode) for ms in (0, 80) for mode in ("replay", "fixed", "jittered")
+    ]
+    plain = {r["mode"]: r for r in rows if r["extra_delay_ms"] == 0}
+    # shown what it saw, a policy does what it did
+    assert plain["replay"]["frequency_hz"] == pytest.approx(
+        plain["fixed"]["frequency_hz"], rel=0.02
+    )
+    assert plain["fixed"]["survival"] == plain["jittered"]["survival"] == 1.0
+    assert plain["fixed"]["frequency_hz"] == pytest.approx(3.25, abs=0.15)
+
+
+def test_an_ablation_hurts_more_the_more_is_taken(walker):
+    policy, trial = walker
+    rows = [r for r in ablation(policy, trial, channels=("last_action",))]
+    noise = [r["correlation"] for r in rows if r["kind"] == "noise"]
+    assert noise[0] > 0.9 and noise[-1] < noise[0] - 0.2
+    assert {r["kind"] for r in rows} == {"noise", "zero", "hold"}
+
+
+def test_joints_that_stand_apart_but_do_not_move_have_no_frequency():
+    still = np.tile(np.linspace(-1.0, 1.0, 12), (400, 1))
+    assert np.isnan(_rate(still, 0.02))
+    swing = still + 0.1 * np.sin(2 * np.pi * 3.0 * 0.02 * np.arange(400))[:, None]
+    assert _rate(swing, 0.02) == pytest.approx(3.0, abs=0.01)
+
+
+# ------------------------------------------------------------------ policies that do not walk
+
+
+def recorded(rollout: Rollout) -> Trial:
+    """A trial whose walks are all this one."""
+
+    class Recorded(Trial):
+        def walk(self, policy, change=None, disturb=None):
+            return rollout
+
+    return Recorded(Walking(), servo_ranges("ideal"), robots=rollout.alive.shape[1])
+
+
+def fallen(rollout: Rollout, robots: list[int], after_s: float) -> Rollout:
+    """The same walk, but these robots fell; what is recorded of them then is noise."""
+    alive, seen = rollout.alive.copy(), rollout.observation.copy()
+    at = round(after_s / rollout.step_s)
+    alive[at:, robots] = False
+    noise = np.random.default_rng(0).standard_normal(seen[at:, robots].shape)
+    seen[at:, robots] = 5 * noise
+    end = len(alive) if alive[-1].any() else at + 1  # a rollout ends when nobody is up
+    parts = {
+        f.name: getattr(rollout, f.name)[:end] for f in fields(rollout)
+        if isinstance(getattr(rollout, f.name), np.ndarray)
+    }  # fmt: skip
+    return replace(rollout, **parts | {"alive": alive[:end], "observation": seen[:end]})
+
+
+def test_replay_is_of_the_robots_that_walked_and_only_while_they_did(walker):
+    policy, trial = walker
+    plain = trial.walk(policy)
+    half = recorded(fallen(plain, [0], 3.0))
+    alone = recorded(replace_robots(plain, [1]))
+    for measure in (
+        lambda t: frozen(policy, t), lambda t: delay_curve(policy, t, (80,))[:1],
+        lambda t: orbits(policy, t, (0.0, 160.0))["actions"]["closure"],
+    ):  # fmt: skip
+        for one, other in zip(measure(half), measure(alone), strict=True):
+            assert one == pytest.approx(other, nan_ok=True, abs=1e-4)
+
+
+def replace_robots(rollout: Rollout, robots: list[int]) -> Rollout:
+    """The same walk of some of its robots."""
+    parts = {
+        f.name: getattr(rollout, f.name)[:, robots] for f in fields(rollout)
+        if isinstance(getattr(rollout, f.name), np.ndarray)
+    }  # fmt: skip
+    return replace(rollout, **parts)
+
+
+@pytest.mark.parametrize("after_s", [0.5, 3.0])
+def test_where_all_fell_there_are_no_numbers_and_no_crash(walker, after_s):
+    policy, trial = walker
+    gone = recorded(fallen(trial.walk(policy), [0, 1], after_s))
+    assert all(np.isnan(r["share"]) for r in frozen(policy, gone))
+    assert all(np.isnan(r["frequency_hz"]) for r in delay_curve(policy, gone, (0, 80)))
+    assert orbits(policy, gone, (0.0, 160.0)) == {} and push_response(policy, gone) == []
+    rows = ablation(policy, gone, ("last_action",))
+    assert all(np.isnan(r["correlation"]) for r in rows)
+    figures.ablation_figure({"fell": rows})
+    figures.gait_figure(gone.walk(policy))
+    figures.autonomy_figure(
+        {"fell": {"frozen": frozen(policy, gone), "push": [],
+                  "rate": [{"rate_hz": 50.0, "frequency_hz": float("nan")}]}}
+    )  # fmt: skip
+
+
+def test_a_policy_that_stands_has_no_orbit_and_no_phase(walker):
+    policy, trial = walker
+    plain = trial.walk(policy)
+    standing = recorded(replace(plain, action=np.zeros_like(plain.action)))
+    assert orbits(policy, standing, (0.0, 160.0)) == {} and push_response(policy, standing) == []
+    assert all(np.isnan(r["share"]) for r in frozen(policy, standing))
+    assert all(np.isnan(r["correlation"]) for r in ablation(policy, standing, ("last_action",)))
+
+
+def test_an_eighth_policy_is_drawn_as_well():
+    row = {"mode": "fixed", "extra_delay_ms": 0, "survival": 1.0, "frequency_hz": 3.0,
+           "amplitude_rad": 0.1}  # fmt: skip
+    figure = figures.delay_figure({f"policy {k}": [row] for k in range(9)})
+    assert [len(axes.lines) for axes in figure.axes] == [9, 9, 9]

@@ -1,0 +1,357 @@
+"""A policy on the emulated robot: it walks, everything is logged, every fault ends it safely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import SyncedText
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.deploy.assembly import assemble, reassemble
+from pupper_sysid.policies.deploy.commands import constant, script
+from pupper_sysid.policies.deploy.controller import Controller, Senses
+from pupper_sysid.policies.deploy.deployment import IMU_SILENT_S, Outcome, deploy
+from pupper_sysid.policies.deploy.filters import Rest
+from pupper_sysid.policies.deploy.observers import ServoModelObserver
+from pupper_sysid.policies.deploy.stacks import STACKS, Stack, suited
+from pupper_sysid.policies.deploy.walk_log import read_walk, replay
+from pupper_sysid.policies.deploy.walk_score import WalkScore
+from pupper_sysid.policies.network.hyperparameters import Architecture
+from pupper_sysid.policies.network.policy_export import write_policy
+from pupper_sysid.policies.network.policy_file import Policy, load_policy
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.env import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.tiny_training import CALIBRATION, networks, tiny_run
+
+JOINTS = load_joint_map("mini_pupper_2")
+FORWARD = constant((0.15, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory) -> Policy:
+    """Random weights, small actions: the robot stands and twitches."""
+    weights = {k: v.clone() for k, v in networks("lstm")[0].state_dict().items()}
+    last = max(k for k in weights if k.startswith("mlp.") and k.endswith("weight"))
+    weights[last] *= 0.03
+    run = tiny_run("lstm", architecture=Architecture("lstm", (32, 16), 24, (16,)))
+    folder = tmp_path_factory.mktemp("policy")
+    write_policy(folder, weights, run, servo_ranges(CALIBRATION), 0, {"seed": 0}, True)
+    return load_policy(folder)
+
+
+class Trotting(Policy):
+    """Acts like the open-loop trot, by a clock."""
+
+    def reset(self, action: np.ndarray) -> None:
+        self.tick = 0
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        trot, pose = Trot(), np.array(list(self.contract.default_pose_rad.values()))
+        self.tick += 1
+        phase = np.full(1, 2 * np.pi * trot.frequency_hz * self.tick * 0.02)
+        target = trot.joints(phase, observation[:, 9:12].astype(float))
+        return ((target - pose) / self.contract.action_scale_rad).astype(np.float32)
+
+
+def robot(seed: int = 0) -> WalkingBus:
+    rng = np.random.default_rng(seed)
+    return WalkingBus(draw_robot(rng), rng)
+
+
+def run(
+    policy: Policy, folder: Path, seconds: float, bus: WalkingBus | None = None,
+    stack: Stack = STACKS["closed-loop"], commands=FORWARD, watchers=(), imu=None,
+) -> Outcome:  # fmt: skip
+    bus = bus or robot()
+    parts = assemble(policy, stack, JOINTS, CALIBRATION, None)
+    guard = GuardedBus(bus)
+    try:
+        return deploy(
+            guard, imu or bus, parts.controller, commands, seconds, folder / "walk.csv",
+            parts.header, watchers=watchers,
+        )  # fmt: skip
+    finally:
+        guard.close()
+
+
+def test_a_trot_walks_through_controller_guard_and_bus(policy, tmp_path):
+    bus = robot()
+    score = WalkScore(bus, bus.robot)
+    trotting = Trotting(policy.network, policy.contract)
+    found = run(trotting, tmp_path, 6.0, bus, watchers=[score])
+    assert found.stop_reason == "time is up" and not found.fell
+    assert found.deadline_misses == 0 and found.steps.count == 300
+    assert score.summary()["mean_motion"][0] == pytest.approx(0.15, abs=0.04)
+    assert bus.robot.trunk(bus.now()).upright > 0.95
+
+
+def test_a_log_repeats_bit_for_bit_and_another_policy_is_refused(policy, tmp_path):
+    run(policy, tmp_path, 1.0)
+    walk = read_walk(tmp_path / "walk.csv")
+    assert len(walk.senses) == 50 and walk.ended == "time is up"
+    assert replay(walk, reassemble(policy, walk.header, tmp_path / "walk.csv")) is None
+    # one bit of one input changes what follows
+    spoilt = replace(walk.senses[20], position=walk.senses[20].position + 1e-3)
+    walk.senses[20] = spoilt
+    assert replay(walk, reassemble(policy, walk.header, tmp_path / "walk.csv")) == 20
+    other = Policy(policy.network, policy.contract.model_copy(update={"weights_sha256": "0" * 64}))
+    with pytest.raises(InputError, match="another policy"):
+        reassemble(other, walk.header, tmp_path / "walk.csv")
+
+
+@pytest.mark.parametrize("cut", [1, 40])
+def test_a_log_cut_short_is_a_log_up_to_there(policy, tmp_path, cut):
+    run(policy, tmp_path, 0.5)
+    path = tmp_path / "walk.csv"
+    whole = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(whole[:-2]) + whole[-2][:cut])
+    walk = read_walk(path)
+    assert len(walk.senses) == 24 and walk.ended is None
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: "x", "no log of a walk"),
+        (lambda t: t.replace("schema_version: 1", "schema_version: 9"), "schema_version"),
+        (lambda t: t.replace("elapsed_s,", "elapsed,", 1), "columns"),
+        (lambda t: t.replace("# rest: ", "# rest: {", 1), "rest is not JSON"),
+        (lambda t: t.replace("# start_rad: [", "# start_rad: [1, ", 1), "damaged"),
+    ],
+)  # fmt: skip
+def test_a_damaged_log_is_refused_in_a_sentence(policy, tmp_path, change, says):
+    run(policy, tmp_path, 0.2)
+    path = tmp_path / "walk.csv"
+    path.write_text(change(path.read_text()))
+    with pytest.raises(InputError, match=says):
+        read_walk(path)
+
+
+class Trouble:
+    """A walking robot that something happens to, `after_s` into its walk."""
+
+    def __init__(self, what: Callable[[WalkingBus], None], tick: int = 30):
+        self.what, self.tick, self.count = what, tick, 0
+
+    def watch(self, bus: WalkingBus):
+        def look(_):
+            self.count += 1
+            if self.count == self.tick:
+                self.what(bus)
+
+        return look
+
+
+def limp(bus: WalkingBus) -> bool:
+    """Whether no servo pushes any more."""
+    loads = []
+    for index in range(12):
+        bus.robot.angle(index, bus.now() + 0.05)  # a load is of when an angle was asked for
+        loads.append(bus.robot.load(index))
+    return not np.any(loads)
+
+
+def test_a_robot_that_falls_is_left_limp_and_the_log_says_so(policy, tmp_path):
+    bus = robot()
+    trouble = Trouble(lambda b: b.robot.push((0.0, 3.0)))
+    found = run(policy, tmp_path, 5.0, bus, watchers=[trouble.watch(bus)])
+    assert found.fell and "fell" in found.stop_reason
+    assert read_walk(tmp_path / "walk.csv").ended == found.stop_reason
+    assert limp(bus)
+
+
+def test_an_imu_that_goes_silent_ends_the_walk(policy, tmp_path):
+    bus = robot()
+
+    class Silent:
+        count = 0
+
+        def imu(self):
+            self.count += 1
+            return bus.imu() if self.count < 100 else None
+
+    found = run(policy, tmp_path, 5.0, bus, imu=Silent())
+    assert "IMU has not answered" in found.stop_reason
+    assert found.seconds < 1.0 + IMU_SILENT_S + 0.05
+    assert limp(bus)
+
+
+def test_a_policy_that_gives_nan_ends_the_walk_with_its_inputs_logged(policy, tmp_path):
+    class Breaks(Trotting):
+        def act(self, observation):
+            found = super().act(observation)
+            return found if self.tick < 20 else found * np.nan
+
+    bus = robot()
+    found = run(Breaks(policy.network, policy.contract), tmp_path, 2.0, bus)
+    assert "not a number" in found.stop_reason and limp(bus)
+    assert len(read_walk(tmp_path / "walk.csv").senses) == 19
+
+
+@pytest.mark.parametrize(("stall_s", "goes_on"), [(0.1, True), (0.3, False)])
+def test_a_loop_that_stood_still_for_long_does_not_go_on(policy, tmp_path, stall_s, goes_on):
+    bus = robot()
+    trouble = Trouble(lambda b: b.sleep_until(b.now() + stall_s))
+    found = run(policy, tmp_path, 2.0, bus, watchers=[trouble.watch(bus)])
+    if goes_on:
+        assert found.stop_reason == "time is up" and found.deadline_misses == 4
+        return
+    assert "deadlines" in found.stop_reason and limp(bus)
+    assert found.seconds < 0.7
+    assert read_walk(tmp_path / "walk.csv").ended == found.stop_reason
+
+
+def test_ctrl_c_parks_the_robot(policy, tmp_path):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    bus = robot()
+    found = run(policy, tmp_path, 2.0, bus, watchers=[interrupt])
+    assert found.stop_reason == "Ctrl-C"
+    assert limp(bus) and bus.robot.trunk(bus.now()).upright > 0.95
+
+
+def test_a_full_disk_parks_the_robot_and_is_said(policy, tmp_path, monkeypatch):
+    write = SyncedText.write
+
+    def full(self, lines):
+        if self.path.stat().st_size > 40_000:
+            raise InputError(f"{self.path} cannot be written: No space left on device.")
+        write(self, lines)
+
+    monkeypatch.setattr(SyncedText, "write", full)
+    bus = robot()
+    with pytest.raises(InputError, match="No space left"):
+        run(policy, tmp_path, 2.0, bus)
+    assert limp(bus)
+
+
+def test_a_robot_that_does_not_stand_still_at_the_start_does_not_walk(policy, tmp_path):
+    bus = robot()
+
+    class Shaken:
+        count = 0
+
+        def imu(self):
+            self.count += 1
+            sample = bus.imu()
+            return replace(sample, rate_rad_s=sample.rate_rad_s + np.sin(self.count))
+
+    with pytest.raises(InputError):
+        run(policy, tmp_path, 1.0, bus, imu=Shaken())
+    assert limp(bus) and not (tmp_path / "walk.csv").exists()
+
+
+def test_what_is_sent_grows_over_the_fade_in(policy, tmp_path):
+    trotting = Trotting(policy.network, policy.contract)
+    run(trotting, tmp_path, 2.0, stack=Stack(fade_in_s=1.0))
+    walk = read_walk(tmp_path / "walk.csv")
+    away = np.abs(walk.target - np.array(list(policy.contract.default_pose_rad.values())))
+    acted = np.abs(walk.action) * policy.contract.action_scale_rad
+    share = np.array([s.elapsed_s for s in walk.senses]).clip(0, 1)
+    inside = acted.max(axis=1) < 0.3  # where no limit cuts
+    assert inside.sum() > 20
+    np.testing.assert_allclose(away[inside], (share[:, None] * acted)[inside], atol=0.02)
+
+
+def test_the_policy_is_shown_a_servo_model_in_place_of_readings(policy):
+    pose, ones = np.array(list(policy.contract.default_pose_rad.values())), np.ones(12)
+    bent = JOINTS.per_servo().to_angles(JOINTS.to_counts(pose))
+    model = CommandNetwork(
+        JOINTS.joint_names, 0.02,
+        {
+            "command_center": bent, "command_scale": ones, "position_center": bent,
+            "position_scale": ones, "bound": np.full(12, np.inf), "fir_bias": 0 * ones,
+            "fir": 0.5 * ones[:, None],
+        },
+    )  # fmt: skip
+    trotting = Trotting(policy.network, policy.contract)
+    stack = Stack("servo-model", fade_in_s=0.0)
+    controller = Controller(trotting, stack, ServoModelObserver(model, 0.02), JOINTS)
+    rest = Rest(np.array([0.0, 0.0, -1.0]), np.zeros(3))
+    controller.reset(pose, rest)
+    nowhere, level = np.full(12, np.nan), np.array([0.0, 0.0, 9.81])
+    command, told = np.array([0.15, 0.0, 0.0]), pose
+    for tick in range(20):
+        senses = Senses(0.02 * tick, command, nowhere, np.zeros(12), np.zeros(3), level)
+        decision = controller.step(senses)
+        # half of what the servos were told, whatever the encoders say; the calf's through the rod
+        seen = decision.observation[OBSERVATION_PARTS["joint_position_relative"]]
+        np.testing.assert_allclose(seen, 0.5 * (told - pose), atol=1e-5)
+        told = decision.target
+    assert np.abs(told - pose).max() > 0.1
+
+
+def test_a_stack_that_lacks_its_servo_model_is_refused(policy):
+    with pytest.raises(InputError, match="--servo"):
+        assemble(policy, STACKS["lstm-servo"], JOINTS, CALIBRATION, None)
+    with pytest.raises(InputError, match="no such folder"):
+        assemble(policy, STACKS["lstm-servo"], JOINTS, CALIBRATION, Path("nowhere"))
+
+
+def test_the_published_observer_does_not_fit_and_that_is_said(policy):
+    parts = assemble(policy, Stack("published-pd"), JOINTS, CALIBRATION, None)
+    assert not parts.match.fits and "Hz" in parts.match.sentence()
+    assert assemble(policy, STACKS["closed-loop"], JOINTS, CALIBRATION, None).match.fits
+
+
+def test_a_policy_gets_the_stack_of_its_training(policy):
+    assert suited(policy.contract) == "closed-loop"
+    ideal = policy.contract.model_copy(update={"feedback": "ideal"})
+    assert suited(ideal) == "lstm-servo"
+    assert suited(ideal.model_copy(update={"kind": "mlp"})) == "mlp-observer"
+
+
+# --------------------------------------------------------------------------------- commands
+
+
+def test_a_script_gives_one_command_after_the_other_and_then_stops(tmp_path):
+    path = tmp_path / "s.csv"
+    path.write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n2,0.1,0,0\n1,0,0,0.4\n")
+    told = script(path)
+    np.testing.assert_array_equal(told(1.99), [0.1, 0, 0])
+    np.testing.assert_array_equal(told(2.0), [0, 0, 0.4])
+    assert told(3.0) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no readable"),
+        ("a,b\n1,2\n", "columns"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n", "rows"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0,0,0\n-1,0,0,0\n", "row 2"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,x,0,0\n", "row 1"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,90,0,0\n", "row 1"),
+    ],
+)
+def test_a_script_that_is_none_is_refused(tmp_path, text, says):
+    path = tmp_path / "s.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=says):
+        script(path)
+
+
+@pytest.mark.parametrize("command", [(9.0, 0, 0), (0, float("nan"), 0)])
+def test_a_command_no_robot_can_follow_is_refused(command):
+    with pytest.raises(InputError, match="--command"):
+        constant(command)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"lowpass_hz": -1.0}, {"rate_hz": 0.0}, {"scale_rad": float("nan")}, {"fade_in_s": -1}],
+)
+def test_settings_of_a_stack_that_cannot_be_are_refused(wrong):
+    with pytest.raises(InputError):
+        Stack(**wrong)

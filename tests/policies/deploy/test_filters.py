@@ -1,0 +1,267 @@
+"""Filters of deployment: the low-pass by its formula, attitude against bodies that really turn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.deploy.filters import ComplementaryFilter, LowPass, Rest, at_rest
+
+G = 9.80665
+DOWN = np.array([0.0, 0.0, -1.0])
+
+# ---------------------------------------------------------------------------------- low-pass
+
+
+def filtered(cutoff_hz: float, rate_hz: float, samples: np.ndarray) -> np.ndarray:
+    smooth = LowPass(cutoff_hz, rate_hz, 1)
+    smooth.reset(samples[:1])
+    return np.array([smooth([x])[0] for x in samples])
+
+
+def transfer(cutoff_hz: float, rate_hz: float, frequency_hz: float) -> complex:
+    """Gain and phase of the running filter, from its output over whole cycles after settling."""
+    steps = round(40 * rate_hz)
+    angle = 2 * np.pi * frequency_hz * np.arange(steps) / rate_hz
+    out = filtered(cutoff_hz, rate_hz, np.sin(angle))
+    last = slice(steps // 2, None)
+    return complex(2j * np.mean(out[last] * np.exp(-1j * angle[last])))
+
+
+def test_impulse_response_obeys_the_published_coefficients_at_25_hz():
+    # facts/paper.md 5.3: b .4347 .8695 .4347, a 1 .5193 .2197
+    smooth = LowPass(8.0, 25.0, 1)
+    y = [smooth([x])[0] for x in (1.0, 0.0, 0.0, 0.0)]
+    b, a1, a2 = (0.4347, 0.8695, 0.4347), 0.5193, 0.2197
+    expected = [b[0], b[1] - a1 * b[0]]
+    expected.append(b[2] - a1 * expected[1] - a2 * expected[0])
+    expected.append(-a1 * expected[2] - a2 * expected[1])
+    assert y == pytest.approx(expected, abs=2e-4)
+
+
+@pytest.mark.parametrize("frequency_hz", [1.0, 2.8, 5.3, 8.0, 10.0])
+def test_gain_is_that_of_a_butterworth_warped_by_the_bilinear_transform(frequency_hz):
+    warped = np.tan(np.pi * frequency_hz / 25) / np.tan(np.pi * 8 / 25)
+    gain = abs(transfer(8.0, 25.0, frequency_hz))
+    assert gain == pytest.approx(1 / np.sqrt(1 + warped**4), abs=2e-3)
+
+
+@pytest.mark.parametrize(("rate_hz", "delay_ms"), [(25.0, 19.0), (50.0, 27.0)])
+def test_phase_delay_at_the_gait_is_the_published_one(rate_hz, delay_ms):
+    delay_s = -np.angle(transfer(8.0, rate_hz, 2.8)) / (2 * np.pi * 2.8)
+    assert 1e3 * delay_s == pytest.approx(delay_ms, abs=0.7)
+
+
+def test_reset_is_the_steady_state_so_a_constant_input_passes_unchanged():
+    value = np.linspace(-2.0, 2.0, 12)
+    smooth = LowPass(8.0, 25.0, 12)
+    smooth([9.0] * 12)
+    smooth.reset(value)
+    for _ in range(50):
+        assert smooth(value) == pytest.approx(value, abs=1e-14)
+
+
+def test_channels_do_not_mix():
+    smooth = LowPass(8.0, 25.0, 3)
+    out = np.array([smooth([0.0, 1.0, 0.0]) for _ in range(5)])
+    assert (out[:, [0, 2]] == 0).all()
+    assert (out[:, 1] > 0).all()
+
+
+@pytest.mark.parametrize("cutoff_hz", [12.5, 20.0, 0.0, -1.0, np.nan])
+def test_a_cutoff_that_is_not_below_half_the_rate_is_refused(cutoff_hz):
+    with pytest.raises(InputError, match=r"half the rate, 12\.5 Hz"):
+        LowPass(cutoff_hz, 25.0, 12)
+
+
+@pytest.mark.parametrize("value", [[0.0] * 11, [[0.0] * 12], [np.nan] * 12])
+def test_a_sample_of_another_shape_or_nan_is_refused_and_leaves_the_state(value):
+    smooth = LowPass(8.0, 25.0, 12)
+    smooth.reset([0.3] * 12)
+    with pytest.raises(InputError, match="low-pass"):
+        smooth(value)
+    assert smooth([0.3] * 12) == pytest.approx([0.3] * 12)
+
+
+# ---------------------------------------------------------------------------------- attitude
+
+
+def start(gravity: list[float]) -> Rest:
+    return Rest(np.array(gravity, float), np.zeros(3))
+
+
+def tumble(steps: int, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Body rates of a tumbling trunk, and gravity in its frame after each step, both (n, 3)."""
+    time = dt_s * np.arange(steps)
+    rates = np.stack([1.3 * np.sin(5 * time), 0.9 * np.cos(3 * time), 0.7 + 0 * time], axis=1)
+    attitude, gravity = Rotation.identity(), []
+    for rate in rates:
+        attitude = attitude * Rotation.from_rotvec(rate * dt_s)
+        gravity.append(attitude.inv().apply(DOWN))
+    return rates, np.array(gravity)
+
+
+def errors(gyro_sign: float, force_sign: float, weight: float) -> np.ndarray:
+    """Angles between the filter's gravity, 0.1 rad wrong at first, and that of a tumbling body."""
+    dt_s, found = 0.02, []
+    imu = ComplementaryFilter(weight)
+    imu.reset(start([np.sin(0.1), 0, -np.cos(0.1)]))
+    for rate, gravity in zip(*tumble(400, dt_s), strict=True):
+        seen = imu.step(gyro_sign * rate, force_sign * -G * gravity, dt_s).gravity
+        found.append(np.linalg.norm(np.cross(seen, gravity)) if seen @ gravity > 0 else 2.0)
+    return np.array(found)
+
+
+def test_the_gyro_alone_turns_gravity_exactly_with_the_body():
+    assert errors(+1, +1, weight=0.0) == pytest.approx(np.full(400, np.sin(0.1)), abs=1e-9)
+
+
+def test_the_accelerometer_takes_a_wrong_start_away_while_the_body_tumbles():
+    # each sample keeps 1 - weight of a small angle: 400 of them leave 0.03 % of it
+    assert errors(+1, +1, weight=0.02)[-1] == pytest.approx(0.1 * 0.98**400, rel=0.02)
+
+
+def test_a_wrong_sign_of_gyro_or_accelerometer_would_be_noticed():
+    assert errors(-1, +1, weight=0.0).max() > 0.5
+    assert errors(-1, +1, weight=0.02)[-100:].max() > 0.5
+    assert errors(+1, -1, weight=0.02)[-1] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("axis", "gravity"),
+    [
+        ([0, 1, 0], [np.sin(0.3), 0, -np.cos(0.3)]),  # nose down: gravity points forward
+        ([1, 0, 0], [0, -np.sin(0.3), -np.cos(0.3)]),  # left side up: gravity points right
+        ([0, 0, 1], [0, 0, -1]),  # a turn on the spot
+    ],
+    ids=["pitch", "roll", "yaw"],
+)
+def test_signs_of_the_body_frame(axis, gravity):
+    imu = ComplementaryFilter(weight=0.0)
+    found = [imu.step(np.array(axis) * 1.5, [0, 0, G], 0.02) for _ in range(10)][-1]
+    assert found.gravity == pytest.approx(gravity, abs=1e-12)
+
+
+def test_a_level_robot_at_rest_stays_at_minus_z():
+    imu = ComplementaryFilter()
+    found = [imu.step([0, 0, 0], [0, 0, G], 0.04) for _ in range(100)][-1]
+    assert found.gravity.tolist() == [0, 0, -1]
+    assert not found.clipped
+    assert imu.clipped_samples == 0
+
+
+def test_a_wrong_start_decays_by_the_weight_in_every_sample():
+    imu = ComplementaryFilter(weight=0.02)
+    imu.reset(start([0.01, 0.0, -1.0]))
+    found = [imu.step([0, 0, 0], [0, 0, G], 0.04) for _ in range(50)][-1]
+    assert found.gravity[0] == pytest.approx(0.01 * 0.98**50, rel=1e-3)
+
+
+def test_the_bias_is_subtracted():
+    imu = ComplementaryFilter(weight=0.0)
+    imu.reset(Rest(DOWN, np.array([0.1, -0.2, 0.3])))
+    found = imu.step([0.1, -0.2, 0.8], [0, 0, G], 0.02)
+    assert found.rate_rad_s == pytest.approx([0, 0, 0.5])
+    assert found.gravity == pytest.approx(DOWN)
+
+
+@pytest.mark.parametrize("force", [[2 * G, 0, G], [0, 0, -2 * G * 32767 / 32768], [0, 30.0, 0]])
+def test_a_clipped_sample_moves_gravity_by_the_gyro_alone_and_is_counted(force):
+    imu, gyro_only = ComplementaryFilter(weight=0.4), ComplementaryFilter(weight=0.0)
+    rate = [0.2, 0.4, -0.1]
+    found = imu.step(rate, force, 0.02)
+    assert found.clipped
+    assert imu.clipped_samples == 1
+    assert found.gravity == pytest.approx(gyro_only.step(rate, force, 0.02).gravity, abs=1e-15)
+    assert not imu.step(rate, [0, 0, G], 0.02).clipped
+    assert imu.clipped_samples == 1
+    imu.reset(start([0, 0, -1]))
+    assert imu.clipped_samples == 0
+
+
+def test_a_failed_read_of_zeros_does_not_move_gravity():
+    imu = ComplementaryFilter(weight=0.4)
+    imu.reset(start([0.6, 0.0, -0.8]))
+    assert imu.step([0, 0, 0], [0, 0, 0], 0.02).gravity == pytest.approx([0.6, 0, -0.8])
+
+
+def test_a_clock_that_stood_still_counts_as_a_millisecond():
+    imu = ComplementaryFilter(weight=0.0)
+    found = imu.step([1.0, 0, 0], [0, 0, G], 0.0)
+    assert found.gravity == pytest.approx([0, -np.sin(1e-3), -np.cos(1e-3)], abs=1e-12)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(InputError, match="weight"):
+        ComplementaryFilter(weight=0.5)
+    with pytest.raises(InputError, match="1 g"):
+        ComplementaryFilter(limit_m_s2=2.0)  # given in g
+    imu = ComplementaryFilter()
+    with pytest.raises(InputError, match="no direction"):
+        imu.reset(start([0, 0, 0]))
+    with pytest.raises(InputError, match="gyro"):
+        imu.step([np.nan, 0, 0], [0, 0, G], 0.02)
+    with pytest.raises(InputError, match="accelerometer"):
+        imu.step([0, 0, 0], [0, 0], 0.02)
+
+
+# ---------------------------------------------------------------------------------- at rest
+
+
+def still(tilt: Rotation | None = None) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(3)
+    up = np.array([0, 0, G]) if tilt is None else tilt.inv().apply([0, 0, G])
+    rates = np.array([0.02, -0.05, 0.01]) + 0.003 * rng.standard_normal((50, 3))
+    return rates, up + 0.05 * rng.standard_normal((50, 3))
+
+
+def test_at_rest_finds_bias_and_gravity_to_the_noise_of_the_mean():
+    tilt = Rotation.from_euler("xy", [4.0, -7.0], degrees=True)
+    rest = at_rest(*still(tilt))
+    assert rest.bias_rad_s == pytest.approx([0.02, -0.05, 0.01], abs=4 * 0.003 / np.sqrt(50))
+    assert rest.gravity == pytest.approx(tilt.inv().apply(DOWN), abs=4 * 0.05 / G / np.sqrt(50))
+    assert np.linalg.norm(rest.gravity) == pytest.approx(1)
+    imu = ComplementaryFilter()
+    imu.reset(rest)
+    assert imu.step(rest.bias_rad_s, -G * rest.gravity, 0.02).gravity == pytest.approx(rest.gravity)
+
+
+def test_at_rest_refuses_a_robot_that_moved():
+    rates, forces = still()
+    rates[20:25, 1] += 0.4
+    with pytest.raises(InputError, match="moved"):
+        at_rest(rates, forces)
+
+
+def test_at_rest_refuses_a_robot_that_turns_evenly():
+    rates, forces = still()
+    with pytest.raises(InputError, match="moved"):
+        at_rest(rates + np.array([0, 0, 0.5]), forces)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.8, 1 / G])
+def test_at_rest_refuses_an_accelerometer_that_does_not_measure_1_g(scale):
+    rates, forces = still()
+    with pytest.raises(InputError, match=r"not 9\.81"):
+        at_rest(rates, scale * forces)
+
+
+def test_at_rest_refuses_a_robot_on_its_side_and_the_chips_own_frame():
+    with pytest.raises(InputError, match="tilted by 4.°"):
+        at_rest(*still(Rotation.from_euler("x", 45, degrees=True)))
+    rates, forces = still()
+    with pytest.raises(InputError, match="upside down"):
+        at_rest(rates, -forces)
+
+
+def test_at_rest_refuses_too_few_or_broken_samples():
+    rates, forces = still()
+    with pytest.raises(InputError, match="19 IMU samples"):
+        at_rest(rates[:19], forces[:19])
+    with pytest.raises(InputError, match="shapes"):
+        at_rest(rates, forces[:-1])
+    rates[3, 0] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        at_rest(rates, forces)

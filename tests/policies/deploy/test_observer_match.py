@@ -1,0 +1,174 @@
+"""The check before deployment: it measures what theory says, and names what does not fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.deploy.observer_match import FREQUENCIES_HZ, compare, response
+from pupper_sysid.policies.deploy.observers import (
+    HeldEncoder,
+    ServoModelObserver,
+    SyntheticPD,
+    Zero,
+)
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+
+P = 0.02
+LINEAR = DelayedPDParameters(
+    stiffness=10.0,
+    damping=0.15,
+    friction_loss=0.0,
+    armature=8e-4,
+    effort_limit=np.inf,
+    velocity_limit=np.inf,
+    delay_s=0.024,
+)
+TRAINED = replace(LINEAR, friction_loss=0.0167, effort_limit=0.35, velocity_limit=7.6)
+
+
+def theory(servo: DelayedPDParameters, frequency_hz: np.ndarray, period_s: float) -> np.ndarray:
+    """Second order with dead time behind a hold, as it is seen once per period.
+
+    A held sine contains images one control rate apart, and sampling folds them back.
+    """
+    k, d, inertia = (float(np.asarray(x)) for x in (servo.stiffness, servo.damping, servo.armature))
+    s = 2j * np.pi * (np.asarray(frequency_hz) + np.arange(-100, 101)[:, None] / period_s)
+    hold = (1 - np.exp(-s * period_s)) / (s * period_s)
+    motion = k / (inertia * s**2 + d * s + k)
+    return (hold * np.exp(-s * float(np.asarray(servo.delay_s))) * motion).sum(axis=0)
+
+
+# ---------------------------------------------------------------------------------- response
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.04])
+def test_response_of_a_linear_servo_is_its_transfer_function(period_s):
+    frequencies = np.array([0.7, 1.0, 2.3, 4.0, 6.0])
+    observer = SyntheticPD(LINEAR, period_s, substeps=50)
+    found = response(observer, frequencies, 0.1, period_s)
+    assert found.shape == (5, 12)
+    expected = theory(LINEAR, frequencies, period_s)
+    assert np.abs(found - expected[:, None]).max() < 0.01
+
+
+def test_response_of_a_pure_delay_is_its_phase():
+    n = 12
+    values = {
+        "command_center": np.zeros(n), "command_scale": np.ones(n), "position_center": np.zeros(n),
+        "position_scale": np.ones(n), "bound": np.full(n, np.inf), "fir_bias": np.zeros(n),
+        "fir": np.tile([0.0, 0.8, 0.0], (n, 1)),
+    }  # fmt: skip
+    observer = ServoModelObserver(CommandNetwork(JOINT_NAMES, P, values), P)
+    frequencies = np.array([0.5, 3.1, 12.5])
+    # one command ago, and the estimate is of the period's end: two periods behind the command
+    expected = 0.8 * np.exp(-2j * np.pi * frequencies * 2 * P)
+    assert response(observer, frequencies, 0.1, P) == pytest.approx(
+        np.repeat(expected[:, None], 12, axis=1), abs=1e-5
+    )
+
+
+def test_frequencies_the_controller_cannot_command_are_refused():
+    with pytest.raises(InputError, match="between 0 and 25 Hz"):
+        response(Zero(P), [1.0, 25.0], 0.1, P)
+    with pytest.raises(InputError, match="between 0 and 25 Hz"):
+        response(Zero(P), [0.0], 0.1, P)
+    with pytest.raises(InputError, match="list"):
+        response(Zero(P), [], 0.1, P)
+    with pytest.raises(InputError, match="amplitude"):
+        response(Zero(P), [1.0], 0.0, P)
+
+
+def test_an_observer_for_another_rate_is_refused():
+    with pytest.raises(InputError, match=r"every 0\.02 s, the controller every 0\.04 s"):
+        response(Zero(0.02), [1.0], 0.1, 0.04)
+
+
+# ---------------------------------------------------------------------------------- match
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.04])
+def test_an_observer_with_the_trained_parameters_fits_exactly(period_s):
+    match = compare(SyntheticPD(TRAINED, period_s), TRAINED, period_s)
+    assert match.fits
+    assert match.worst_gain_ratio == pytest.approx(1)
+    assert match.worst_phase_difference_deg == pytest.approx(0, abs=1e-9)
+    assert match.sentence().startswith(
+        "The observer moves like the trained actuator from 0.5 to 6 Hz: gain ratio 1.00"
+    )
+
+
+def test_readings_of_the_actuator_itself_fit():
+    match = compare(HeldEncoder(P, 4), TRAINED, P)
+    assert match.fits
+    assert match.worst_gain_ratio == pytest.approx(1)
+
+
+def test_readings_are_those_of_the_robot_not_of_the_training():
+    late = replace(TRAINED, delay_s=0.024 + 2 * P)
+    match = compare(HeldEncoder(P, 4), TRAINED, P, late)
+    assert not match.fits and "40 ms later than the trained actuator" in match.sentence()
+    assert compare(HeldEncoder(P, 4), TRAINED, P, TRAINED).fits
+
+
+def test_the_papers_observer_does_not_fit_and_the_sentence_names_its_resonance():
+    match = compare(SyntheticPD.paper(P), TRAINED, P)
+    assert not match.fits
+    i, _ = np.unravel_index(np.argmax(match.gain_ratio), match.gain_ratio.shape)
+    # natural frequency of 70 N·m/rad on 0.20 kg·m²
+    assert match.frequencies_hz[i] == pytest.approx(np.sqrt(70 / 0.20) / (2 * np.pi), abs=0.15)
+    assert match.sentence().startswith("The observer swings 3.")
+    assert f"times as far as commanded at {match.frequencies_hz[i]:.1f} Hz" in match.sentence()
+    assert "(all joints)" in match.sentence()
+    assert "resonance" in match.sentence()
+
+
+def test_a_delay_of_two_hundred_milliseconds_is_unwrapped_and_named():
+    late = replace(TRAINED, delay_s=0.024 + 0.2)
+    match = compare(SyntheticPD(late, P), TRAINED, P)
+    assert not match.fits
+    assert match.worst_gain_ratio == pytest.approx(1, abs=1e-3)
+    # 360° x 6 Hz x 0.2 s, beyond a whole turn
+    assert match.worst_phase_difference_deg == pytest.approx(-432, abs=0.5)
+    assert "200 ms later than the trained actuator at 6.0 Hz, 432°" in match.sentence()
+
+
+def test_an_early_observer_is_called_early_and_the_one_joint_is_named():
+    delays = np.full(12, 0.024)
+    delays[7] = 0.0
+    match = compare(SyntheticPD(replace(TRAINED, delay_s=delays), P), TRAINED, P)
+    assert not match.fits
+    assert match.worst_phase_difference_deg == pytest.approx(360 * 6 * 0.024, abs=0.5)
+    assert "24 ms earlier" in match.sentence()
+    assert "LB_thigh" in match.sentence()
+
+
+@pytest.mark.parametrize(("shift_s", "fits"), [(0.008, True), (0.011, False)])
+def test_twenty_degrees_at_six_hertz_are_the_border(shift_s, fits):
+    shifted = replace(TRAINED, delay_s=0.024 + shift_s)
+    assert compare(SyntheticPD(shifted, P), TRAINED, P).fits is fits
+
+
+def test_an_observer_that_stands_still_does_not_fit():
+    match = compare(Zero(P), TRAINED, P)
+    assert not match.fits
+    assert match.worst_gain_ratio == pytest.approx(0, abs=1e-12)
+    assert "swings 0.0 times" in match.sentence()
+    assert "would not see" in match.sentence()
+
+
+def test_table_has_a_row_for_every_kind_of_joint_and_frequency():
+    rows = compare(SyntheticPD(LINEAR, P, substeps=20), LINEAR, P).table()
+    assert len(rows) == 3 * len(FREQUENCIES_HZ)
+    assert [r["joints"] for r in rows[:: len(FREQUENCIES_HZ)]] == ["hip", "thigh", "calf"]
+    last = rows[len(FREQUENCIES_HZ) - 1]
+    expected = theory(LINEAR, np.array([6.0]), P)[0]
+    assert last["frequency_hz"] == 6.0
+    assert last["observer_gain"] == pytest.approx(abs(expected), abs=0.01)
+    assert last["actuator_gain"] == pytest.approx(abs(expected), abs=0.03)
+    assert last["observer_phase_deg"] == pytest.approx(np.degrees(np.angle(expected)), abs=1)

@@ -1,0 +1,337 @@
+"""Observers: the simulated servo is the trained one, the paper's resonates, readings are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.deploy.observer_match import response
+from pupper_sysid.policies.deploy.observers import (
+    HeldEncoder,
+    Observer,
+    ServoModelObserver,
+    SyntheticPD,
+    Zero,
+)
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+
+P = 0.02
+CALIBRATED = DelayedPDParameters(
+    stiffness=np.linspace(9.0, 11.0, 12),
+    damping=0.083,
+    friction_loss=0.0167,
+    armature=8.08e-4,
+    effort_limit=0.35,
+    velocity_limit=7.6,
+    delay_s=np.linspace(0.0201, 0.0287, 12),
+)
+UNKNOWN = np.full(12, np.nan)
+
+
+def servo_model(period_s: float = P, joints: tuple[str, ...] = JOINT_NAMES) -> CommandNetwork:
+    """Each joint is where it was told to be one period ago."""
+    n = len(joints)
+    values = {
+        "command_center": np.zeros(n), "command_scale": np.ones(n), "position_center": np.zeros(n),
+        "position_scale": np.ones(n), "bound": np.full(n, np.inf), "fir_bias": np.zeros(n),
+        "fir": np.tile([0.0, 1.0, 0.0], (n, 1)),
+    }  # fmt: skip
+    return CommandNetwork(joints, period_s, values)
+
+
+OBSERVERS: dict[str, Callable[[], Observer]] = {
+    "synthetic PD": lambda: SyntheticPD(CALIBRATED, P),
+    "paper PD": lambda: SyntheticPD.paper(P),
+    "servo model": lambda: ServoModelObserver(servo_model(), P),
+    "held encoder": lambda: HeldEncoder(P, 4),
+    "zero": lambda: Zero(P),
+}
+each_observer = pytest.mark.parametrize("make", OBSERVERS.values(), ids=OBSERVERS.keys())
+
+
+def walk(steps: int, period_s: float = P) -> np.ndarray:
+    """Targets of a gait-like motion, another for each joint, shape (steps, 12)."""
+    time = period_s * np.arange(steps)[:, None]
+    joint = np.arange(12)
+    return 0.2 * np.sin(2 * np.pi * 2.5 * time + joint) + 0.1 * np.sign(np.sin(7 * time))
+
+
+# ---------------------------------------------------------------------------------- every one
+
+
+@each_observer
+def test_at_rest_it_stays_at_rest(make):
+    observer = make()
+    rest = np.linspace(-1, 1, 12)
+    observer.reset(rest)
+    for _ in range(3):
+        estimate = observer.step(rest, rest)
+        assert estimate.position == pytest.approx(rest, abs=1e-6)
+        assert estimate.velocity == pytest.approx(np.zeros(12), abs=1e-5)
+        assert estimate.effort == pytest.approx(np.zeros(12), abs=1e-6)
+
+
+@each_observer
+def test_reset_forgets_everything(make):
+    observer, fresh = make(), make()
+    for target in walk(30):
+        observer.step(target, target)
+    for one in (observer, fresh):
+        one.reset(np.full(12, 0.1))
+    for target in walk(10):
+        a, b = observer.step(target, target), fresh.step(target, target)
+        assert np.array_equal(a.position, b.position)
+        assert np.array_equal(a.velocity, b.velocity)
+        assert np.array_equal(a.effort, b.effort)
+
+
+@each_observer
+def test_robots_side_by_side_move_as_each_would_alone(make):
+    together, alone = make(), make()
+    start, shift = np.zeros((2, 3, 12)), np.arange(6).reshape(2, 3, 1) / 10
+    start = start + shift
+    together.reset(start)
+    alone.reset(start[1, 2])
+    for target in walk(20):
+        many = together.step(target + shift, target + shift)
+        one = alone.step(target + shift[1, 2], target + shift[1, 2])
+        for name in ("position", "velocity", "effort"):
+            assert getattr(many, name).shape == (2, 3, 12)
+            assert getattr(many, name)[1, 2] == pytest.approx(getattr(one, name), abs=2e-5)
+
+
+@each_observer
+def test_what_it_gave_does_not_change_later(make):
+    observer = make()
+    first = observer.step(np.full(12, 0.5), np.full(12, 0.5))
+    kept = [x.copy() for x in (first.position, first.velocity, first.effort)]
+    observer.step(np.full(12, -0.5), np.full(12, -0.5))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(kept, (first.position, first.velocity, first.effort), strict=True)
+    )
+
+
+@each_observer
+def test_positions_that_are_not_of_twelve_joints_are_refused(make):
+    observer = make()
+    with pytest.raises(InputError, match="12 joints"):
+        observer.reset(np.zeros(11))
+    with pytest.raises(InputError, match="12 joints"):
+        observer.reset(0.0)
+    with pytest.raises(InputError, match="not finite"):
+        observer.reset(UNKNOWN)
+
+
+@pytest.mark.parametrize("name", ["synthetic PD", "servo model"])
+def test_a_target_that_is_nan_or_of_another_shape_is_refused(name):
+    observer = OBSERVERS[name]()
+    with pytest.raises(InputError, match="not finite"):
+        observer.step(UNKNOWN, UNKNOWN)
+    with pytest.raises(InputError, match="reset with"):
+        observer.step(np.zeros((2, 12)), UNKNOWN)
+    assert np.isfinite(observer.step(np.zeros(12), UNKNOWN).position).all()
+
+
+@pytest.mark.parametrize("period_s", [0.0, -0.02, np.nan, np.inf])
+def test_a_period_that_is_no_time_is_refused(period_s):
+    for make in (Zero, lambda t: HeldEncoder(t, 4), lambda t: SyntheticPD(CALIBRATED, t)):
+        with pytest.raises(InputError, match="control period"):
+            make(period_s)
+
+
+# ---------------------------------------------------------------------------------- synthetic PD
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.04])
+def test_with_the_trained_parameters_it_is_the_trained_servo(period_s):
+    observer, servo = SyntheticPD(CALIBRATED, period_s), DelayedPD(CALIBRATED)
+    start, per_period = np.full(12, 0.1), round(period_s / servo.time_step_s)
+    observer.reset(start)
+    servo.reset(start)
+    targets = walk(80, period_s)
+    expected = servo.rollout(np.repeat(targets, per_period, axis=0))
+    estimates = [observer.step(target, UNKNOWN) for target in targets]
+    positions = np.stack([e.position for e in estimates])
+    assert positions == pytest.approx(expected[per_period - 1 :: per_period], abs=1e-12)
+    # semi-implicit Euler: the last change of position is the velocity times the time step
+    change = np.diff(expected, axis=0)[per_period - 2 :: per_period] / servo.time_step_s
+    assert np.stack([e.velocity for e in estimates]) == pytest.approx(change, abs=1e-9)
+
+
+def test_effort_is_the_torque_within_its_limit():
+    stiff = replace(CALIBRATED, stiffness=10.0, friction_loss=0.35, delay_s=0.0)
+    observer = SyntheticPD(stiff, P)
+    # dry friction as large as the limit: the joint cannot move, so torque = stiffness * target
+    half = observer.step(np.full(12, 0.0175), UNKNOWN)
+    assert half.position == pytest.approx(np.zeros(12), abs=1e-4)
+    assert half.effort == pytest.approx(np.full(12, 0.175), abs=0.0035)
+    assert observer.step(np.full(12, -0.1), UNKNOWN).effort == pytest.approx(np.full(12, -0.35))
+
+
+def test_it_stops_at_a_limit_and_comes_back_from_it():
+    low, high = np.full(12, -0.1), np.linspace(0.05, 0.2, 12)
+    observer = SyntheticPD(CALIBRATED, P, limits_rad=(low, high))
+    pushed = [observer.step(np.full(12, 0.5), UNKNOWN) for _ in range(40)]
+    assert all((estimate.position <= high).all() for estimate in pushed)
+    assert np.array_equal(pushed[-1].position, high)
+    assert (pushed[-1].velocity == 0).all()
+    back = [observer.step(np.zeros(12), UNKNOWN) for _ in range(40)]
+    assert np.abs(back[-1].position).max() < 0.01
+
+
+def test_a_servo_too_stiff_for_its_substeps_is_refused_with_how_many_it_needs():
+    stiff = replace(CALIBRATED, stiffness=70.0, damping=0.0)
+    limit = 2 / np.sqrt(70.0 / 8.08e-4)  # of semi-implicit Euler without damping
+    assert SyntheticPD(stiff, P, substeps=int(np.ceil(P / limit)))
+    with pytest.raises(InputError, match=f"take {int(np.ceil(P / limit))} or more"):
+        SyntheticPD(stiff, P, substeps=2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stiffness": np.ones(11)}, "shape"),
+        ({"damping": np.ones((2, 12))}, "shape"),
+        ({"armature": 0.0}, "armature"),
+        ({"delay_s": -0.1}, "delay_s"),
+    ],
+)
+def test_parameters_that_are_no_servos_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        SyntheticPD(replace(CALIBRATED, **changes), P)
+
+
+def test_limits_and_substeps_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="lower limit"):
+        SyntheticPD(CALIBRATED, P, limits_rad=(0.5, 0.5))
+    with pytest.raises(InputError, match="substeps"):
+        SyntheticPD(CALIBRATED, P, substeps=0)
+
+
+# ---------------------------------------------------------------------------------- the paper's
+
+
+def paper_swing(targets: np.ndarray, period_s: float, delay_steps: int, limit: float) -> np.ndarray:
+    """The authors' arithmetic, facts/paper.md 5.2: explicit damping, a queue of targets."""
+    q = v = 0.0
+    queue, dt, found = [0.0] * (delay_steps + 1), period_s / 4, []
+    for target in targets:
+        queue = [*queue[1:], target]
+        for _ in range(4):
+            v += (70 * (queue[0] - q) - 1.2 * v - 0.03 * np.sign(v)) / 0.20 * dt
+            q += v * dt
+            if abs(q) > limit:
+                q, v = np.sign(q) * limit, 0.0
+        found.append(q)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.25], ids=["free", "stopped"])
+@pytest.mark.parametrize(("period_s", "delay_steps"), [(0.02, 9), (0.04, 5)])
+def test_the_papers_preset_moves_as_the_authors_arithmetic(period_s, delay_steps, limit):
+    targets = 0.2 * np.sin(2 * np.pi * 2 * period_s * np.arange(200))
+    targets[:20] = 0.0
+    observer = SyntheticPD.paper(period_s, (-limit, limit))
+    moved = [observer.step(np.full(12, t), UNKNOWN) for t in targets]
+    positions = np.array([e.position[0] for e in moved])
+    expected = paper_swing(targets, period_s, delay_steps, limit)
+    assert np.abs(expected).max() > min(0.34, limit - 1e-9)  # 1.7 times 0.2 rad, when free
+    # dry friction differs where the joint turns round: here it can hold it
+    assert np.abs(positions - expected).max() < 1e-3
+    # nothing arrives before the delay is over
+    assert np.flatnonzero(expected)[0] == np.flatnonzero(positions)[0] == 20 + delay_steps
+    assert (np.array([e.effort for e in moved]) == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "gain"), [(1.0, 1.1), (2.0, 1.7), (2.9, 3.0), (4.0, 1.1), (5.3, 0.45)]
+)
+def test_the_papers_preset_resonates_as_published(frequency_hz, gain):
+    found = abs(response(SyntheticPD.paper(P), [frequency_hz], 0.2, P))
+    assert found == pytest.approx(np.full((1, 12), gain), rel=0.08)
+
+
+def test_the_papers_preset_is_known_for_its_two_rates_only():
+    with pytest.raises(InputError, match=r"0\.02 and 0\.04 s"):
+        SyntheticPD.paper(0.01)
+
+
+# ---------------------------------------------------------------------------------- servo model
+
+
+def test_a_servo_model_runs_freely_and_its_velocity_is_the_difference():
+    observer = ServoModelObserver(servo_model(), P)
+    observer.reset(np.zeros(12))
+    targets = [np.full(12, x) for x in (0.1, 0.3, 0.2)]
+    found = [observer.step(t, np.full(12, 99.0)) for t in targets]
+    assert [f.position[0] for f in found] == pytest.approx([0.0, 0.1, 0.3])
+    assert [f.velocity[0] for f in found] == pytest.approx([0.0, 5.0, 10.0], rel=1e-5)
+    assert all((f.effort == 0).all() for f in found)
+
+
+def test_a_servo_model_of_another_rate_or_other_joints_is_refused():
+    with pytest.raises(InputError, match=r"every 0\.04 s, the controller every 0\.02 s"):
+        ServoModelObserver(servo_model(period_s=0.04), P)
+    with pytest.raises(InputError, match="all twelve"):
+        ServoModelObserver(servo_model(joints=("LF_hip", "RB_calf")), P)
+
+
+# ---------------------------------------------------------------------------------- held encoder
+
+
+def test_readings_pass_and_velocity_spans_the_contracts_steps():
+    observer = HeldEncoder(P, velocity_steps=4)
+    observer.reset(np.zeros(12))
+    # reading = step number + joint / 100, so that a wrong gather shows
+    joint = np.arange(12) / 100
+    found = [observer.step(UNKNOWN, k + joint) for k in range(1, 8)]
+    assert found[-1].position == pytest.approx(7 + joint)
+    assert found[-1].velocity == pytest.approx(np.full(12, 4 / (4 * P)))
+    # before the span is over it reaches back to the position at reset
+    assert found[1].velocity == pytest.approx((2 + joint) / (4 * P))
+    assert (found[-1].effort == 0).all()
+
+
+def test_a_missing_reading_leaves_the_last_one_of_that_joint():
+    observer = HeldEncoder(P, velocity_steps=1)
+    observer.reset(np.full(12, 0.1))
+    reading = np.full(12, 0.2)
+    reading[3] = np.nan
+    found = observer.step(UNKNOWN, reading)
+    assert found.position[3] == 0.1
+    assert found.velocity[3] == 0.0
+    assert found.position[4] == 0.2
+    assert found.velocity[4] == pytest.approx(0.1 / P)
+    later = observer.step(UNKNOWN, UNKNOWN)
+    assert np.array_equal(later.position, found.position)
+    assert (later.velocity == 0).all()
+
+
+def test_an_encoder_refuses_another_shape_and_no_steps():
+    with pytest.raises(InputError, match="A reading has shape"):
+        HeldEncoder(P, 4).step(np.zeros(12), np.zeros(11))
+    with pytest.raises(InputError, match="velocity steps"):
+        HeldEncoder(P, 0)
+
+
+# ---------------------------------------------------------------------------------- zero
+
+
+def test_zero_stays_whatever_happens():
+    observer = Zero(P)
+    observer.reset(np.full(12, 0.7))
+    found = observer.step(np.full(12, 9.0), np.full(12, -9.0))
+    assert (found.position == 0.7).all()
+    assert (found.velocity == 0).all()
+    assert (found.effort == 0).all()
+
+
+def test_a_recorded_rate_is_never_quite_the_one_that_was_asked_for():
+    assert ServoModelObserver(servo_model(period_s=1.0002 * P), P).period_s == P

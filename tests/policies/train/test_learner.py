@@ -1,0 +1,340 @@
+"""The learner: what it is given (vec_env), what it adds to PPO, and its checkpoints."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, Ranks, read_checkpoint
+from pupper_sysid.policies.train.training import make_env, make_learner
+from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.walking.config import Walking
+from support.tiny_training import observations, ppo, tiny_run
+
+GAMMA = 0.99
+
+# ------------------------------------------------------------------------------ vec_env
+
+
+def walkers(episode_steps: int, history: int, robots: int = 3) -> WalkingVecEnv:
+    run = tiny_run(environments=robots, task=Walking(episode_s=0.02 * episode_steps))
+    return WalkingVecEnv(make_env(run, Ranks()), history)
+
+
+def act(env: WalkingVecEnv, number: float):
+    """All joints of all robots do `number`."""
+    return env.step(torch.full((env.num_envs, 12), number))
+
+
+def history_of(groups, robot: int) -> list[list[float]]:
+    return groups["actions"][robot].reshape(-1, 12).tolist()
+
+
+def test_past_actions_are_newest_first_and_begin_as_the_start_action():
+    env = walkers(episode_steps=100, history=3)
+    start = env.env.action.astype(np.float32).copy()
+    for robot in range(3):
+        assert history_of(env.get_observations(), robot) == [start[robot].tolist()] * 3
+    for step in (1, 2):
+        seen = act(env, 0.01 * step)[0]
+    for robot in range(3):
+        newest, before, oldest = history_of(seen, robot)
+        assert newest == pytest.approx([0.02] * 12) and before == pytest.approx([0.01] * 12)
+        assert oldest == start[robot].tolist()
+
+
+def test_after_a_time_out_past_actions_begin_anew_but_the_terminal_ones_are_those_taken():
+    env = walkers(episode_steps=4, history=3)
+    for step in range(1, 5):
+        seen, _, dones, extras = act(env, 0.01 * step)
+        assert bool(dones.all()) is (step == 4)
+    assert extras["terminal_ids"].tolist() == [0, 1, 2]
+    for robot in range(3):
+        taken = history_of(extras["terminal_observations"], robot)
+        assert [row[0] for row in taken] == pytest.approx([0.04, 0.03, 0.02])
+        own = env.env.action[robot].astype(np.float32).tolist()
+        assert history_of(seen, robot) == [own] * 3
+        assert abs(own[0] - 0.04) > 1e-3  # the start action, not the last one taken
+
+
+def test_without_history_there_is_no_group_of_actions():
+    assert set(walkers(4, 0).get_observations().keys()) == {"policy", "privileged"}
+
+
+def test_observations_that_were_handed_out_do_not_change_with_the_next_step():
+    env = walkers(episode_steps=100, history=2)
+    first = env.get_observations()
+    kept = first.clone()
+    act(env, 0.3)
+    assert all(torch.equal(first[k], kept[k]) for k in ("policy", "privileged", "actions"))
+
+
+def test_the_learner_sees_the_rewards_and_ends_that_the_environment_gave():
+    env, twin = walkers(4, 0), walkers(4, 0)
+    for step in range(1, 6):
+        _, rewards, dones, extras = act(env, 0.01 * step)
+        found = twin.env.step(np.full((3, 12), 0.01 * step, np.float32))
+        assert rewards.tolist() == found.reward.astype(np.float32).tolist()
+        assert dones.tolist() == found.done.tolist()
+        assert sum(extras["terms"].values()) == pytest.approx(found.reward)
+        assert env.episode_length_buf.tolist() == twin.env.episode_step.tolist()
+
+
+# ------------------------------------------------------------------------------ time-outs
+
+
+def test_a_time_out_is_worth_the_value_of_the_state_reached_and_a_fall_nothing():
+    """Robot 0 goes on, 1 falls, 2 runs out of time: r + γ V(reached), r, and r."""
+    learner = ppo("mlp", robots=3, steps=1)
+    learner.gamma = GAMMA
+    generator = torch.Generator().manual_seed(1)
+    before, reached, after = (observations(3, generator) for _ in range(3))
+    with torch.inference_mode():
+        learner.act(before)
+        extras = {"terminal_ids": torch.tensor([2]), "terminal_observations": reached[2:]}
+        rewards = torch.tensor([10.0, 20.0, 30.0])
+        learner.process_env_step(after, rewards, torch.tensor([False, True, True]), extras)
+        learner.compute_returns(after)
+        value = {n: learner.critic(o)[:, 0] for n, o in [("s", before), ("r", reached)]}
+        next_value = learner.critic(after)[:, 0]
+    assert abs(value["r"][2] - value["s"][2]) > 0.05, "or the two could not be told apart"
+    stored = learner.storage.rewards[0, :, 0]
+    bootstrapped = 30.0 + GAMMA * float(value["r"][2])
+    assert stored.tolist() == pytest.approx([10.0, 20.0, bootstrapped], abs=1e-5)
+    assert rewards.tolist() == [10.0, 20.0, 30.0]
+    # with one step, the return is r + γ V(next) where the episode goes on, and r where it ended
+    goes_on = 10.0 + GAMMA * float(next_value[0])
+    returns = learner.storage.returns[0, :, 0]
+    assert returns.tolist() == pytest.approx([goes_on, 20.0, bootstrapped], abs=1e-5)
+
+
+def test_in_a_rollout_every_time_out_is_worth_the_value_of_its_own_terminal_observation():
+    run = tiny_run(task=Walking(episode_s=0.06))
+    learner = make_learner(run, Ranks())
+    seen = []
+    learner.rollout(lambda rewards, dones, extras: seen.append((rewards.clone(), extras)))
+    late = [len(extras["terminal_ids"]) for _, extras in seen]
+    # four episodes of three steps each, begun at different times
+    assert sum(late) == 8 and max(late) < 4 and late[:3] == late[3:]
+    for step, (rewards, extras) in enumerate(seen):
+        expected = rewards.clone()
+        if late[step]:
+            with torch.inference_mode():
+                value = learner.ppo.critic(extras["terminal_observations"])[:, 0]
+            expected[extras["terminal_ids"]] += learner.hyper.discount * value
+        torch.testing.assert_close(learner.ppo.storage.rewards[step, :, 0], expected)
+
+
+# ------------------------------------------------------------------------------ checkpoints
+
+
+def saved(tmp_path, kind: str = "mlp"):
+    learner = make_learner(tiny_run(kind), Ranks())
+    learner.rollout()
+    learner.update()
+    path = tmp_path / "last.pt"
+    learner.save(path, {"note": 5})
+    return learner, path
+
+
+@pytest.mark.parametrize("kind", ["mlp-actions", "gru"])
+def test_a_loaded_learner_goes_on_exactly_as_the_one_that_was_saved(tmp_path, kind):
+    first, path = saved(tmp_path, kind)
+    second = make_learner(tiny_run(kind, seed=99), Ranks())
+    rng = torch.get_rng_state()
+    assert second.load(path) == {"note": 5} and second.iteration == 1
+    for learner in (first, second):
+        torch.set_rng_state(read_checkpoint(path)["torch_rng"])
+        learner.rollout()
+        learner.update()
+    assert not torch.equal(rng, torch.get_rng_state())
+    for a, b in zip(
+        (*first.actor.state_dict().values(), *first.observations.values()),
+        (*second.actor.state_dict().values(), *second.observations.values()),
+        strict=True,
+    ):
+        assert torch.equal(a, b)
+
+
+def test_it_learns_on_the_processor_though_the_machine_has_a_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    learner = make_learner(tiny_run(), Ranks())
+    learner.rollout()
+    learner.update()
+    devices = {p.device.type for p in learner.actor.parameters()}
+    assert devices == {learner.observations["policy"].device.type} == {"cpu"}
+
+
+def test_what_was_learned_can_be_taken_back():
+    learner = make_learner(tiny_run(), Ranks())
+    learner.rollout()
+    before = learner.networks()
+    weights = learner.actor.mlp[0].weight.detach().clone()
+    learner.update()
+    assert not torch.equal(weights, learner.actor.mlp[0].weight) and learner.iteration == 1
+    learner.take_back(before)
+    assert torch.equal(weights, learner.actor.mlp[0].weight) and learner.iteration == 0
+    assert learner.ppo.optimizer.state_dict()["state"] == {}
+    learner.rollout()
+    learner.update()
+    assert torch.equal(weights, before["actor_state_dict"]["mlp.0.weight"]), "copies stay copies"
+
+
+@pytest.mark.parametrize("where", ["actor", "critic", "observations", "memory"])
+def test_a_learner_knows_when_it_holds_no_numbers(where):
+    learner = make_learner(tiny_run("lstm"), Ranks())
+    learner.rollout()
+    learner.update()
+    assert learner.finite
+    hidden = learner.actor.get_hidden_state()
+    tensor = {
+        "actor": learner.actor.mlp[0].weight.data,
+        "critic": learner.ppo.critic.obs_normalizer._mean,
+        "observations": learner.observations["policy"],
+        "memory": hidden[1],
+    }[where]
+    with torch.inference_mode():
+        tensor.view(-1)[3] = float("nan")
+    assert not learner.finite
+
+
+def refusal(path, run=None) -> str:
+    """What is said about a checkpoint: one sentence or two, no line breaks."""
+    with pytest.raises(InputError) as refused:
+        make_learner(run or tiny_run(), Ranks()).load(path)
+    text = str(refused.value)
+    assert "\n" not in text and str(path) in text and text.endswith(".")
+    return text
+
+
+def test_a_missing_checkpoint_is_refused(tmp_path):
+    assert "does not exist" in refusal(tmp_path / "last.pt")
+
+
+def test_a_checkpoint_of_another_kind_of_policy_is_refused_by_name(tmp_path):
+    _, path = saved(tmp_path)
+    said = refusal(path, tiny_run("gru"))
+    assert "kind mlp" in said and "run says gru" in said
+
+
+def test_a_checkpoint_of_another_size_is_refused(tmp_path):
+    _, path = saved(tmp_path)
+    run = tiny_run()
+    larger = replace(run, architecture=replace(run.architecture, hidden=(17,)))
+    assert "does not fit this run's networks" in refusal(path, larger)
+
+
+def test_a_checkpoint_of_another_number_of_environments_is_refused(tmp_path):
+    _, path = saved(tmp_path)
+    with pytest.raises(InputError, match="settings of the run"):
+        make_learner(tiny_run(environments=5), Ranks()).load(path)
+
+
+def test_a_checkpoint_of_another_robot_is_refused(tmp_path):
+    _, path = saved(tmp_path)
+    serial = tiny_run(task=Walking(episode_s=0.2, knee="serial"))
+    with pytest.raises(InputError, match="settings of the run"):
+        make_learner(serial, Ranks()).load(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_checkpoint_is_refused(tmp_path, share):
+    _, path = saved(tmp_path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    assert "damaged" in refusal(path)
+
+
+def test_random_bytes_are_refused(tmp_path):
+    path = tmp_path / "last.pt"
+    path.write_bytes(np.random.default_rng(0).bytes(5000))
+    assert "damaged" in refusal(path)
+
+
+class Runs:
+    """An object whose unpickling makes a folder."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("how", ["torch", "pickle"])
+def test_code_in_a_checkpoint_is_not_run(tmp_path, how):
+    path, made = tmp_path / "last.pt", tmp_path / "made"
+    if how == "torch":
+        torch.save({"schema": "pupper-checkpoint", "more": Runs(str(made))}, path)
+    else:
+        path.write_bytes(pickle.dumps(Runs(str(made))))
+    assert "damaged" in refusal(path)
+    assert not made.exists()
+    pickle.loads(pickle.dumps(Runs(str(made))))
+    assert made.exists(), "or the test would prove nothing"
+
+
+def test_what_is_no_checkpoint_or_of_another_version_or_incomplete_is_refused(tmp_path):
+    _, path = saved(tmp_path)
+    good = torch.load(path, weights_only=True)
+    for change, words in [
+        ({"schema": "something else"}, "not a checkpoint"),
+        ({"schema_version": CHECKPOINT_VERSION + 1}, f"reads {CHECKPOINT_VERSION}). Upgrade"),
+    ]:
+        torch.save(good | change, path)
+        assert words in refusal(path)
+    for part in ("hidden", "environment", "learning_rate"):
+        torch.save({k: v for k, v in good.items() if k != part}, path)
+        assert f"has no {part}" in refusal(path)
+    good["environment"].pop("command")
+    torch.save(good, path)
+    assert "command" in refusal(path)
+    torch.save([1, 2], path)
+    assert "not a checkpoint" in refusal(path)
+
+
+@pytest.mark.parametrize("fails", ["write", "replace"])
+def test_a_full_disk_leaves_the_checkpoint_before_and_is_said(tmp_path, monkeypatch, fails):
+    learner, path = saved(tmp_path)
+    before = path.read_bytes()
+    full = OSError(errno.ENOSPC, "No space left on device")
+
+    class Full:
+        def __init__(self, handle, mode):
+            self.handle = handle
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            os.close(self.handle)
+
+        def write(self, data):
+            raise full
+
+    def refuse(*_):
+        raise full
+
+    monkeypatch.setattr(os, *(("fdopen", Full) if fails == "write" else ("replace", refuse)))
+    learner.rollout()
+    learner.update()
+    with pytest.raises(InputError, match=r"last\.pt cannot be written: No space left on device"):
+        learner.save(path, {})
+    monkeypatch.undo()
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["last.pt"], "nothing half written stays"
+
+
+def test_a_recurrent_policy_needs_an_environment_per_minibatch():
+    run = tiny_run("lstm", environments=1)
+    with pytest.raises(InputError, match="1 environments cannot be split into 2 minibatches"):
+        make_learner(run, Ranks())
+    make_learner(tiny_run("mlp", environments=1), Ranks())

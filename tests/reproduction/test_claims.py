@@ -1,0 +1,352 @@
+"""Claims are judged by what the evidence says, and unknown evidence is said to be unknown."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_paths import walked
+
+import reproduction.page
+from pupper_sysid.cli.commands.sweep import Sweep
+from pupper_sysid.cli.programs import pupper_analyze
+from pupper_sysid.common.files import sha256
+from pupper_sysid.policies.analysis.phase_reset import NUDGE_M_S, PUSH_M_S
+from pupper_sysid.policies.analysis.rhythm import Estimate
+from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
+from reproduction import servos as servo_claims
+from reproduction.claims import Claim
+from reproduction.evidence import DELAYS_MS, PolicyEvidence
+from reproduction.policies import judge
+from support.browser import looks_right
+from support.command_line import refused, run_program
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLES = ROOT / "data/samples"
+CURVE = np.random.default_rng(0).random((50, 3))
+
+
+def known(value: float) -> Estimate:
+    return Estimate(value, value - 0.1, value + 0.1)
+
+
+def evidence(kind: str, name: str | None = None) -> PolicyEvidence:
+    """A policy that walks well whatever is done to it."""
+    delays = sorted({*DELAYS_MS, 160.0})
+    orbit = {
+        "states": [np.zeros((500, 12))] * 3, "orbits": [CURVE[:, :3]] * 3,
+        "explained_3": 0.9, "closure": [0.1] * 3, "area_ratio": [1.0] * 3,
+    }  # fmt: skip
+    frozen = [
+        {"test": test, "frequency_hz": 3.0, "amplitude_rad": 0.2, "share": share}
+        for test, share in (
+            ("nothing frozen", 1.0), ("senses frozen, its own last action", 1.0),
+            ("senses and last action frozen", 0.0), ("last action frozen, senses recorded", 0.5),
+        )
+    ]  # fmt: skip
+    gait = {"survival": 1.0, "frequency_hz": 3.0, "amplitude_rad": 0.2, "mae_vx_m_s": 0.02}
+    directions = ("forward", "backward", "left", "right", "turn left", "turn right")
+    return PolicyEvidence(
+        name or kind, kind, {"reward": 7.0, "std": 0.01, "updates": 60.0, "steps_per_s": 1000.0},
+        False, "flat", walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
+        {"actions": orbit, "hidden": orbit},
+        [
+            gait | {"extra_delay_ms": d, "mode": m}
+            for d in delays for m in ("replay", "fixed", "jittered")
+        ],
+        [
+            gait | {"channel": "all joints", "kind": k, "level": level, "correlation": r}
+            for k, level, r in (("noise", 0.1, 0.99), ("noise", 0.5, 0.6), ("zero", 0.0, 0.7))
+        ],
+        frozen,
+        [
+            {"push_m_s": speed, "survival": 1.0, "shift_early": s, "shift_late": s, "kept": 1.0,
+             "phases": [0.1, 0.6], "shifts": [s, -s]}
+            for speed, s in ((NUDGE_M_S, 0.01), (PUSH_M_S, 0.2))
+        ],
+        [gait | {"rate_hz": r, "cycles_per_step": 0.06} for r in (25.0, 50.0)],
+        [gait | {"scale_rad": s} for s in (0.45, 0.5, 0.6, 0.75)],
+        [gait | {"ground": g} for g in ("flat", "rough")],
+        [
+            {"direction": d, "command": (0.1, 0, 0), "survival": 1.0, "share": known(0.9),
+             "drift": known(0.0), "arc_rad_m": known(-0.2), "wander_m": known(0.0),
+             "path": CURVE[:, :2]}
+            for d in directions
+        ],
+    )  # fmt: skip
+
+
+def claims(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, Claim]:
+    return {c.id: c for c in judge(policies, played or {}, stacks)}
+
+
+def verdicts(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, str]:
+    return {i: c.verdict for i, c in claims(*policies, played=played, stacks=stacks).items()}
+
+
+BOTH = (evidence("mlp"), evidence("lstm"))
+
+
+def test_every_claim_has_a_row_with_all_its_parts():
+    found = [*servo_claims.judge(servo_claims.ServoEvidence()), *judge(BOTH, {}, [])]
+    assert len(found) >= 30 and len({c.id for c in found}) == len(found)
+    for claim in found:
+        assert claim.claim and claim.paper and claim.ours and claim.how
+
+
+def test_without_evidence_nothing_is_decided():
+    found = verdicts(evidence("gru"))
+    for id_ in ("T1", "G2", "G3", "P1", "P2", "B1", "B3", "X1", "X2", "D2", "D3", "G1"):
+        assert found[id_] == "not testable here", id_
+    nothing = servo_claims.judge(servo_claims.ServoEvidence())
+    assert {c.verdict for c in nothing} == {"not testable here"}
+    assert all("--recordings" in c.how for c in nothing)
+
+
+def test_a_gru_with_the_lstms_reward_contradicts_and_one_with_a_third_confirms():
+    gru = evidence("gru")
+    assert verdicts(*BOTH, gru)["T1"] == "does not hold here"
+    poor = replace(gru, trained=gru.trained | {"reward": 2.0})
+    assert verdicts(*BOTH, poor)["T1"] == "holds"
+
+
+def test_an_oscillator_in_the_cell_would_be_one_and_a_loop_through_the_action_is_half_of_one():
+    mlp, lstm = BOTH
+    assert verdicts(mlp, lstm)["X1"] == "holds partly"
+    inside = [r | {"share": 0.9} for r in lstm.frozen]
+    assert verdicts(mlp, replace(lstm, frozen=inside))["X1"] == "holds"
+    driven = [r | {"share": 0.1} for r in lstm.frozen]
+    assert verdicts(mlp, replace(lstm, frozen=driven))["X1"] == "does not hold here"
+
+
+def test_an_lstm_that_does_not_walk_is_no_oscillator_to_judge():
+    mlp, lstm = BOTH
+    still = [r | {"share": float("nan")} for r in lstm.frozen]
+    assert verdicts(mlp, replace(lstm, frozen=still, push=[]))["X1"] == "not testable here"
+    # nobody stayed up to be pushed: what is frozen in replay decides
+    assert verdicts(mlp, replace(lstm, push=[]))["X1"] == "holds partly"
+
+
+def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
+    mlp, lstm = BOTH
+    assert verdicts(mlp, lstm)["G2"] == "holds" and verdicts(mlp, lstm)["G3"] == (
+        "does not hold here"
+    )
+    wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in mlp.delay]
+    assert verdicts(replace(mlp, delay=wild), lstm)["G3"] == "holds"
+    assert verdicts(mlp, replace(lstm, delay=wild))["G2"] == "does not hold here"
+
+
+def test_two_policies_that_each_keep_a_rate_of_their_own_are_not_erratic():
+    slow, quick = ([r | {"frequency_hz": hz} for r in BOTH[0].delay] for hz in (2.5, 2.9))
+    four = [
+        replace(p, name=f"{p.kind}-{i}", delay=delay)
+        for p in BOTH for i, delay in enumerate((slow, quick))
+    ]  # fmt: skip
+    found = verdicts(*four)
+    assert found["G2"] == "holds" and found["G3"] == "does not hold here"
+    wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in slow]
+    one_wild = [replace(p, delay=wild) if p.name.endswith("-1") else p for p in four]
+    assert verdicts(*one_wild)["G2"] == verdicts(*one_wild)["G3"] == "holds partly"
+
+
+def test_a_policy_without_a_rhythm_is_neither_constant_nor_erratic():
+    mlp, lstm = BOTH
+    still = [r | {"frequency_hz": float("nan")} for r in mlp.delay]
+    found = claims(replace(mlp, delay=still), replace(lstm, delay=still))
+    for id_ in ("G2", "G3"):
+        assert found[id_].verdict == "not testable here" and "no rhythm" in found[id_].how
+
+
+def test_noise_that_is_never_worse_than_zeros_contradicts():
+    mlp, lstm = BOTH
+    robust = [r | {"correlation": 0.95 if r["kind"] == "noise" else 0.7} for r in mlp.ablation]
+    found = claims(mlp, replace(lstm, ablation=robust))["B2"]
+    assert found.verdict == "does not hold here" and "LSTM ∞" in found.ours
+    # one of two is not left out of the mean
+    found = claims(mlp, lstm, replace(lstm, name="b", ablation=robust))["B2"]
+    assert "LSTM ∞" in found.ours
+
+
+def test_policies_that_were_given_but_have_no_number_are_not_asked_for():
+    mlp, lstm = BOTH
+    lost = [r | {"correlation": float("nan")} for r in lstm.ablation]
+    how = claims(mlp, replace(lstm, ablation=lost))["B2"].how
+    assert "Of the LSTM that was given there is no number" in how and "Give a run" not in how
+    fallen = [
+        r | ({"frequency_hz": float("nan"), "survival": 0.0} if r["rate_hz"] < 50 else {})
+        for r in mlp.rate
+    ]
+    found = claims(replace(mlp, rate=fallen), replace(lstm, rate=fallen))["D1"]
+    assert found.verdict == "does not hold here" and "MLP 0, LSTM 0 %" in found.ours
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_direction_in_which_nothing_is_known_hides_nowhere(place):
+    mlp, lstm = BOTH
+    rows = [dict(r) for r in lstm.compliance]
+    rows[place]["share"] = known(0.0)
+    assert verdicts(mlp, replace(lstm, compliance=rows))["C1"] == "does not hold here"
+    rows[place]["share"] = known(float("nan"))
+    assert "LSTM" not in claims(mlp, replace(lstm, compliance=rows))["C1"].ours
+
+
+@pytest.mark.parametrize(
+    ("id_", "trained"),
+    [
+        ("T3", {"curriculum": True}), ("T3", {"curriculum": None}), ("B3", {"ground": "rough"}),
+        ("B3", {"ground": None}),
+    ],
+)  # fmt: skip
+def test_how_a_policy_was_trained_is_looked_at_not_taken_for_granted(id_, trained):
+    mlp, lstm = BOTH
+    assert verdicts(mlp, lstm)[id_] != "not testable here"
+    assert verdicts(replace(mlp, **trained), lstm)[id_] == "not testable here"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [(-0.03, -0.01, "holds"), (0.01, 0.03, "does not hold here"), (-0.01, 0.01, "holds partly")],
+)
+def test_stacks_differ_only_if_the_interval_of_their_difference_says_so(low, high, verdict):
+    keys = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
+    row = {"falls": 0.0} | {k: known(0.05) for k in keys}
+    less = {f"less_{k}": Estimate((low + high) / 2, low, high) for k in keys}
+    stacks = [row | {"stack": "encoders"}, row | {"stack": "servo model"} | less]
+    assert verdicts(*BOTH, stacks=stacks)["D3"] == verdict
+
+
+def test_servos_that_make_a_saw_tooth_rounder_are_seen_in_the_sine_fit():
+    time = 0.02 * np.arange(500)
+    saw = 2 * (2.8 * time % 1.0) - 1
+    smooth = np.sin(2 * np.pi * 2.8 * time)
+    found = {c.id: c for c in judge(BOTH, {"LF_thigh": (time, saw, smooth)}, [])}
+    assert found["G1"].verdict == "holds partly" and "2.80 Hz" in found["G1"].ours
+
+
+def test_drift_is_not_judged_as_a_gait():
+    rng = np.random.default_rng(0)
+    time = 0.04 * np.arange(300)
+    walk = np.cumsum(rng.standard_normal((2, 300)), axis=1)
+    found = claims(*BOTH, played={"LF_thigh": (time, walk[0], walk[1])})["G1"]
+    assert found.verdict == "not testable here" and "of noise" in found.how
+    unread = np.full(300, np.nan)
+    found = claims(*BOTH, played={"LF_thigh": (time, walk[0], unread)})["G1"]
+    assert found.verdict == "not testable here" and "nothing was read" in found.how
+
+
+def test_intervals_are_over_policies_of_a_kind():
+    second = replace(evidence("lstm", "lstm-1"), trained=BOTH[1].trained | {"reward": 6.0})
+    claim = next(c for c in judge([*BOTH, second, evidence("gru")], {}, []) if c.id == "T1")
+    assert claim.interval is not None
+    low, high = claim.interval["LSTM"]
+    assert low < 6.5 < high and "MLP" not in claim.interval
+
+
+def test_four_ways_on_the_sample_playback_score_unseen_readings_only():
+    recording = load(SAMPLES / "playback.csv")
+    found = four_way(recording, ["LF_thigh"], seed=0)
+    assert set(found.tracks) == {PUBLISHED, "LSTM", "MLP"} and FITTED in found.errors
+    whole = sum(len(t.send_time_s) for t in recording.trials("LF_thigh"))
+    scored = {n: len(e["LF_thigh"].free_run) for n, e in found.errors.items()}
+    assert len(set(scored.values())) == 1 and next(iter(scored.values())) < 0.5 * whole
+    rms = {n: np.sqrt(np.mean(e["LF_thigh"].free_run ** 2)) for n, e in found.errors.items()}
+    assert rms["MLP"] < rms[PUBLISHED]
+    claims = {
+        c.id: c for c in servo_claims.judge(
+            servo_claims.ServoEvidence(servos=found, played=recording)
+        )
+    }  # fmt: skip
+    assert claims["S1"].verdict in ("holds", "does not hold here") and "mrad" in claims["S1"].ours
+    assert claims["A1"].verdict == "not testable here"
+    # commands that were never repeated do not say how well the robot repeats itself
+    once = replace(found, repeatability={"LF_thigh": float("nan")})
+    for c in servo_claims.judge(servo_claims.ServoEvidence(servos=once, played=recording)):
+        assert c.id != "S4" or c.verdict == "not testable here"
+
+
+def test_a_sweep_says_how_much_of_the_lag_is_stale_feedback(tmp_path):
+    path = tmp_path / "sweep.csv"
+    Sweep(joints="LF_thigh", freqs="2,4", duration=2.0, out=path, seed=3, json=True).run()
+    found = servo_claims.gather([load(path)], seed=0)
+    claims = {c.id: c for c in servo_claims.judge(found)}
+    assert claims["A1"].verdict == "holds partly" and "bus and stale" in claims["A1"].how
+    assert claims["A3"].verdict == "does not hold here"
+
+
+def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "reproduction.evidence.gather",
+        lambda name, policy, *rest: evidence(policy.contract.kind, name),
+    )
+    policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
+    arguments = ("claims", *policies, "--actuator", SAMPLES / "calibrated.yaml")
+    code, out, err = run_program(capsys, pupper_analyze, *arguments, "--json")
+    assert code == 0, err
+    assert " ".join(err.split()).count("they take the numbers of") == 1, "said once, not by policy"
+    found = json.loads(out)
+    assert set(found["claims"][0]) == {
+        "id", "claim", "paper", "ours", "interval", "verdict", "how",
+    }  # fmt: skip
+    page = Path(found["page"]).read_text()
+    for claim in found["claims"]:
+        assert f"| {claim['id']} |" in page
+    for picture in found["pictures"]:
+        assert f"({picture})" in page
+        # not where `pupper-analyze ablation` draws its own
+        assert (tmp_path / "analysis/claims" / picture).stat().st_size > 5000
+    assert "Table I" in page
+    assert "--command 0.15 0 0 --robots 16 --seconds 10 --seed 0" in page
+    contract = json.loads((policies[0] / "contract.json").read_text())
+    for digest in (contract["weights_sha256"], sha256(SAMPLES / "calibrated.yaml")):
+        assert digest in page
+    assert f"mujoco {version('mujoco')}" in page
+    assert {Path(p).stem for p in found["pictures"]} <= set(reproduction.page.PICTURES)
+    beside = {p.relative_to("analysis/claims") for p in Path("analysis/claims").rglob("*.*")}
+    drawn = {Path(p).with_suffix(ending) for p in found["pictures"] for ending in (".png", ".svg")}
+    tables = {Path(f"tables/{name}.csv") for name in reproduction.page.TABLES}
+    assert beside == drawn | tables | {Path("claims.md"), Path("claims.html")}
+    rows = list(csv.DictReader((Path("analysis/claims") / "tables/claims.csv").open()))
+    assert [row["verdict"] for row in rows] == [claim["verdict"] for claim in found["claims"]]
+    report = Path(found["report"]).read_text()
+    assert "Table I" in report and report.count("data:image/png") == len(found["pictures"])
+    assert all(claim["id"] in report for claim in found["claims"])
+    if shutil.which("chromium"):
+        looks_right(Path(found["report"]), tmp_path, 375, dark=False)
+        looks_right(Path(found["report"]), tmp_path, 1280, dark=True)
+    again = refused(capsys, pupper_analyze, *arguments)
+    assert "claims.md exists already" in again
+    twice = refused(
+        capsys,
+        pupper_analyze,
+        "claims",
+        policies[0],
+        policies[0],
+        *arguments[3:],
+        "--out",
+        "b",
+    )
+    assert "rename" in twice
+    Path("c/figures").mkdir(parents=True)
+    Path("c/figures/ablation.png").touch()
+    taken = refused(capsys, pupper_analyze, *arguments, "--out", "c")
+    assert "ablation.png exists already" in taken
+
+
+def test_a_kind_of_policy_about_which_nothing_was_published_is_refused(capsys, tmp_path):
+    contract = tmp_path / "more/contract.json"
+    shutil.copytree(SAMPLES / "policies/mlp", contract.parent)
+    contract.write_text(contract.read_text().replace('"kind": "mlp"', '"kind": "mlp-actions"'))
+    said = refused(
+        capsys, pupper_analyze, "claims", contract.parent, "--actuator",
+        SAMPLES / "calibrated.yaml", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert "of the kind mlp-actions" in said

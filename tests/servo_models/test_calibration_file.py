@@ -1,0 +1,150 @@
+"""Calibration files: what is written reads back, and the presets hold what was published."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
+from pupper_sysid.servo_models.calibration.parts import (
+    Actuator,
+    Feedback,
+    LadderRow,
+    Lag,
+    Quantity,
+    RatiosToArmature,
+    Scale,
+    Scores,
+    unit_of,
+)
+from support.calibration_examples import calibration, joint_calibration
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "calibrated.yaml"
+    calibration().save(path)
+    return path
+
+
+def test_what_is_saved_reads_back_exactly(file):
+    saved = calibration()
+    loaded = load_calibration(file)
+    assert loaded.joints == saved.joints
+    assert (loaded.inputs, loaded.notes, loaded.seed) == (saved.inputs, saved.notes, saved.seed)
+    assert loaded.to_yaml() == file.read_text()
+
+
+def test_an_ordinary_yaml_reader_sees_the_same_data(file):
+    loaded = load_calibration(file)
+    assert yaml.safe_load(file.read_text()) == loaded.model_dump(mode="json", by_alias=True)
+
+
+def test_the_file_explains_itself_and_keeps_a_number_on_one_line(file):
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("# Calibration") and any("interval" in line for line in lines[:12])
+    (delay,) = [line for line in lines if line.strip().startswith("delay_s:")]
+    assert "value: 0.025" in delay and "identified:" in delay
+
+
+def test_saving_refuses_to_overwrite_without_force(file):
+    before = file.read_text()
+    other = calibration(RB_calf=joint_calibration())
+    with pytest.raises(FileExistsRefusal, match="--force"):
+        other.save(file)
+    assert file.read_text() == before
+    other.save(file, force=True)
+    assert load_calibration(file).joint_names == ("RB_calf",)
+
+
+def test_handwritten_words_and_numbers_mean_what_they_say(file):
+    text = file.read_text()
+    text = text.replace("identified: 'yes'", "identified: yes").replace("0.025,", "25e-3,")
+    file.write_text(text)
+    assert load_calibration(file).joints == calibration().joints
+
+
+def test_numpy_numbers_are_stored_as_plain_numbers(tmp_path):
+    number = Quantity(value=np.float64(0.5), low=np.float64(0.25), identified="yes")
+    assert type(number.value) is float and type(number.low) is float
+
+
+def test_joints_are_in_the_one_joint_order_and_models_in_the_one_asked_for():
+    both = calibration(LF_thigh=joint_calibration(12.0), LF_hip=joint_calibration(11.0))
+    assert both.joint_names == ("LF_hip", "LF_thigh")
+    model = both.delayed_pd(["LF_thigh", "LF_hip"], time_step_s=0.001)
+    assert model.time_step_s == 0.001
+    np.testing.assert_array_equal(model.parameters.stiffness, [12.0, 11.0])
+    assert both.delayed_pd(["LF_thigh"]).batch == (1,)
+
+
+def test_every_number_reaches_the_models_it_is_for():
+    hip = calibration()
+    parameters = hip.delayed_pd().parameters
+    assert [np.asarray(v).tolist() for v in vars(parameters).values()] == [
+        [11.0], [0.1], [0.2], [1.1e-5], [0.35], [7.6], [0.025],
+    ]  # fmt: skip
+    feedback = hip.held_feedback("LF_hip")
+    assert vars(feedback) == {
+        "poll_period_s": 0.02685, "loss": 0.42, "quantum_rad": math.pi / 550, "offset_rad": -0.1,
+    }  # fmt: skip
+
+
+def test_asking_for_a_joint_that_was_not_calibrated_says_which_were():
+    for ask in (calibration().held_feedback, lambda name: calibration().delayed_pd([name])):
+        with pytest.raises(InputError, match=r"no joint RB_calf.*LF_hip"):
+            ask("RB_calf")
+    with pytest.raises(InputError, match="at least one"):
+        calibration().delayed_pd([])
+
+
+def test_a_calibration_cannot_be_changed():
+    with pytest.raises(ValidationError, match="frozen"):
+        calibration().joints["LF_hip"].actuator.delay_s.value = 0.0  # pyright: ignore
+
+
+# Numbers of the paper's text and of its authors' released training configuration.
+PUBLISHED = {
+    "paper": [70.0, 1.2, 0.03, 0.005, 5.0, 10.5, 0.076],
+    "release": [80.0, 2.5, 0.03, 0.005, 0.7, 15.0, 0.057],
+}
+PUBLISHED_STEPS = {"paper": (33, 43), "release": (26, 31)}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_hold_the_published_numbers_for_all_joints_and_call_none_a_measurement(name):
+    preset = load_calibration(name)
+    assert preset.joint_names == JOINT_NAMES
+    for joint in preset.joints.values():
+        actuator = joint.actuator
+        assert (actuator.delay_steps_min, actuator.delay_steps_max) == PUBLISHED_STEPS[name]
+        quantities = [q for _, q in actuator if isinstance(q, Quantity)]
+        assert [q.value for q in quantities] == PUBLISHED[name]
+        for ratio, quantity in zip(
+            ("stiffness_nm_per_rad", "damping_nm_s_per_rad", "friction_loss_nm", "effort_limit_nm"),
+            dict(actuator.ratios_to_armature).values(),
+            strict=True,
+        ):
+            assert quantity.value == pytest.approx(getattr(actuator, ratio).value / 0.005)
+        for q in (*quantities, *dict(joint.feedback).values()):
+            assert q.identified == "no" and q.low is None and q.high is None
+        assert all("not a measurement" in str(q.why) for q in quantities)
+        assert joint.lag == Lag() and joint.scores == Scores()
+    assert vars(preset.held_feedback("LF_hip")) == dict.fromkeys(
+        ("poll_period_s", "loss", "quantum_rad", "offset_rad"), 0.0
+    )
+
+
+def test_every_quantity_of_a_calibration_has_a_unit_and_a_description():
+    for part in (Actuator, Feedback, Lag, Scores, RatiosToArmature, Scale, LadderRow):
+        for name, field in part.model_fields.items():
+            assert field.description, f"{part.__name__}.{name} is not documented"
+            if "Quantity" in str(field.annotation) or "float" in str(field.annotation):
+                assert unit_of(name) or name == "parameters", f"{part.__name__}.{name}: no unit"

@@ -1,0 +1,185 @@
+"""DelayedPD is MuJoCo's native servo, step for step, and free-air data fix only ratios."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.sim.robot.servo_mjcf import actuator_attributes, free_air_xml, mujoco, rest_at
+
+H = 0.002
+PAPER = DelayedPDParameters(
+    stiffness=70.0,
+    damping=1.2,
+    friction_loss=0.03,
+    armature=0.005,
+    effort_limit=5.0,
+    velocity_limit=10.5,
+    delay_s=0.076,
+)
+MEASURED = DelayedPDParameters(
+    stiffness=10.3,
+    damping=0.083,
+    friction_loss=0.167,
+    armature=8.08e-4,
+    effort_limit=0.35,
+    velocity_limit=7.6,
+    delay_s=0.025,
+)
+TIME = np.arange(1000) * H
+SINE = 0.3 * np.sin(2 * np.pi * 3 * TIME)
+STEPS = np.select([TIME < 0.1, TIME < 0.8, TIME < 1.4], [0.0, 0.3, -0.5], 0.1)
+
+
+def native(servo: DelayedPDParameters, commands: np.ndarray, start: float = 0.0) -> np.ndarray:
+    model = mujoco.MjModel.from_xml_string(free_air_xml([servo], H))
+    data = mujoco.MjData(model)
+    rest_at(model, data, [start])
+    positions = []
+    for command in commands:
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data)
+        positions.append(data.qpos[0])
+    return np.array(positions)
+
+
+def ours(servo: DelayedPDParameters, commands: np.ndarray, start: float = 0.0) -> np.ndarray:
+    model = DelayedPD(servo, H)
+    model.reset(np.array(start))
+    return model.rollout(commands)
+
+
+SERVOS = {
+    "measured": MEASURED,
+    "fractional delay": replace(MEASURED, delay_s=0.0273),
+    "one step of delay": replace(MEASURED, delay_s=H),
+    "no delay": replace(MEASURED, delay_s=0.0),
+    "no friction": replace(MEASURED, friction_loss=0.0),
+    "paper": PAPER,
+    "torque always saturated": replace(MEASURED, effort_limit=0.19),
+    "slow set-point": replace(MEASURED, velocity_limit=2.0),
+    "no limits": replace(MEASURED, effort_limit=np.inf, velocity_limit=np.inf),
+}
+
+
+@pytest.mark.parametrize("start", [0.0, 0.785])
+@pytest.mark.parametrize("commands", [SINE, STEPS], ids=["sine", "steps"])
+@pytest.mark.parametrize("servo", SERVOS.values(), ids=SERVOS.keys())
+def test_numpy_servo_equals_mujocos_native_servo(servo, commands, start):
+    expected = native(servo, start + commands, start)
+    assert np.ptp(expected) > 0.05, "the servo must move for this to be a comparison"
+    np.testing.assert_allclose(ours(servo, start + commands, start), expected, rtol=0, atol=1e-9)
+
+
+def test_mujoco_takes_a_delay_below_one_step_for_one_step():
+    short, one = replace(MEASURED, delay_s=0.3 * H), replace(MEASURED, delay_s=H)
+    np.testing.assert_allclose(native(short, STEPS), native(one, STEPS), atol=1e-9)
+
+
+def test_many_servos_in_one_mujoco_model_move_as_each_alone():
+    servos = [MEASURED, PAPER, SERVOS["fractional delay"]]
+    model = mujoco.MjModel.from_xml_string(free_air_xml(servos, H))
+    data = mujoco.MjData(model)
+    rest_at(model, data, [0.1, 0.0, -0.2])
+    together = []
+    for command in SINE:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        together.append(data.qpos.copy())
+    alone = [native(s, SINE, x) for s, x in zip(servos, (0.1, 0.0, -0.2), strict=True)]
+    np.testing.assert_allclose(together, np.stack(alone, axis=-1), atol=1e-9)
+
+
+def test_a_resting_servo_stays_because_its_delay_line_holds_the_start_pose():
+    resting = native(PAPER, np.full(100, -1.57), -1.57)
+    np.testing.assert_allclose(resting, -1.57, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.0019, 0.002, 0.02, 0.0273, 0.1])
+def test_mujocos_delay_line_is_long_enough_for_the_delay(delay):
+    attributes = actuator_attributes(replace(MEASURED, delay_s=delay), H)
+    assert int(attributes["nsample"]) * H > float(attributes["delay"]) == delay
+
+
+def test_a_step_has_no_effect_before_the_delay_and_some_right_after():
+    commands = np.full(50, 0.3)
+    moved = np.flatnonzero(np.abs(ours(replace(MEASURED, delay_s=0.03), commands)) > 1e-12)
+    assert moved[0] == 0.03 / H
+
+
+def test_delay_between_two_steps_is_the_linear_mean_of_the_commands():
+    linear = replace(MEASURED, friction_loss=0.0, effort_limit=np.inf, velocity_limit=np.inf)
+    early, late, between = (ours(replace(linear, delay_s=d * H), SINE) for d in (10.0, 11.0, 10.25))
+    np.testing.assert_allclose(between, 0.75 * early + 0.25 * late, atol=1e-12)
+
+
+def test_step_by_step_equals_rollout_and_reset_forgets_everything():
+    model = DelayedPD(MEASURED, H)
+    model.reset(np.array(0.2))
+    whole = model.rollout(0.2 + SINE)
+    model.reset(np.array(0.2))
+    np.testing.assert_array_equal([model.step(c) for c in 0.2 + SINE], whole)
+    model.reset(np.array(0.2))
+    halves = np.concatenate([model.rollout(0.2 + SINE[:333]), model.rollout(0.2 + SINE[333:])])
+    np.testing.assert_array_equal(halves, whole)
+
+
+def test_a_batch_of_servos_moves_as_each_of_them_alone():
+    delays, friction = np.array([0.0, 0.011, 0.0273]), np.array([[0.0], [0.1]])
+    batch = DelayedPD(replace(MEASURED, delay_s=delays, friction_loss=friction), H)
+    together = batch.rollout(np.broadcast_to(STEPS[:, None, None], (len(STEPS), 2, 3)))
+    for i, j in np.ndindex(2, 3):
+        one = replace(MEASURED, delay_s=delays[j], friction_loss=friction[i, 0])
+        np.testing.assert_array_equal(together[:, i, j], ours(one, STEPS))
+
+
+def test_only_ratios_to_the_inertia_matter():
+    for other in (MEASURED.per_inertia(), MEASURED.scaled(0.0055)):
+        np.testing.assert_allclose(ours(other, STEPS), ours(MEASURED, STEPS), atol=1e-9)
+    assert np.asarray(MEASURED.scaled(0.0055).armature) == 0.0055
+    assert MEASURED.per_inertia().effort_limit == pytest.approx(0.35 / 8.08e-4)
+
+
+def test_friction_holds_an_error_smaller_than_friction_over_stiffness():
+    band = MEASURED.friction_loss / MEASURED.stiffness
+    np.testing.assert_allclose(ours(MEASURED, np.full(100, 0.9 * band)), 0.0, atol=1e-4)
+    assert ours(MEASURED, np.full(500, 3 * band))[-1] > band
+
+
+def test_the_setpoints_rate_bounds_the_speed_of_a_long_move():
+    slow = replace(MEASURED, velocity_limit=2.0)
+    position = ours(slow, np.full(500, 1.5))
+    cruising = position[150:300]
+    np.testing.assert_allclose(np.diff(cruising) / H, 2.0, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("stiffness", -1.0),
+        ("armature", 0.0),
+        ("delay_s", np.nan),
+        ("friction_loss", np.array([0.1, -0.1])),
+        ("effort_limit", np.nan),
+        ("velocity_limit", -7.5),
+    ],
+)
+def test_impossible_parameters_are_refused_by_name(name, value):
+    with pytest.raises(InputError, match=name):
+        DelayedPD(replace(MEASURED, **{name: value}))
+
+
+@pytest.mark.parametrize("step", [0.0, -0.002, np.nan, np.inf])
+def test_impossible_time_steps_are_refused(step):
+    with pytest.raises(InputError, match="time_step_s"):
+        DelayedPD(MEASURED, step)
+
+
+@pytest.mark.parametrize("delay", [-0.001, np.nan, np.inf])
+def test_mujoco_is_not_given_an_impossible_delay(delay):
+    with pytest.raises(InputError, match="delay_s"):
+        actuator_attributes(replace(MEASURED, delay_s=delay), H)

@@ -1,0 +1,389 @@
+"""Servo model files: what was saved is what runs, and what is not that model is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_tensors
+
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.servo_file import (
+    CONTRACT,
+    WEIGHTS,
+    SavedModel,
+    input_names,
+    load_servo_model,
+    save_servo_model,
+)
+
+P = 0.02
+JOINTS = ("LF_hip", "RB_calf", "RF_thigh")
+TAPS, UNITS, MEMBERS = 5, 4, 2
+KINDS = ("fir", "mlp", "mlp with feedback", "lstm", "lstm with feedback", "delayed-pd", "sindy")
+
+Arrays = dict[str, NDArray]
+
+
+def arrays(kind: str, seed: int = 0) -> Arrays:
+    """Random parameters of a model for `JOINTS`."""
+    rng = np.random.default_rng(seed)
+    n = len(JOINTS)
+    if kind == "delayed-pd":
+        values = DelayedPDParameters(
+            stiffness=rng.uniform(1e3, 4e3, n), damping=rng.uniform(40, 90, n),
+            friction_loss=rng.uniform(0, 20, n), armature=np.ones(n),
+            effort_limit=np.full(n, np.inf), velocity_limit=rng.uniform(5, 9, n),
+            delay_s=rng.uniform(0.01, 0.05, n),
+        )  # fmt: skip
+        return {k: np.asarray(v) for k, v in vars(values).items()} | {
+            "offset_rad": 0.01 * rng.normal(size=n)
+        }
+    if kind == "sindy":
+        return {
+            "stiffness_per_s2": rng.uniform(1e3, 4e3, n),
+            "damping_per_s": rng.uniform(40, 90, n),
+            "delay_s": rng.uniform(0.01, 0.05, n),
+            "offset_rad": 0.01 * rng.normal(size=n),
+        }
+    feedback = int("feedback" in kind)
+    taps = 1 if kind == "lstm with feedback" else TAPS
+    found: Arrays = {
+        "command_center": rng.normal(size=n), "command_scale": rng.uniform(0.2, 0.6, n),
+        "position_center": rng.normal(size=n), "position_scale": rng.uniform(0.2, 0.6, n),
+        # the published networks, which see their last position, have no bound
+        "bound": np.full(n, np.inf) if feedback else rng.uniform(0.2, 0.4, n),
+        "fir": 0.3 * rng.normal(size=(n, taps)), "fir_bias": 0.1 * rng.normal(size=n),
+    }  # fmt: skip
+    if kind.startswith("mlp"):
+        sizes = (TAPS + feedback, UNITS, UNITS, 1)
+        for layer, (a, b) in enumerate(pairwise(sizes)):
+            found[f"weight_{layer}"] = rng.normal(size=(n, a, b)) / np.sqrt(a)
+            found[f"bias_{layer}"] = 0.1 * rng.normal(size=(n, b))
+    if kind.startswith("lstm"):
+        found |= {
+            "weight_input": rng.normal(size=(n, MEMBERS, 1 + feedback, 4 * UNITS)),
+            "weight_hidden": 0.5 * rng.normal(size=(n, MEMBERS, UNITS, 4 * UNITS)),
+            "bias": 0.1 * rng.normal(size=(n, MEMBERS, 4 * UNITS)),
+            "weight_out": 0.5 * rng.normal(size=(n, MEMBERS, UNITS)),
+            "bias_out": 0.1 * rng.normal(size=(n, MEMBERS)),
+        }
+    return {k: v.astype(np.float32) for k, v in found.items()}
+
+
+def contract(kind: str, parameters: Arrays) -> dict[str, Any]:
+    feedback = "feedback" in kind
+    joint = {"scores": {"rmse_free_run_rad": 0.01, "repeatability_rad": None}, "readings": 900}
+    joint |= {"band_noise_rad": 0.004, "band_timing_s": 0.002}
+    return {
+        "arch": kind.split()[0], "preset": "paper" if feedback else "default",
+        "created": "2026-11-21T12:00:00Z", "time_step_s": P,
+        "inputs": input_names(parameters, feedback), "feedback": feedback,
+        "warm_up": 8 if kind == "lstm" else 0, "joints": dict.fromkeys(JOINTS, joint),
+        "readings_counted": dict.fromkeys(JOINTS, "fresh"), "split": "by hand",
+        "choices": {"ridge": 0.1}, "recordings": [{"name": "a.csv", "sha256": "0" * 64}],
+        "seed": 0, "versions": {"numpy": "2"}, "notes": ["Ein Hüftgelenk, # and \"quotes\"."],
+    }  # fmt: skip
+
+
+def saved(folder: Path, kind: str = "mlp", seed: int = 0) -> SavedModel:
+    parameters = arrays(kind, seed)
+    save_servo_model(folder, parameters, contract(kind, parameters))
+    return load_servo_model(folder)
+
+
+def crafted(folder: Path, kind: str, parameters: Arrays | bytes, **changes: Any) -> Path:
+    """A model whose hash fits its weights, whatever those are: made to mislead."""
+    saved(folder, kind)
+    data = parameters
+    if not isinstance(data, bytes):
+        data = save_tensors({k: np.ascontiguousarray(v) for k, v in data.items()})
+    (folder / WEIGHTS).write_bytes(data)
+    return edited(folder, weights_sha256=hashlib.sha256(data).hexdigest(), **changes)
+
+
+def edited(folder: Path, **changes: Any) -> Path:
+    path = folder / CONTRACT
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    return folder
+
+
+def commands(steps: int = 40, joints: int = len(JOINTS)) -> NDArray:
+    return 0.4 * np.random.default_rng(9).normal(size=(steps, joints)).cumsum(0) / 4
+
+
+def refusal(folder: Path, **wanted: Any) -> str:
+    with pytest.raises(InputError) as found:
+        load_servo_model(folder, **wanted)
+    return str(found.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_model_moves_the_same_after_it_was_saved_and_read(tmp_path: Path, kind: str):
+    parameters = arrays(kind)
+    save_servo_model(tmp_path / "a", parameters, contract(kind, parameters))
+    first = load_servo_model(tmp_path / "a", JOINTS, P)
+    assert {k: v.tobytes() for k, v in first.parameters.items()} == {
+        k: v.tobytes() for k, v in parameters.items()
+    }
+    written = first.contract.model_dump(mode="json", by_alias=True, exclude={"weights_sha256"})
+    save_servo_model(tmp_path / "b", first.parameters, written)
+    again = load_servo_model(tmp_path / "b")
+    assert again.contract == first.contract and again.model.time_step_s == pytest.approx(P)
+    runs = []
+    for model in (first.model, again.model):
+        model.reset(np.full(len(JOINTS), 0.1))
+        runs.append(model.rollout(commands()))
+    np.testing.assert_array_equal(*runs)
+    assert np.ptp(runs[0], axis=0).min() > 1e-3, "the models compared do move"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_joints_in_another_order_get_their_own_models(tmp_path: Path, kind: str):
+    whole = saved(tmp_path / "a", kind).model
+    whole.reset(np.zeros(len(JOINTS)))
+    every = whole.rollout(commands())
+    order = ["RF_thigh", "LF_hip"]
+    index = [JOINTS.index(j) for j in order]
+    part = load_servo_model(tmp_path / "a", order)
+    assert list(part.contract.joints) == order
+    part.model.reset(np.zeros(2))
+    np.testing.assert_allclose(part.model.rollout(commands()[:, index]), every[:, index], atol=1e-6)
+    assert np.abs(every[:, index] - every[:, index[::-1]]).max() > 1e-3, "a mix-up would show"
+
+
+def test_each_joint_gets_the_numbers_that_were_saved_under_its_name(tmp_path: Path):
+    parameters = arrays("fir")
+    parameters["fir_bias"] = np.array([10.0, 20.0, 30.0], np.float32)
+    save_servo_model(tmp_path / "a", parameters, contract("fir", parameters))
+    part = load_servo_model(tmp_path / "a", ["RF_thigh", "LF_hip"])
+    assert part.parameters["fir_bias"].tolist() == [30.0, 10.0]
+
+
+def test_training_ended_before_its_first_comparison_leaves_a_linear_model(tmp_path: Path):
+    parameters = arrays("fir")
+    for arch in ("mlp", "lstm"):
+        save_servo_model(tmp_path / arch, parameters, contract(arch, parameters))
+        assert load_servo_model(tmp_path / arch).contract.arch == arch
+
+
+# ------------------------------------------------------------------------------- refusals
+
+
+def test_a_folder_without_a_model_is_refused(tmp_path: Path):
+    assert "holds no servo model" in refusal(tmp_path / "missing")
+    assert "fit-servo --out" in refusal(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert "holds no servo model" in refusal(tmp_path / "file")
+    assert "cannot be read" in refusal(tmp_path / ("long" * 100))
+
+
+def test_a_model_without_its_weights_is_refused(tmp_path: Path):
+    saved(tmp_path / "a")
+    (tmp_path / "a" / WEIGHTS).unlink()
+    assert "cannot be read: No such file" in refusal(tmp_path / "a")
+    (tmp_path / "a" / WEIGHTS).mkdir()
+    assert "no regular file" in refusal(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[:-3],
+        lambda data: b"",
+        lambda data: data[:700] + bytes([data[700] ^ 1]) + data[701:],
+    ],
+    ids=["cut short", "empty", "one bit flipped"],
+)
+def test_damaged_weights_are_refused(tmp_path: Path, damage: Callable[[bytes], bytes]):
+    saved(tmp_path / "a")
+    path = tmp_path / "a" / WEIGHTS
+    path.write_bytes(damage(path.read_bytes()))
+    assert "is not the file that contract.json describes" in refusal(tmp_path / "a")
+
+
+def test_weights_of_another_model_of_the_same_shape_are_refused(tmp_path: Path):
+    saved(tmp_path / "a", seed=0)
+    saved(tmp_path / "b", seed=1)
+    (tmp_path / "b" / WEIGHTS).replace(tmp_path / "a" / WEIGHTS)
+    assert "exchanged" in refusal(tmp_path / "a")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numbers_that_are_none_are_refused_even_with_a_matching_hash(tmp_path: Path, kind: str):
+    for n, name in enumerate(arrays(kind)):
+        parameters = arrays(kind)
+        parameters[name].flat[0] = np.nan
+        said = refusal(crafted(tmp_path / str(n), kind, parameters))
+        assert f"{name} holds NaN" in said and str(tmp_path) in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missing_or_a_foreign_array_is_refused_by_name(tmp_path: Path, kind: str):
+    for n, name in enumerate(arrays(kind)):
+        if kind == "sindy" and name.startswith(("stiffness", "damping")):
+            continue  # a term may be absent from an equation
+        parameters = arrays(kind)
+        removed = parameters.pop(name)
+        said = refusal(crafted(tmp_path / str(n), kind, parameters))
+        assert f"{name} is missing" in said or "weights are not those" in said
+        said = refusal(crafted(tmp_path / f"{n}x", kind, arrays(kind) | {"extra": removed}))
+        assert "extra is none of its arrays" in said
+
+
+@pytest.mark.parametrize("kind", ["fir", "mlp", "lstm", "delayed-pd", "sindy"])
+def test_the_arrays_of_another_architecture_are_refused(tmp_path: Path, kind: str):
+    for other in {"fir", "mlp", "lstm", "delayed-pd", "sindy"} - {kind}:
+        if other == "fir" and kind in ("mlp", "lstm"):
+            continue  # a network whose training was ended at once
+        said = refusal(crafted(tmp_path / other, kind, arrays(other)))
+        assert f"not those of a model of type {kind}" in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_arrays_of_the_wrong_shape_are_refused(tmp_path: Path, kind: str):
+    for n, name in enumerate(arrays(kind)):
+        for k, change in enumerate(
+            (
+                lambda v: v[:-1],
+                lambda v: v[..., None],
+                lambda v: v[:, :0] if v.ndim > 1 else v[:0],
+                lambda v: v.astype(int),
+                lambda v: np.ones((), np.float32),
+            )
+        ):
+            parameters = arrays(kind) | {name: change(np.nan_to_num(arrays(kind)[name], posinf=9))}
+            said = refusal(crafted(tmp_path / f"{n}-{k}", kind, parameters))
+            assert "shape" in said or "axes" in said
+
+
+def test_a_bound_that_only_some_joints_have_is_refused(tmp_path: Path):
+    parameters = arrays("lstm")
+    parameters["bound"][1] = np.inf  # inf * tanh(x / inf) would be no number
+    said = refusal(crafted(tmp_path / "a", "lstm", parameters))
+    assert "bound is infinite for some joints only" in said
+
+
+@pytest.mark.parametrize("value", [-1.0, 1e12, np.inf])
+def test_a_delay_that_no_servo_has_is_refused_before_it_takes_all_memory(tmp_path: Path, value):
+    for kind in ("delayed-pd", "sindy"):
+        parameters = arrays(kind) | {"delay_s": np.full(len(JOINTS), value)}
+        assert "delay_s" in refusal(crafted(tmp_path / kind, kind, parameters))
+
+
+def test_a_contract_is_refused_that_says_what_the_model_is_not(tmp_path: Path):
+    changes: list[tuple[dict[str, Any], str]] = [
+        ({"colour": "red"}, "colour: unknown entry"),
+        ({"schema_version": 2}, "newer version"),
+        ({"schema_version": "one"}, "schema_version"),
+        ({"schema": "pupper-calibration"}, "is no servo model's contract"),
+        ({"arch": "transformer"}, "arch"),
+        ({"units": "degrees"}, "units"),
+        ({"time_step_s": 0.0}, "time_step_s"),
+        ({"time_step_s": float("nan")}, "time_step_s"),
+        ({"time_step_s": "0.02"}, "time_step_s"),
+        ({"weights_sha256": "abc"}, "weights_sha256"),
+        ({"joints": {}}, "joints"),
+        ({"joints": []}, "joints"),
+        ({"inputs": ["command_rad[t]"]}, "its arrays take command_rad[t], command_rad[t-1]"),
+        ({"feedback": True}, "predicted_position_rad"),
+    ]
+    saved(tmp_path / "a")
+    original = (tmp_path / "a" / CONTRACT).read_text()
+    for change, phrase in changes:
+        assert phrase in refusal(edited(tmp_path / "a", **change)), change
+        (tmp_path / "a" / CONTRACT).write_text(original)
+    without = json.loads(original)
+    del without["time_step_s"]
+    (tmp_path / "a" / CONTRACT).write_text(json.dumps(without))
+    assert "time_step_s: Field required" in refusal(tmp_path / "a")
+    renamed = json.loads(original)
+    renamed["joints"]["XY_hip"] = renamed["joints"].pop("LF_hip")
+    (tmp_path / "a" / CONTRACT).write_text(json.dumps(renamed))
+    assert "XY_hip is no joint" in refusal(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (b"{", "is no JSON"),
+        (b"\xff\xfe\x00", "is no JSON"),
+        (b"", "is no JSON"),
+        (b"[" * 200_000, "nested too deeply"),
+        (b'{"seed": ' + b"9" * 5000 + b"}", "is no JSON"),
+        (b"[1, 2]", "is no servo model's contract"),
+        (b" " * 50_000_001, "more than 50 MB"),
+    ],
+    ids=["cut", "no text", "empty", "nested", "endless number", "a list", "huge"],
+)
+def test_a_contract_that_is_none_is_refused(tmp_path: Path, text: bytes, said: str):
+    saved(tmp_path / "a")
+    (tmp_path / "a" / CONTRACT).write_bytes(text)
+    assert said in refusal(tmp_path / "a")
+
+
+def test_another_rate_is_refused_with_the_way_to_get_it(tmp_path: Path):
+    saved(tmp_path / "a")
+    said = refusal(tmp_path / "a", time_step_s=0.04)
+    assert "every 20.0 ms" in said and "every 40.0 ms" in said
+    assert "record at the new one" in said and "--arch delayed-pd" in said
+    assert load_servo_model(tmp_path / "a", time_step_s=0.0203), "a clock may be off by 2 %"
+
+
+def test_a_joint_without_a_model_is_refused_with_those_that_have_one(tmp_path: Path):
+    saved(tmp_path / "a")
+    said = refusal(tmp_path / "a", joints=["LF_hip", "LB_hip"])
+    assert "no model for LB_hip" in said and "it has LF_hip, RB_calf, RF_thigh" in said
+    assert "fit-servo --joints LB_hip" in said
+
+
+class _Trap:
+    def __reduce__(self):
+        return (Path.touch, (Path("unpickled"),))
+
+
+def test_nothing_is_unpickled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    folder = crafted(tmp_path / "a", "mlp", pickle.dumps({"fir": _Trap()}))
+    assert "is no safetensors file" in refusal(folder)
+    assert not Path("unpickled").exists()
+
+
+# ------------------------------------------------------------------------------- saving
+
+
+def test_a_model_is_replaced_only_when_forced(tmp_path: Path):
+    saved(tmp_path / "a", seed=0)
+    before = (tmp_path / "a" / WEIGHTS).read_bytes()
+    other = arrays("mlp", seed=1)
+    with pytest.raises(FileExistsRefusal, match="--force"):
+        save_servo_model(tmp_path / "a", other, contract("mlp", other))
+    assert (tmp_path / "a" / WEIGHTS).read_bytes() == before
+    save_servo_model(tmp_path / "a", other, contract("mlp", other), force=True)
+    assert load_servo_model(tmp_path / "a").parameters["fir"].tolist() == other["fir"].tolist()
+
+
+def test_a_file_where_the_folder_should_be_is_left_alone(tmp_path: Path):
+    (tmp_path / "a").write_text("mine")
+    with pytest.raises(InputError, match="is a file"):
+        save_servo_model(tmp_path / "a", arrays("fir"), contract("fir", arrays("fir")), force=True)
+    assert (tmp_path / "a").read_text() == "mine"
+
+
+def test_what_could_not_be_read_back_is_not_written(tmp_path: Path):
+    good = arrays("fir")
+    bad_arrays = good | {"fir": np.full_like(good["fir"], np.nan)}
+    bad_contract = contract("fir", good) | {"choices": {"ridge": float("inf")}}
+    for parameters, said in ((bad_arrays, contract("fir", good)), (good, bad_contract)):
+        with pytest.raises(InputError, match=str(tmp_path / "a")):
+            save_servo_model(tmp_path / "a", parameters, said)
+    assert not (tmp_path / "a").exists()

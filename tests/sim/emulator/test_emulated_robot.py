@@ -1,0 +1,315 @@
+"""The emulated robot is wrong in the ways it says, by as much as it says, and repeats itself."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.sim.emulator.bus import TRUTH_COLUMNS, EmulatedBus
+from pupper_sysid.sim.emulator.free_air_servo import FreeAirServo
+from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot, random_spec
+
+POSE = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
+PERFECT = RobotSpec(
+    poll_period_s=0.0,
+    loss=0.0,
+    quantum_rad=0.0,
+    reading_noise_rad=0.0,
+    offset_sd_rad=0.0,
+    sleep_overshoot_s=0.0,
+)
+SERVO = DelayedPDParameters(
+    stiffness=10.3,
+    damping=0.083,
+    friction_loss=0.167,
+    armature=8.08e-4,
+    effort_limit=0.35,
+    velocity_limit=7.6,
+    delay_s=0.025,
+)
+
+
+def make_bus(spec: RobotSpec, seed: int = 1) -> EmulatedBus:
+    rng = np.random.default_rng(seed)
+    return EmulatedBus(draw_robot(rng, spec), rng)
+
+
+def swing(bus: EmulatedBus, seconds: float, amplitude: float = 0.3, hertz: float = 2.3):
+    """All joints on a sine; returns (send time, goal, sample) per tick of 19 ms."""
+    start, ticks = bus.now(), []
+    for k in range(int(seconds / 0.019)):
+        bus.sleep_until(start + k * 0.019)
+        goal = POSE + amplitude * np.sin(2 * np.pi * hertz * (bus.now() - start))
+        ticks.append((bus.write(goal).time_s, goal, bus.read()))
+    return ticks
+
+
+def table_of(bus: EmulatedBus) -> pd.DataFrame:
+    return pd.DataFrame(bus.truth_rows(), columns=list(TRUTH_COLUMNS))
+
+
+def test_servo_moves_as_delayed_pd_when_commands_come_on_physics_steps():
+    step = 0.001
+    steps = np.arange(1500)
+    commands = 0.785 + np.where(steps % 19 == 0, 0.3 * np.sin(2 * np.pi * 3 * steps * step), np.nan)
+    commands = pd.Series(commands).ffill().to_numpy()
+    model = DelayedPD(SERVO, step)
+    model.reset(np.array(0.785))
+    expected = model.rollout(commands)
+    servo = FreeAirServo(SERVO, 0.785, step)
+    got = []
+    for k in steps:
+        servo.command(k * step, commands[k])
+        got.append(servo.position_at((k + 1) * step))
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+def test_a_command_between_physics_steps_keeps_its_timing():
+    servo = FreeAirServo(SERVO, 0.0, 0.001)
+    servo.command(0.0104, 0.3)
+    later = DelayedPD(replace(SERVO, delay_s=0.0254), 0.001)
+    later.reset(np.array(0.0))
+    expected = later.rollout(np.where(np.arange(300) >= 10, 0.3, 0.0))
+    got = [servo.position_at((k + 1) * 0.001) for k in range(300)]
+    # at rest MuJoCo's friction creeps by microradians, which the emulator leaves out
+    np.testing.assert_allclose(got[:100], expected[:100], atol=1e-9)
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+
+
+def test_position_inside_a_physics_step_lies_on_the_line_between_its_ends():
+    servo = FreeAirServo(SERVO, 0.0, 0.001)
+    servo.command(0.0, 0.3)
+    left, inside, right = (servo.position_at(t) for t in (0.05, 0.05025, 0.051))
+    assert left < right
+    assert inside == pytest.approx(0.75 * left + 0.25 * right, abs=1e-12)
+
+
+def test_a_servo_that_was_left_alone_for_long_still_answers_on_time():
+    rested, fresh = FreeAirServo(SERVO, 0.1), FreeAirServo(SERVO, 0.1)
+    for k in range(40):
+        rested.position_at(k * 1.0)
+    rested.command(40.0, 0.4)
+    fresh.command(0.0, 0.4)
+    times = np.arange(0.001, 0.4, 0.003)
+    np.testing.assert_allclose(
+        [rested.position_at(40 + t) for t in times],
+        [fresh.position_at(t) for t in times],
+        atol=1e-9,
+    )
+
+
+def test_a_delay_too_short_for_the_emulator_is_refused():
+    with pytest.raises(InputError, match="delay_s"):
+        FreeAirServo(replace(SERVO, delay_s=0.0015), 0.0)
+
+
+def test_readings_are_the_position_at_the_poll_rounded_to_counts_with_the_offset():
+    bus = make_bus(RobotSpec(reading_noise_rad=0.0, poll_drift=0.0))
+    ticks = swing(bus, 3.0)
+    truth = table_of(bus)
+    for i, truth_of in enumerate(bus.robot.servos):
+        rows = truth[truth["joint"] == truth_of.joint].reset_index()
+        twin, quantum = FreeAirServo(truth_of.actuator, POSE[i]), truth_of.feedback.quantum_rad
+        # the goal after truncation of its count: the next whole count in the count's direction
+        whole = np.ceil if truth_of.command_rounding == "up" else np.floor
+        reading = np.array([sample.position_rad[i] for _, _, sample in ticks])
+        sent = iter(ticks)
+        pending = next(sent)
+        for k, at in enumerate(rows["reading_time_s"]):
+            while pending is not None and pending[0] < at:
+                count = whole((pending[1][i] - truth_of.zero_rad) / quantum - 1e-12)
+                twin.command(pending[0], truth_of.zero_rad + count * quantum)
+                pending = next(sent, None)
+            error = reading[k] - truth_of.feedback.offset_rad - twin.position_at(at)
+            assert abs(error) <= 0.5 * quantum + 1e-6
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.42])
+def test_age_and_loss_of_the_readings_are_those_of_held_feedback(loss):
+    spec = RobotSpec(loss=loss, friction_per_inertia=0.0)
+    bus = make_bus(spec)
+    swing(bus, 5.0)
+    duration = 120.0
+    start = bus.now()
+    for k in range(int(duration / 0.019)):
+        bus.sleep_until(start + k * 0.019)
+        bus.read()
+    log = [(t, measured) for t, _, measured in bus._log if t > start]
+    age = np.array([t - measured for t, measured in log])
+    assert age.min() > 0
+    expected = bus.robot.servos[0].feedback.mean_age_s
+    assert age.mean() == pytest.approx(expected, rel=0.02)
+    polls = duration / spec.poll_period_s
+    # a read every 19 ms sees every success of a poll every 26.85 ms
+    seen = np.array([len(np.unique([m[i] for _, m in log])) for i in range(12)])
+    sd = np.sqrt(12 * polls * loss * (1 - loss))
+    drift = 12 * polls * spec.poll_drift
+    assert abs(seen.sum() - 12 * polls * (1 - loss)) < 4 * sd + drift + 12
+
+
+def test_servos_are_polled_in_turn_by_their_id():
+    spec = RobotSpec(loss=0.0, poll_jitter_s=0.0, poll_drift=0.0)
+    servos = draw_robot(np.random.default_rng(3), spec).servos
+    by_id = sorted(servos, key=lambda s: s.poll_phase_s)
+    assert [s.joint for s in by_id[:4]] == ["RF_hip", "RF_thigh", "RF_calf", "LF_hip"]
+    gaps = np.diff([s.poll_phase_s for s in by_id])
+    np.testing.assert_allclose(gaps, spec.poll_period_s / 12)
+
+
+def test_polls_lie_on_their_lattice_within_jitter_and_drift():
+    rng = np.random.default_rng(5)
+    still = PollSchedule(0.02685, np.array([0.004]), 0.0, 0.0, 0.0, rng)
+    instants = np.unique([still.advance(t)[0] for t in np.arange(0.05, 30.0, 0.01)])
+    np.testing.assert_allclose(np.diff(instants), 0.02685, atol=1e-9)
+    shift = (instants - 0.004) / 0.02685
+    np.testing.assert_allclose(shift, np.round(shift), atol=1e-6)
+    jittery = PollSchedule(0.02685, np.array([0.0]), 0.0, 0.0008, 0.0, rng)
+    instants = np.unique([jittery.advance(t)[0] for t in np.arange(0.05, 60.0, 0.01)])
+    residual = instants - 0.02685 * np.round(instants / 0.02685)
+    # four standard errors of a standard deviation from 2232 instants are 6 %
+    assert residual.std() == pytest.approx(0.0008, rel=0.06)
+    drifting = PollSchedule(0.02685, np.array([0.0]), 0.0, 0.0, 0.002, rng)
+    instants = np.unique([drifting.advance(t)[0] for t in np.arange(0.05, 600.0, 0.02)])
+    periods = np.diff(instants)
+    assert 0.001 < periods.std() / 0.02685 < 0.003
+    assert np.corrcoef(periods[1:], periods[:-1])[0, 1] > 0.95, "it must wander, not jitter"
+
+
+@pytest.mark.parametrize(("joint", "counts"), [("LF_hip", 1), ("LB_hip", 0), ("RF_hip", 1)])
+def test_commands_are_truncated_in_the_direction_of_the_counts(joint, counts):
+    bus = make_bus(replace(PERFECT, quantum_rad=np.pi / 550, friction_per_inertia=0.0))
+    i = JOINT_NAMES.index(joint)
+    goal = POSE.copy()
+    goal[i] = 0.4 * np.pi / 550
+    bus.write(goal)
+    bus.sleep_until(2.0)
+    bus.read()
+    true = bus._log[-1][1][i]
+    assert true == pytest.approx(counts * np.pi / 550, abs=1e-6)
+    assert bus.metadata["command_rounding"][joint] == ("up" if counts else "down")
+
+
+def test_without_faults_a_reading_is_the_true_position_at_the_read():
+    bus = make_bus(PERFECT)
+    ticks = swing(bus, 1.0)
+    readings = np.stack([sample.position_rad for _, _, sample in ticks])
+    true = table_of(bus)["true_position_rad"].to_numpy().reshape(readings.shape)
+    np.testing.assert_allclose(readings, true, atol=1e-12)
+    assert np.ptp(readings, axis=0).min() > 0.3
+    assert (ticks[-1][2].position_count == -1).all()
+
+
+def test_counts_and_angles_of_a_reading_say_the_same():
+    bus = make_bus(RobotSpec())
+    sample = swing(bus, 1.0)[-1][2]
+    for i, servo in enumerate(bus.robot.servos):
+        angle = servo.zero_rad + servo.count_sign * (sample.position_count[i] - 512) * np.pi / 550
+        assert sample.position_rad[i] == pytest.approx(angle, abs=1e-12)
+
+
+def test_the_same_seed_gives_the_same_robot_and_the_same_readings():
+    first, second, other = (swing(make_bus(RobotSpec(), seed), 1.0) for seed in (7, 7, 8))
+    for (t1, g1, s1), (t2, g2, s2) in zip(first, second, strict=True):
+        assert (t1, *s1.time_s) == (t2, *s2.time_s)
+        np.testing.assert_array_equal(g1, g2)
+        np.testing.assert_array_equal(s1.position_rad, s2.position_rad)
+    assert any(
+        (a[2].position_rad != b[2].position_rad).any() for a, b in zip(first, other, strict=True)
+    )
+
+
+def test_the_mean_servo_is_the_published_one():
+    rng = np.random.default_rng(11)
+    servos = [s.actuator for _ in range(40) for s in draw_robot(rng).servos]
+    per_inertia = [s.per_inertia() for s in servos]
+    for name, mean in (("stiffness", 12_700), ("damping", 103), ("friction_loss", 207)):
+        logs = np.log([float(np.asarray(getattr(s, name))) for s in per_inertia])
+        # 480 servos: the mean's standard error is 0.5 %, the spread's 3 %
+        assert logs.mean() == pytest.approx(np.log(mean), abs=0.02)
+        assert logs.std() == pytest.approx(0.10, rel=0.15)
+    delays = np.array([float(np.asarray(s.delay_s)) for s in servos])
+    assert delays.mean() == pytest.approx(0.025, abs=0.0003)
+    assert delays.std() == pytest.approx(0.0015, rel=0.15)
+    assert {s.effort_limit for s in servos} == {0.35}
+
+
+def test_random_specs_span_their_range_and_keep_what_was_chosen():
+    specs = [random_spec(np.random.default_rng(i), loss=0.3) for i in range(60)]
+    assert {s.loss for s in specs} == {0.3}
+    assert len({s.quantum_rad for s in specs}) == 3
+    delays = np.array([s.delay_s for s in specs])
+    assert delays.min() < 0.014 and delays.max() > 0.036
+    with pytest.raises(InputError, match="losses"):
+        random_spec(np.random.default_rng(0), losses=0.1)
+
+
+@pytest.mark.parametrize(("name", "value"), [("loss", 1.0), ("loss", -0.1), ("delay_s", np.nan)])
+def test_impossible_robots_are_refused(name, value):
+    with pytest.raises(InputError, match=name):
+        RobotSpec(**{name: value})
+
+
+def test_a_limp_robot_ignores_goals_and_holds_its_pose_when_switched_on_again():
+    bus = make_bus(PERFECT)
+    bus.torque(False)
+    bus.write(POSE + 0.3)
+    bus.sleep_until(1.0)
+    np.testing.assert_allclose(bus.read().position_rad, POSE, atol=1e-9)
+    bus.torque(True)
+    bus.sleep_until(2.0)
+    np.testing.assert_allclose(bus.read().position_rad, POSE, atol=1e-9)
+    bus.write(POSE + 0.3)
+    bus.sleep_until(3.0)
+    assert (bus.read().position_rad > POSE + 0.25).all()
+
+
+@pytest.mark.parametrize("goal", [np.full(12, np.nan), np.zeros(3)])
+def test_impossible_goals_and_a_closed_bus_are_refused(goal):
+    bus = make_bus(PERFECT)
+    with pytest.raises(BusError, match="12 finite angles"):
+        bus.write(goal)
+    bus.close()
+    bus.close()
+    with pytest.raises(BusError, match="closed"):
+        bus.read()
+
+
+def test_truth_files_say_every_parameter_and_every_read(tmp_path):
+    bus = make_bus(RobotSpec())
+    ticks = swing(bus, 1.0)
+    numbers, rows = bus.write_truth(tmp_path / "sweep")
+    assert (numbers.name, rows.name) == ("sweep.truth.yaml", "sweep.truth.csv")
+    truth = yaml.safe_load(numbers.read_text())
+    hip = truth["joints"]["LF_hip"]
+    assert hip["actuator"]["delay_s"] == bus.robot.servos[0].actuator.delay_s
+    assert hip["feedback"]["loss"] == 0.42 and "phase_s" in hip["feedback"]
+    table = pd.read_csv(rows)
+    assert tuple(table.columns) == TRUTH_COLUMNS
+    assert len(table) == 12 * len(ticks)
+    assert (table["reading_time_s"] <= table["read_time_s"]).all()
+    assert table["read_time_s"].unique().tolist() == [sample.time_s[0] for _, _, sample in ticks]
+    with pytest.raises(FileExistsRefusal):
+        bus.write_truth(tmp_path / "sweep")
+    bus.write_truth(tmp_path / "sweep", force=True)
+
+
+def test_a_minute_in_virtual_time_takes_seconds_and_in_real_time_as_long_as_it_says():
+    bus = make_bus(RobotSpec())
+    began = time.monotonic()
+    bus.sleep_until(60.0)
+    bus.read()
+    assert time.monotonic() - began < 5.0
+    rng = np.random.default_rng(1)
+    real = EmulatedBus(draw_robot(rng), rng, real_time=True)
+    began = time.monotonic()
+    real.sleep_until(real.now() + 0.3)
+    assert 0.29 < time.monotonic() - began < 1.0

@@ -1,0 +1,168 @@
+"""Robots that are no Mini Pupper: an arm of six servos, and one servo on a bench."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from test_simulator_export import in_free_air
+
+from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.robot.mini_pupper import robot_xml
+from pupper_sysid.sim.robot.robot_map import joint_map_of
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sysid.recordings.recording import load
+from support.command_line import refused, run, run_program
+from support.servo_servers import on_a_port
+
+ARM = """<mujoco><worldbody>
+<body><joint name="base_yaw" type="hinge" axis="0 0 1" range="-110 110"/><geom size=".02"/>
+<body><joint name="shoulder" type="hinge" axis="0 1 0" range="20 120"/><geom size=".02"/>
+<body><joint name="elbow" type="hinge" axis="0 1 0" range="-95 95"/><geom size=".02"/>
+<body><joint name="wrist_pitch" type="hinge" axis="0 1 0" range="-95 95"/><geom size=".02"/>
+<body><joint name="wrist_roll" type="hinge" axis="0 0 1"/><geom size=".02"/>
+<body><joint name="gripper" type="hinge" axis="0 1 0" range="-10 100"/><geom size=".02"/>
+</body></body></body></body></body></body></worldbody></mujoco>"""
+BENCH = """<mujoco><worldbody>
+<body><joint name="bench" type="hinge" axis="0 1 0" range="-80 80"/><geom size=".02"/></body>
+<body><freejoint/><geom size=".01"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("arm.xml").write_text(ARM)
+    Path("bench.xml").write_text(BENCH)
+
+
+def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys):
+    code, out, err = run(capsys, "init-robot", "arm.xml", "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert found["ids"] == [1, 2, 3, 4, 5, 6] and found["joints"][0] == "base_yaw"
+    arm = load_joint_map(Path("arm.joints.yaml"))
+    # 100° is 4096 / 360 · 100 = 1137.8 counts
+    low, high = arm.file.joints["shoulder"].limits_counts
+    assert (low, high) == (2048 - 568, 2048 + 568)
+    assert arm.file.joints["shoulder"].neutral_rad == pytest.approx(np.radians(70))
+    np.testing.assert_allclose(arm.to_counts(arm.zero_rad()), 2048)
+    pose = dict(zip(arm.joint_names, arm.rest_pose(), strict=True))
+    # 10° before its lower end, a gripper at zero has no room to swing
+    assert pose["gripper"] == pytest.approx(np.radians(-10) + 0.4, abs=2e-3)
+    assert pose["elbow"] == 0.0 and min(found["room_rad"].values()) > 0.39
+
+
+def test_what_is_guessed_is_said_with_what_corrects_it(capsys):
+    code, out, _ = run(capsys, "init-robot", "arm.xml")
+    said = " ".join(out.split())
+    assert code == 0 and "Ids and signs are for you to check" in said
+    # ids first: a centre is measured for the servo that has the joint's id
+    assert 0 < said.find("monitor --joint-map arm.joints.yaml") < said.find("calibrate-joints")
+
+
+def test_limits_in_the_wrong_unit_are_said(capsys):
+    hinge = '<joint name="{}" axis="0 0 1" range="-1.5 1.5"/><geom size=".02"/>'
+    Path("odd_unit.xml").write_text(
+        f"<mujoco><worldbody><body>{hinge.format('lift')}</body></worldbody></mujoco>"
+    )
+    code, _, err = run(capsys, "init-robot", "odd_unit.xml", "--json")
+    assert code == 0 and "lift: less than 0.05 rad of room" in " ".join(err.split())
+    assert 'angle="radian"' in err
+
+
+def test_hinges_driven_through_tendons_and_in_the_parent_s_frame_are_taken_and_others_named(capsys):
+    driven = """</worldbody><tendon><fixed name="t"><joint joint="elbow" coef="1"/></fixed></tendon>
+    <actuator><position joint="base_yaw"/><position jointinparent="shoulder"/>
+    <position tendon="t"/></actuator>"""
+    Path("driven.xml").write_text(ARM.replace("</worldbody>", driven))
+    code, out, err = run(capsys, "init-robot", "driven.xml", "--json")
+    assert code == 0 and json.loads(out)["joints"] == ["base_yaw", "shoulder", "elbow"]
+    assert json.loads(out)["left_out"] == ["wrist_pitch", "wrist_roll", "gripper"]
+    assert "left out" in err and "wrist_pitch, wrist_roll, gripper" in " ".join(err.split())
+
+
+def test_the_mini_pupper_s_own_model_has_its_twelve_joints():
+    Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
+    layout, left_out = joint_map_of(Path("pupper.xml"), "scs0009")
+    assert layout.joint_names == JOINT_NAMES and left_out == []
+
+
+def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys):
+    for words in (
+        "init-robot arm.xml",
+        "sweep --joint-map arm.joints.yaml --joints elbow,gripper --freqs 1,2,3,4 --truth "
+        "--out arm.csv",
+        "calibrate arm.csv --out arm.yaml",
+        "fit-servo arm.csv --arch fir --out servo",
+        "export arm.yaml --to isaaclab",
+        "export arm.yaml --to mjcf --out servos.xml",
+    ):
+        code, _, err = run(capsys, *words.split())
+        assert code == 0, f"{words}: {err}"
+    recording, found = load(Path("arm.csv")), load_calibration(Path("arm.yaml"))
+    assert recording.joints == ["elbow", "gripper"] == list(found.joint_names)
+    truth = yaml.safe_load(Path("arm.truth.yaml").read_text())["joints"]
+    for name in found.joint_names:
+        own = found.joint(name).actuator
+        assert own.delay_s.value == pytest.approx(truth[name]["actuator"]["delay_s"], abs=4e-3)
+        assert found.joint(name).feedback.poll_period_s.value == 0.0
+    model = load_servo_model(Path("servo"), joints=["gripper"]).model
+    start = float(recording.trials("gripper")[0].command_rad[0])
+    model.reset([start])
+    assert float(model.step([start])[0]) == pytest.approx(start, abs=0.02)
+    arm = in_free_air(Path("servos.xml").read_text(), found.joint_names)
+    assert arm.nu == 2 and arm.nsensor == 2
+
+
+def test_one_servo_on_a_bench_is_swept_over_a_serial_line_and_calibrated(capsys):
+    code, _, err = run(capsys, "init-robot", "bench.xml")
+    assert code == 0, err
+    layout = load_joint_map(Path("bench.joints.yaml"))
+    rng = np.random.default_rng(2)
+    robot = draw_robot(rng, RobotSpec(poll_period_s=0, loss=0, quantum_rad=0), layout)
+    bench = ServoBench(robot, layout, rng.spawn(1)[0])
+    with on_a_port(FeetechEmulator(bench, STS3215, rng)) as server:
+        arguments = (
+            "sweep", "--bus", f"feetech:{server.device}", "--joint-map", "bench.joints.yaml",
+            "--freqs", "2,4", "--duration", "2", "--rate", "50", "--out", "bench.csv",
+        )  # fmt: skip
+        code, _, err = run_program(capsys, pupper_sysid, *arguments)
+    assert code == 0, err
+    code, _, err = run(capsys, "calibrate", "bench.csv", "--out", "bench.yaml")
+    assert code == 0, err
+    own = load_calibration(Path("bench.yaml")).joint("bench").actuator
+    true = float(np.asarray(robot.servos[0].actuator.delay_s))
+    assert own.delay_s.value == pytest.approx(true, abs=8e-3)
+
+
+def test_what_is_no_robot_is_refused_in_a_sentence(capsys):
+    Path("broken.xml").write_text("<mujoco><worldbody><body></worldbody></mujoco>")
+    Path("fixed.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    slide = '<actuator><position joint="lift"/></actuator></mujoco>'
+    lift = '<body><joint name="lift" type="slide"/><geom size=".02"/></body></worldbody>'
+    Path("lift.xml").write_text(ARM.replace("</worldbody>", lift).replace("</mujoco>", slide))
+    Path("odd.xml").write_text(ARM.replace("base_yaw", "base yaw!"))
+    program = pupper_sysid
+    assert "MuJoCo's viewer" in refused(capsys, program, "init-robot", "broken.xml")
+    assert "no hinge joint" in refused(capsys, program, "init-robot", "fixed.xml")
+    assert "drive none of its hinges" in refused(capsys, program, "init-robot", "lift.xml")
+    assert "letters, digits" in refused(capsys, program, "init-robot", "odd.xml")
+    assert "is no file" in refused(capsys, program, "init-robot", "nowhere.xml")
+    code, _, _ = run(capsys, "init-robot", "arm.xml")
+    assert code == 0
+    assert "exists already" in refused(capsys, program, "init-robot", "arm.xml")
+    assert "no joint" in refused(
+        capsys, program, "sweep", "--joint-map", "arm.joints.yaml", "--joints", "LF_hip"
+    )

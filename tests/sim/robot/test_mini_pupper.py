@@ -1,0 +1,294 @@
+"""The robot's model has the masses, sizes, limits, linkage and IMU that were published."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.joints import JOINT_NAMES, LEGS
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.mini_pupper import (
+    FOOT_RADIUS_M,
+    STANDING_HEIGHT_M,
+    Knee,
+    foot_position,
+    joint_angles,
+    limits,
+    robot_xml,
+)
+from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.robot_in_air import error_in_air, in_free_space, standing
+
+H = 0.002
+STIFF = DelayedPDParameters(
+    stiffness=20.0,
+    damping=0.25,
+    friction_loss=0.0,
+    armature=8e-4,
+    effort_limit=1e3,
+    velocity_limit=1e3,
+    delay_s=0.0,
+)
+
+# facts/hardware.md C4, left legs: mass [kg], centre [m], inertia xx yy zz xy xz yz [kg m²]
+PUBLISHED = {
+    "hip": (
+        0.023343,
+        (0.0068, 0.0052, 0.0066),
+        (4.01e-6, 4.63e-6, 5.06e-6, -7.1e-7, -4.9e-8, -1.0e-7),
+    ),
+    "thigh": (
+        0.004137,
+        (-0.0012, 0.0041, -0.0170),
+        (1.42e-6, 1.48e-6, 2.63e-7, 2.5e-8, -1.9e-7, -1.8e-8),
+    ),
+    "calf": (0.002549, (0.0003, -0.0001, -0.0379), (1.47e-6, 1.57e-6, 1.22e-7, 0.0, 2.1e-7, 0.0)),
+}
+MIRROR = np.diag([1.0, -1.0, 1.0])
+
+
+def model_of(knee: Knee = "linkage", servo: DelayedPDParameters = STIFF) -> Any:
+    return mujoco.MjModel.from_xml_string(robot_xml(dict.fromkeys(JOINT_NAMES, servo), H, knee))
+
+
+def inertia(model: Any, body: str) -> np.ndarray:
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, model.body(body).iquat)
+    axes = axes.reshape(3, 3)
+    return axes @ np.diag(model.body(body).inertia) @ axes.T
+
+
+def tensor(xx, yy, zz, xy, xz, yz) -> np.ndarray:
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+# ----------------------------------------------------------------------------- masses and sizes
+
+
+def test_the_robot_weighs_465_grams():
+    assert model_of().body_mass.sum() == pytest.approx(0.465, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+@pytest.mark.parametrize("leg", LEGS)
+def test_leg_bodies_have_the_published_mass_centre_and_inertia_mirrored_on_the_right(leg, kind):
+    mass, centre, moments = PUBLISHED[kind]
+    turn = np.eye(3) if leg.startswith("L") else MIRROR
+    model = model_of()
+    body = model.body(f"{leg}_{kind}")
+    assert body.mass[0] == pytest.approx(mass, rel=1e-9)
+    np.testing.assert_allclose(body.ipos, turn @ centre, atol=1e-9)
+    np.testing.assert_allclose(
+        inertia(model, f"{leg}_{kind}"), turn @ tensor(*moments) @ turn, atol=1e-12
+    )
+
+
+def test_the_trunk_is_the_published_one_scaled_to_the_robots_mass():
+    model = model_of()
+    # 0.465 - 4 · (0.023343 + 0.004137 + 0.002549), and the tensor by 0.344884 / 0.125594
+    assert model.body("trunk").mass[0] == pytest.approx(0.344884, abs=1e-6)
+    np.testing.assert_allclose(model.body("trunk").ipos, (-0.0016, 0.0003, -0.0020))
+    np.testing.assert_allclose(
+        inertia(model, "trunk"),
+        2.746 * tensor(8.24e-5, 3.61e-4, 3.64e-4, 1.2e-6, -1.0e-5, 2.9e-7),
+        rtol=1e-3,
+        atol=1e-9,
+    )
+
+
+def test_right_legs_are_mirror_images_of_left_ones():
+    model = model_of()
+    for i in range(model.ngeom):
+        geom = model.geom(i)
+        if not geom.name.startswith("L"):
+            continue
+        other = model.geom("R" + geom.name[1:])
+        np.testing.assert_allclose(other.size, geom.size)
+        np.testing.assert_allclose(other.pos, MIRROR @ geom.pos, atol=1e-12)
+    for leg, other in (("LF", "RF"), ("LB", "RB")):
+        for kind in PUBLISHED:
+            left, right = model.body(f"{leg}_{kind}"), model.body(f"{other}_{kind}")
+            np.testing.assert_allclose(right.pos, MIRROR @ left.pos, atol=1e-12)
+
+
+def test_the_standing_robots_soles_are_on_the_ground_where_the_facts_say():
+    model = model_of()
+    data = standing(model)
+    assert STANDING_HEIGHT_M == 0.0835
+    for leg in LEGS:
+        foot = data.site(f"{leg}_foot").xpos
+        x = 0.0542 if leg.endswith("F") else -0.0618
+        y = 0.048 if leg.startswith("L") else -0.048
+        np.testing.assert_allclose(foot[:2], (x, y), atol=1e-4)
+        assert foot[2] - FOOT_RADIUS_M == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_robot_one_millimetre_lower_is_one_millimetre_deep_in_the_ground():
+    model = model_of()
+    data = standing(model)
+    data.qpos[2] -= 0.001
+    mujoco.mj_forward(model, data)
+    feet = {model.geom(f"{leg}_foot").id for leg in LEGS}
+    assert {g for pair in data.contact.geom for g in pair} == feet | {model.geom("ground").id}
+    assert data.contact.dist.min() == pytest.approx(-0.001, abs=1e-4)
+
+
+def test_the_simulated_robot_stands_with_its_weight_on_its_feet():
+    model = model_of()
+    data = standing(model)
+    mujoco.mj_step(model, data, 500)
+    assert data.qpos[2] == pytest.approx(STANDING_HEIGHT_M, abs=0.003)
+    load = sum(data.sensor(f"{leg}_foot_touch").data[0] for leg in LEGS)
+    assert load == pytest.approx(0.465 * 9.81, rel=0.02)
+
+
+def test_joints_have_the_published_limits_in_the_projects_order():
+    expected = {"thigh": (0.55, 2.40), "calf": (-2.18, -0.22)}
+    low, high = limits()
+    model = model_of()
+    for i, name in enumerate(JOINT_NAMES):
+        leg, kind = name.split("_")
+        own = expected.get(kind, (-0.550, 0.425) if leg.startswith("L") else (-0.425, 0.550))
+        assert (low[i], high[i]) == own
+        assert tuple(model.joint(name).range) == own
+        assert model.joint(name).qposadr[0] == 7 + i
+        assert model.actuator(name).id == i
+
+
+# ------------------------------------------------------------------------------------ kinematics
+
+
+def random_poses(count: int = 50) -> np.ndarray:
+    low, high = limits()
+    return np.random.default_rng(0).uniform(low, high, (count, 12))
+
+
+def test_joint_angles_undo_foot_positions_wherever_a_foot_hangs_below_its_hip():
+    poses = random_poses(100)
+    for i, leg in enumerate(LEGS):
+        own = poses[:, 3 * i : 3 * i + 3]
+        below = 0.050 * np.cos(own[:, 1]) + 0.056 * np.cos(own[:, 1] + own[:, 2]) > 0.001
+        assert below.sum() > 50
+        own = own[below]
+        np.testing.assert_allclose(joint_angles(leg, foot_position(leg, *own.T)), own, atol=1e-6)
+
+
+def test_a_foot_out_of_reach_is_answered_with_a_straight_leg_towards_it():
+    hip = np.array([0.05 - 0.00004, 0.0235, 0.0])  # under which the straight leg hangs
+    found = joint_angles("LF", hip + np.array([0.0, 0.02445, -1.0]))
+    # 1e-6 m short of straight: cos(bend) = 1 - 0.106e-6 / (0.05 · 0.056)
+    np.testing.assert_allclose(found, [0.0, 0.0, 0.0], atol=0.01)
+    assert np.isfinite(joint_angles("LF", hip)).all()
+
+
+def test_forward_kinematics_are_mujocos():
+    model = model_of()
+    data = mujoco.MjData(model)
+    for pose in random_poses(10):
+        data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
+        data.qpos[7:] = pose
+        mujoco.mj_kinematics(model, data)
+        for i, leg in enumerate(LEGS):
+            np.testing.assert_allclose(
+                foot_position(leg, *pose[3 * i : 3 * i + 3]),
+                data.site(f"{leg}_foot").xpos,
+                atol=1e-12,
+            )
+
+
+def test_a_positive_hip_angle_swings_the_left_foot_outward_and_the_right_one_inward():
+    for leg, outward in (("LF", 1), ("RF", -1)):
+        rest, moved = foot_position(leg, 0.0, 0.785, -1.57), foot_position(leg, 0.1, 0.785, -1.57)
+        assert moved[1] > rest[1]
+        assert np.sign(abs(moved[1]) - abs(rest[1])) == outward
+
+
+# ----------------------------------------------------------------------------------------- knee
+
+
+@pytest.mark.parametrize("knee", ["linkage", "serial"])
+def test_moving_the_thigh_alone_keeps_the_calfs_absolute_angle_only_behind_a_linkage(knee):
+    model = model_of(knee)
+    data = standing(model)
+    in_free_space(model, data)
+    data.ctrl[model.actuator("LF_thigh").id] += 0.3
+    mujoco.mj_step(model, data, 400)
+    thigh, calf = data.joint("LF_thigh").qpos[0], data.joint("LF_calf").qpos[0]
+    assert thigh == pytest.approx(0.785 + 0.3, abs=1e-3)
+    if knee == "linkage":
+        assert thigh + calf == pytest.approx(0.785 - 1.57, abs=1e-3)
+    else:
+        assert calf == pytest.approx(-1.57, abs=1e-3)
+
+
+# ------------------------------------------------------------------------------------------ IMU
+
+
+def test_the_imu_sits_upside_down_with_x_and_y_exchanged():
+    model = model_of()
+    data = standing(model)
+    chip = data.site("imu").xmat.reshape(3, 3)  # columns: the chip's axes in the trunk's frame
+    on_chip = np.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(chip @ on_chip, [2.0, 1.0, -3.0], atol=1e-12)
+    data.qvel[3:6] = 0.1, 0.2, 0.3
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.sensor("gyro").data, [0.2, 0.1, -0.3], atol=1e-12)
+
+
+def test_at_rest_the_accelerometer_reads_minus_one_g_on_the_chips_z():
+    model = model_of()
+    data = standing(model)
+    mujoco.mj_step(model, data, 500)
+    reading = data.sensor("accelerometer").data / 9.81
+    np.testing.assert_allclose(reading, [0.0, 0.0, -1.0], atol=0.05)
+
+
+# --------------------------------------------------------------------------------------- servos
+
+
+ACTUATORS = ("data/samples/calibrated.yaml", "paper")
+
+
+def swinging(actuator: str, knee: Knee, exactly_solved: bool) -> np.ndarray:
+    servos = servo_ranges(actuator).nominal()
+    model = mujoco.MjModel.from_xml_string(robot_xml(servos, H, knee))
+    return error_in_air(model, [servos[name] for name in JOINT_NAMES], exactly_solved)
+
+
+@pytest.mark.parametrize("knee", ["linkage", "serial"])
+@pytest.mark.parametrize("actuator", ACTUATORS)
+def test_with_weightless_links_every_servo_of_the_robot_is_the_fitted_servo(actuator, knee):
+    np.testing.assert_allclose(swinging(actuator, knee, exactly_solved=True), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("knee", ["linkage", "serial"])
+def test_the_solvers_iterations_are_enough_for_the_measured_friction(knee):
+    # a count is 5.7 mrad; a tenth of it cannot be measured
+    assert swinging(ACTUATORS[0], knee, exactly_solved=False).max() < math.pi / 550 / 10
+
+
+def test_each_actuator_has_its_own_joints_numbers():
+    servos = {
+        name: replace(STIFF, stiffness=10.0 + i, armature=1e-3 * (i + 1), friction_loss=0.01 * i)
+        for i, name in enumerate(JOINT_NAMES)
+    }
+    for knee in ("linkage", "serial"):
+        model = mujoco.MjModel.from_xml_string(robot_xml(servos, H, knee))
+        np.testing.assert_allclose(-model.actuator_biasprm[:, 1], 10.0 + np.arange(12))
+        for i, name in enumerate(JOINT_NAMES):
+            joint = model.joint(name)
+            armature, friction = joint.armature[0], joint.frictionloss[0]
+            if knee == "linkage" and name.endswith("calf"):
+                assert armature == friction == 0
+                tendon = model.tendon(f"{name}_servo").id
+                armature, friction = (
+                    model.tendon_armature[tendon],
+                    model.tendon_frictionloss[tendon],
+                )
+            assert armature == pytest.approx(1e-3 * (i + 1))
+            assert friction == pytest.approx(0.01 * i)

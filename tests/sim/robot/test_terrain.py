@@ -1,0 +1,127 @@
+"""The ground that can be looked up is the ground that MuJoCo simulates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pupper_sysid.sim.robot.mini_pupper import robot_xml
+from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.terrain import SPACING_M, TILE_M, Ground, make_ground
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+
+KINDS = ("flat", "rough", "slopes", "troughs", "steps", "mixed")
+
+
+def ground_of(kind) -> Ground:
+    return make_ground(kind, np.random.default_rng(3))
+
+
+def heights_of(ground: Ground) -> np.ndarray:
+    assert ground.heights is not None
+    return ground.heights
+
+
+def simulated(ground: Ground) -> Any:
+    servos = servo_ranges("ideal").nominal()
+    model = mujoco.MjModel.from_xml_string(
+        robot_xml(servos, 0.002, "linkage", ground.xml, ground.assets)
+    )
+    ground.fill(model)
+    return model
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_heights_are_where_rays_hit_mujocos_ground(kind):
+    ground = ground_of(kind)
+    model = simulated(ground)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 10.0  # the robot out of the way
+    mujoco.mj_forward(model, data)
+    points = np.random.default_rng(0).uniform(-7.9, 7.9, (200, 2))
+    hit = np.zeros(1, np.int32)
+    below = [
+        3.0 - mujoco.mj_ray(model, data, [x, y, 3.0], [0.0, 0.0, -1.0], None, 1, -1, hit, None)
+        for x, y in points
+    ]
+    assert model.geom(int(hit[0])).name == "ground"
+    if kind != "flat":
+        assert np.ptp(below) > 0.005, "the ground must be uneven for this to be a comparison"
+    np.testing.assert_allclose(ground.height(points[:, 0], points[:, 1]), below, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["slopes", "troughs"])
+def test_slopes_are_at_most_eight_and_a_half_degrees(kind):
+    heights = heights_of(ground_of(kind))
+    # the last row and column repeat their neighbours; between tiles there is a step of one edge
+    inside = heights[: len(heights) // 2, : len(heights) // 2]
+    steepest = max(np.abs(np.diff(inside, axis=axis)).max() for axis in (0, 1)) / SPACING_M
+    assert 2.0 < np.degrees(np.arctan(steepest)) <= 8.531
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("slopes", 1), ("troughs", -1)])
+def test_hills_rise_and_troughs_fall_to_a_flat_platform_of_60_centimetres(kind, sign):
+    heights = heights_of(ground_of(kind))
+    count = round(TILE_M / SPACING_M)
+    for row in (0, count):
+        for column in (0, count):
+            tile = sign * heights[row : row + count, column : column + count]
+            middle = tile[count // 2 - 6 : count // 2 + 6, count // 2 - 6 : count // 2 + 6]
+            assert np.ptp(middle) == 0.0
+            assert middle.max() == tile.max() > 0.1
+            assert tile.min() >= 0.0
+            assert np.ptp(tile[count // 2 - 7 : count // 2 + 7, count // 2]) > 0
+
+
+def test_steps_are_level_and_as_high_as_a_foot_is_lifted_at_most():
+    heights, count = heights_of(ground_of("steps")), round(TILE_M / SPACING_M)
+    tile = heights[:count, :count]
+    risers = np.unique(np.round(np.diff(tile[count // 2, : count // 2]), 9))
+    assert len(risers) == 2 and risers[0] == 0 and 0.003 <= risers[1] <= 0.01
+    # mostly treads
+    assert (np.diff(tile[count // 2]) == 0).mean() > 0.8
+
+
+def test_rough_ground_is_one_or_two_centimetres_high_with_a_flat_border_around_each_tile():
+    heights = heights_of(ground_of("rough"))
+    assert set(np.unique(heights)) == {0.0, 0.01, 0.02}
+    count = round(TILE_M / SPACING_M)
+    tile = heights[:count, :count]
+    assert not tile[:5].any()
+    assert not tile[:, -5:].any()
+    assert tile[5:-5, 5:-5].min() == 0.01
+    # a fair choice between two heights, within four standard deviations
+    inner = tile[5:-5, 5:-5].ravel() == 0.02
+    assert inner.mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(inner.size))
+
+
+def test_mixed_ground_has_one_tile_of_each_kind():
+    heights, count = heights_of(ground_of("mixed")), round(TILE_M / SPACING_M)
+    flat, rough = heights[:count, :count], heights[:count, count : 2 * count]
+    hill, trough = heights[count : 2 * count, :count], heights[count:-1, count:-1]
+    assert not flat.any()
+    assert rough.max() == 0.02
+    assert hill.max() > 0.1 and hill.min() >= 0
+    assert trough.min() < -0.1 and trough.max() <= 0
+
+
+def test_flat_ground_is_zero_everywhere_and_never_ends():
+    ground = ground_of("flat")
+    assert ground.heights is None
+    assert ground.half_size_m == np.inf
+    assert not ground.height(np.array([0.0, 1e6]), np.array([1.0, -1e6])).any()
+
+
+def test_beyond_the_edge_the_ground_is_as_at_the_edge():
+    ground = ground_of("slopes")
+    inside = ground.height(np.array([ground.half_size_m]), np.array([1.0]))
+    beyond = ground.height(np.array([ground.half_size_m + 5.0]), np.array([1.0]))
+    np.testing.assert_array_equal(beyond, inside)
+
+
+def test_the_same_random_numbers_give_the_same_ground_and_others_another():
+    np.testing.assert_array_equal(heights_of(ground_of("mixed")), heights_of(ground_of("mixed")))
+    other = heights_of(make_ground("mixed", np.random.default_rng(4)))
+    assert (other != heights_of(ground_of("mixed"))).any()

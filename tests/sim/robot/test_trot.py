@@ -1,0 +1,143 @@
+"""The open-loop trot: diagonal pairs, speed as commanded, a phase that can be read back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import LEGS
+from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position, limits
+from pupper_sysid.sim.robot.trot import Trot
+
+TROT = Trot(frequency_hz=2.5, lift_m=0.020, duty=0.6, gain=1.0, turn_gain=1.0)
+STEP_S = 0.02
+COMMANDS = {
+    "forward": (0.2, 0.0, 0.0),
+    "backward": (-0.2, 0.0, 0.0),
+    "sideways": (0.0, 0.1, 0.0),
+    "turning": (0.0, 0.0, 0.5),
+    "all at once": (0.15, -0.05, 0.3),
+}
+
+
+def feet(joints: np.ndarray) -> np.ndarray:
+    """Foot positions in the trunk's frame [m], shape (n, 4, 3)."""
+    return np.stack(
+        [foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T) for i, leg in enumerate(LEGS)], axis=1
+    )
+
+
+def phase_read(phase: np.ndarray, command: np.ndarray, wrong_rad: float = 0.0) -> np.ndarray:
+    """Phase read off the trot's targets of now and one control step before, slightly wrong."""
+    rng = np.random.default_rng(0)
+    before = phase - 2 * np.pi * TROT.frequency_hz * STEP_S
+    now, earlier = (
+        joints + rng.uniform(-wrong_rad, wrong_rad, joints.shape)
+        for joints in (TROT.joints(phase, command), TROT.joints(before, command))
+    )
+    return TROT.phase_of(now, earlier, STEP_S, command)
+
+
+def along(command, count: int) -> np.ndarray:
+    return np.tile(np.array(command, float), (count, 1))
+
+
+NEUTRAL = feet(default_pose()[None])[0]
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS.keys())
+def test_the_phase_is_read_back_from_the_joints(command):
+    phase = np.linspace(-np.pi, np.pi, 41)[:-1] + 0.01
+    found = phase_read(phase, along(command, 40))
+    # half a step of its grid, at touch-down and lift-off, where the path has corners
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * phase), atol=0.035)
+
+
+def test_a_step_of_phase_is_read_as_a_step_of_phase_from_slightly_wrong_joints():
+    phase = np.linspace(0, 2 * np.pi, 20)
+    found = phase_read(phase, along((0.2, 0, 0), 20), wrong_rad=0.01)
+    # 0.01 rad at a leg of 75 mm is 0.75 mm; a stance moves 1 mm in 0.08 rad
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * phase), atol=0.08)
+
+
+@pytest.mark.parametrize("turn", [0.4, -0.4])
+def test_short_strokes_still_tell_a_rising_foot_from_a_falling_one(turn):
+    """A turn moves feet by 4 mm and lifts them by 20 mm: the lift alone is ambiguous."""
+    phase = np.linspace(0, 2 * np.pi, 60)
+    found = phase_read(phase, along((0, 0, turn), 60), wrong_rad=0.02)
+    late = np.angle(np.exp(1j * (found - phase)))
+    # worst while all four feet carry and only the short stroke tells
+    assert np.abs(late).max() < 0.7
+    assert np.sqrt(np.mean(late**2)) < 0.25
+
+
+def test_diagonal_feet_move_together_and_the_two_pairs_half_a_cycle_apart():
+    phase = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    away = feet(TROT.joints(phase, along((0.2, 0.0, 0.0), 24))) - NEUTRAL
+    lf, rf, lb, rb = np.moveaxis(away, 1, 0)
+    np.testing.assert_allclose(lf, rb, atol=1e-9)
+    np.testing.assert_allclose(rf, lb, atol=1e-9)
+    np.testing.assert_allclose(np.roll(lf, 12, axis=0), rf, atol=1e-9)
+
+
+def test_each_foot_is_down_for_its_duty_and_lifted_by_the_lift_in_the_rest():
+    phase = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    up = (feet(TROT.joints(phase, along((0.2, 0.0, 0.0), 400))) - NEUTRAL)[..., 2]
+    assert up.min() == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(up.max(axis=0), 0.020, atol=1e-5)
+    np.testing.assert_allclose((up < 1e-9).mean(axis=0), TROT.duty, atol=0.01)
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS.keys())
+def test_over_a_stance_the_ground_passes_under_the_trunk_as_commanded(command):
+    # LF stands from phase 0 for its duty; a foot on the ground moves against the trunk, evenly
+    phase = np.linspace(0.0, 2 * np.pi * TROT.duty, 7)
+    path = feet(TROT.joints(phase, along(command, 7)))[:, 0, :2]
+    speed = -np.diff(path, axis=0) * TROT.frequency_hz * 6 / TROT.duty
+    vx, vy, turn = command
+    x, y = NEUTRAL[0, :2]
+    np.testing.assert_allclose(speed, np.tile([vx - turn * y, vy + turn * x], (6, 1)), atol=1e-6)
+
+
+def test_feet_do_not_jump_at_touch_down_or_lift_off():
+    phase = np.linspace(0, 2 * np.pi, 2001)
+    path = feet(TROT.joints(phase, along((0.2, 0.1, 0.3), 2001)))
+    assert np.abs(np.diff(path, axis=0)).max() < 2e-4
+
+
+@pytest.mark.parametrize("duty", [0.0, 1.0, 1.2, -0.1])
+def test_a_duty_that_cannot_be_is_refused(duty):
+    with pytest.raises(InputError, match="trot.duty"):
+        Trot(duty=duty)
+
+
+def test_gain_lengthens_the_stroke_in_proportion():
+    command, phase = along((0.1, 0.0, 0.0), 1), np.zeros(1)
+    one, more = (feet(Trot(gain=g).joints(phase, command))[0, 0] - NEUTRAL[0] for g in (1, 1.5))
+    assert more[0] == pytest.approx(1.5 * one[0], rel=1e-6)
+
+
+def test_a_command_of_zero_stands_in_the_default_pose_at_any_phase():
+    phase = np.linspace(0, 2 * np.pi, 9)
+    joints = TROT.joints(phase, along((0.0, 0.0, 0.0), 9))
+    np.testing.assert_array_equal(joints, np.tile(default_pose(), (9, 1)))
+
+
+def test_each_robot_follows_its_own_phase_and_command():
+    commands = np.array([[0.2, 0, 0], [0, 0, 0], [0.0, 0.1, 0.2]])
+    phase = np.array([0.3, 1.0, 4.0])
+    together = TROT.joints(phase, commands)
+    for i in range(3):
+        np.testing.assert_array_equal(
+            together[i], TROT.joints(phase[i : i + 1], commands[i : i + 1])[0]
+        )
+
+
+def test_the_trot_stays_within_the_joint_limits_up_to_the_robots_rated_speed():
+    phase = np.linspace(0, 2 * np.pi, 100)
+    low, high = limits()
+    # 0.15 m/s: facts/paper.md 1.4; at 0.2 m/s the thigh reaches its front stop
+    for command in ((0.15, 0.0, 0.0), (-0.15, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.5)):
+        joints = Trot().joints(phase, along(command, 100))
+        assert (joints >= low).all() and (joints <= high).all(), command

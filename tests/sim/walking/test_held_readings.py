@@ -1,0 +1,184 @@
+"""Readings of many robots are as old, coarse and off as the measured feedback says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.sim.walking.held_readings import HeldReadings
+
+H, SUBSTEPS = 0.002, 10
+SPAN = H * SUBSTEPS
+MEASURED = HeldFeedback(poll_period_s=0.0268, loss=0.42)
+JITTER_S = 0.0008 * np.sqrt(3)  # half width of a uniform jitter of 0.8 ms standard deviation
+
+
+class Bus:
+    """`HeldReadings` whose robots move at one constant speed, so that a reading tells its time."""
+
+    def __init__(self, feedback: HeldFeedback, environments=200, servos=12, speed=1.0, seed=0):
+        self.readings = HeldReadings(
+            (feedback,) * servos, environments, H, np.random.default_rng(seed)
+        )
+        self.shape, self.speed, self.time = (environments, servos), speed, 0.0
+        self.readings.reset(np.arange(environments), np.zeros(self.shape))
+
+    def step(self) -> None:
+        times = self.time + H * np.arange(SUBSTEPS + 1)
+        position = np.broadcast_to(
+            (self.speed * times)[None, :, None], (self.shape[0], SUBSTEPS + 1, self.shape[1])
+        )
+        self.readings.advance(position, 10 * position)
+        self.time = times[-1]
+
+
+def settled(feedback: HeldFeedback, **options) -> Bus:
+    """After so long that no reading is of the start."""
+    bus = Bus(feedback, **options)
+    for _ in range(60):
+        bus.step()
+    return bus
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.42, 0.7])
+@pytest.mark.parametrize("period", [0.006, 0.0268])
+def test_the_mean_age_is_the_feedbacks(period, loss):
+    feedback = HeldFeedback(poll_period_s=period, loss=loss)
+    bus = settled(feedback)
+    ages = []
+    for _ in range(60):
+        bus.step()
+        ages.append(bus.readings.age_s.mean())
+    # an age is uniform over a round, plus a geometric number of missed rounds
+    spread = period * np.sqrt(1 / 12 + loss / (1 - loss) ** 2)
+    # and is another one after a successful poll or two
+    independent = bus.shape[0] * bus.shape[1] * 60 * SPAN / (3 * (period / (1 - loss) + SPAN))
+    error = 4 * spread / np.sqrt(independent)
+    assert error < 0.05 * feedback.mean_age_s + 1e-4, "too few readings to tell"
+    assert np.mean(ages) == pytest.approx(feedback.mean_age_s, abs=error)
+
+
+def test_the_share_of_fresh_readings_is_the_share_of_successful_polls():
+    bus = settled(MEASURED)
+    fresh = []
+    for _ in range(50):
+        before = bus.readings.position.copy()
+        bus.step()
+        fresh.append((bus.readings.position != before).mean())
+    # at most one poll fits into a step that is shorter than the period
+    expected = (1 - MEASURED.loss) * SPAN / MEASURED.poll_period_s
+    assert np.mean(fresh) == pytest.approx(expected, abs=0.01)
+
+
+def test_a_reading_is_the_position_at_the_instant_of_its_poll():
+    bus = settled(MEASURED, speed=3.0)
+    age = bus.readings.age_s
+    assert age.min() >= 0
+    assert age.max() > 5 * MEASURED.poll_period_s
+    np.testing.assert_allclose(bus.time * 3.0 - bus.readings.position, 3.0 * age, atol=1e-9)
+
+
+def test_between_polls_a_reading_stays_and_ages_with_the_clock():
+    bus = settled(MEASURED)
+    before, age = bus.readings.position.copy(), bus.readings.age_s.copy()
+    bus.step()
+    same = bus.readings.position == before
+    assert 0.3 < same.mean() < 0.8
+    np.testing.assert_allclose(bus.readings.age_s[same], age[same] + SPAN, atol=1e-12)
+    assert bus.readings.age_s[~same].max() <= SPAN
+
+
+def test_the_load_is_read_with_the_position():
+    bus = settled(MEASURED)
+    # loads are held over a physics step: of the one that the poll falls into, 10 rad⁻¹ · position
+    late = bus.readings.load - 10 * bus.readings.position
+    assert late.min() >= -1e-9
+    assert late.max() <= 10 * H + 1e-9
+
+
+def test_a_bus_without_losses_is_never_older_than_a_period():
+    bus = settled(HeldFeedback(poll_period_s=0.0268))
+    for _ in range(20):
+        bus.step()
+        # 0.2 % of drift, at five standard deviations, and a jitter of two polls
+        assert bus.readings.age_s.max() < 0.0268 * 1.01 + 2 * JITTER_S
+
+
+def test_if_almost_every_poll_is_lost_the_old_reading_stays():
+    bus = Bus(HeldFeedback(poll_period_s=0.0268, loss=1 - 1e-12))
+    first = bus.readings.age_s.copy()
+    for _ in range(20):
+        bus.step()
+    assert not bus.readings.position.any()
+    np.testing.assert_allclose(bus.readings.age_s, first + 20 * SPAN)
+
+
+def test_a_direct_bus_reads_the_present():
+    bus = Bus(HeldFeedback(), environments=2)
+    for _ in range(3):
+        bus.step()
+        np.testing.assert_allclose(bus.readings.position, bus.time)
+        np.testing.assert_allclose(bus.readings.load, 10 * bus.time)
+        assert not bus.readings.age_s.any()
+
+
+def test_readings_are_whole_counts_of_the_offset_position():
+    feedback = HeldFeedback(quantum_rad=0.01, offset_rad=0.003)
+    readings = HeldReadings((feedback,), 1, H, np.random.default_rng(0))
+    readings.reset(np.array([0]), np.array([[0.0]]))
+    for position, expected in ((0.0, 0.0), (0.0019, 0.0), (0.0021, 0.01), (-0.0081, -0.01)):
+        readings.advance(np.full((1, 2, 1), position), np.zeros((1, 2, 1)))
+        assert readings.position[0, 0] == pytest.approx(expected, abs=1e-12)
+    readings.reset(np.array([0]), np.array([[0.052]]))
+    assert readings.position[0, 0] == pytest.approx(0.06)  # 0.055 rounds to the even count
+
+
+def test_each_servo_has_its_own_feedback():
+    direct, slow = HeldFeedback(offset_rad=0.5), HeldFeedback(poll_period_s=10.0)
+    readings = HeldReadings((direct, slow), 50, H, np.random.default_rng(0))
+    readings.reset(np.arange(50), np.zeros((50, 2)))
+    readings.advance(np.full((50, SUBSTEPS + 1, 2), 1.0), np.zeros((50, SUBSTEPS + 1, 2)))
+    np.testing.assert_allclose(readings.position[:, 0], 1.5)
+    # of 50 robots polled every 10 s, hardly any in 20 ms
+    assert (readings.position[:, 1] == 0.0).mean() > 0.9
+
+
+def test_servos_are_polled_in_turn_a_twelfth_of_a_round_apart():
+    bus = settled(HeldFeedback(poll_period_s=0.0268), environments=300)
+    at = bus.time - bus.readings.age_s
+    round_ = np.angle(np.exp(2j * np.pi * np.diff(at, axis=1) / 0.0268)) / (2 * np.pi)
+    assert round_.mean() == pytest.approx(1 / 12, abs=0.005)
+    assert np.abs(round_ - 1 / 12).max() < (2 * JITTER_S + 12e-5) / 0.0268
+
+
+def test_robots_are_polled_at_their_own_times():
+    bus = settled(HeldFeedback(poll_period_s=0.0268), environments=500)
+    phase = bus.readings.age_s[:, 0] / 0.0268
+    # uniform over the round: mean 1/2, standard deviation 1/√12, five standard errors
+    assert phase.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * 500))
+    assert phase.std() == pytest.approx(1 / np.sqrt(12), rel=0.1)
+
+
+def test_resetting_some_robots_leaves_the_others_alone():
+    bus = settled(MEASURED, environments=4)
+    before = {k: v.copy() for k, v in bus.readings.state.items()}
+    bus.readings.reset(np.array([1, 3]), np.full((2, 12), -7.0))
+    np.testing.assert_array_equal(bus.readings.position[[1, 3]], -7.0)
+    assert not bus.readings.load[[1, 3]].any()
+    for name, value in bus.readings.state.items():
+        np.testing.assert_array_equal(value[[0, 2]], before[name][[0, 2]])
+
+
+def test_a_copied_state_reads_on_as_the_original():
+    bus = settled(MEASURED, environments=3)
+    saved = {k: v.copy() for k, v in bus.readings.state.items()}
+    random, time = bus.readings.rng_state, bus.time
+    bus.step()
+    first = bus.readings.position.copy()
+    bus.step()
+    for name, value in bus.readings.state.items():
+        value[:] = saved[name]
+    bus.readings.rng_state, bus.time = random, time
+    bus.step()
+    np.testing.assert_array_equal(bus.readings.position, first)

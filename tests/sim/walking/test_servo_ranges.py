@@ -1,0 +1,196 @@
+"""What `--actuator` means: intervals of twelve servos, from a calibration, a preset or nothing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.sim.walking.servo_ranges import (
+    ServoRanges,
+    check_actuator,
+    servo_model_of,
+    servo_ranges,
+)
+from support.calibration_examples import calibration, joint_calibration
+
+TORQUES = ("stiffness", "damping", "friction_loss", "armature", "effort_limit")
+
+
+def ranges_of(tmp_path, found: Calibration | None = None, **options) -> ServoRanges:
+    path = tmp_path / "calibrated.yaml"
+    (found or calibration()).save(path)
+    return servo_ranges(path, **options)
+
+
+def test_an_interval_of_the_calibration_is_the_range(tmp_path):
+    ranges = ranges_of(tmp_path)
+    # calibration_examples: delay 0.025 ± 10 %, identified
+    assert ranges.low["delay_s"][0] == pytest.approx(0.0225)
+    assert ranges.value["delay_s"][0] == 0.025
+    assert ranges.high["delay_s"][0] == pytest.approx(0.0275)
+    assert ranges.longest_delay_s == pytest.approx(0.0275)
+
+
+def test_a_number_without_an_interval_is_itself(tmp_path):
+    ranges = ranges_of(tmp_path)
+    for field, value in (("stiffness", 11.0), ("effort_limit", 0.35), ("velocity_limit", 7.6)):
+        for end in (ranges.low, ranges.value, ranges.high):
+            np.testing.assert_array_equal(end[field], value)
+
+
+def test_the_measured_sample_gives_its_own_intervals():
+    ranges = servo_ranges("data/samples/calibrated.yaml")
+    for field in ("stiffness", "damping", "friction_loss", "delay_s"):
+        assert (ranges.low[field] < ranges.value[field]).all()
+        assert (ranges.value[field] < ranges.high[field]).all()
+    # the armature is the scale that torque_scale draws, not a range of its own
+    np.testing.assert_array_equal(ranges.low["armature"], ranges.high["armature"])
+
+
+@pytest.mark.parametrize(
+    ("preset", "steps", "stiffness", "effort"),
+    # facts/paper.md 2: 76 ms as 33 to 43 steps of 2 ms; released: 26 to 31 steps
+    [("paper", (33, 43), 70.0, 5.0), ("release", (26, 31), 80.0, 0.7)],
+)
+def test_presets_delays_are_their_whole_physics_steps(preset, steps, stiffness, effort):
+    ranges = servo_ranges(preset)
+    np.testing.assert_allclose(ranges.low["delay_s"], steps[0] * 0.002)
+    np.testing.assert_allclose(ranges.high["delay_s"], steps[1] * 0.002)
+    np.testing.assert_array_equal(ranges.value["stiffness"], stiffness)
+    np.testing.assert_array_equal(ranges.high["effort_limit"], effort)
+    assert ranges.borrowed == {}
+    assert set(ranges.feedback) == {HeldFeedback()}
+
+
+def test_joints_that_were_not_calibrated_borrow_from_their_own_kind_and_say_so(tmp_path):
+    joints = {
+        "LF_hip": joint_calibration(5.0),
+        "RB_thigh": joint_calibration(6.0),
+        "LF_calf": joint_calibration(7.0),
+    }
+    ranges = ranges_of(tmp_path, calibration(**joints))
+    expected = {"hip": 5.0, "thigh": 6.0, "calf": 7.0}
+    for name, stiffness in zip(JOINT_NAMES, ranges.value["stiffness"], strict=True):
+        assert stiffness == expected[name.split("_")[1]]
+    lenders = {"hip": "LF_hip", "thigh": "RB_thigh", "calf": "LF_calf"}
+    assert ranges.borrowed == {
+        name: lenders[name.split("_")[1]] for name in JOINT_NAMES if name not in joints
+    }
+
+
+def test_a_joint_whose_kind_nobody_calibrated_borrows_from_its_own_leg(tmp_path):
+    joints = {"LF_hip": joint_calibration(5.0), "RB_thigh": joint_calibration(6.0)}
+    ranges = ranges_of(tmp_path, calibration(**joints))
+    assert ranges.borrowed["LF_calf"] == "LF_hip"
+    assert ranges.borrowed["RB_calf"] == "RB_thigh"
+
+
+def test_one_servo_on_a_bench_lends_to_all_joints(tmp_path):
+    ranges = ranges_of(tmp_path, calibration(bench=joint_calibration(5.0)))
+    assert ranges.borrowed == dict.fromkeys(JOINT_NAMES, "bench")
+
+
+def test_feedback_comes_with_the_calibration_and_can_be_exchanged(tmp_path):
+    held = ranges_of(tmp_path).feedback
+    expected = HeldFeedback(0.02685, 0.42, math.pi / 550, -0.1)
+    assert held == (expected,) * 12
+    path = tmp_path / "calibrated.yaml"
+    assert servo_ranges(path, feedback="ideal").feedback == (HeldFeedback(),) * 12
+    assert servo_ranges("paper", feedback=path).feedback == (expected,) * 12
+    np.testing.assert_array_equal(servo_ranges("paper", feedback=path).value["stiffness"], 70.0)
+
+
+def test_ideal_servos_are_immediate_and_free_of_friction_with_exact_feedback():
+    ranges = servo_ranges("ideal")
+    for end in (ranges.low, ranges.value, ranges.high):
+        assert not end["delay_s"].any()
+        assert not end["friction_loss"].any()
+    assert ranges.longest_delay_s == 0.0
+    assert set(ranges.feedback) == {HeldFeedback()}
+
+
+@pytest.mark.parametrize("actuator", ["paper", "ideal"])
+def test_later_moves_every_delay_and_nothing_else(actuator):
+    before = servo_ranges(actuator)
+    after = before.later(0.04)
+    for name in ("low", "value", "high"):
+        old, new = getattr(before, name), getattr(after, name)
+        np.testing.assert_allclose(new["delay_s"], old["delay_s"] + 0.04)
+        for field in old.keys() - {"delay_s"}:
+            np.testing.assert_array_equal(new[field], old[field])
+    assert after.longest_delay_s == pytest.approx(before.longest_delay_s + 0.04)
+    assert servo_ranges(actuator).longest_delay_s == before.longest_delay_s
+
+
+def test_drawn_numbers_fill_their_intervals_and_never_leave_them():
+    ranges = servo_ranges("data/samples/calibrated.yaml")
+    drawn = ranges.draw(500, (1.0, 1.0), np.random.default_rng(0))
+    for field, values in drawn.items():
+        low, high = ranges.low[field], ranges.high[field]
+        assert values.shape == (500, 12)
+        assert (values >= low).all() and (values <= high).all(), field
+        # of 500 uniform numbers the extremes are within 3 % of the ends but for e⁻¹⁵ of times
+        assert (np.ptp(values, axis=0) >= 0.94 * (high - low)).all(), field
+
+
+def test_the_torque_scale_is_one_factor_per_robot_on_all_torques_and_the_armature():
+    ranges = servo_ranges("paper")
+    drawn = ranges.draw(200, (0.5, 2.0), np.random.default_rng(0))
+    factor = drawn["stiffness"] / 70.0
+    np.testing.assert_allclose(factor, np.broadcast_to(factor[:, :1], factor.shape))
+    assert 0.5 <= factor.min() < 0.6 and 1.9 < factor.max() <= 2.0
+    for field in TORQUES:
+        np.testing.assert_allclose(drawn[field], factor * ranges.value[field], err_msg=field)
+    np.testing.assert_array_equal(drawn["velocity_limit"], 10.5)
+    assert drawn["delay_s"].max() <= 0.086
+
+
+def test_drawing_leaves_the_ranges_as_they_were():
+    ranges = servo_ranges("paper")
+    ranges.draw(3, (2.0, 2.0), np.random.default_rng(0))
+    np.testing.assert_array_equal(ranges.value["stiffness"], 70.0)
+    np.testing.assert_array_equal(ranges.high["armature"], 0.005)
+
+
+def test_the_nominal_servo_of_a_joint_is_the_middle_of_its_intervals(tmp_path):
+    joints = {name: joint_calibration(5.0 + i) for i, name in enumerate(JOINT_NAMES)}
+    nominal = ranges_of(tmp_path, calibration(**joints)).nominal()
+    assert tuple(nominal) == JOINT_NAMES
+    for i, name in enumerate(JOINT_NAMES):
+        assert nominal[name].stiffness == 5.0 + i
+        assert nominal[name].delay_s == 0.025
+
+
+@pytest.mark.parametrize("actuator", ["paper", "release", "ideal", "data/samples/calibrated.yaml"])
+def test_what_can_be_given_is_accepted(actuator):
+    check_actuator(actuator)
+
+
+def test_an_unknown_file_is_answered_with_what_can_be_given():
+    with pytest.raises(InputError, match=r"nowhere\.yaml.*no such file.*paper, release, ideal"):
+        check_actuator("nowhere.yaml")
+    with pytest.raises(InputError, match="does not exist"):
+        servo_ranges("nowhere.yaml")
+    with pytest.raises(InputError, match="does not exist"):
+        servo_ranges("paper", feedback="nowhere.yaml")
+
+
+def test_a_calibration_is_not_a_learned_servo_model():
+    assert servo_model_of("paper", 0.02) is None
+    assert servo_model_of("data/samples/calibrated.yaml", 0.02) is None
+
+
+def test_a_folder_without_a_model_is_refused(tmp_path):
+    with pytest.raises(InputError):
+        servo_model_of(tmp_path, 0.02)
+
+
+def test_no_delay_becomes_negative():
+    ranges = servo_ranges("paper").later(-1.0)
+    assert not ranges.low["delay_s"].any() and not ranges.high["delay_s"].any()

@@ -1,0 +1,745 @@
+"""The walking environment: what is seen, what delays, what resets, and that it can walk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pupper_sysid.sim.robot.robot_batch
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES, LEGS
+from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.mini_pupper import (
+    STANDING_HEIGHT_M,
+    default_pose,
+    foot_position,
+    joint_angles,
+    limits,
+    robot_xml,
+)
+from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.walking.config import (
+    Commands,
+    Curriculum,
+    Observation,
+    Randomisation,
+    Walking,
+)
+from pupper_sysid.sim.walking.env import OBSERVATION, OBSERVATION_SIZE, PupperEnv, StepResult
+from pupper_sysid.sim.walking.env import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.rewards import Rewards, weights
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
+from support.robot_in_air import error_in_air, lags_in_air
+
+MEASURED = "data/samples/calibrated.yaml"
+ACTUATORS = (MEASURED, "paper", "release", "ideal")
+H, SPAN = 0.002, 0.02
+STILL = Randomisation(
+    friction=(0.8, 0.8),
+    payload_kg=(0.0, 0.0),
+    torque_scale=(1.0, 1.0),
+    joint_rad=0.0,
+    joint_rad_s=0.0,
+    base_velocity_m_s=(0.0, 0.0, 0.0),
+    base_rate_rad_s=(0.0, 0.0, 0.0),
+    push_m_s=0.0,
+    on_the_move=0.0,
+)
+SEEN = Observation(noise=False, base_velocity="true")
+QUIET = Walking(randomisation=STILL, observation=SEEN)
+
+
+def make(
+    actuator: str | ServoRanges = "ideal", config: Walking = QUIET, count: int = 4, **options
+) -> PupperEnv:
+    servos = actuator if isinstance(actuator, ServoRanges) else servo_ranges(actuator)
+    return PupperEnv(config, servos, count, **{"seed": 0, "threads": 1, **options})
+
+
+def still(env: PupperEnv) -> np.ndarray:
+    return np.zeros((env.environments, 12))
+
+
+def walk_about(env: PupperEnv, steps: int, seed: int = 5) -> list[StepResult]:
+    """Small random actions."""
+    rng = np.random.default_rng(seed)
+    return [env.step(rng.uniform(-0.3, 0.3, (env.environments, 12))) for _ in range(steps)]
+
+
+def drawn_field(env: PupperEnv, name: str) -> np.ndarray:
+    """A field of the model as it is in each simulation."""
+    values = env.robots.batch.expanded(name)
+    assert values is not None
+    return values
+
+
+def only(**given: Any) -> Rewards:
+    """No reward term but these."""
+    none: dict[str, Any] = dict.fromkeys(weights(Rewards()), 0.0)
+    return Rewards(**(none | given))
+
+
+def lift(env: PupperEnv) -> None:
+    """Into free fall, where joints feel no weight."""
+    env.robots.batch.bind("qpos")[:, 2] = 1.0
+
+
+def with_delay(low: float, high: float) -> ServoRanges:
+    """The paper's servos without friction, and with other delays."""
+    paper = servo_ranges("paper")
+    none = {"friction_loss": np.zeros(12)}
+    delay = {"low": low, "value": (low + high) / 2, "high": high}
+    return replace(
+        paper,
+        **{
+            name: getattr(paper, name) | none | {"delay_s": np.full(12, seconds)}
+            for name, seconds in delay.items()
+        },
+    )
+
+
+def throw(env: PupperEnv, ids) -> None:
+    """On their backs."""
+    env.robots.batch.bind("qpos")[ids, 3:7] = 0.0, 1.0, 0.0, 0.0
+
+
+def time_out(env: PupperEnv, ids) -> None:
+    env.episode_step[ids] = env.config.episode_steps - 1
+
+
+def spoil(env: PupperEnv, ids) -> None:
+    env.robots.batch.bind("qvel")[ids, 7] = np.nan
+
+
+ENDS = {"fall": throw, "time-out": time_out, "NaN": spoil}
+
+
+# --------------------------------------------------------------------------------- the open loop
+
+
+def published_trot(cycles: float, amplitude_m: float, lift_m: float) -> np.ndarray:
+    """Joint targets of facts/training.md section 6: a cosine fore and aft, half a sine up."""
+    joints = []
+    for i, (leg, behind) in enumerate(zip(LEGS, (0.0, 0.5, 0.5, 0.0), strict=True)):
+        phase = 2 * np.pi * (cycles + behind)
+        path = np.array([amplitude_m * np.cos(phase), 0.0, lift_m * max(-np.sin(phase), 0.0)])
+        neutral = foot_position(leg, *default_pose()[3 * i : 3 * i + 3])
+        joints.append(joint_angles(leg, (neutral + path)[None])[0])
+    return np.concatenate(joints)
+
+
+@pytest.mark.parametrize("actuator", ACTUATORS)
+def test_the_open_loop_trot_walks_after_every_kind_of_reset(actuator):
+    start = Randomisation(push_m_s=0.0)
+    if actuator == "ideal":
+        # without a limit on its torque, a robot that snaps into the trot from far away is thrown
+        start = replace(start, joint_rad=0.1, on_the_move=0.0, friction=(0.8, 0.8))
+    config = Walking(randomisation=start)
+    env = make(actuator, config, 8)
+    command = np.array([0.2, 0.0, 0.0])  # strokes of 20 mm to either side
+    walk_about(env, 2)
+    # robots 0 and 1 walk on from their initial reset
+    for i, end in enumerate(ENDS.values()):
+        end(env, [2 * i + 2, 2 * i + 3])
+    ended = env.step(still(env)).done
+    np.testing.assert_array_equal(ended, [False, False, True, True, True, True, True, True])
+    assert env.nan_resets == 2
+    speed, height = [], []
+    for i in range(100):
+        env.set_command(command)
+        target = np.tile(published_trot(2.5 * SPAN * i, 0.020, 0.020), (8, 1))
+        result = env.step((target - env.default) / config.action_scale)
+        assert not result.done.any(), f"fell at step {i}"
+        if i >= 40:
+            speed.append(result.facts.linear_velocity[:, 0])
+            height.append(env.robots.batch.bind("qpos")[:, 2].copy())
+        assert result.facts.gravity[:, 2].max() < -0.8  # within 37 degrees of upright
+    speed, height = np.mean(speed, axis=0), np.array(height)
+    assert 0.1 < speed.mean() < 0.25, speed
+    assert (speed > 0.05).all() and (speed < 0.30).all(), (
+        speed
+    )  # each slips, and bounces, its own way
+    assert (height.mean(axis=0) > 0.070).all() and (height.mean(axis=0) < 0.090).all()
+
+
+# --------------------------------------------------------------------------------- learned servos
+
+
+def proportional(gain: float | np.ndarray) -> CommandNetwork:
+    """A servo model that goes to `gain` times the command's distance from the default pose."""
+    ones, pose = np.ones(12), default_pose()
+    return CommandNetwork(
+        JOINT_NAMES, SPAN,
+        {
+            "command_center": pose, "command_scale": ones, "position_center": pose,
+            "position_scale": ones, "bound": np.full(12, np.inf), "fir_bias": 0 * ones,
+            "fir": (gain * ones)[:, None],
+        },
+    )  # fmt: skip
+
+
+def test_a_servo_model_decides_where_the_joints_go():
+    env = make("ideal", QUIET, 2, servo_model=proportional(0.5))
+    action = np.tile([0.0, 0.2, -0.2], (2, 4))
+    for _ in range(40):
+        env.step(action)
+    moved = env.robots.joints - default_pose()
+    np.testing.assert_allclose(moved, 0.5 * 0.5 * action, atol=0.01)
+
+
+def test_a_servo_model_speaks_of_servos_not_of_joints():
+    """The third servo of a leg sets thigh + calf; it was fitted while the thigh stood still."""
+    env = make("ideal", QUIET, 1, servo_model=proportional(np.tile([1.0, 0.0, 1.0], 4)))
+    for _ in range(40):
+        env.step(np.tile([0.0, 0.2, 0.0], (1, 4)))
+    moved = (env.robots.joints - default_pose())[0].reshape(4, 3)
+    # the thighs' servos do not move; the calves' were told to hold the calf against them
+    np.testing.assert_allclose(moved, np.tile([0.0, 0.0, 0.1], (4, 1)), atol=0.01)
+
+
+# ----------------------------------------------------------------------------- what the policy sees
+
+
+def test_an_observation_is_sixty_named_numbers_in_the_published_order():
+    # facts/paper.md 1.1: index ranges and half widths of the noise
+    assert [(n, PARTS[n].start, PARTS[n].stop, w) for n, _, w in OBSERVATION] == [
+        ("base_linear_velocity", 0, 3, 0.1),
+        ("base_angular_velocity", 3, 6, 0.2),
+        ("projected_gravity", 6, 9, 0.05),
+        ("command", 9, 12, 0.0),
+        ("joint_position_relative", 12, 24, 0.01),
+        ("joint_velocity", 24, 36, 1.5),
+        ("joint_effort", 36, 48, 0.1),
+        ("last_action", 48, 60, 0.0),
+    ]
+    assert OBSERVATION_SIZE == 60
+    env = make()
+    observation, privileged = env.reset()
+    assert observation.shape == (4, 60) and observation.dtype == np.float32
+    assert privileged.shape == (4, env.privileged_size) and privileged.dtype == np.float32
+
+
+def test_the_last_action_is_seen_raw_and_the_command_as_given():
+    env = make()
+    env.set_command(np.array([0.1, -0.05, 0.3]))
+    action = np.random.default_rng(0).uniform(-5, 5, (4, 12))  # beyond what joints can do
+    observation = env.step(action).observation
+    np.testing.assert_allclose(observation[:, PARTS["last_action"]], action, rtol=1e-6)
+    np.testing.assert_allclose(observation[0, PARTS["command"]], [0.1, -0.05, 0.3], rtol=1e-6)
+
+
+def test_a_level_robot_sees_gravity_straight_down():
+    observation, _ = make().reset()
+    np.testing.assert_allclose(
+        observation[:, PARTS["projected_gravity"]], np.tile([0, 0, -1.0], (4, 1)), atol=1e-6
+    )
+
+
+def test_speed_and_gravity_are_seen_in_the_trunks_frame():
+    env, rng = make(), np.random.default_rng(0)
+    turn = rng.standard_normal((4, 4))
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    speed, rate = rng.standard_normal((2, 4, 3))
+    env.robots.batch.bind("qpos")[:, 3:7] = turn
+    env.robots.batch.bind("qvel")[:, :3], env.robots.batch.bind("qvel")[:, 3:6] = speed, rate
+    observation, _ = env.observe()
+    for i in range(4):
+        back, expected = np.zeros(4), np.zeros(3)
+        mujoco.mju_negQuat(back, turn[i])
+        mujoco.mju_rotVecQuat(expected, speed[i], back)
+        np.testing.assert_allclose(
+            observation[i, PARTS["base_linear_velocity"]], expected, atol=1e-6
+        )
+        mujoco.mju_rotVecQuat(expected, np.array([0.0, 0.0, -1.0]), back)
+        np.testing.assert_allclose(observation[i, PARTS["projected_gravity"]], expected, atol=1e-6)
+        # a free joint's rate is in its own frame already
+        np.testing.assert_allclose(observation[i, PARTS["base_angular_velocity"]], rate[i], 1e-5)
+
+
+def test_a_robot_that_cannot_measure_its_speed_sees_zeros_without_noise():
+    env = make(config=replace(QUIET, observation=Observation(noise=True, base_velocity="zero")))
+    env.robots.batch.bind("qvel")[:, :3] = 1.0
+    assert not env.observe()[0][:, PARTS["base_linear_velocity"]].any()
+
+
+def test_noise_stays_within_the_published_bounds_and_fills_them():
+    env = make(config=replace(QUIET, observation=replace(SEEN, noise=True)), count=16)
+    noisy = np.stack([env.observe()[0] for _ in range(40)])
+    env.config = QUIET
+    noise = noisy - env.observe()[0]
+    for name, _, half in OBSERVATION:
+        own = np.abs(noise[..., PARTS[name]])
+        assert own.max() <= half * (1 + 1e-5) + 1e-6, name
+        assert own.max() >= 0.95 * half, name
+        assert noise[..., PARTS[name]].mean() == pytest.approx(0.0, abs=0.1 * half + 1e-12), name
+
+
+@pytest.mark.parametrize("knee", ["linkage", "serial"])
+def test_with_ideal_feedback_joints_are_seen_as_they_are(knee):
+    env = make(servo_ranges(MEASURED, "ideal"), replace(QUIET, knee=knee))
+    seen, rng = [], np.random.default_rng(0)
+    for _ in range(6):
+        result = env.step(rng.uniform(-0.3, 0.3, (4, 12)))
+        seen.append(env.robots.batch.bind("qpos")[:, 7:] - default_pose())
+        part = result.observation[:, PARTS["joint_position_relative"]]
+        np.testing.assert_allclose(part, seen[-1], atol=1e-6)
+        effort = result.observation[:, PARTS["joint_effort"]]
+        np.testing.assert_allclose(effort, result.facts.torque, atol=1e-6)
+        if len(seen) > 4:
+            velocity = result.observation[:, PARTS["joint_velocity"]]
+            np.testing.assert_allclose(velocity, (seen[-1] - seen[-5]) / (4 * SPAN), atol=1e-4)
+
+
+def test_with_the_measured_feedback_joints_are_seen_late_coarse_and_off():
+    env = make(MEASURED)
+    result = walk_about(env, 10)[-1]
+    truth = env.robots.batch.bind("qpos")[:, 7:] - default_pose()
+    error = result.observation[:, PARTS["joint_position_relative"]] - truth
+    assert np.abs(error).max() > 0.01
+    quantum = servo_ranges(MEASURED).feedback[0].quantum_rad
+    hip = result.observation[:, PARTS["joint_position_relative"]][:, 0::3] / quantum
+    np.testing.assert_allclose(hip, np.round(hip), atol=1e-3)
+
+
+def test_observing_lets_no_time_pass():
+    env = make(MEASURED, Walking())
+    walk_about(env, 3)
+    before = env.state
+    for _ in range(3):
+        env.observe()
+    after = env.state
+    for name in before.keys() - {"rng"}:
+        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
+
+
+# --------------------------------------------------------------------------------- reproducibility
+
+
+def trajectory(env: PupperEnv) -> np.ndarray:
+    return np.stack([r.observation for r in walk_about(env, 6)])
+
+
+def test_the_same_seed_gives_the_same_trajectories_and_another_seed_others():
+    first = trajectory(make(MEASURED, Walking()))
+    np.testing.assert_array_equal(trajectory(make(MEASURED, Walking())), first)
+    assert (trajectory(make(MEASURED, Walking(), seed=1)) != first).any(axis=(0, 2)).all()
+
+
+def test_the_number_of_threads_changes_nothing():
+    one = trajectory(make(MEASURED, Walking(), threads=1))
+    np.testing.assert_array_equal(trajectory(make(MEASURED, Walking(), threads=2)), one)
+
+
+def test_a_restored_state_goes_on_bit_by_bit():
+    # short episodes, frequent commands and pushes: everything random is drawn meanwhile
+    config = Walking(
+        episode_s=0.16,
+        commands=Commands(every_s=0.1),
+        randomisation=Randomisation(push_every_s=(0.04, 0.1)),
+    )
+    env = make(MEASURED, config)
+    walk_about(env, 5)
+    saved = env.state
+    first = walk_about(env, 10)
+    assert any(r.timed_out.any() for r in first)
+    env.restore(saved)
+    again = walk_about(env, 10)
+    another = make(MEASURED, config, seed=9)
+    another.restore(saved)
+    resumed = walk_about(another, 10)
+    for a, b, c in zip(first, again, resumed, strict=True):
+        for name in ("observation", "privileged", "reward", "done", "timed_out"):
+            np.testing.assert_array_equal(getattr(b, name), getattr(a, name))
+            np.testing.assert_array_equal(getattr(c, name), getattr(a, name))
+
+
+def test_a_state_of_another_number_of_robots_is_refused():
+    with pytest.raises(InputError, match="Resume with the settings"):
+        make(count=2).restore(make(count=3).state)
+
+
+# ------------------------------------------------------------------------------------- servos
+
+
+@pytest.mark.parametrize("knee", ["linkage", "serial"])
+def test_each_simulated_robot_has_the_servos_that_were_drawn_for_it(knee):
+    env = make(MEASURED, Walking(knee=knee), 3)
+    walk_about(env, 2)
+    throw(env, [1])
+    env.step(still(env))
+    for i in (0, 1):
+        drawn = {field: values[i] for field, values in env.robots.drawn.items()}
+        servos = [
+            DelayedPDParameters(**{field: values[j] for field, values in drawn.items()})
+            for j in range(12)
+        ]
+        error = error_in_air(env.robots.batch.get_model(i), servos)
+        np.testing.assert_allclose(error, 0.0, atol=1e-6)
+    assert (env.robots.drawn["stiffness"][0] != env.robots.drawn["stiffness"][1]).all()
+
+
+@pytest.mark.parametrize("step_s", [0.001, 0.004, 0.005])
+def test_in_other_physics_steps_servos_lag_as_in_those_they_were_measured_in(step_s):
+    measured = servo_ranges(MEASURED)
+    still_ones = replace(measured, low=measured.value, high=measured.value)
+    lags = []
+    for step in (H, step_s):
+        env = make(still_ones, replace(QUIET, physics_step_s=step), 1)
+        lags.append(lags_in_air(env.robots.batch.get_model(0), SPAN))
+    assert (lags[0] > 0.03).all()
+    np.testing.assert_allclose(lags[1], lags[0], atol=7e-4)  # without: 1.2 to 3.1 ms off
+
+
+def test_a_command_acts_after_the_delay_that_was_drawn_and_in_part_between_steps():
+    env = make(with_delay(0.004, 0.017), count=12)
+    lift(env)
+    start, saved = env.robots.batch.bind("ctrl").copy(), env.state
+    moved = []
+    for change in (0.0, 0.01):  # small: neither rate nor torque is limited
+        env.restore(saved)
+        env.robots.batch.bind("ctrl")[:] = start
+        env.robots.batch.bind("ctrl")[:, 0] += change
+        moved.append(env.robots.batch.rollout(10, record=("qpos",))["qpos"][:, :, 7])
+    effect = moved[1] - moved[0]
+    steps = env.robots.drawn["delay_s"][:, 0] / H
+    assert np.ptp(steps) > 3
+    first = (np.abs(effect) > 1e-9).argmax(axis=1)
+    np.testing.assert_array_equal(first, np.floor(steps))
+    # linear interpolation: the first effect is that share of the change which has arrived
+    share = 1 - (steps - np.floor(steps))
+    ratio = effect[np.arange(12), first] / share
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-3)
+    assert ratio[0] > 0
+
+
+@pytest.mark.parametrize("end", [None, *ENDS.values()], ids=["initial", *ENDS])
+def test_after_a_reset_nothing_moves_until_the_delay_is_over(end):
+    config = replace(QUIET, randomisation=replace(STILL, joint_rad=0.1))
+    env = make("paper", config)  # 66 to 86 ms
+    if end is not None:
+        walk_about(env, 3)
+        end(env, slice(None))
+        assert env.step(still(env) + 1.0).done.all()
+    start = env.robots.batch.bind("qpos")[:, 7:].copy()
+    told = env.robots.to_servo(start)
+    np.testing.assert_array_equal(env.robots.batch.bind("ctrl"), told)
+    lines = env.robots.batch.bind("history").reshape(4, 12, -1)
+    values = (lines.shape[2] - 2) // 2
+    np.testing.assert_array_equal(lines[:, :, -values:], np.repeat(told[..., None], values, 2))
+    lift(env)
+    for _ in range(3):
+        env.step(still(env) + 0.5)
+        np.testing.assert_allclose(env.robots.batch.bind("qpos")[:, 7:], start, atol=1e-6)
+    for _ in range(3):
+        env.step(still(env) + 0.5)
+    assert (np.abs(env.robots.batch.bind("qpos")[:, 7:] - start).max(axis=1) > 0.05).all()
+
+
+@pytest.mark.parametrize("more", [0.0, 0.0005, 0.02, 0.1])
+def test_the_delay_buffers_hold_the_longest_delay_that_can_be_drawn(more):
+    for actuator in ACTUATORS:
+        servos = servo_ranges(actuator).later(more)
+        env = make(servos, count=1)
+        assert env.robots.model.actuator_history[:, 0].min() * H > servos.longest_delay_s
+
+
+def test_a_delay_that_does_not_fit_its_buffer_is_refused(monkeypatch):
+    def short(servos, *rest):
+        return robot_xml({k: replace(v, delay_s=0.01) for k, v in servos.items()}, *rest)
+
+    monkeypatch.setattr(pupper_sysid.sim.robot.robot_batch, "robot_xml", short)
+    with pytest.raises(InputError, match=r"does not fit the buffer of 0\.014 s"):
+        make("paper")
+
+
+def test_an_action_moves_the_target_by_its_scale_within_the_joint_limits():
+    env = make()
+    low, high = limits()
+    for action in (0.2, 9.0, -9.0):
+        env.step(still(env) + action)
+        target = np.clip(default_pose() + 0.5 * action, low, high)
+        target[2::3] += target[1::3]  # servo 3 holds thigh + calf
+        np.testing.assert_allclose(
+            env.robots.batch.bind("ctrl"), np.tile(target, (4, 1)), atol=1e-12
+        )
+
+
+# ------------------------------------------------------------------------------------- episodes
+
+
+def test_a_simulation_that_becomes_nan_ends_without_reward_and_starts_anew():
+    env = make(MEASURED)
+    walk_about(env, 3)
+    spoil(env, [1, 3])
+    result = env.step(still(env))
+    np.testing.assert_array_equal(result.done, [False, True, False, True])
+    assert not result.timed_out.any()
+    assert (result.reward[[1, 3]] == 0.0).all() and (result.reward[[0, 2]] != 0.0).all()
+    assert env.nan_resets == 2
+    np.testing.assert_array_equal(env.episode_step, [4, 0, 4, 0])
+    for _ in range(3):
+        assert np.isfinite(env.robots.batch.state).all()
+        assert np.isfinite(result.observation).all() and np.isfinite(result.privileged).all()
+        result = env.step(still(env))
+        assert not result.done.any() and np.isfinite(result.reward).all()
+    assert env.nan_resets == 2
+
+
+@pytest.mark.parametrize(("degrees", "falls"), [(0, False), (50, False), (56, True), (180, True)])
+def test_a_robot_has_fallen_when_it_tilts_beyond_53_degrees(degrees, falls):
+    env = make()
+    lift(env)
+    half = np.radians(degrees) / 2
+    env.robots.batch.bind("qpos")[:, 3:7] = np.cos(half), np.sin(half), 0.0, 0.0
+    result = env.step(still(env))
+    assert (result.done == falls).all() and not result.timed_out.any()
+
+
+def test_a_robot_has_fallen_when_its_trunk_touches_the_ground():
+    env = make()
+    qpos, folded = env.robots.batch.bind("qpos"), np.tile([0.0, 2.4, -2.18], 4)
+    # folded feet reach 26.3 mm down, the trunk 26.75 mm: a little above the ground, it lands on it
+    qpos[0, 2], qpos[0, 7:] = 0.028, folded
+    qpos[1, 2], qpos[1, 7:] = 1.0, folded
+    action = still(env)
+    action[:2] = (folded - default_pose()) / 0.5
+    done = np.array([env.step(action).done for _ in range(3)]).any(axis=0)
+    np.testing.assert_array_equal(done, [True, False, False, False])
+
+
+def test_a_time_out_hands_over_the_last_observation_of_the_old_episode():
+    long, short = replace(QUIET, episode_s=10.0), replace(QUIET, episode_s=0.1)
+    expected = walk_about(make(MEASURED, long), 5)[-1]
+    result = walk_about(make(MEASURED, short), 5)[-1]
+    assert result.timed_out.all() and result.done.all()
+    np.testing.assert_array_equal(result.terminal["ids"], np.arange(4))
+    np.testing.assert_array_equal(result.terminal["observation"], expected.observation)
+    # the critic's last number is the share of the episode that is left
+    np.testing.assert_array_equal(
+        result.terminal["privileged"][:, :-1], expected.privileged[:, :-1]
+    )
+    assert (result.terminal["privileged"][:, -1] == 0.0).all()
+    assert (result.privileged[:, -1] == 1.0).all()
+    assert (result.observation != expected.observation).any(axis=1).all()
+
+
+def test_only_those_whose_time_is_up_hand_over_a_last_observation():
+    env = make()
+    walk_about(env, 2)
+    throw(env, [0])
+    time_out(env, [2])
+    result = env.step(still(env))
+    np.testing.assert_array_equal(result.done, [True, False, True, False])
+    np.testing.assert_array_equal(result.timed_out, [False, False, True, False])
+    np.testing.assert_array_equal(result.terminal["ids"], [2])
+    assert len(result.terminal["observation"]) == 1
+
+
+def test_facts_are_of_the_old_episode_also_where_it_ended():
+    env = make(config=replace(QUIET, randomisation=replace(STILL, joint_rad=0.2)))
+    env.set_command(np.array([0.1, 0.0, 0.0]))
+    walk_about(env, 2)
+    throw(env, [0])
+    time_out(env, [1])
+    facts = env.step(still(env) + 0.25).facts
+    np.testing.assert_array_equal(facts.action, 0.25)
+    np.testing.assert_array_equal(facts.command, np.tile([0.1, 0.0, 0.0], (4, 1)))
+    assert facts.gravity[0, 2] > 0.9
+    assert (facts.air_s + facts.contact_s >= SPAN).all()  # a new episode starts with zeros
+
+
+def test_the_stride_average_forgets_with_its_time_constant_and_at_the_end_of_an_episode():
+    env = make()
+    lift(env)
+    env.robots.batch.bind("qvel")[:, :2] = np.random.default_rng(0).uniform(-1, 1, (4, 2))
+    velocity = env.observe()[0][:, :2]
+    for k in range(1, 4):
+        average = env.step(still(env)).facts.stride_velocity[:, :2]
+        # a share of 20 ms / 200 ms each step, from a start at rest
+        np.testing.assert_allclose(average, velocity * (1 - 0.9**k), atol=1e-4)
+    throw(env, slice(None))
+    env.step(still(env))
+    assert np.abs(env.step(still(env)).facts.stride_velocity).max() < 0.01
+
+
+def test_a_standing_robot_has_its_feet_on_the_ground_and_does_not_slip():
+    env = make()
+    facts = [env.step(still(env)).facts for _ in range(20)][-1]
+    assert facts.contact.all()
+    assert np.abs(facts.foot_height_m).max() < 0.001
+    assert facts.foot_speed_m_s.max() < 0.01
+    assert (facts.contact_s > 0.3).all() and not facts.air_s.any()
+    np.testing.assert_allclose(env.robots.batch.bind("qpos")[:, 2], STANDING_HEIGHT_M, atol=0.003)
+
+
+def test_the_reward_is_the_sum_of_its_terms_times_the_control_period():
+    rewards = only(alive=0.5, action_rate=-1.0)
+    env = make(config=replace(QUIET, rewards=rewards))
+    result = env.step(still(env) + 0.1)
+    # action 0 before: the default pose at rest; 12 squares of 0.1
+    np.testing.assert_allclose(result.reward, 0.02 * (0.5 - 12 * 0.01))
+    assert set(result.terms) == {"alive", "action_rate"}
+
+
+def test_leaving_the_field_is_a_time_out():
+    env = make(config=replace(QUIET, terrain="rough"))
+    qpos = env.robots.batch.bind("qpos")
+    qpos[:, 0] = 7.4, 7.6, -7.6, 0.0
+    qpos[:, 1:3] = 0.0, 1.0
+    result = env.step(still(env))
+    np.testing.assert_array_equal(result.timed_out, [False, True, True, False])
+    assert np.abs(env.robots.batch.bind("qpos")[1:3, :2]).max() <= 7.0
+
+
+def test_robots_start_on_the_ground_of_every_terrain_and_stand():
+    for terrain in ("rough", "mixed"):
+        env = make(config=replace(QUIET, terrain=terrain), count=8)
+        x, y = env.robots.batch.bind("qpos")[:, :2].T
+        under = env.ground.height(x, y)
+        assert (env.robots.batch.bind("qpos")[:, 2] >= under + STANDING_HEIGHT_M).all()
+        for _ in range(15):
+            assert not env.step(still(env)).done.any(), terrain
+
+
+# ------------------------------------------------------------------------ commands and randomness
+
+
+def test_commands_are_redrawn_at_random_times():
+    env = make(config=replace(QUIET, commands=Commands(every_s=0.1, standing=0.0)), count=16)
+    changes = []
+    for _ in range(60):
+        before = env.command.copy()
+        result = env.step(still(env))
+        changes.append((env.command != before).any(axis=1)[~result.done])
+    changes = np.concatenate(changes)
+    # exponential times with a mean of five steps: a step sees one with 1 - e^(-1/5)
+    expected = 1 - np.exp(-SPAN / 0.1)
+    error = 5 * np.sqrt(expected * (1 - expected) / len(changes))
+    assert changes.mean() == pytest.approx(expected, abs=error)
+
+
+def test_commands_fill_their_ranges_with_the_given_shares_of_standing_and_single():
+    commands = Commands((-0.2, 0.3), (-0.1, 0.1), (-0.5, 0.5), 0.25, 0.4)
+    env = make(config=replace(QUIET, commands=commands), count=512)
+    ranges = np.array([(-0.2, 0.3), (-0.1, 0.1), (-0.5, 0.5)])
+    assert (env.command >= ranges[:, 0]).all() and (env.command <= ranges[:, 1]).all()
+    assert (np.ptp(env.command, axis=0) > 0.9 * np.diff(ranges)[:, 0]).all()
+    axes = (env.command != 0).sum(axis=1)
+    # four standard errors of a share of 512
+    assert (axes == 0).mean() == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 512))
+    assert (axes == 1).mean() == pytest.approx(0.75 * 0.4, abs=4 * np.sqrt(0.3 * 0.7 / 512))
+    assert not (axes == 2).any()
+
+
+def test_a_set_command_holds_until_the_episode_ends():
+    env = make(config=replace(QUIET, commands=Commands(every_s=0.02, standing=0.0)))
+    env.set_command(np.array([0.1, 0.0, 0.0]))
+    for _ in range(10):
+        env.step(still(env))
+        np.testing.assert_array_equal(env.command, np.tile([0.1, 0.0, 0.0], (4, 1)))
+    throw(env, [0])
+    env.step(still(env))
+    assert (env.command[0] != [0.1, 0.0, 0.0]).any()
+    np.testing.assert_array_equal(env.command[1], [0.1, 0.0, 0.0])
+
+
+def test_friction_payload_and_start_are_drawn_within_their_ranges():
+    env = make(config=Walking(randomisation=Randomisation(on_the_move=0.0)), count=64)
+    feet = [env.robots.model.geom(f"{leg}_foot").id for leg in ("LF", "RF", "LB", "RB")]
+    friction = drawn_field(env, "geom_friction")[:, feet, 0]
+    np.testing.assert_array_equal(friction, np.repeat(friction[:, :1], 4, axis=1))
+    assert 0.3 <= friction.min() < 0.4 and 0.9 < friction.max() <= 1.0
+    trunk = env.robots.model.body("trunk").id
+    payload = drawn_field(env, "body_mass")[:, trunk] - env.robots.model.body_mass[trunk]
+    assert -0.05 <= payload.min() < -0.03 and 0.03 < payload.max() <= 0.05
+    away = env.robots.batch.bind("qpos")[:, 7:] - default_pose()
+    low, _ = limits()
+    assert 0.18 < np.abs(away).max() <= 0.2
+    assert (away >= low - default_pose() - 1e-12).all()
+    observation, _ = PupperEnv(
+        Walking(randomisation=Randomisation(on_the_move=0.0), observation=SEEN),
+        servo_ranges("ideal"), 64, 0, 1,
+    ).observe()  # fmt: skip
+    speed = np.abs(observation[:, PARTS["base_linear_velocity"]]).max(axis=0)
+    assert (speed <= [0.3, 0.2, 0.1]).all() and (speed > [0.25, 0.15, 0.08]).all()
+
+
+def test_pushes_set_the_horizontal_speed_within_their_range_at_their_times():
+    push = replace(STILL, push_m_s=0.5, push_every_s=(0.1, 0.1))
+    env = make(config=replace(QUIET, randomisation=push), count=16)
+    lift(env)
+    pushed = []
+    for _ in range(10):
+        before = env.robots.batch.bind("qvel")[:, :2].copy()
+        env.step(still(env))
+        now = env.robots.batch.bind("qvel")[:, :2]
+        pushed.append((np.abs(now - before) > 1e-3).any(axis=1).mean())
+        assert np.abs(now).max() <= 0.5 + 1e-6
+    np.testing.assert_array_equal(pushed, [0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+
+
+# ------------------------------------------------------------------------------------ curriculum
+
+
+def test_the_curriculum_rises_in_equal_stages():
+    stages = Curriculum(on=True, stages=3, stage_steps=10)
+    assert [stages.level(s) for s in (0, 9, 10, 19, 20, 999)] == [0, 0, 0.5, 0.5, 1, 1]
+    assert Curriculum(on=False).level(0) == 1.0
+
+
+def test_the_curriculum_eases_delay_commands_penalties_and_action_scale():
+    rewards = only(alive=1.0, action_rate=-1.0)
+    config = replace(
+        QUIET,
+        rewards=rewards,
+        commands=Commands((0.2, 0.2), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0),
+        curriculum=Curriculum(on=True, stages=2, stage_steps=3, easiest=0.25, action_scale=0.6),
+    )
+    env = make(with_delay(0.04, 0.04), config)
+
+    def facts() -> tuple[float, float, float, float]:
+        env.reset()
+        delay, forward = drawn_field(env, "actuator_delay")[0, 0], env.command[0, 0]
+        terms = env.step(still(env) + 0.1).terms
+        hip = env.robots.batch.bind("ctrl")[0, 0]
+        return delay, forward, terms["action_rate"][0], hip
+
+    full = -1.0 * 12 * 0.1**2 * SPAN
+    assert env.level == 0.0
+    assert facts() == pytest.approx((0.01, 0.05, 0.25 * full, 0.6 * 0.5 * 0.1))
+    env.step(still(env))
+    env.step(still(env))
+    assert env.level == 1.0
+    assert facts() == pytest.approx((0.04, 0.2, full, 0.5 * 0.1))
+
+
+# -------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"control_step_s": 0.005}, "whole multiple"),
+        ({"physics_step_s": 0.0}, "whole multiple"),
+        ({"episode_s": 0.01}, "at least one step"),
+        ({"commands": Commands(standing=1.5)}, r"commands\.standing"),
+        ({"commands": Commands(single=-0.1)}, r"commands\.single"),
+    ],
+)
+def test_impossible_settings_are_refused_by_name(settings, message):
+    with pytest.raises(InputError, match=message):
+        Walking(**settings)
+
+
+def test_no_robots_are_refused():
+    with pytest.raises(InputError, match="at least 1"):
+        make(count=0)
+
+
+def test_the_joints_of_the_model_are_in_the_projects_order():
+    env = make(count=1)
+    assert [env.robots.model.joint(i + 1).name for i in range(12)] == list(JOINT_NAMES)

@@ -1,0 +1,307 @@
+"""Reward terms by hand: tiny examples, and the weights that were published."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pupper_sysid.sim.walking import rewards as wr
+from pupper_sysid.sim.walking.config import PRESETS
+from pupper_sysid.sim.walking.rewards import (
+    DEFAULT,
+    PAPER,
+    RELEASE,
+    TERMS,
+    Rewards,
+    Step,
+    weighted,
+    weights,
+)
+
+SIZES = {
+    "command": 3,
+    "linear_velocity": 3,
+    "angular_velocity": 3,
+    "gravity": 3,
+    "stride_velocity": 3,
+    "contact": 4,
+    "air_s": 4,
+    "contact_s": 4,
+    "last_air_s": 4,
+    "last_contact_s": 4,
+    "foot_height_m": 4,
+    "foot_speed_m_s": 4,
+}
+P = Rewards()
+E1 = np.exp(-1.0)
+
+
+def step(**known) -> Step:
+    """One robot, all zeros but what is given."""
+    values: dict[str, Any] = {f.name: np.zeros((1, SIZES.get(f.name, 12))) for f in fields(Step)}
+    values["contact"] = np.zeros((1, 4), bool)
+    for name, value in known.items():
+        values[name][:] = value
+    return Step(**values)
+
+
+def joints(**known: float) -> np.ndarray:
+    """Twelve zeros but `j<index>`."""
+    values = np.zeros(12)
+    for name, value in known.items():
+        values[int(name[1:])] = value
+    return values
+
+
+FORWARD = (0.2, 0.0, 0.0)
+EXPONENTIAL = replace(
+    P, tracking_shape="exponential", linear_sigma=0.1, angular_sigma=0.2, fast_bonus=0.0
+)
+GAUSSIAN = replace(EXPONENTIAL, tracking_shape="gaussian")
+
+
+def test_speed_is_tracked_by_the_exponential_of_the_horizontal_error():
+    # error (0.06, 0.08) → 0.1 = σ; the vertical speed does not count
+    s = step(command=FORWARD, linear_velocity=(0.14, -0.08, 5.0))
+    assert wr.base_linear_velocity(s, EXPONENTIAL)[0] == pytest.approx(E1)
+    far = step(command=FORWARD, linear_velocity=(0.0, 0.0, 0.0))
+    assert wr.base_linear_velocity(far, EXPONENTIAL)[0] == pytest.approx(np.exp(-2))
+    assert wr.base_linear_velocity(far, GAUSSIAN)[0] == pytest.approx(np.exp(-4))
+
+
+def test_fast_commands_earn_more_by_the_bonus_and_slow_ones_do_not_earn_less():
+    p = replace(EXPONENTIAL, fast_bonus=0.5, fast_above=0.15)
+    perfect = step(command=(0.35, 0, 0), linear_velocity=(0.35, 0, 0))
+    assert wr.base_linear_velocity(perfect, p)[0] == pytest.approx(1 + 0.5 * 0.2)
+    slow = step(command=(0.05, 0, 0), linear_velocity=(0.05, 0, 0))
+    assert wr.base_linear_velocity(slow, p)[0] == 1.0
+
+
+def test_turn_rate_is_tracked_by_the_error_about_the_vertical():
+    s = step(command=(0, 0, 0.3), angular_velocity=(9.0, 9.0, 0.5))
+    assert wr.base_angular_velocity(s, EXPONENTIAL)[0] == pytest.approx(E1)
+    assert wr.base_angular_velocity(s, GAUSSIAN)[0] == pytest.approx(E1)
+
+
+def test_stride_terms_look_at_the_average_and_not_at_the_instant():
+    p = replace(EXPONENTIAL, stride_linear_sigma=0.05, stride_angular_sigma=0.2)
+    s = step(
+        command=(0.2, 0, 0.4), stride_velocity=(0.17, 0.04, 0.2), linear_velocity=(9.0, 9.0, 9.0)
+    )
+    assert wr.stride_linear_velocity(s, p)[0] == pytest.approx(E1)
+    assert wr.stride_angular_velocity(s, p)[0] == pytest.approx(E1)
+
+
+def test_being_alive_is_one():
+    assert wr.alive(step(), P)[0] == 1.0
+
+
+def test_air_time_pays_for_swings_and_stances_up_to_the_longest_while_moving():
+    p = replace(P, air_time_most=0.25)
+    s = step(command=FORWARD, air_s=(0.1, 0, 0.3, 0), contact_s=(0, 0.2, 0, 0.25))
+    # 0.1 + 0.2; a swing of 0.3 and a stance of 0.25 are too long to count
+    assert wr.air_time(s, p)[0] == pytest.approx(0.3)
+
+
+def test_air_time_pays_for_feet_on_the_ground_while_standing():
+    p = replace(P, air_time_most=0.25)
+    s = step(air_s=(0.1, 0, 0.9, 0), contact_s=(0, 0.2, 0, 5.0))
+    assert wr.air_time(s, p)[0] == pytest.approx(-0.1 + 0.2 - 0.25 + 0.25)
+
+
+def test_a_perfect_trot_earns_the_whole_gait_reward():
+    # LF and RB in the air for as long as RF and LB have been on the ground
+    s = step(command=FORWARD, air_s=(0.1, 0, 0, 0.1), contact_s=(0, 0.1, 0.1, 0))
+    assert wr.gait(s, P)[0] == pytest.approx(1.0)
+
+
+def test_a_bound_earns_little_of_the_gait_reward():
+    p = replace(P, gait_sigma=0.08, gait_most=0.15)
+    s = step(command=FORWARD, air_s=(0.1, 0.1, 0, 0), contact_s=(0, 0, 0.1, 0.1))
+    # two pairs that should be together: (0.1² + 0.1²) each; of the four that should alternate,
+    # the two sides do, the two ends (LF-RF, RB-LB) differ by 0.1² + 0.1² each
+    assert wr.gait(s, p)[0] == pytest.approx(np.exp(-4 * 0.02 / 0.08))
+
+
+def test_differences_of_times_beyond_the_longest_do_not_count_more():
+    p = replace(P, gait_sigma=0.08, gait_most=0.15)
+    s = step(command=FORWARD, air_s=(9.0, 0, 0, 0))
+    # LF against RB, RF and LB: 0.15² once in each of three pairs
+    assert wr.gait(s, p)[0] == pytest.approx(np.exp(-3 * 0.15**2 / 0.08))
+
+
+def test_a_robot_that_stands_as_told_earns_no_gait_reward():
+    trot = {"air_s": (0.1, 0, 0, 0.1), "contact_s": (0, 0.1, 0.1, 0)}
+    assert wr.gait(step(**trot), P)[0] == 0.0
+    # but one that moves faster than the threshold without being told does
+    moving = step(**trot, linear_velocity=(0.0, 0.16, 0.0))
+    assert wr.gait(moving, replace(P, gait_threshold=0.1))[0] == pytest.approx(1.0)
+
+
+def test_foot_clearance_counts_the_error_of_moving_feet():
+    p = replace(P, clearance_height=0.03, clearance_sigma=0.05, clearance_speed=2.0)
+    s = step(foot_height_m=(0.03, 0.0, 0.0, 0.13), foot_speed_m_s=(9.0, 0.0, 0.5, 1e6))
+    error = 0.03**2 * np.tanh(1.0) + 0.1**2
+    assert wr.foot_clearance(s, p)[0] == pytest.approx(np.exp(-error / 0.05))
+
+
+def test_swing_height_counts_only_what_is_missing():
+    p = replace(P, clearance_height=0.015)
+    s = step(foot_height_m=(0.005, 0.015, 0.1, 0.0), foot_speed_m_s=(0.5, 1.0, 1.0, 2.0))
+    assert wr.swing_height(s, p)[0] == pytest.approx(0.01**2 * 0.5 + 0.015**2 * 2.0)
+
+
+def test_changes_of_the_action_are_counted_as_norm_square_and_second_difference():
+    s = step(
+        action=joints(j0=3.0, j5=4.0), last_action=joints(j11=0.0), earlier_action=joints(j0=1.0)
+    )
+    assert wr.action_smoothness(s, P)[0] == pytest.approx(5.0)
+    assert wr.action_rate(s, P)[0] == pytest.approx(25.0)
+    assert wr.action_jerk(s, P)[0] == pytest.approx((3 + 1) ** 2 + 4**2)
+    steady = step(action=3.0, last_action=2.0, earlier_action=1.0)
+    assert wr.action_jerk(steady, P)[0] == 0.0
+    assert wr.action_rate(steady, P)[0] == pytest.approx(12.0)
+
+
+def test_air_time_variance_is_over_feet_of_times_up_to_half_a_second():
+    s = step(last_air_s=(0.1, 0.3, 0.1, 0.3), last_contact_s=(0.5, 9.0, 0.5, 0.5))
+    # mean 0.2, four deviations of 0.1, divided by three: the sample variance
+    assert wr.air_time_variance(s, P)[0] == pytest.approx(4 * 0.1**2 / 3)
+
+
+def test_base_motion_is_bouncing_and_rocking():
+    s = step(linear_velocity=(9.0, 9.0, 0.5), angular_velocity=(1.0, -2.0, 9.0))
+    assert wr.base_motion(s, P)[0] == pytest.approx(0.8 * 0.25 + 0.2 * 3.0)
+
+
+def test_base_orientation_is_the_sine_of_the_tilt():
+    tilt = np.radians(30)
+    s = step(gravity=(np.sin(tilt), 0.0, -np.cos(tilt)))
+    assert wr.base_orientation(s, P)[0] == pytest.approx(0.5)
+
+
+def test_only_feet_on_the_ground_slip():
+    s = step(contact=(True, False, True, False), foot_speed_m_s=(0.1, 0.2, 0.4, 0.8))
+    assert wr.foot_slip(s, P)[0] == pytest.approx(0.5)
+
+
+def test_the_distance_from_the_default_pose_counts_more_while_standing():
+    p, pose = replace(P, standing_factor=10.0), joints(j1=0.3, j2=-0.4)
+    assert wr.joint_position(step(position_relative=pose), p)[0] == pytest.approx(5.0)
+    told = step(position_relative=pose, command=FORWARD)
+    assert wr.joint_position(told, p)[0] == pytest.approx(0.5)
+
+
+def test_hip_abduction_looks_at_the_hips_only():
+    s = step(position_relative=joints(j0=0.3, j9=0.4, j1=9.0, j11=9.0))
+    assert wr.hip_abduction(s, P)[0] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("term", "field"),
+    [
+        ("joint_torques", "torque"),
+        ("joint_acceleration", "acceleration"),
+        ("joint_velocity", "velocity"),
+    ],
+)
+def test_effort_terms_are_norms_over_all_joints(term, field):
+    assert TERMS[term](step(**{field: joints(j2=6.0, j7=-8.0)}), P)[0] == pytest.approx(10.0)
+
+
+def test_every_robot_is_judged_by_its_own_numbers():
+    one, other = step(command=FORWARD), step(foot_height_m=0.1, linear_velocity=(0.3, 0.0, 0.1))
+    both = Step(
+        **{
+            f.name: np.concatenate([getattr(one, f.name), getattr(other, f.name)])
+            for f in fields(Step)
+        }
+    )
+    for name, term in TERMS.items():
+        np.testing.assert_allclose(
+            term(both, RELEASE), [term(one, RELEASE)[0], term(other, RELEASE)[0]], err_msg=name
+        )
+
+
+# --------------------------------------------------------------------------------------- weights
+
+
+def only(**given: Any) -> Rewards:
+    none: dict[str, Any] = dict.fromkeys(TERMS, 0.0)
+    return Rewards(**(none | given))
+
+
+def test_a_weight_of_zero_leaves_the_term_out():
+    assert weighted(step(), only()) == {}
+    assert list(weighted(step(), only(alive=0.5))) == ["alive"]
+    assert set(weighted(step(), RELEASE)) == {k for k, v in weights(RELEASE).items() if v}
+
+
+def test_a_term_counts_with_its_weight_and_penalties_with_their_factor():
+    s = step(action=joints(j0=2.0))
+    found = weighted(s, only(alive=0.5, action_rate=-0.1), penalties=0.25)
+    assert found["alive"][0] == 0.5
+    assert found["action_rate"][0] == pytest.approx(-0.1 * 0.25 * 4.0)
+    assert weighted(s, only(action_rate=-0.1))["action_rate"][0] == pytest.approx(-0.4)
+
+
+def test_every_term_has_a_weight_and_every_weight_a_term():
+    assert set(weights(DEFAULT)) == set(TERMS)
+
+
+# facts/paper.md section 3: weights of the released training configuration
+PUBLISHED = {
+    "base_linear_velocity": 15.0,
+    "base_angular_velocity": 10.0,
+    "air_time": 5.0,
+    "foot_clearance": 1.0,
+    "gait": 10.0,
+    "action_smoothness": -2.0,
+    "air_time_variance": -1.0,
+    "base_motion": -2.0,
+    "base_orientation": -5.0,
+    "foot_slip": -0.5,
+    "joint_position": -3.0,
+    "hip_abduction": -2.5,
+    "joint_torques": -5e-4,
+    "joint_acceleration": -2.5e-4,
+    "joint_velocity": -1e-2,
+}
+PARAMETERS = {
+    "tracking_shape": "exponential",
+    "linear_sigma": 0.1,
+    "angular_sigma": 0.2,
+    "fast_bonus": 0.5,
+    "fast_above": 0.15,
+    "air_time_most": 0.25,
+    "clearance_height": 0.03,
+    "clearance_sigma": 0.05,
+    "clearance_speed": 2.0,
+    "gait_sigma": 0.08,
+    "gait_most": 0.15,
+    "standing_factor": 10.0,
+    "moving_threshold": 0.15,
+    "gait_threshold": 0.1,
+}
+# the paper's text: smoothness -1.0, joint position -0.7 (orientation and slip as released)
+PAPERS_OWN = {"action_smoothness": -1.0, "joint_position": -0.7}
+
+
+def test_the_released_weights_are_the_published_ones_and_no_others():
+    assert {k: v for k, v in weights(RELEASE).items() if v} == PUBLISHED
+    assert {k: getattr(RELEASE, k) for k in PARAMETERS} == PARAMETERS
+
+
+def test_the_papers_weights_are_its_own_where_it_gives_any_and_else_the_released_ones():
+    found = {k: v for k, v in weights(PAPER).items() if v}
+    assert found == {**PUBLISHED, **PAPERS_OWN}
+    assert {k: getattr(PAPER, k) for k in PARAMETERS} == PARAMETERS
+
+
+def test_the_presets_use_these_weights():
+    assert PRESETS["paper"].rewards == PAPER
+    assert PRESETS["release"].rewards == RELEASE
+    assert PRESETS["fast"].rewards == DEFAULT

@@ -1,0 +1,365 @@
+"""The robot that walks: it stands, obeys on time, tells where it is, and passes the guard."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.bus import ServoBus
+from pupper_sysid.hardware.esp32 import bus as esp32_bus
+from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.feetech.frames import Frame
+from pupper_sysid.hardware.feetech.registers import BROADCAST_ID, READ, STS3215, SYNC_WRITE
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.robot.mini_pupper import default_pose
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.robot import WalkingRobot
+from support.servo_servers import exact_spec, on_a_socket, wait_until
+
+POSE = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
+HIP, THIGH, CALF = 0, 1, 2
+FORWARD, TURN = (0.15, 0.0, 0.0), (0.0, 0.0, 0.5)
+PERIOD_S = 0.02
+
+
+def make_robot(seed: int = 0, spec: RobotSpec | None = None) -> WalkingRobot:
+    rng = np.random.default_rng(seed)
+    return WalkingRobot(draw_robot(rng, spec), rng)
+
+
+def make_bus(seed: int = 0, spec: RobotSpec | None = None) -> WalkingBus:
+    rng = np.random.default_rng(seed)
+    return WalkingBus(draw_robot(rng, spec), rng)
+
+
+def trot(time_s: float, command: tuple[float, float, float]) -> np.ndarray:
+    """Joint targets of the trot, begun at 0 s."""
+    phase = 2 * np.pi * Trot().frequency_hz * time_s
+    return Trot().joints(np.array([phase]), np.array([command]))[0]
+
+
+def walk(
+    bus: ServoBus,
+    seconds: float,
+    command: tuple[float, float, float] = FORWARD,
+    look: Callable[[], None] = lambda: None,
+) -> None:
+    """Switch the torque on, stand for half a second, trot for `seconds`, at 50 Hz."""
+    bus.read()
+    bus.torque(True)
+    start = bus.now()
+    while (since := bus.now() - start) < seconds + 0.5:
+        bus.write(default_pose() if since < 0.5 else trot(since - 0.5, command))
+        bus.read()
+        look()
+        bus.sleep_until(start + PERIOD_S * (np.floor(since / PERIOD_S) + 1))
+
+
+# ---- standing ----
+
+
+def test_it_starts_standing_at_the_origin_in_the_default_pose():
+    robot = make_robot()
+    np.testing.assert_allclose([robot.angle(i, 0.0) for i in range(12)], POSE, atol=0.005)
+    trunk = robot.trunk(2.0)
+    np.testing.assert_allclose(trunk.position_m, [0.0, 0.0, 0.0835], atol=0.001)
+    np.testing.assert_allclose(trunk.velocity_m_s, 0.0, atol=1e-4)
+    assert abs(trunk.heading_rad) < 1e-3 and trunk.upright > 0.9999
+    np.testing.assert_allclose([robot.angle(i, 2.0) for i in range(12)], POSE, atol=0.005)
+
+
+def test_its_servos_carry_its_weight():
+    robot = make_robot()
+    for i in range(12):
+        robot.angle(i, 0.5)
+    loads = np.array([robot.load(i) for i in range(12)])
+    # 0.465 kg on four legs, feet 4 mm from below the hips: millinewton metres, of 0.35 N·m
+    assert 0 < np.abs(loads).max() < 0.2
+
+
+def test_a_robot_left_alone_for_a_day_is_not_stepped_and_answers_on_time():
+    rested, fresh = make_robot(), make_robot()
+    began = time.monotonic()
+    day = 86_400.0
+    rested.angle(HIP, day)
+    assert time.monotonic() - began < 0.5
+    rested.command(HIP, day, 0.2)
+    fresh.command(HIP, 0.0, 0.2)
+    times = np.arange(0.01, 0.3, 0.01)
+    np.testing.assert_allclose(
+        [rested.angle(HIP, day + t) for t in times], [fresh.angle(HIP, t) for t in times], atol=1e-5
+    )
+
+
+# ---- commands ----
+
+
+def test_a_servo_begins_to_move_one_dead_time_after_its_command():
+    robot = make_robot(spec=RobotSpec(delay_s=0.025, delay_sd_s=0.0))
+    start = robot.angle(HIP, 0.1)
+    robot.command(HIP, 0.1, 0.3)
+    assert robot.angle(HIP, 0.1245) == pytest.approx(start, abs=1e-6)
+    assert robot.angle(HIP, 0.131) > start + 2e-4
+
+
+def test_a_command_between_physics_steps_keeps_its_timing():
+    # a step that neither the speed nor the torque limit swallows
+    linear = RobotSpec(velocity_limit_rad_s=1e3, friction_per_inertia=0.0)
+    on_a_step, between = make_robot(spec=linear), make_robot(spec=linear)
+    on_a_step.command(HIP, 0.010, 0.03)
+    between.command(HIP, 0.0104, 0.03)
+    times = np.arange(0.03, 0.12, 0.003)
+    earlier = np.array([on_a_step.angle(HIP, t) for t in times])
+    later = np.array([between.angle(HIP, t + 0.0004) for t in times])
+    assert np.ptp(earlier) > 0.025
+    # taken on the next step it would be 0.6 ms late: 0.9 mrad at 1.5 rad/s
+    np.testing.assert_allclose(later, earlier, atol=4e-4)
+
+
+def test_each_servo_obeys_its_own_command():
+    robot = make_robot()
+    robot.command(THIGH, 0.0, POSE[THIGH] + 0.1)
+    robot.command(3, 0.0003, 0.15)
+    moved = np.array([robot.angle(i, 1.0) for i in range(12)]) - POSE
+    assert moved[THIGH] > 0.08 and moved[3] > 0.12
+    # servo 3 holds the calf's absolute angle: a moving thigh does not turn it
+    np.testing.assert_allclose(np.delete(moved, [THIGH, 3]), 0.0, atol=0.03)
+
+
+def test_a_position_asked_for_late_is_the_one_asked_for_in_time():
+    prompt, late = make_robot(), make_robot()
+    for robot in (prompt, late):
+        robot.command(HIP, 0.0, 0.3)
+    times = np.arange(0.03, 0.1, 0.00315)
+    expected = [prompt.angle(HIP, t) for t in times]
+    late.angle(THIGH, 0.5)
+    assert [late.angle(HIP, t) for t in times] == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_limp_servo_ignores_goals_and_holds_where_it_is_when_switched_on_again():
+    robot = make_robot()
+    robot.torque(HIP, 0.1, False)
+    robot.command(HIP, 0.2, 0.3)
+    assert robot.angle(HIP, 1.0) == pytest.approx(0.0, abs=0.02)
+    assert robot.load(HIP) == 0.0
+    robot.torque(HIP, 1.0, True)
+    held = robot.angle(HIP, 1.0)
+    assert robot.angle(HIP, 2.0) == pytest.approx(held, abs=0.02)
+    robot.command(HIP, 2.0, 0.3)
+    assert robot.angle(HIP, 3.0) > 0.25
+
+
+def test_a_delay_too_short_for_the_emulator_is_refused():
+    servos = draw_robot(np.random.default_rng(0))
+    short = replace(servos.servos[4].actuator, delay_s=0.0015)
+    wrong = replace(
+        servos,
+        servos=tuple(
+            replace(s, actuator=short) if i == 4 else s for i, s in enumerate(servos.servos)
+        ),
+    )
+    with pytest.raises(InputError, match="RF_thigh: delay_s"):
+        WalkingRobot(wrong, np.random.default_rng(0))
+
+
+# ---- the IMU ----
+
+
+def test_standing_the_imu_reads_one_g_up_with_the_noise_it_says_in_whole_counts():
+    robot = make_robot()
+    samples = [robot.imu(t) for t in np.arange(0.002, 8.0, 1 / 235)]
+    force = np.array([s.acceleration_m_s2 for s in samples if s])
+    rate = np.array([s.rate_rad_s for s in samples if s])
+    np.testing.assert_allclose(force.mean(axis=0), [0, 0, 9.81], atol=0.02)
+    # four standard errors of a standard deviation from 1880 numbers are 6.5 %
+    np.testing.assert_allclose(force.std(axis=0), 0.002 * 9.80665, rtol=0.07)
+    np.testing.assert_allclose(rate.std(axis=0), np.radians(0.15), rtol=0.08)
+    counts = np.degrees(rate) * 16
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+
+
+def test_between_two_conversions_the_imu_says_the_same():
+    robot = make_robot()
+    times = np.arange(0.0, 1.0, 0.0005)
+    seen = {tuple(s.rate_rad_s) + tuple(s.acceleration_m_s2) for s in map(robot.imu, times) if s}
+    assert len(seen) == 235
+
+
+def test_a_robot_pushed_onto_its_back_says_so():
+    robot = make_robot()
+    robot.push(np.array([0.0, 1.5]))
+    reads = [robot.imu(t) for t in np.arange(0.005, 1.0, 0.005)]
+    assert robot.trunk(3.0).upright < -0.9
+    last = robot.imu(3.0)
+    assert last is not None and last.acceleration_m_s2[2] < -9.5
+    # it rolls over its left side, and hits the ground harder than the chip can tell
+    roll = np.array([s.rate_rad_s[0] for s in reads if s])
+    assert roll.min() < -3 and abs(roll.min()) > roll.max()
+    assert any(s.clipped for s in reads if s)
+
+
+def test_the_gyros_integral_is_the_turn_to_the_left():
+    bus = make_bus()
+    rates = []
+
+    def look():
+        # several conversions per tick: at 50 Hz alone, each would meet the same part of a tick
+        rates.extend(bus.robot.imu(bus.now() + s) for s in np.arange(0.002, 0.018, 1 / 235))
+
+    walk(bus, 3.0, TURN, look)
+    turned = bus.robot.trunk(bus.now()).heading_rad
+    assert turned > 0.7
+    mean = np.mean([s.rate_rad_s[2] for s in rates if s])
+    assert mean * 3.5 == pytest.approx(turned, rel=0.1)
+
+
+# ---- the bus ----
+
+
+def test_readings_and_goals_are_joint_angles_a_calf_relative_to_its_thigh():
+    bus = make_bus(spec=exact_spec())
+    goal = default_pose()
+    goal[THIGH] += 0.1
+    bus.write(goal)
+    bus.sleep_until(1.5)
+    position = bus.read().position_rad
+    np.testing.assert_allclose(position, goal, atol=0.04)
+    # in servo coordinates the calf's servo has turned with the thigh: its joint has not
+    assert bus.robot.angle(CALF, 1.5) - POSE[CALF] == pytest.approx(0.1, abs=0.04)
+    assert bus.metadata["coordinates"] == "joint"
+
+
+def test_readings_are_held_between_polls_and_whole_counts():
+    bus = make_bus()
+    readings = []
+    walk(bus, 2.0, look=lambda: readings.append(bus._bus._reading.copy()))
+    changed = np.diff(np.array(readings[25:]), axis=0) != 0
+    # a poll every 26.85 ms of which 42 % fail, read every 20 ms
+    assert 0.25 < changed.mean() < 0.6
+
+
+def test_impossible_goals_and_a_closed_bus_are_refused():
+    bus = make_bus()
+    for goal in (np.zeros(3), np.full(12, np.nan)):
+        with pytest.raises(BusError, match="12 finite angles"):
+            bus.write(goal)
+    bus.close()
+    with pytest.raises(BusError, match="closed"):
+        bus.read()
+
+
+def test_the_same_seed_walks_the_same_way():
+    first, second, other = (make_bus(seed) for seed in (3, 3, 4))
+    for bus in (first, second, other):
+        walk(bus, 0.5)
+    a, b, c = (bus.robot.trunk(bus.now()).position_m for bus in (first, second, other))
+    np.testing.assert_array_equal(a, b)
+    assert (a != c).any()
+
+
+# ---- walking ----
+
+
+def test_the_guard_lets_a_trotting_robot_walk_for_twenty_seconds():
+    bus = make_bus()
+    guard = GuardedBus(bus)
+    force, upright = [], []
+
+    def look():
+        trunk = bus.robot.trunk(bus.now())
+        upright.append(trunk.upright)
+        # over all of a tick: commands come in steps, and each part of a tick has its own jerk
+        force.extend(bus.robot.imu(bus.now() + s) for s in np.arange(0.002, 0.018, 1 / 235))
+
+    walk(guard, 20.0, look=look)
+    trunk = bus.robot.trunk(bus.now())
+    # 0.15 m/s with some slip
+    assert trunk.position_m[0] > 0.85 * 0.15 * 20.0
+    assert min(upright) > 0.98
+    mean = np.mean([s.acceleration_m_s2 for s in force if s], axis=0)
+    # who neither flies nor falls has felt g on average
+    np.testing.assert_allclose(mean, [0.0, 0.0, 9.81], atol=0.5)
+    guard.park()
+    assert guard.report.missing == 0 and guard.report.unsent == 0
+
+
+@pytest.fixture
+def path(monkeypatch) -> Iterator[Path]:
+    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)  # the proxy shares this process
+    with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
+        yield Path(folder) / "s"
+
+
+def test_it_walks_behind_the_robots_proxy_in_real_time(path):
+    rng = np.random.default_rng(0)
+    truth = draw_robot(rng)
+    robot = WalkingRobot(truth, rng)
+    bench = ServoBench(truth, load_joint_map("mini_pupper_2"), rng, keep_log=False, plant=robot)
+    samples = []
+    with on_a_socket(ProxyEmulator(bench, rng), path) as server:
+        bus = Esp32Bus(path, load_joint_map("mini_pupper_2"))
+        guard = GuardedBus(bus)
+        # the proxy knows of no position until it has polled
+        assert wait_until(lambda: bool(np.isfinite(guard.read().position_rad).all()))
+        walk(guard, 5.0, look=lambda: samples.append(bus.imu()))
+        trunk = robot.trunk(server.now())
+        guard.park()
+        bus.close()
+    assert trunk.upright > 0.98 and trunk.position_m[0] > 0.4
+    read = [s for s in samples if s]
+    assert len(read) > 0.9 * len(samples)
+    assert max(abs(s.rate_rad_s).max() for s in read) > 0.3
+
+
+def test_it_walks_on_a_line_of_feetech_servos():
+    rng = np.random.default_rng(0)
+    truth, layout = draw_robot(rng, exact_spec()), load_joint_map("sts3215")
+    robot = WalkingRobot(truth, rng)
+    line = FeetechEmulator(
+        ServoBench(truth, layout, rng, keep_log=False, plant=robot), STS3215, rng
+    )
+    answers = []
+    goal, position = (STS3215.registers[name].address for name in ("goal", "position"))
+    for k in range(150):
+        now = k * PERIOD_S
+        counts = layout.clip_counts(layout.to_counts(trot(now, FORWARD)))
+        words = b"".join(
+            bytes([i]) + STS3215.encode("goal", int(c))
+            for i, c in zip(layout.ids, counts, strict=True)
+        )
+        line.receive(Frame(BROADCAST_ID, SYNC_WRITE, bytes([goal, 2]) + words).encode(), now)
+        answers = line.receive(Frame(4, READ, bytes([position, 2])).encode(), now + 0.005)
+        assert len(answers) == 1
+    trunk = robot.trunk(3.0)
+    assert trunk.upright > 0.98 and trunk.position_m[0] > 0.25
+    reply = answers[0][1]
+    there = int.from_bytes(reply[5:7], "little")
+    expected = layout.per_servo().to_counts(np.array([robot.angle(i, 3.0) for i in range(12)]))[HIP]
+    assert there == pytest.approx(expected, abs=40)
+
+
+def test_the_proxy_without_a_host_tells_of_a_standing_robot():
+    rng = np.random.default_rng(0)
+    truth = draw_robot(rng)
+    bench = ServoBench(truth, load_joint_map("mini_pupper_2"), rng, plant=WalkingRobot(truth, rng))
+    proxy = ProxyEmulator(bench, rng)
+    counts = datagrams.parse_counts(proxy.answer(b"\x02\x02", b"", 1000.0))
+    assert counts is not None and np.abs(counts - 512).max() <= 4
+    raw = datagrams.parse_imu(proxy.answer(b"\x02\x04", b"", 1000.0))
+    assert raw is not None
+    np.testing.assert_allclose(raw[:3], [0.0, 0.0, -1.0], atol=0.012)

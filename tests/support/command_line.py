@@ -1,0 +1,31 @@
+"""Run a command as a user does, in this process."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+from pupper_sysid.cli.programs import pupper_sysid
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    """Exit code, stdout, and stderr on one line, of one command of pupper-sysid."""
+    return run_program(capsys, pupper_sysid, *arguments)
+
+
+def run_program(capsys, module: ModuleType, *arguments) -> tuple[int, str, str]:
+    """The same of the program in a module of `cli`."""
+    try:
+        module.main([str(a) for a in arguments])
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    said = capsys.readouterr()
+    return code, said.out, " ".join(said.err.split())
+
+
+def refused(capsys, module: ModuleType, *arguments) -> str:
+    """What is said to input that cannot be used: no traceback, no blame on the program."""
+    code, out, err = run_program(capsys, module, *arguments)
+    assert code == 2, err
+    assert out == "" and "Traceback" not in err and "defect" not in err
+    return err

@@ -1,0 +1,178 @@
+"""Emulated servos behind a real port or socket, in a thread of the test that talks to them."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
+from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+
+LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy": "mini_pupper_2"}
+
+
+class StillBench(ServoBench):
+    """Servos that stand at the counts they are given, and write down what they are told."""
+
+    def __init__(self, layout: str):
+        rng = np.random.default_rng(0)
+        # the proxy polls; a direct bus measures when it is asked
+        spec = RobotSpec(loss=0.0) if layout == LAYOUTS["proxy"] else exact_spec()
+        super().__init__(draw_robot(rng, spec), load_joint_map(layout), rng)
+        self.id_of_index = {k: i for i, k in self.index_of_id.items()}
+        self.counts = {i: self.map.file.counts // 2 for i in self.index_of_id}
+        self.loads = dict.fromkeys(self.index_of_id, 0)
+        self.goals: list[tuple[int, int]] = []
+        """Id and count of every goal."""
+        self.torques: list[tuple[int, bool]] = []
+
+    def command(self, index: int, time_s: float, count: int) -> None:
+        self.goals.append((self.id_of_index[index], int(count)))
+
+    def torque(self, index: int, time_s: float, on: bool) -> None:
+        self.torques.append((self.id_of_index[index], on))
+
+    def count(self, index: int, time_s: float) -> int:
+        return self.counts[self.id_of_index[index]]
+
+    def load(self, index: int) -> int:
+        return self.loads[self.id_of_index[index]]
+
+
+class Listening(FeetechEmulator):
+    """Servos that keep what they heard and said."""
+
+    def __init__(self, *args, **keywords):
+        super().__init__(*args, **keywords)
+        self.heard, self.said = b"", b""
+        self.bauds: set[int | None] = set()
+
+    def receive(
+        self, data: bytes, now: float, baud: int | None = None
+    ) -> list[tuple[float, bytes]]:
+        pieces = super().receive(data, now, baud)
+        self.said += b"".join(piece for _, piece in pieces)
+        self.heard += data
+        self.bauds.add(baud)
+        return pieces
+
+
+class Scripted(FeetechEmulator):
+    """A line that says what a test wants: `answer(request)` gives pieces with their delays."""
+
+    def __init__(self, answer: Callable[[Frame], list[tuple[float, bytes]]]):
+        self.answers = answer
+        self.unplug_for_s = 0.0
+        self.faults = BusFaults({}, np.random.default_rng(0))
+        self._requests = FrameReader()
+
+    def receive(
+        self, data: bytes, now: float, baud: int | None = None
+    ) -> list[tuple[float, bytes]]:
+        pieces = [p for frame in self._requests.feed(data) for p in self.answers(frame)]
+        return [(now + delay, piece) for delay, piece in pieces]
+
+
+class ScriptedProxy(ProxyEmulator):
+    """A proxy that says what a test wants; None is silence."""
+
+    def __init__(self, answers: Callable[[bytes], bytes | None]):
+        self.answers = answers
+        self.unplug_for_s = 0.0
+        self.faults = BusFaults({}, np.random.default_rng(0))
+        self.requests: list[bytes] = []
+
+    def answer(self, request: bytes, previous: bytes, now: float) -> bytes:
+        self.requests.append(request)
+        return self.answers(request) or b""
+
+    def resend(self, now: float) -> None:
+        """See `ProxyEmulator`."""
+
+    def strike(self, now: float) -> str | None:
+        return None
+
+    def spoil(self, kind: str | None, reply: bytes) -> list[tuple[float, bytes]]:
+        return [(0.0, reply)] if reply else []
+
+
+def exact_spec() -> RobotSpec:
+    """A robot whose encoders tell the truth of the very moment."""
+    return RobotSpec(
+        poll_period_s=0.0, loss=0.0, quantum_rad=0.0, reading_noise_rad=0.0, offset_sd_rad=0.0
+    )
+
+
+def still_servos(
+    series: Series = STS3215, ids: Sequence[int] | None = None, **keywords
+) -> Listening:
+    """Servos without physics."""
+    bench = StillBench(LAYOUTS[series.name])
+    return Listening(bench, series, np.random.default_rng(0), ids, **keywords)
+
+
+def moving_servos(series: Series = STS3215, **keywords) -> Listening:
+    """Servos with physics."""
+    rng = np.random.default_rng(0)
+    layout = load_joint_map(LAYOUTS[series.name])
+    bench = ServoBench(draw_robot(rng, exact_spec()), layout, rng)
+    return Listening(bench, series, rng, **keywords)
+
+
+def bench_of(emulator: FeetechEmulator | ProxyEmulator) -> StillBench:
+    """The bench of servos without physics."""
+    assert isinstance(emulator.bench, StillBench)
+    return emulator.bench
+
+
+@contextmanager
+def on_a_port(emulator: FeetechEmulator) -> Iterator[FeetechPty]:
+    """The servos behind a pseudo-terminal that is there for as long as the block."""
+    with tempfile.TemporaryDirectory(prefix="fp") as folder:
+        server = FeetechPty(emulator, Path(folder) / "bus")
+        thread = threading.Thread(target=server.serve, daemon=True)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.stop()
+            thread.join(5)
+            server.close()
+
+
+@contextmanager
+def on_a_socket(emulator: ProxyEmulator, path: Path) -> Iterator[ProxySocket]:
+    """The proxy on its socket for as long as the block."""
+    server = ProxySocket(emulator, path)
+    thread = threading.Thread(target=server.serve, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.stop()
+        thread.join(5)
+        server.close()
+
+
+def wait_until(true: Callable[[], bool], seconds: float = 3.0) -> bool:
+    """Whether it became true in time."""
+    until = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.005)
+    return True

@@ -1,0 +1,256 @@
+"""Exported servo models: other runtimes compute what the model computes, tables hold every number.
+
+Each export is driven as its metadata says: the caller shifts the history and feeds back what comes
+back, with several environments at once.
+"""
+
+from __future__ import annotations
+
+import builtins
+import io
+import json
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pandas as pd
+import pytest
+import torch
+from numpy.typing import NDArray
+from onnx.reference import ReferenceEvaluator
+from test_servo_file import JOINTS, KINDS, P, arrays, commands, contract, saved
+
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model, save_servo_model
+from pupper_sysid.sysid.export.servo_networks import (
+    ENDINGS,
+    export_servo_model,
+    parameter_table,
+    to_onnx,
+)
+from support.command_line import run
+
+LEARNED = [kind for kind in KINDS if kind not in ("delayed-pd", "sindy")]
+STEPS, ENVIRONMENTS = 30, 4
+CLOSE_RAD = 1e-5
+
+Call = Callable[[dict[str, NDArray]], Any]
+
+
+def given() -> tuple[NDArray, NDArray]:
+    """Positions of rest (environments, joints), and commands (steps, environments, joints)."""
+    rest = np.linspace(-0.4, 0.5, ENVIRONMENTS * len(JOINTS)).reshape(ENVIRONMENTS, -1)
+    moves = commands(STEPS, ENVIRONMENTS * len(JOINTS)).reshape(STEPS, *rest.shape)
+    return rest.astype(np.float32), (rest + moves).astype(np.float32)
+
+
+def driven(call: Call, names: Sequence[Any], model: SavedModel) -> NDArray:
+    """Positions (steps, environments, joints) of an export, reset and stepped as documented."""
+    rest, given_commands = given()
+    taps = model.parameters["fir"].shape[1]
+    state = {"command_history_rad": np.repeat(rest[..., None], taps, axis=-1)}
+    warm_up = 0
+    if isinstance(model.model, RecurrentNetwork):
+        members, units = model.parameters["weight_out"].shape[1:]
+        zeros = np.zeros((*rest.shape, members, units), np.float32)
+        state |= {"hidden": zeros, "cell": zeros}
+        warm_up = model.contract.warm_up
+    if model.contract.feedback:
+        state["position_rad"] = rest
+    assert names == list(state)
+    out = []
+    for k, command in enumerate([rest] * warm_up + list(given_commands)):
+        history = state["command_history_rad"]
+        state["command_history_rad"] = np.concatenate(
+            [command[..., None], history[..., :-1]], axis=-1
+        )
+        position, *memory = call(state)
+        state |= dict(zip(("hidden", "cell"), memory, strict=False))
+        if k >= warm_up:
+            out.append(position)
+            state |= {"position_rad": position} if "position_rad" in state else {}
+    return np.stack(out)
+
+
+def own(model: SavedModel) -> NDArray:
+    rest, given_commands = given()
+    model.model.reset(rest)
+    return np.stack([model.model.step(c) for c in given_commands])
+
+
+def read_torchscript(path: Path) -> tuple[Any, dict, dict]:
+    extra: dict = {"contract.json": "", "metadata.json": ""}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch.jit.load is deprecated, too
+        module = torch.jit.load(path, _extra_files=extra)
+    return module, json.loads(extra["contract.json"]), json.loads(extra["metadata.json"])
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_onnx_computes_what_the_model_computes(tmp_path: Path, kind: str):
+    model = saved(tmp_path / "a", kind)
+    export_servo_model(model, "onnx", tmp_path / "a.onnx")
+    made = onnx.load(str(tmp_path / "a.onnx"))
+    runtime = ReferenceEvaluator(made)
+    found = driven(lambda state: runtime.run(None, state), runtime.input_names, model)
+    np.testing.assert_allclose(found, own(model), rtol=0, atol=CLOSE_RAD)
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_torchscript_computes_what_the_model_computes(tmp_path: Path, kind: str):
+    model = saved(tmp_path / "a", kind)
+    export_servo_model(model, "torchscript", tmp_path / "a.pt")
+    module, _, metadata = read_torchscript(tmp_path / "a.pt")
+    names = [a.name for a in module.forward.schema.arguments][1:]
+    assert names == json.loads(metadata["inputs"])
+
+    def call(state: dict[str, NDArray]) -> list[NDArray]:
+        with torch.no_grad():
+            found = module(*(torch.from_numpy(state[n].copy()) for n in names))
+        return [f.numpy() for f in (found if isinstance(found, tuple) else (found,))]
+
+    np.testing.assert_allclose(driven(call, names, model), own(model), rtol=0, atol=CLOSE_RAD)
+
+
+def test_a_model_that_stands_still_would_not_pass_for_equal(tmp_path: Path):
+    for kind in LEARNED:
+        moved = own(saved(tmp_path / kind, kind))
+        assert np.ptp(moved, axis=0).min() > 100 * CLOSE_RAD, kind
+
+
+def test_the_network_corrects_the_linear_filter_in_what_is_compared(tmp_path: Path):
+    for kind in ("mlp", "lstm"):
+        whole = own(saved(tmp_path / kind, kind))
+        linear = own(saved_linear(tmp_path / f"{kind}-fir", kind))
+        assert np.abs(whole - linear).max() > 100 * CLOSE_RAD
+
+
+def saved_linear(folder: Path, kind: str) -> SavedModel:
+    """The linear filter of `saved(folder, kind)` alone."""
+    everything = arrays(kind)
+    linear = {n: everything[n] for n in arrays("fir")}
+    save_servo_model(folder, linear, contract("fir", linear))
+    return load_servo_model(folder)
+
+
+def test_onnx_takes_any_number_of_environments_and_is_for_old_runtimes(tmp_path: Path):
+    made = to_onnx(saved(tmp_path / "a", "lstm"))
+    assert made.opset_import[0].version <= 17 and made.ir_version <= 8
+    for port in [*made.graph.input, *made.graph.output]:
+        first, second = port.type.tensor_type.shape.dim[:2]
+        assert (first.dim_param, second.dim_value) == ("environments", len(JOINTS))
+    assert [o.name for o in made.graph.output] == ["position_rad_next", "hidden_next", "cell_next"]
+
+
+def test_an_export_says_what_it_is(tmp_path: Path):
+    model = saved(tmp_path / "a", "lstm")
+    written = json.loads((tmp_path / "a" / "contract.json").read_text())
+    onnx_says = {p.key: p.value for p in to_onnx(model).metadata_props}
+    export_servo_model(model, "torchscript", tmp_path / "a.pt")
+    _, in_archive, torch_says = read_torchscript(tmp_path / "a.pt")
+    assert onnx_says == torch_says and in_archive == json.loads(onnx_says["contract"]) == written
+    assert json.loads(onnx_says["joints"]) == list(JOINTS)
+    assert float(onnx_says["time_step_s"]) == P and "radians" in onnx_says["units"]
+    assert json.loads(onnx_says["input_order"])[:2] == ["command_rad[t]", "command_rad[t-1]"]
+    assert "run 8 steps" in onnx_says["reset"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_table_gives_every_number_back(tmp_path: Path, kind: str):
+    model = saved(tmp_path / "a", kind)
+    text = parameter_table(model)
+    table = pd.read_csv(io.StringIO(text), comment="#", dtype={"value": str})
+    axes = [c for c in table if c.startswith("index_")]
+    assert not table.duplicated(["joint", "parameter", *axes]).any()
+    assert len(table) == sum(v.size for v in model.parameters.values())
+    for name, expected in model.parameters.items():
+        found = np.full_like(expected, np.nan)
+        for row in table.query(f"parameter == '{name}'").to_dict("records"):
+            place = [int(row[a]) for a in axes if not np.isnan(row[a])]
+            found[(JOINTS.index(row["joint"]), *place)] = float(row["value"])
+        np.testing.assert_array_equal(found, expected)
+    lines = [line[2:] for line in text.splitlines() if line.startswith("# ")]
+    assert lines[0] == "pupper-sysid servo model table"
+    said = {key: json.loads(value) for key, _, value in (s.partition(": ") for s in lines[1:])}
+    assert said.pop("versions_when_exported")["pupper-sysid"]
+    assert said == json.loads((tmp_path / "a" / "contract.json").read_text())
+
+
+# ------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("kind", ["delayed-pd", "sindy"])
+@pytest.mark.parametrize("to", ["onnx", "torchscript"])
+def test_a_physical_model_becomes_no_network(tmp_path: Path, kind: str, to):
+    with pytest.raises(InputError, match=rf"{kind} model, which steps physics.*sysid calibrate"):
+        export_servo_model(saved(tmp_path / "a", kind), to, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_the_package_onnx_a_sentence_says_what_to_install(tmp_path: Path, monkeypatch):
+    original = builtins.__import__
+
+    def without_onnx(name, *arguments, **more):
+        if name.split(".")[0] == "onnx":
+            raise ImportError(name)
+        return original(name, *arguments, **more)
+
+    model = saved(tmp_path / "a")
+    monkeypatch.setattr(builtins, "__import__", without_onnx)
+    with pytest.raises(InputError, match=r"pip install 'pupper-sysid\[onnx\]'"):
+        to_onnx(model)
+
+
+@pytest.mark.parametrize("to", list(ENDINGS))
+def test_nothing_is_overwritten_unless_forced(tmp_path: Path, to):
+    path = tmp_path / "out"
+    path.write_text("mine")
+    with pytest.raises(FileExistsRefusal, match="--force"):
+        export_servo_model(saved(tmp_path / "a"), to, path)
+    assert path.read_text() == "mine"
+    export_servo_model(saved(tmp_path / "b"), to, path, force=True)
+    assert path.stat().st_size > 500
+
+
+# ------------------------------------------------------------------------------- command line
+
+
+def test_the_command_names_its_output_after_the_folder(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    saved(tmp_path / "servo-0.5")
+    for to, ending in ENDINGS.items():
+        code, out, err = run(capsys, "export", "servo-0.5/", "--to", to, "--json")
+        assert code == 0, err
+        assert json.loads(out) == {"written": f"servo-0.5{ending}"}
+        assert Path(f"servo-0.5{ending}").stat().st_size > 500
+        assert "warning" not in err.lower(), "torch's deprecations are not the user's concern"
+    code, _, err = run(capsys, "export", "servo-0.5", "--to", "onnx")
+    assert code == 2 and "--force" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("paper", "--to", "onnx"), "only a learned servo model can"),
+        (("a.csv", "--to", "torchscript"), "only a learned servo model can"),
+        (("a.yaml", "--to", "onnx"), "only a learned servo model can"),
+        (("servo/contract.json", "--to", "onnx"), "give its folder"),
+        (("empty", "--to", "onnx"), "holds no servo model"),
+        (("missing/", "--to", "onnx"), "neither a calibration"),
+        (("sindy", "--to", "onnx"), "steps physics between commands"),
+    ],
+)
+def test_what_is_no_network_is_refused_in_a_sentence(
+    tmp_path: Path, monkeypatch, capsys, arguments, said
+):
+    monkeypatch.chdir(tmp_path)
+    saved(tmp_path / "servo")
+    saved(tmp_path / "sindy", "sindy")
+    Path("empty").mkdir()
+    code, _, err = run(capsys, "export", *arguments)
+    assert code == 2 and said in err
+    assert not [p for ending in (".onnx", ".pt") for p in Path().glob(f"*{ending}")]

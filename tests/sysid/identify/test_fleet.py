@@ -1,0 +1,174 @@
+"""Many robots: one table, outliers named, failures told, and nothing done twice."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sysid.identify import fleet
+from pupper_sysid.sysid.identify.fleet import QUANTITIES, UNLIKE, _unlike
+from pupper_sysid.sysid.servo_fit.fleet import ServoSettings, fit_servo_fleet
+from support.command_line import refused, run
+
+NAMES = tuple(QUANTITIES)
+SWEEP = ("sweep", "--freqs", "2,4", "--joints", "LF_hip", "--duration", "2")
+
+
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory) -> Path:
+    """Two robots that can be calibrated, and a log that cannot."""
+    folder = tmp_path_factory.mktemp("robots")
+    for seed in (1, 2):
+        pupper_sysid.main([*SWEEP, "--seed", str(seed), "--out", str(folder / f"r{seed}.csv")])
+    (folder / "torn.csv").write_text("time,what\n1,2\n")
+    return folder
+
+
+def two_made_and_one_failed(said: str, out: Path) -> pd.DataFrame:
+    """What `--json` said of `sweeps` and what the table has of them, which it returns."""
+    found = json.loads(said)
+    assert sorted(found["made"]) == ["r1", "r2"] and found["failed"] == ["torn"]
+    table = pd.read_csv(out / "fleet.csv")
+    assert table["robot"].to_list() == ["r1", "r2", "torn"]
+    assert "column" in table["problem"].iloc[2]
+    return table
+
+
+def test_a_folder_becomes_a_calibration_per_robot_and_one_table(sweeps, tmp_path, capsys):
+    out = tmp_path / "fleet"
+    code, said, err = run(capsys, "calibrate", sweeps, "--jobs", "2", "--out", out, "--json")
+    assert code == 0, err
+    table = two_made_and_one_failed(said, out)
+    own = load_calibration(out / "r2.yaml").joint("LF_hip").actuator
+    assert table["delay_ms"].iloc[1] == pytest.approx(1e3 * own.delay_s.value)
+
+    # nothing is calibrated twice, and what was edited is seen
+    code, said, err = run(capsys, "calibrate", sweeps, "--out", out, "--json")
+    assert code == 0, err
+    assert sorted(json.loads(said)["kept"]) == ["r1", "r2"] and json.loads(said)["made"] == []
+    assert "--force" in refused(
+        capsys,
+        pupper_sysid,
+        "calibrate",
+        sweeps,
+        "--out",
+        out,
+        "--seed",
+        "3",
+    )
+
+
+def test_a_folder_becomes_a_servo_model_per_robot_and_one_table(sweeps, tmp_path, capsys):
+    out = tmp_path / "models"
+    arguments = ("fit-servo", sweeps, "--arch", "fir", "--out", out)
+    code, said, err = run(capsys, *arguments, "--json")
+    assert code == 0, err
+    table = two_made_and_one_failed(said, out)
+    known = load_servo_model(out / "r2").contract.joints["LF_hip"].scores["rmse_free_run_rad"]
+    assert table["free_run_mrad"].iloc[1] == pytest.approx(1e3 * known)
+    assert 0 < known < 1e-3 * table["persistence_mrad"].iloc[1]
+
+    code, said, err = run(capsys, *arguments)
+    assert code == 0 and "2 kept" in err and "torn was left out" in err
+    assert "--force" in refused(capsys, pupper_sysid, *arguments, "--seed", "3")
+    # another split or other readings are another model, too; what auto took stays
+    loops = ("--train-before", "1", "--test-after", "1")
+    assert "--force" in refused(capsys, pupper_sysid, *arguments, *loops)
+    counted = load_servo_model(out / "r1").contract.readings_counted["LF_hip"]
+    code, _, err = run(capsys, *arguments, "--readings", counted)
+    assert code == 0 and "2 kept" in err
+    other = "all" if counted == "fresh" else "fresh"
+    assert "--force" in refused(capsys, pupper_sysid, *arguments, "--readings", other)
+
+
+def test_a_robot_that_fails_now_is_not_shown_with_what_it_was_before(sweeps, tmp_path):
+    root, out = tmp_path / "robots", tmp_path / "out"
+    root.mkdir()
+    shutil.copy(sweeps / "r1.csv", root)
+    fleet.calibrate_fleet(root, out, fleet.Settings())
+    (root / "r1.csv").write_text("time,what\n1,2\n")
+    again = fleet.calibrate_fleet(root, out, fleet.Settings(), force=True)
+    assert again.failed == ["r1"] and again.table["robot"].to_list() == ["r1"]
+    assert again.table["problem"].iloc[0]
+
+
+def test_an_interrupted_training_is_not_kept_for_a_finished_one(sweeps, tmp_path, monkeypatch):
+    def stop(*arguments, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torch.optim.Adam.step", stop)
+    with pytest.raises(KeyboardInterrupt):
+        fit_servo_fleet(sweeps, tmp_path / "out", ServoSettings())
+    assert not (tmp_path / "out" / "r1").exists()
+
+
+def test_one_robot_alone_and_in_a_fleet_get_the_same_numbers(sweeps, tmp_path, capsys):
+    code, _, err = run(capsys, "calibrate", sweeps / "r1.csv", "--out", tmp_path / "alone.yaml")
+    assert code == 0, err
+    fleet.calibrate_fleet(sweeps, tmp_path / "fleet", fleet.Settings())
+    alone, among = (
+        load_calibration(tmp_path / name).joint("LF_hip")
+        for name in ("alone.yaml", "fleet/r1.yaml")
+    )
+    assert alone.actuator == among.actuator and alone.feedback == among.feedback
+
+
+def test_a_dask_cluster_gives_what_one_process_gives(sweeps, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        there = fleet.calibrate_fleet(
+            sweeps, tmp_path / "there", fleet.Settings(), cluster=cluster.scheduler_address
+        )
+    here = fleet.calibrate_fleet(sweeps, tmp_path / "here", fleet.Settings())
+    pd.testing.assert_frame_equal(there.table, here.table)
+
+
+def test_a_servo_unlike_its_sisters_is_named_and_equal_ones_are_not():
+    rows = [
+        {"robot": f"r{k}", "joint": "LF_hip"} | dict.fromkeys(QUANTITIES, 1.0) for k in range(9)
+    ]
+    for k, row in enumerate(rows):
+        row["lag_ms"] = 40 + 0.1 * k
+    # with it the median is 40.5, the median deviation 0.3
+    rows[4]["lag_ms"] = 40.5 + 1.1 * UNLIKE * 1.4826 * 0.3
+    found = _unlike(pd.DataFrame(rows), NAMES)
+    assert found == ["lag_ms" if k == 4 else "" for k in range(9)]
+    assert _unlike(pd.DataFrame(rows[2:6]), NAMES) == [""] * 4  # too few to say what is usual
+
+
+def test_what_is_no_fleet_is_refused_in_a_sentence(sweeps, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    program = pupper_sysid
+    assert "no recording" in refused(capsys, program, "calibrate", tmp_path / "empty")
+    double = tmp_path / "double"
+    shutil.copytree(sweeps, double / "a")
+    shutil.copy(sweeps / "r1.csv", double / "a_r1.csv")
+    assert "a_r1" in refused(capsys, program, "calibrate", double)
+    assert "--jobs" in refused(capsys, program, "calibrate", sweeps, "--jobs", "0")
+    assert "--cluster" in refused(
+        capsys, program, "calibrate", sweeps, "--cluster", "tcp://127.0.0.1:1", "--out", tmp_path
+    )
+
+
+def test_outliers_do_not_depend_on_order():
+    rng = np.random.default_rng(0)
+    rows = [
+        {"robot": f"r{k}", "joint": "LF_hip"} | {q: float(x) for q, x in zip(
+            QUANTITIES, rng.normal(size=len(QUANTITIES)), strict=True)}
+        for k in range(20)
+    ]  # fmt: skip
+    rows[7]["loss"] = 50.0
+    table = pd.DataFrame(rows)
+    turned = table.iloc[::-1].reset_index(drop=True)
+    assert _unlike(table, NAMES) == _unlike(turned, NAMES)[::-1]
+    assert "loss" in _unlike(table, NAMES)[7]

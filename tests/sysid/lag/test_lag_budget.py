@@ -1,0 +1,199 @@
+"""The lag, its budget and the poll lattice, on signals whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    find_poll_lattice,
+    fresh_rows,
+    quantum,
+    readings,
+)
+from pupper_sysid.sysid.lag.lag_budget import lag_budget, tone_lags
+from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.recordings.recording import Trial
+from support.synthetic import LOOP_S, held_trial, tone_trials
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3, 0.5])
+def test_hold_aware_lag_is_unbiased_whatever_share_of_the_reads_is_lost(loss):
+    errors = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        trials = tone_trials(0.040, rng, loss=loss)
+        errors.append(lag_budget("LF_hip", trials, rng).lag.value - 0.040)
+    assert abs(np.mean(errors)) < 0.5e-3
+    assert np.max(np.abs(errors)) < 1.5e-3
+
+
+def test_the_budget_adds_up_and_the_hold_is_half_a_loop():
+    rng = np.random.default_rng(0)
+    b = lag_budget("LF_hip", tone_trials(0.040, rng), rng)
+    assert b.naive.value == pytest.approx(b.feedback_age_s + b.command_hold_s + b.lag.value)
+    assert b.command_hold_s == pytest.approx(LOOP_S / 2, abs=2e-4)
+    # mean age of a held reading: T (1/2 + p / (1 - p))
+    assert b.feedback_age_s == pytest.approx(0.02685 * (0.5 + 0.42 / 0.58), abs=5e-3)
+
+
+def test_lags_beyond_a_period_of_the_highest_tone_come_out_whole():
+    rng = np.random.default_rng(1)
+    trials = tone_trials(0.160, rng, frequencies=(1.0, 2.0, 4.0, 6.0, 8.0, 10.0), amplitude=0.1)
+    b = lag_budget("LF_hip", trials, rng)
+    assert b.lag.value == pytest.approx(0.160, abs=1.5e-3)
+    assert [round(f.lag.value, 2) for f in b.by_frequency] == [0.16] * 6
+
+
+def test_tone_lags_follow_a_lag_that_grows_with_frequency():
+    frequency = np.arange(1.0, 11.0)
+    lags = 0.03 + 0.01 * frequency
+    response = np.exp(-2j * np.pi * frequency * lags)
+    np.testing.assert_allclose(tone_lags(response, frequency), lags, atol=1e-12)
+
+
+def test_fresh_readings_show_the_true_gain_where_all_rows_show_attenuation():
+    rng = np.random.default_rng(2)
+    (b,) = [lag_budget("LF_hip", tone_trials(0.04, rng, (1.0, 4.0), gain=1.0), rng)]
+    at_4_hz = b.by_frequency[1]
+    assert at_4_hz.gain == pytest.approx(1.0, abs=0.03)
+    assert at_4_hz.naive_gain < 0.95
+
+
+def test_the_poll_lattice_is_found_with_its_loss():
+    rng = np.random.default_rng(3)
+    lattice = find_poll_lattice(tone_trials(0.04, rng), np.random.default_rng(0))
+    assert lattice.kind == "lattice"
+    assert lattice.period_s == pytest.approx(0.02685, abs=1e-4)
+    assert lattice.loss == pytest.approx(0.42, abs=3 * lattice.loss_sd)
+    assert lattice.z_score > 4
+
+
+def test_no_lattice_is_claimed_where_readings_change_at_random():
+    rng = np.random.default_rng(4)
+    trials = []
+    for trial in tone_trials(0.04, rng, period_s=0.0, quantum_rad=0.0057):
+        position = trial.position_rad.copy()
+        held = rng.random(len(position)) < 0.55  # any row may be stale, no clock behind it
+        for k in np.flatnonzero(held):
+            position[k] = position[k - 1] if k else position[k]
+        trials.append(type(trial)(**{**vars(trial), "position_rad": position}))
+    assert find_poll_lattice(trials, np.random.default_rng(0)).kind == "unresolved"
+
+
+@pytest.mark.parametrize("share", [0.05, 0.1])
+def test_reads_that_are_answered_at_once_and_sometimes_lost_make_no_poll(share):
+    rng = np.random.default_rng(11)
+    trials = []
+    for trial in tone_trials(0.04, rng, period_s=0.0, quantum_rad=0.001):
+        position = trial.position_rad.copy()
+        for k in np.flatnonzero(rng.random(len(position)) < share):
+            position[k] = position[k - 1] if k else position[k]
+        trials.append(replace(trial, position_rad=position))
+    b = lag_budget("LF_hip", trials, rng)
+    assert b.lattice.kind != "lattice"
+    assert b.lag.low < 0.04 < b.lag.high
+    for f in b.by_frequency:
+        assert f.lag.low < 0.04 < f.lag.high
+
+
+def test_when_readings_were_taken_is_part_of_the_interval():
+    trials = tone_trials(0.04, np.random.default_rng(13), period_s=0.0, quantum_rad=0.001)
+    doubted = [replace(t, read_time_doubt_s=0.0004) for t in trials]
+    known, unknown = (lag_budget("LF_hip", t, np.random.default_rng(0)) for t in (trials, doubted))
+    for a, b in ((known.lag, unknown.lag), (known.fresh, unknown.fresh)):
+        assert (b.value, b.low, b.high) == (a.value, a.low - 0.0004, a.high + 0.0004)
+    for a, b in zip(known.by_frequency, unknown.by_frequency, strict=True):
+        assert b.lag.high - b.lag.low == pytest.approx(a.lag.high - a.lag.low + 0.0008)
+
+
+@pytest.mark.parametrize("rows_per_period", [3, 4, 6])
+def test_a_harmonic_that_the_rows_cannot_tell_from_the_tone_is_left_out(rows_per_period):
+    rng = np.random.default_rng(12)
+    time = np.arange(0.0, 6.0, 1 / 30)
+    f = 30 / rows_per_period
+    command = 0.3 * np.sin(2 * np.pi * f * time + 0.4)
+    position = 0.3 * np.sin(2 * np.pi * f * (time - 0.02) + 0.4)
+    trial = Trial("LF_hip", 0, f, time, time, command, position, None, 0.0)
+    tone = tone_response(trial, readings(trial, find_poll_lattice([trial], rng)), rng)
+    assert tone is not None
+    late = -np.angle(tone.fresh / tone.command_rows) / (2 * np.pi * f)
+    assert late == pytest.approx(0.02, abs=1e-4)
+
+
+def test_two_trials_of_one_fast_tone_do_not_move_the_lag_by_a_period():
+    frequency = np.array([3.0, 3.004, 3.009])
+    response = np.exp(-2j * np.pi * frequency * 0.05 + 0.05j * np.array([1, -1, 1]))
+    assert tone_lags(response, frequency) == pytest.approx([0.05] * 3, abs=5e-3)
+
+
+def test_readings_that_are_never_held_are_dated_to_the_read():
+    rng = np.random.default_rng(5)
+    trials = tone_trials(0.04, rng, period_s=0.0, quantum_rad=0.0001)
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
+    assert lattice.kind == "every read"
+    np.testing.assert_array_equal(readings(trials[0], lattice).time_s, trials[0].read_time_s)
+    assert lag_budget("LF_hip", trials, rng).feedback_age_s == pytest.approx(0.0, abs=1e-3)
+
+
+def test_fresh_readings_are_dated_to_the_poll_that_made_them():
+    rng = np.random.default_rng(6)
+    trials = tone_trials(0.04, rng, loss=0.2, quantum_rad=0.001)
+    read = readings(trials[3], find_poll_lattice(trials, np.random.default_rng(0)))
+    # identifiable data: at 4 Hz the reading tells the time at which the true motion had it
+    late = 0.04 + LOOP_S / 2
+    amplitude = 0.3 * np.sinc(4 * LOOP_S)
+    time = read.time_s - trials[3].send_time_s[0]
+    wrong = read.position_rad - amplitude * np.sin(2 * np.pi * 4 * (time - late))
+    settled = time > 0.1
+    assert np.sqrt(np.mean(wrong[settled] ** 2)) < 0.015  # 2 ms at 7.5 rad/s
+
+
+def test_quantum_is_the_greatest_common_divisor_of_the_changes():
+    trials = tone_trials(0.04, np.random.default_rng(7), quantum_rad=np.pi / 550)
+    assert quantum(trials) == pytest.approx(np.pi / 550, rel=1e-6)
+
+
+def test_fresh_rows_skip_missing_readings():
+    trial = tone_trials(0.04, np.random.default_rng(8), (2.0,))[0]
+    position = trial.position_rad.copy()
+    position[10:20] = np.nan
+    gap = type(trial)(**{**vars(trial), "position_rad": position})
+    assert not np.isin(fresh_rows(gap), np.arange(10, 20)).any()
+
+
+def test_a_servo_that_is_stuck_has_no_lag():
+    rng = np.random.default_rng(13)
+    stuck = tone_trials(0.04, rng, gain=0.02, quantum_rad=0.0, noise_rad=0.003)
+    with pytest.raises(InputError, match="moved by 2 % of what it was told"):
+        lag_budget("LF_hip", stuck, rng)
+
+
+def test_one_frequency_is_said_to_leave_the_period_open():
+    rng = np.random.default_rng(9)
+    b = lag_budget("LF_hip", tone_trials(0.04, rng, (2.0,), duration_s=6.0), rng)
+    assert any("one frequency only" in w for w in b.warnings)
+
+
+def test_motion_without_tones_still_has_a_lag():
+    rng = np.random.default_rng(10)
+    knots = np.cumsum(rng.standard_normal(400)) * 0.05
+    wander = lambda t: np.interp(t, np.arange(400) * 0.05, knots)  # noqa: E731
+    send = np.arange(0.0, 12.0, LOOP_S)
+
+    def held(t):  # what the bus holds of the command
+        row = np.clip(np.floor(t / LOOP_S).astype(int), 0, len(send) - 1)
+        return wander(send[row])
+
+    trial = held_trial(lambda t: held(t - 0.04), wander, rng, duration_s=12.0)
+    b = lag_budget("LF_hip", [trial], rng)
+    assert b.lag.value == pytest.approx(0.04, abs=4e-3)
+    assert b.naive.value > b.fresh.value > b.lag.value
+
+
+def test_a_joint_that_does_not_move_is_refused():
+    still = lambda t: np.zeros_like(t)  # noqa: E731
+    trial = held_trial(still, lambda t: np.sin(t), np.random.default_rng(0))
+    with pytest.raises(InputError, match="too few to measure a lag"):
+        lag_budget("LF_hip", [trial], np.random.default_rng(0))

@@ -1,0 +1,245 @@
+"""Recordings: what is written is read back, and what cannot be used is refused in a sentence."""
+
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.sysid.recordings.recording import (
+    RecordingWriter,
+    Truncation,
+    load,
+    newest_recording,
+)
+
+HEADER = "send_time_s,read_time_s,trial,joint,frequency_hz,command_rad,position_rad"
+
+
+def rows(count=40, joint="LF_hip", trial=0):
+    """Lines of a plausible recording."""
+    return [
+        f"{0.019 * k:.6f},{0.019 * k + 0.0005:.6f},{trial},{joint},1.0,"
+        f"{0.3 * np.sin(0.12 * k):.6f},{0.3 * np.sin(0.12 * (k - 3)):.6f}"
+        for k in range(count)
+    ]
+
+
+def write(tmp_path, lines, header=HEADER, top=("# pupper-sysid recording", "# schema_version: 1")):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([*top, header, *lines, '# completed: {"rows": 1}', ""]))
+    return path
+
+
+def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_thread():
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    before = threading.active_count()
+    with pytest.raises(InputError, match="No space left"):
+        RecordingWriter(Path("/dev/full"), {}, force=True)
+    assert threading.active_count() == before
+
+
+def test_what_the_writer_writes_load_reads_back(tmp_path):
+    path = tmp_path / "out" / "a.csv"
+    with RecordingWriter(path, {"start_pose_rad": {"LF_hip": 0.5}, "seed": 3}) as writer:
+        for k in range(30):
+            writer.append(
+                {"send_time_s": 0.02 * k, "read_time_s": 0.02 * k + 0.001, "trial": 0,
+                 "joint": "LF_hip", "frequency_hz": 2.0, "command_rad": 0.01 * k,
+                 "position_rad": float("nan") if k == 5 else 0.02 * k, "position_count": 512 + k}
+            )  # fmt: skip
+        writer.close({"rows": 30})
+    recording = load(path)
+    (trial,) = recording.trials("LF_hip")
+    np.testing.assert_allclose(trial.command_rad, 0.01 * np.arange(30))
+    assert np.isnan(trial.position_rad[5]) and trial.position_count[7] == 519
+    assert trial.initial_command_rad == 0.5 and recording.metadata["seed"] == 3
+    assert recording.metadata["completed"] == {"rows": 30}
+
+
+def test_rows_are_on_disk_before_the_next_is_appended(tmp_path):
+    path = tmp_path / "a.csv"
+    writer = RecordingWriter(path, {})
+    row = dict(zip(HEADER.split(","), [0.0, 0.1, 0, "LF_hip", 1.0, 0.2, 0.3], strict=True))
+    writer.append(row)
+    assert path.read_text().count("LF_hip") == 1
+    writer.close()
+
+
+def test_an_existing_file_is_kept_without_force(tmp_path):
+    path = write(tmp_path, rows())
+    before = path.read_bytes()
+    with pytest.raises(FileExistsRefusal, match="--force"):
+        RecordingWriter(path, {})
+    assert path.read_bytes() == before
+
+
+def test_a_file_cut_in_the_middle_of_a_line_loads_without_that_line(tmp_path):
+    path = tmp_path / "cut.csv"
+    path.write_text("\n".join(["# pupper-sysid recording", HEADER, *rows(40)])[:-30])
+    recording = load(path)
+    assert len(recording.table) == 39
+    assert any("cut short" in w for w in recording.warnings)
+    assert any("not recorded to its end" in w for w in recording.warnings)
+
+
+def changed(index, column, text):
+    """Rows with one cell replaced."""
+    lines = rows()
+    cells = lines[index].split(",")
+    cells[HEADER.split(",").index(column)] = text
+    lines[index] = ",".join(cells)
+    return lines
+
+
+# fmt: off
+BAD = {
+    "no rows": ([], HEADER, "no rows"),
+    "missing column": (rows(), HEADER.replace(",position_rad", ",x"), "position_rad is missing"),
+    "renamed column": (
+        rows(), HEADER.replace("command_rad", "comand_rad"), "Was .comand_rad. meant"),
+    "text in a number": (
+        changed(3, "position_rad", "hello"), HEADER, r"line 7, .*'hello' is not a"),
+    "infinite": (changed(3, "command_rad", "inf"), HEADER, "infinite"),
+    "one row": (rows(1), HEADER, "1 usable rows"),
+    "no position at all": (
+        [r.rsplit(",", 1)[0] + "," for r in rows()], HEADER, "bus never answered"),
+    "times backwards": (changed(25, "send_time_s", "0.0101"), HEADER, "runs backwards"),
+    "degrees": (changed(8, "position_rad", "45.0"), HEADER, "looks like degrees"),
+    "another length": ([*rows()[:10], "0.5,0.5,0", *rows()[11:]], HEADER, "same number of values"),
+    "unknown joint": (rows(joint="LF_hipp"), HEADER, "did you mean LF_hip"),
+    "a stray quote": (changed(3, "position_rad", '"0.1'), HEADER, "line 7"),
+    "semicolons": (
+        [r.replace(",", ";") for r in rows()], HEADER.replace(",", ";"), "separated by semicolons"),
+    "tones in a trial": (changed(30, "frequency_hz", "2.0"), HEADER, "its own trial number"),
+    "column twice": (rows(), HEADER.replace("read_time_s", "send_time_s"), "stands twice"),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_refused_in_a_sentence_that_names_the_file(tmp_path, case):
+    lines, header, said = BAD[case]
+    path = write(tmp_path, lines, header)
+    with pytest.raises(InputError, match=said) as refusal:
+        load(path)
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is empty"),
+        (b"  \n ", "is empty"),
+        (b"\x00\x01\x02PNG", "not a text file"),
+        (b"\xff\xfe\xfa\xfb" * 50, "not a text file"),
+        (b"hello world\n", "no rows"),
+    ],
+)
+def test_files_that_are_no_recording_are_refused(tmp_path, content, said):
+    path = tmp_path / "x.csv"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        load(path)
+
+
+def test_a_file_of_a_newer_version_is_refused(tmp_path):
+    path = write(tmp_path, rows(), top=("# pupper-sysid recording", "# schema_version: 2"))
+    with pytest.raises(InputError, match="newer"):
+        load(path)
+
+
+def test_the_truth_beside_a_recording_is_not_taken_for_one(tmp_path):
+    (tmp_path / "a.truth.csv").write_text("x")
+    with pytest.raises(InputError, match="truth"):
+        load(tmp_path / "a.truth.csv")
+    with pytest.raises(InputError, match="pupper-sysid sweep"):
+        newest_recording(tmp_path)
+
+
+def test_a_trial_that_had_hardly_begun_is_left_out(tmp_path):
+    last = "2.0,2.0005,1,LF_hip,2.0,0.0,0.0"
+    recording = load(write(tmp_path, [*rows(), last]))
+    assert len(recording.trials("LF_hip")) == 1
+    assert any("trial 1 of LF_hip is too short" in w for w in recording.warnings)
+
+
+def test_the_hash_is_that_of_the_bytes_whatever_wrote_them(tmp_path):
+    path = write(tmp_path, rows(), top=())
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())  # as spreadsheets save UTF-8
+    recording = load(path)
+    assert recording.sha256 == sha256(path)
+    # a table that this program did not write has no end to miss
+    assert recording.warnings == ()
+
+
+def test_each_trial_knows_how_its_bus_cut_commands(tmp_path):
+    bus = {"command_quantum_rad": {"LF_hip": 0.0057}, "command_rounding": {"LF_hip": "up"}}
+    top = ("# pupper-sysid recording", f"# bus: {json.dumps(bus)}")
+    (cut,) = load(write(tmp_path, rows(), top=top)).trials("LF_hip")
+    assert cut.truncation == Truncation(0.0057, "up")
+
+
+@pytest.mark.parametrize(
+    ("bus", "where"),
+    [
+        ({"command_quantum_rad": "wide"}, "command_quantum_rad"),
+        ({"command_quantum_rad": {"LF_hip": [1]}}, "command_quantum_rad"),
+        ({"command_rounding": {"LF_hip": "sideways"}}, "command_rounding.LF_hip"),
+        ({"count_zero_rad": {"LF_hip": "0"}}, "count_zero_rad.LF_hip"),
+        ({"read_time_doubt_s": -1}, "read_time_doubt_s"),
+        ({"speed_limit_rad_s": "fast"}, "speed_limit_rad_s"),
+        ({"kind": 7}, "kind"),
+    ],
+)
+def test_what_numbers_are_made_of_is_checked_in_the_header_s_bus(tmp_path, bus, where):
+    top = ("# pupper-sysid recording", f"# bus: {json.dumps(bus)}")
+    with pytest.raises(InputError, match=f"header, bus.{where}"):
+        load(write(tmp_path, rows(), top=top))
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        load(tmp_path / "nothing.csv")
+
+
+def test_rows_without_a_reading_are_kept_and_said(tmp_path):
+    recording = load(write(tmp_path, changed(3, "position_rad", "")))
+    assert any("missing" in w for w in recording.warnings)
+    assert np.isnan(recording.trials("LF_hip")[0].position_rad[3])
+
+
+def test_the_sweep_layout_is_recognised_by_its_columns(tmp_path):
+    path = tmp_path / "sweep.csv"
+    lines = ["time_s,phase,amp_rad,freq_hz,motor_idx,signal,command_rad,actual_rad"]
+    for f in (1.0, 2.0):
+        lines += [f"{0.02 * k},0,0.3,{f},1,0,{0.01 * k},{0.005 * k}" for k in range(30)]
+    path.write_text("\n".join(lines) + "\n")
+    recording = load(path)
+    first, second = recording.trials("LF_thigh")
+    assert recording.joints == ["LF_thigh"] and second.frequency_hz == 2.0
+    # 0.02 · 29 s of tone, then half a second of pause
+    assert second.send_time_s[0] == pytest.approx(0.58 + 0.5)
+    assert first.command_rad[10] == pytest.approx(0.785 + 0.1)  # absolute: standing pose added
+    assert first.initial_command_rad == 0.785
+    assert recording.metadata["bus"]["command_rounding"]["LF_thigh"] == "up"
+
+
+def test_the_playback_layout_has_a_trial_per_loop(tmp_path):
+    path = tmp_path / "playback.csv"
+    lines = ["global_step,loop,csv_step,time_s,LF_hip_command_rad,LF_hip_position_rad"]
+    lines += [f"{k},{k // 30},{k % 30},{0.04 * k},{0.1 * np.sin(k)},0.1" for k in range(90)]
+    path.write_text("\n".join(lines) + "\n")
+    recording = load(path)
+    assert [t.number for t in recording.trials("LF_hip")] == [0, 1, 2]
+    assert np.isnan(recording.trials("LF_hip")[0].frequency_hz)
+
+
+def test_header_values_are_json_and_nothing_else(tmp_path):
+    top = ("# pupper-sysid recording", "# seed: __import__('os')")
+    with pytest.raises(InputError, match="not JSON"):
+        load(write(tmp_path, rows(), top=top))

@@ -1,0 +1,436 @@
+"""The report: one self-contained page, honest tables, nothing overwritten, names escaped."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.text import Text
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.figure_style import save
+from pupper_sysid.common.page import Column, Section, Table, render
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.doctor.examination import Examination, JointExamination
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, RungResult
+from pupper_sysid.sysid.identify.calibration_file import to_calibration
+from pupper_sysid.sysid.identify.models import LADDER, rung
+from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
+from pupper_sysid.sysid.identify.scores import Scores
+from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse, TransferFunction
+from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, Interval, LagBudget
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.report import figures
+from pupper_sysid.sysid.report.advice import advice
+from pupper_sysid.sysid.report.figure_data import (
+    LONGEST_RUN,
+    hold_runs,
+    lag_parts,
+    response_errors,
+    tracks,
+    window,
+)
+from pupper_sysid.sysid.report.report import write_report
+from support.browser import looks_right, needs_chromium
+
+HOSTILE = '<script>alert("x")</script>&lt;'
+POLL_S, LOOP_S, AGE_S = 0.030, 0.020, 0.025
+LATTICE = PollLattice("lattice", POLL_S, 1e-5, 0.0, 0.01, 20.0, 1.0, 2 / 3)
+
+
+def interval(value: float) -> Interval:
+    return Interval(value, 0.9 * value, 1.1 * value)
+
+
+def fitted(name: str, scores: Scores, undecided: dict[str, str] | None = None) -> RungResult:
+    values = {p.name: p.nominal for p in rung(name).parameters}
+    return RungResult(
+        name, values, {k: interval(v) for k, v in values.items()}, undecided or {}, scores
+    )
+
+
+def trial_of(model: RungResult, frequency_hz: float) -> TrialData:
+    """A trial whose fresh readings are exactly what `model` does; rows show them `AGE_S` late."""
+    steps = 1000
+    command = 0.2 * np.sin(2 * np.pi * frequency_hz * TIME_STEP_S * np.arange(steps))
+    row = np.arange(20.0, 980.0, LOOP_S / TIME_STEP_S)
+    empty = np.zeros(0)
+    bare = TrialData(frequency_hz, 0.5, command, empty, empty, empty, empty, empty)
+    values = np.array([list(model.values.values())])
+    track = positions(rung(model.name), [(values, [bare])])[0][:, 0, 0]
+    measured = row - AGE_S / TIME_STEP_S
+    reading = look_up(track, measured)
+    return replace(
+        bare, sample_step=measured, sample_rad=reading, held_step=measured, row_step=row,
+        row_rad=reading,
+    )  # fmt: skip
+
+
+def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
+    scores = Scores(0.010, 0.011, 0.120, 0.020, 0.015, {1.0: 0.015, 2.0: 0.015}, 95.0)
+    naive_best = replace(scores, fresh=0.150, naive=0.100)
+    rungs = {r.name: fitted(r.name, scores) for r in LADDER}
+    tones = tuple(
+        FrequencyLag(f, 1.02, -15.0 * f, interval(0.042), 0.080, 0.88, n)
+        for n, f in enumerate((1.0, 2.0))
+    )
+    budget = LagBudget(
+        joint, interval(0.081), interval(0.0535), interval(0.044), 0.0275, 0.0095, tones,
+        {"integer cross-correlation, all rows": 0.076, "hold-aware (default)": 0.044}, LATTICE,
+        0.01, ("Only two frequencies.",),
+    )  # fmt: skip
+    made = JointCalibrationResult(
+        joint, "delayed_pd", rungs, Interval(0.024, 0.0205, 0.0275), budget, np.pi / 550,
+        Interval(0.01, 0.009, 0.011), {"paper": naive_best},
+        tuple(trial_of(rungs["delayed_pd"], f) for f in (1.0, 2.0)), ("Only two frequencies.",),
+    )  # fmt: skip
+    return replace(made, **changes)
+
+
+def recording_of(name: str = "sweep") -> Recording:
+    rows = 20
+    table = pd.DataFrame(
+        {
+            "send_time_s": LOOP_S * np.arange(rows),
+            "read_time_s": LOOP_S * np.arange(rows) + 1e-3,
+            "trial": 0,
+            "joint": "LF_thigh",
+            "frequency_hz": 1.0,
+            "command_rad": 0.5,
+            "position_rad": 0.5,
+        }
+    )
+    return Recording(table, {"bus": {"kind": "emulated"}}, name, None, "0" * 64)
+
+
+def examined_joint() -> JointExamination:
+    return JointExamination(
+        verdict="use with care", reasons=("two frequencies only.",), loop_period_ms=20.0,
+        jitter_ms=0.1, fresh_fraction=2 / 3, poll_period_ms=30.0, loss=0.0, z_score=20.0,
+        hit_rate=1.0, quantum_rad=0.0057, offset_rad=0.01, missing_fraction=0.0,
+        peak_command_rad_s=2.5, hold_histogram=(50, 50),
+    )  # fmt: skip
+
+
+def examined(name: str) -> Examination:
+    return Examination(name, (), {"LF_thigh": examined_joint()})
+
+
+def write(folder, name: str = "sweep", force: bool = False):
+    recordings, results = [recording_of(name)], {"LF_thigh": result_of()}
+    calibration = to_calibration(results, recordings, 3)
+    return write_report(
+        folder,
+        recordings,
+        results,
+        calibration,
+        [(name, examined(name))],
+        {"LF_thigh": response_of()},
+        force,
+    )
+
+
+class Page(HTMLParser):
+    """Tags, attributes and text of a page, as a browser would see them."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("report"), HOSTILE)
+
+
+@pytest.fixture(scope="module")
+def page(written):
+    return Page(written.path.read_text(encoding="utf-8"))
+
+
+def rows_of(written, name: str) -> list[dict[str, str]]:
+    (path,) = [p for p in written.tables if p.stem == name]
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_page_asks_for_nothing_but_itself(page, written):
+    loads = [
+        v for _, a in page.tags for k, v in a.items() if k in ("src", "srcset", "data", "action")
+    ]
+    links = [a["href"] or "" for _, a in page.tags if "href" in a]
+    assert loads and all(v is not None and v.startswith("data:image/png;base64,") for v in loads)
+    assert links and all(link.startswith("#") for link in links)
+    assert "url(" not in (html := written.path.read_text(encoding="utf-8"))
+    assert "@import" not in html
+    assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
+
+
+def test_every_link_of_the_contents_has_its_section(page):
+    anchors = {a["href"] for tag, a in page.tags if tag == "a"}
+    assert anchors == {f"#{a['id']}" for tag, a in page.tags if tag == "section"}
+
+
+def test_a_hostile_recording_name_is_shown_not_run(page):
+    assert HOSTILE in page.text
+
+
+def test_commands_in_sentences_are_set_as_code_and_escaped():
+    section = Section("a", "A", text=["Add `sweep --kind steps`, not `<b>`."], notes=["A ` alone."])
+    html = render("t", "s", [section])
+    assert "Add <code>sweep --kind steps</code>, not <code>&lt;b&gt;</code>." in html
+    assert "<li>A ` alone.</li>" in html
+    words = Column("", lambda row: row[""], "words")
+    table = Table("t", "T", (words,), ({"": "run `delay`"},))
+    assert "run <code>delay</code></td>" in render("t", "s", [Section("a", "A", tables=[table])])
+
+
+def test_the_doctors_verdict_is_on_the_page_in_sentences(page):
+    assert "Use with care. Two frequencies only." in page.text
+
+
+def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
+    images = [a for tag, a in page.tags if tag == "img"]
+    assert len(images) == len(written.figures)
+    assert all(len(a["alt"] or "") > 20 for a in images)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written.figures)
+    assert [p.stem for p in written.drawings] == [p.stem for p in written.figures]
+
+
+def test_the_finding_says_what_the_naive_lag_is_made_of(page):
+    assert (
+        "of the naive 81 ms, 28 ms is stale feedback, 10 ms command hold, 44 ms the servo: "
+        "24 ms dead time + 20 ms dynamics." in page.text
+    )
+
+
+def test_the_parts_of_the_lag_add_up_to_the_naive_lag():
+    p = lag_parts(result_of())
+    total = p.command_hold_ms + p.dead_time_ms.value + p.dynamics_ms + p.feedback_age_ms
+    assert total == pytest.approx(p.naive_ms.value)
+
+
+def test_lag_budget_csv_has_the_numbers_of_the_result(written):
+    (row,) = rows_of(written, "lag_budget")
+    assert row["joint"] == "LF_thigh"
+    assert float(row["naive_lag_ms"]) == pytest.approx(81.0)
+    assert float(row["feedback_age_ms"]) == pytest.approx(27.5)
+    assert float(row["dead_time_ms_low"]) == pytest.approx(20.5)
+    assert float(row["dynamics_ms"]) == pytest.approx(20.0)
+    # 20.5 to 27.5 ms in steps of 2 ms, rounded outward
+    assert (row["delay_steps_min"], row["delay_steps_max"]) == ("10", "14")
+
+
+def test_frequency_csv_has_one_row_per_tone(written):
+    rows = rows_of(written, "by_frequency")
+    assert [float(r["frequency_hz"]) for r in rows] == [1.0, 2.0]
+    assert float(rows[1]["phase_deg"]) == pytest.approx(-30.0)
+
+
+def test_transfer_function_csv_has_every_fitted_number(written):
+    rows = {r["parameter"]: r for r in rows_of(written, "transfer_functions")}
+    assert float(rows["delay_s"]["value_high"]) == pytest.approx(0.11)
+    assert float(rows["gain"]["chi2_per_dof"]) == 1.5
+
+
+def test_ladder_csv_scores_models_and_presets_and_marks_the_chosen_one(written):
+    rows = {r["model"]: r for r in rows_of(written, "ladder")}
+    assert list(rows) == [*(r.name for r in LADDER), "paper"]
+    assert [m for m, r in rows.items() if r["is_chosen"] == "True"] == ["delayed_pd"]
+    assert float(rows["paper"]["rmse_fresh_mrad"]) == pytest.approx(150.0)
+    assert float(rows["delayed_pd"]["rmse_naive_mrad"]) == pytest.approx(120.0)
+
+
+def test_the_page_says_whom_the_naive_score_would_have_chosen(page):
+    assert "On LF_thigh it prefers preset “paper”." in page.text
+
+
+def test_parameter_csv_carries_intervals_and_identifiability(written):
+    rows = {(r["part"], r["parameter"]): r for r in rows_of(written, "parameters")}
+    delay = rows["actuator", "delay_s"]
+    assert (float(delay["value"]), float(delay["low"]), delay["unit"]) == (0.024, 0.0205, "s")
+    # stiffness = ratio × armature, and armature = stall torque / effort ratio: 9000 × 0.35 / 450
+    stiffness = rows["actuator", "stiffness_nm_per_rad"]
+    assert float(stiffness["value"]) == pytest.approx(7.0)
+    assert stiffness["identified"] == "ratio only"
+    assert rows["actuator", "effort_limit_nm"]["identified"] == "no"
+
+
+def test_nothing_is_overwritten_without_force(tmp_path):
+    first = write(tmp_path)
+    victim = next(p for p in first.tables if p.stem == "ladder")
+    victim.write_text("mine")
+    for path in (first.path, *first.figures, *first.drawings, *first.tables):
+        if path != victim:
+            path.unlink()
+    with pytest.raises(InputError, match=r"ladder\.csv exists already.*--force"):
+        write(tmp_path)
+    assert victim.read_text() == "mine"
+    assert not first.path.exists(), "a refused report leaves no half of one behind"
+    write(tmp_path, force=True)
+    assert victim.read_text() != "mine"
+
+
+def test_advice_asks_for_steps_only_if_a_limit_was_not_reached():
+    open_limit = fitted("delayed_pd", result_of().rungs["delayed_pd"].scores,
+                        {"velocity_limit_rad_s": "never reached"})  # fmt: skip
+    without = advice({"LF_thigh": result_of()})
+    with_limit = advice(
+        {"LF_thigh": result_of(rungs={**result_of().rungs, "delayed_pd": open_limit})}
+    )
+    assert not any("--kind steps" in s for s in without)
+    assert any("limit of its speed" in s and "--kind steps" in s for s in with_limit)
+
+
+def test_advice_names_joints_with_the_same_gap_in_one_sentence():
+    same = {j: result_of(j) for j in ("LF_hip", "LF_thigh")}
+    said = advice(same)
+    assert sum("only 2 frequencies" in s for s in said) == 1
+    assert any(s.startswith("LF_hip, LF_thigh: only 2 frequencies (1, 2 Hz)") for s in said)
+
+
+def test_advice_names_the_joints_that_nothing_is_known_of():
+    (missing,) = [s for s in advice({"LF_thigh": result_of()}) if "Nothing is known" in s]
+    assert "LF_hip" in missing and "LF_thigh" not in missing
+
+
+def test_a_reading_that_is_late_is_wrong_by_speed_times_age():
+    for track in tracks(result_of()):
+        assert np.max(np.abs(track.fresh_error_rad)) < 1e-12
+        moving = np.abs(track.row_speed_rad_s) > 0.5 * np.max(np.abs(track.row_speed_rad_s))
+        slope = track.row_error_rad[moving] / track.row_speed_rad_s[moving]
+        # the joint turns within the reading's age, so only the average is the age
+        assert np.mean(slope) == pytest.approx(-AGE_S, rel=0.15)
+
+
+def test_a_window_lies_inside_its_trial_and_holds_whole_periods():
+    for track in tracks(result_of()):
+        start, stop = window(track, periods=1.5)
+        assert 0 <= start < stop <= track.time_s[-1] + 1e-9
+        assert (stop - start) * track.frequency_hz == pytest.approx(1.5)
+
+
+def test_the_last_bar_of_the_hold_runs_holds_all_longer_ones():
+    found = SimpleNamespace(loop_period_ms=20.0, hold_histogram=(3, 1) + (0,) * LONGEST_RUN + (2,))
+    runs = hold_runs([found, found], LATTICE)
+    assert runs.count.tolist() == [6, 2] + [0] * (LONGEST_RUN - 3) + [4]
+
+
+def test_predicted_hold_runs_follow_from_poll_and_loss():
+    # a poll every 1.5 rows that never fails is seen after 1 row or 2, equally often
+    runs = hold_runs([SimpleNamespace(loop_period_ms=20.0, hold_histogram=(50,))], LATTICE)
+    assert runs.expected == pytest.approx([25.0, 25.0] + [0.0] * (LONGEST_RUN - 2), abs=1e-9)
+    # half of the polls lost: gaps of 2, 4, 6 … rows, each half as frequent as the one before
+    halves = replace(LATTICE, period_s=0.040, loss=0.5)
+    runs = hold_runs([SimpleNamespace(loop_period_ms=20.0, hold_histogram=(64,))], halves)
+    assert runs.expected[:6] == pytest.approx([0, 32, 0, 16, 0, 8], abs=1e-6)
+
+
+def test_letters_in_figures_are_nine_points_or_more():
+    drawn = [
+        figures.lag_budget_figure({"LF_thigh": result_of()}),
+        figures.overlay_figure(result_of()),
+        figures.hold_histogram_figure({"LF_thigh": hold_runs([examined_joint()], LATTICE)}),
+        figures.residual_figure(result_of()),
+    ]
+    for figure in drawn:
+        sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]
+        assert sizes and min(sizes) >= 9.0
+
+
+def test_the_lag_figure_draws_the_parts_end_to_end():
+    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    bars = [p for p in figure.axes[0].patches if p.get_width() > 0]
+    ends = [(b.get_x(), b.get_x() + b.get_width()) for b in bars]
+    assert np.ravel(ends) == pytest.approx([0, 9.5, 9.5, 33.5, 33.5, 53.5, 53.5, 81.0])
+
+
+def response_of() -> FrequencyResponse:
+    """A tenth of the command, 100 ms late; 2 % uncertain along the response, 1 % across."""
+    frequency = np.array([1.0, 4.0, 8.0])
+    turned = 0.1 * np.exp(-2j * np.pi * 0.1 * frequency)
+    along = np.stack([turned.real, turned.imag], axis=-1) / 0.1
+    across = along[:, ::-1] * np.array([-1.0, 1.0])
+    covariance = np.stack(
+        [
+            0.002**2 * np.outer(u, u) + 0.001**2 * np.outer(v, v)
+            for u, v in zip(along, across, strict=True)
+        ]
+    )
+    fit = TransferFunction(
+        "FOPDT",
+        {"gain": interval(0.1), "delay_s": interval(0.1), "time_constant_s": interval(1e-3)},
+        1.5,
+    )
+    return FrequencyResponse(
+        "LF_thigh", frequency, np.full(3, 0.2), turned, 0.5 * turned, covariance, None, (fit,)
+    )
+
+
+def test_the_bode_figure_shows_gain_in_decibels_and_unwrapped_phase():
+    gain, phase = figures.bode_figure({"LF_thigh": response_of()}).axes
+    assert gain.lines[0].get_ydata() == pytest.approx([-20.0] * 3)
+    assert phase.lines[0].get_ydata() == pytest.approx([-36.0, -144.0, -288.0])
+
+
+def test_bode_intervals_follow_from_the_covariance():
+    gain_db, phase_deg = response_errors(response_of())
+    # 90 % of a Gaussian lies within 1.645 standard deviations; 1 % is 0.0869 dB or 0.573 degrees
+    assert gain_db == pytest.approx(np.full(3, 1.645 * 2 * 0.08686), rel=1e-3)
+    assert phase_deg == pytest.approx(np.full(3, 1.645 * 0.57296), rel=1e-3)
+
+
+def test_a_figure_is_written_as_its_ending_says(tmp_path):
+    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    save(figure, tmp_path / "a.svg")
+    drawing = ElementTree.parse(tmp_path / "a.svg").getroot()
+    assert drawing.tag == "{http://www.w3.org/2000/svg}svg"
+    width, height = (float(drawing.attrib[k].removesuffix("pt")) for k in ("width", "height"))
+    assert (width, height) == pytest.approx(72 * figure.get_size_inches())
+    save(figures.lag_budget_figure({"LF_thigh": result_of()}), tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    with pytest.raises(InputError, match=r"a\.jpg: pictures are written as \.png or \.svg"):
+        save(figure, tmp_path / "a.jpg")
+
+
+def test_saving_a_figure_refuses_to_overwrite(tmp_path):
+    path = tmp_path / "figure.png"
+    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    save(figure, path)
+    with pytest.raises(InputError, match="exists already"):
+        save(figure, path)
+
+
+def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path):
+    unknown = replace(LATTICE, kind="unresolved", period_s=np.nan, loss=np.nan)
+    budget = replace(result_of().budget, lattice=unknown)
+    results, recordings = {"LF_thigh": result_of(budget=budget)}, [recording_of()]
+    made = write_report(
+        tmp_path, recordings, results, to_calibration(results, recordings, 0), [], {}
+    )
+    (row,) = rows_of(made, "lag_budget")
+    assert row["poll_period_ms"] == row["loss"] == ""
+    assert not re.search(r">\s*-?(nan|inf|None)\s*<", made.path.read_text(encoding="utf-8"))
+
+
+@needs_chromium
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [375, 1280])
+def test_in_a_browser_nothing_overflows_or_complains(written, tmp_path, width, dark):
+    looks_right(written.path, tmp_path, width, dark)

@@ -1,0 +1,285 @@
+"""A recording holds what was sent and read, survives its process, and leaves the robot safe."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError, SafetyStop
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.moves import GENTLE_RAD_S
+from pupper_sysid.hardware.safety.limits import PositionLimits
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, plan
+from pupper_sysid.sysid.sweep.playback import playback
+from pupper_sysid.sysid.sweep.recorder import REST_S, record
+
+PERIOD = 0.019
+
+
+def emulated(seed: int = 1, **spec: float) -> EmulatedBus:
+    rng = np.random.default_rng(seed)
+    return EmulatedBus(draw_robot(rng, RobotSpec(**spec)), rng)
+
+
+def short_sweep(joints=("LF_hip",), frequencies=(2.0, 3.0), **more) -> Plan:
+    return plan("sine", list(joints), list(frequencies), duration_s=1.0, **more)
+
+
+class ScriptedBus:
+    """Perfect servos: a read gives the last goal. Logs calls; is slow or fails on demand."""
+
+    name = "scripted"
+    joint_names = JOINT_NAMES
+
+    def __init__(self, start: np.ndarray, slow_at: int = -1, fail_at: int = -1, raises=None):
+        self.metadata = {"kind": "scripted"}
+        self.limits = PositionLimits(np.full(12, -np.inf), np.full(12, np.inf))
+        self.goal, self.time, self.calls = start.astype(float), 0.0, []
+        self.written: list[tuple[float, np.ndarray]] = []
+        self._slow_at, self._fail_at, self._raises = slow_at, fail_at, raises
+
+    def now(self):
+        return self.time
+
+    def sleep_until(self, time_s):
+        self.time = max(self.time, time_s)
+
+    def write(self, position_rad):
+        if len(self.written) == self._fail_at:
+            self._fail_at = -1
+            raise self._raises
+        self.time += 0.055 if len(self.written) == self._slow_at else 0.0
+        self.goal = position_rad.copy()
+        self.written.append((self.time, self.goal))
+        return Sent(self.time, self.goal)
+
+    def read(self):
+        self.time += 0.001
+        return BusSample(np.full(12, self.time), self.goal.copy(), np.arange(12))
+
+    def torque(self, on):
+        self.calls.append(f"torque {on}")
+        return True
+
+    def close(self):
+        self.calls.append("close")
+
+
+POSE = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
+
+
+def test_a_recording_holds_every_command_and_reading_of_every_trial(tmp_path):
+    bus = ScriptedBus(POSE)
+    made = short_sweep(["LF_hip", "RB_calf"])
+    path = record(bus, made, tmp_path / "a.csv", loop_period_s=PERIOD, metadata={"seed": 5})
+    recording = load(path)
+    assert recording.joints == ["LF_hip", "RB_calf"]
+    assert recording.metadata["seed"] == 5
+    assert recording.metadata["bus"]["kind"] == "scripted"
+    assert recording.metadata["excitation"]["kind"] == "sine"
+    assert recording.metadata["start_pose_rad"] == DEFAULT_POSE
+    trials = [*recording.trials("LF_hip"), *recording.trials("RB_calf")]
+    assert [t.frequency_hz for t in trials] == [2.0, 3.0, 2.0, 3.0]
+    for trial, planned in zip(trials, made.trials, strict=True):
+        assert len(trial.send_time_s) == np.ceil((1.0 + LEAD_IN_S) / PERIOD)
+        # a perfect servo's reading is the command, read 1 ms after it was sent
+        np.testing.assert_allclose(trial.position_rad, trial.command_rad, atol=1e-7)
+        np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.001, atol=1e-6)
+        assert set(trial.position_count) == {JOINT_NAMES.index(trial.joint)}
+        elapsed = trial.send_time_s - trial.send_time_s[0]
+        np.testing.assert_allclose(elapsed, PERIOD * np.arange(len(elapsed)), atol=1e-6)
+        expected = DEFAULT_POSE[trial.joint] + planned.offset(elapsed)
+        np.testing.assert_allclose(trial.command_rad, expected, atol=1e-5)
+    footer = recording.metadata["completed"]
+    assert footer["rows"] == len(recording.table) == footer["loop"]["ticks"]
+    assert footer["loop"]["missed_deadlines"] == 0
+    assert footer["loop"]["mean_period_s"] == pytest.approx(PERIOD, abs=1e-6)
+
+
+def test_other_joints_rest_and_moves_between_trials_are_gentle(tmp_path):
+    bus = ScriptedBus(POSE + 0.5)
+    record(bus, short_sweep(frequencies=[2.3]), tmp_path / "a.csv", loop_period_s=PERIOD)
+    times = np.array([t for t, _ in bus.written])
+    goals = np.stack([g for _, g in bus.written])
+    recorded = load(tmp_path / "a.csv").trials("LF_hip")[0].send_time_s
+    inside = (times >= recorded[0] - 1e-9) & (times <= recorded[-1] + 1e-9)
+    np.testing.assert_allclose(goals[inside][:, 1:], np.tile(POSE[1:], (inside.sum(), 1)))
+    before = times < recorded[0] - 1e-9
+    way = np.abs(np.diff(goals[before], axis=0, prepend=[POSE + 0.5])).max(axis=1)
+    allowed = GENTLE_RAD_S * np.diff(times[before], prepend=0.0)
+    assert (way <= 1.01 * allowed + 1e-12).all() and way.max() > 0.5 * GENTLE_RAD_S * PERIOD
+    resting = np.abs(goals[before] - POSE).max(axis=1) < 1e-12
+    assert recorded[0] - times[before][np.argmax(resting)] >= REST_S - 1e-9
+    np.testing.assert_allclose(goals[-1], POSE + 0.5, atol=1e-12, err_msg="where it was found")
+    # parking ticks every 20 ms and a read takes 1 ms
+    assert np.abs(np.diff(goals[~before & ~inside], axis=0)).max() <= 1.01 * GENTLE_RAD_S * 0.021
+    assert bus.calls == ["torque True", "torque False", "close"]
+
+
+def test_a_late_tick_is_counted_and_the_tone_keeps_its_phase(tmp_path):
+    late = ScriptedBus(POSE, slow_at=40)
+    made = short_sweep(frequencies=[3.0])
+    recording = load(record(late, made, tmp_path / "a.csv", loop_period_s=PERIOD))
+    trial = recording.trials("LF_hip")[0]
+    elapsed = trial.send_time_s - trial.send_time_s[0]
+    # 56 ms are 2.9 periods: one tick is left out, the next comes late, the rest on time
+    assert recording.metadata["completed"]["loop"]["missed_deadlines"] == 1
+    slow = int(np.argmax(np.diff(elapsed))) + 1
+    others = np.delete(np.arange(len(elapsed)), slow)  # the slow write stamps its end
+    expected = DEFAULT_POSE["LF_hip"] + made.trials[0].offset(elapsed)
+    np.testing.assert_allclose(trial.command_rad[others], expected[others], atol=1e-5)
+    ticks = elapsed[slow + 3 :] / PERIOD
+    np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-3, err_msg="the schedule drifted")
+
+
+@pytest.mark.parametrize("raises", [KeyboardInterrupt(), BusError("cable out")])
+def test_an_interrupted_recording_keeps_its_rows_and_switches_the_torque_off(tmp_path, raises):
+    at_rest = round(REST_S / PERIOD + 0.5)  # written before the trial, not recorded
+    bus = ScriptedBus(POSE, fail_at=at_rest + 60, raises=raises)
+    with pytest.raises(type(raises)):
+        record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=PERIOD)
+    assert bus.calls[-2:] == ["torque False", "close"]
+    recording = load(tmp_path / "a.csv")
+    assert "completed" not in recording.metadata
+    assert len(recording.table) == 60
+    if isinstance(raises, KeyboardInterrupt):
+        np.testing.assert_allclose(bus.written[-1][1], POSE, atol=1e-12)
+
+
+def test_a_sweep_that_nobody_controls_goes_limp_where_it_is(tmp_path):
+    at = round(REST_S / PERIOD + 0.5) + 20
+    bus = ScriptedBus(POSE, fail_at=at, raises=SafetyStop("the loop missed 10 deadlines in a row"))
+    with pytest.raises(SafetyStop):
+        record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=PERIOD)
+    assert len(bus.written) == at, "it was driven on after the stop"
+    assert bus.calls[-2:] == ["torque False", "close"]
+
+
+def test_nothing_moves_if_the_file_exists_already(tmp_path):
+    (tmp_path / "a.csv").write_text("precious")
+    bus = ScriptedBus(POSE)
+    with pytest.raises(FileExistsRefusal):
+        record(bus, short_sweep(), tmp_path / "a.csv")
+    assert bus.written == [] and bus.calls == ["close"]
+    assert (tmp_path / "a.csv").read_text() == "precious"
+    record(ScriptedBus(POSE), short_sweep(), tmp_path / "a.csv", force=True)
+    assert len(load(tmp_path / "a.csv").table) > 100
+
+
+def test_a_plan_for_joints_that_the_bus_has_not_is_refused(tmp_path):
+    bus = ScriptedBus(POSE)
+    with pytest.raises(InputError, match="tail"):
+        record(bus, plan("sine", ["tail"], [1.0]), tmp_path / "a.csv")
+    with pytest.raises(InputError, match="no trials"):
+        record(bus, Plan(()), tmp_path / "a.csv")
+    with pytest.raises(InputError, match="loop_period_s"):
+        record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=0.0)
+    assert bus.calls == ["close"] * 3 and not list(tmp_path.iterdir())
+
+
+def test_a_robot_that_never_says_where_it_is_is_not_moved(tmp_path):
+    silent = POSE.copy()
+    silent[3] = np.nan
+    bus = ScriptedBus(silent)
+    with pytest.raises(BusError, match="RF_hip"):
+        record(bus, short_sweep(), tmp_path / "a.csv")
+    assert bus.written == [] and bus.calls == ["close"]
+
+
+def test_progress_runs_from_nothing_to_the_whole(tmp_path):
+    seen = []
+    made = short_sweep()
+    record(ScriptedBus(POSE), made, tmp_path / "a.csv", progress=lambda *call: seen.append(call))
+    done = np.array([d for d, _, _ in seen])
+    assert done[0] == 0 and (np.diff(done) >= 0).all()
+    assert done[-1] == pytest.approx(made.duration_s, abs=0.03)
+    assert {total for _, total, _ in seen} == {made.duration_s}
+    assert "LF_hip at 3 Hz" in {what for _, _, what in seen}
+
+
+def test_a_played_back_file_moves_all_its_joints_at_once(tmp_path):
+    commands = pd.DataFrame(
+        {
+            "time_s": 0.04 * np.arange(10),
+            "LF_hip_command_rad": np.linspace(0.1, 0.2, 10),
+            "LF_calf_command_rad": np.linspace(-1.4, -1.6, 10),
+        }
+    )
+    commands.to_csv(tmp_path / "gait.csv", index=False)
+    bus = ScriptedBus(POSE)
+    recording = load(record(bus, playback(tmp_path / "gait.csv"), tmp_path / "a.csv"))
+    for joint in ("LF_hip", "LF_calf"):
+        (trial,) = recording.trials(joint)
+        wanted = commands[f"{joint}_command_rad"].to_numpy()
+        assert trial.initial_command_rad == pytest.approx(wanted[0])
+        np.testing.assert_allclose(np.unique(trial.command_rad), np.sort(wanted), atol=1e-7)
+
+
+def test_the_same_seed_records_the_same_rows_and_another_seed_others(tmp_path):
+    tables = [
+        load(record(emulated(seed), short_sweep(), tmp_path / f"{i}.csv")).table
+        for i, seed in enumerate((3, 3, 4))
+    ]
+    pd.testing.assert_frame_equal(tables[0], tables[1])
+    assert not tables[0]["position_rad"].equals(tables[2]["position_rad"])
+
+
+def test_each_recorded_row_has_its_truth_and_the_file_does_not_tell_it(tmp_path):
+    bus = emulated()
+    path = record(bus, short_sweep(["LF_hip", "RB_calf"]), tmp_path / "sweep.csv")
+    bus.write_truth(tmp_path / "sweep")
+    rows, truth = load(path).table, pd.read_csv(tmp_path / "sweep.truth.csv")
+    merged = rows.merge(truth, on=["read_time_s", "joint"])
+    assert len(merged) == len(rows)
+    age = merged["read_time_s"] - merged["reading_time_s"]
+    assert (age >= 0).all() and age.mean() > 0.015
+    assert (merged["position_rad"] - merged["true_position_rad"]).std() > 0.02
+    said = path.read_text()
+    for secret in ("0.02685", "0.42", "delay", "stiffness", "loss"):
+        assert secret not in said
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import numpy as np
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
+rng = np.random.default_rng(1)
+bus = EmulatedBus(draw_robot(rng), rng, real_time=True)
+record(bus, plan("sine", ["LF_hip"], [2.0], duration_s=60.0), Path(sys.argv[1]))
+"""
+
+
+def test_a_process_killed_in_mid_sweep_leaves_a_recording(tmp_path):
+    path = tmp_path / "killed.csv"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
+    try:
+        until = time.monotonic() + 60
+        while not (path.exists() and path.read_text().count("LF_hip,") > 60):
+            assert time.monotonic() < until and process.poll() is None
+            time.sleep(0.05)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    recording = load(path)
+    assert "completed" not in recording.metadata
+    trial = recording.trials("LF_hip")[0]
+    assert len(trial.send_time_s) >= 60
+    assert recording.loop_period_s == pytest.approx(PERIOD, rel=0.1)
+    # real time passed as the recording says
+    assert np.ptp(trial.send_time_s) > 0.9 * PERIOD * len(trial.send_time_s)
+    assert recording.warnings, "an unfinished recording must say so"
