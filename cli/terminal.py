@@ -20,6 +20,7 @@ from rich.text import Text
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
+from pupper_sysid.common.results import plain
 from pupper_sysid.sysid.recordings.recording import Recording, load, newest_recording
 
 if TYPE_CHECKING:
@@ -51,20 +52,8 @@ def pick_joints(recordings: Sequence[Recording], text: str) -> list[str]:
 
 
 def print_json(value: Any) -> None:
-    """One JSON object on stdout; numbers that are none become null."""
-    print(json.dumps(_finite(value), indent=2, ensure_ascii=False))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    """One JSON object on stdout; non-finite numbers become null."""
+    print(json.dumps(plain(value), indent=2, ensure_ascii=False))
 
 
 def warn(sentences) -> None:

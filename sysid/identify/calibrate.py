@@ -20,6 +20,7 @@ from zlib import crc32
 import numpy as np
 from scipy.stats import norm
 
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.joints import JOINT_NAMES, in_order
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, quantum, readings
@@ -34,7 +35,7 @@ from pupper_sysid.sysid.identify.search import (
     integrated_autocorrelation_time,
     leave_one_out_folds,
 )
-from pupper_sysid.sysid.lag.lag_budget import LEVEL, Interval, LagBudget, lag_budget
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 _PREFERENCE = 1.05

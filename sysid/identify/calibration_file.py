@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from pupper_sysid.common.files import versions
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import (
     PRESETS,
@@ -36,7 +37,6 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameter
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, RungResult
 from pupper_sysid.sysid.identify.search import PREFERRED
-from pupper_sysid.sysid.lag.lag_budget import Interval
 from pupper_sysid.sysid.recordings.recording import Recording
 
 STALL_TORQUE_NM = 0.35

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.identify.models import Rung
 from pupper_sysid.sysid.identify.output_error import (
@@ -35,7 +36,6 @@ from pupper_sysid.sysid.identify.output_error import (
     look_up,
     positions,
 )
-from pupper_sysid.sysid.lag.lag_budget import LEVEL, Interval
 
 PREFERRED = "delayed_pd"
 """The rung that simulators and training run."""
@@ -222,7 +222,7 @@ def dead_time_profile(
     Returns
     -------
     Interval
-        Dead time [s] at the confidence `sysid.lag.lag_budget.LEVEL`.
+        Dead time [s] at the confidence `common.interval.LEVEL`.
     Fit
         `best`, or a better one.
     """

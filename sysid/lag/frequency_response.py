@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
-from pupper_sysid.sysid.lag.lag_budget import LEVEL, Interval, tone_lags
+from pupper_sysid.sysid.lag.lag_budget import tone_lags
 from pupper_sysid.sysid.lag.multisine import multisine_responses
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.recordings.recording import Trial

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
@@ -36,9 +37,6 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
 
-LEVEL = 0.90
-"""Coverage of every interval."""
-
 LONGEST_LAG_S = 0.5
 
 _BLOCK_S = 0.5  # of the bootstrap where there are no periods
@@ -46,25 +44,6 @@ _ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
 _MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
 _FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
-
-
-@dataclass(frozen=True)
-class Interval:
-    """An estimate with its 90 % interval, both in the same unit."""
-
-    value: float
-    low: float
-    high: float
-
-    @classmethod
-    def of_draws(cls, value: float, draws: NDArray[np.float64]) -> Interval:
-        """The interval that holds the middle 90 % of `draws`."""
-        low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-        return cls(float(value), float(low), float(high))
-
-    def widened(self, by: float) -> Interval:
-        """The interval if all of it may be off by as much as `by`, to either side."""
-        return Interval(self.value, self.low - by, self.high + by)
 
 
 @dataclass(frozen=True)

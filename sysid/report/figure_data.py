@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
 from pupper_sysid.sysid.identify.models import rung
 from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.search import PREFERRED
-from pupper_sysid.sysid.lag.lag_budget import LEVEL, Interval
 
 if TYPE_CHECKING:  # the second brings python-control, which is not needed here
     from pupper_sysid.sysid.doctor.examination import JointExamination

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.calibrate import DeadTime, JointCalibrationResult, RungResult
 from pupper_sysid.sysid.identify.search import PREFERRED
-from pupper_sysid.sysid.lag.lag_budget import Interval
 
 
 def delay_json(found: dict[str, DeadTime]) -> dict[str, Any]:

@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
 from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
 from pupper_sysid.sysid.identify.scores import Scores
-from pupper_sysid.sysid.lag.lag_budget import Interval
 from pupper_sysid.sysid.report.figure_data import lag_parts
 
 if TYPE_CHECKING:  # it brings python-control, which a table does not need

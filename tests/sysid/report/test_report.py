@@ -16,6 +16,7 @@ from matplotlib.text import Text
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import save
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.page import Column, Section, Table, render
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.examination import Examination, JointExamination
@@ -26,7 +27,7 @@ from pupper_sysid.sysid.identify.models import LADDER, rung
 from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.scores import Scores
 from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse, TransferFunction
-from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, Interval, LagBudget
+from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures
 from pupper_sysid.sysid.report.advice import advice

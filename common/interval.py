@@ -1,0 +1,30 @@
+"""An estimate with its 90 % interval: the one form in which results and files carry it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEVEL = 0.90
+"""Coverage of every interval of this project."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 90 % interval, all three in the same unit."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of_draws(cls, value: float, draws: NDArray[np.float64]) -> Interval:
+        """The interval that holds the middle 90 % of `draws`."""
+        low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        return cls(float(value), float(low), float(high))
+
+    def widened(self, by: float) -> Interval:
+        """The interval with `by` added on either side."""
+        return Interval(self.value, self.low - by, self.high + by)
