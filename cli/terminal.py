@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from pupper_sysid.cli.flags import spell
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.common.results import plain
@@ -59,7 +60,7 @@ def print_json(value: Any) -> None:
 def warn(sentences) -> None:
     """Sentences the user should read, on stderr."""
     for sentence in sentences:
-        err.print(Text.assemble(("warning: ", "yellow"), sentence))
+        err.print(Text.assemble(("warning: ", "yellow"), spell(sentence)))
 
 
 def table(title: str, *columns: str) -> Table:

@@ -18,6 +18,7 @@ from typing import TypeVar
 import tyro
 from rich.text import Text
 
+from pupper_sysid.cli.flags import remember, spell
 from pupper_sysid.cli.terminal import err, out
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import versions
@@ -44,6 +45,7 @@ def run_program(
             options, args=rest, description=description, prog=program,
             config=(tyro.conf.FlagCreatePairsOff,),
         )  # fmt: skip
+        remember(parsed)
         need_seed(parsed)
         work(parsed)
 
@@ -80,7 +82,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     except PupperError as error:
         if debug:
             raise
-        _tell(str(error))
+        _tell(spell(str(error)))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         err.print("Stopped.")

@@ -26,6 +26,7 @@ from pupper_sysid.cli.commands.report import Report
 from pupper_sysid.cli.commands.scan import Scan
 from pupper_sysid.cli.commands.sindy import Sindy
 from pupper_sysid.cli.commands.sweep import Sweep
+from pupper_sysid.cli.flags import remember
 from pupper_sysid.cli.user_errors import end_politely, need_seed, user_errors
 
 Command = (
@@ -63,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=rest or ["--help"],
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
+        remember(command)
         need_seed(command)
         end_politely()
         command.run()

@@ -21,6 +21,7 @@ import tyro
 import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from pupper_sysid.cli.flags import remember
 from pupper_sysid.cli.terminal import err, out, print_json
 from pupper_sysid.cli.user_errors import user_errors
 from pupper_sysid.common.errors import InputError
@@ -61,7 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, "pupper-train") as rest:
-        _run(_parse(rest), rest)
+        options = _parse(rest)
+        remember(options)
+        _run(options, rest)
 
 
 def _parse(given: list[str]) -> Options:
