@@ -21,7 +21,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
-from test_servo_file import JOINTS, KINDS, P, arrays, commands, contract, saved
 
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
@@ -33,6 +32,7 @@ from pupper_sysid.sysid.export.servo_networks import (
     to_onnx,
 )
 from support.command_line import run
+from support.saved_servo_models import JOINTS, KINDS, P, arrays, commands, contract, saved
 
 LEARNED = [kind for kind in KINDS if kind not in ("delayed-pd", "sindy")]
 STEPS, ENVIRONMENTS = 30, 4

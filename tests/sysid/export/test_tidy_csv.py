@@ -36,7 +36,7 @@ def with_one_measurement() -> Calibration:
     )
     measured = hip.model_copy(
         update={
-            "actuator": hip.actuator.model_copy(update={"delay_s": delay}),
+            "actuator": hip.actuator.model_copy(update={"dead_time_s": delay}),
             "scores": Scores(rmse_free_run_held_rad=0.0136),
         }
     )
@@ -56,11 +56,11 @@ def test_a_calibration_becomes_one_row_per_joint_and_quantity():
 
 def test_a_number_keeps_its_value_interval_and_reason_exactly():
     table = table_of(to_csv(with_one_measurement()))
-    row = table[(table.joint == "LF_hip") & (table.quantity == "delay_s")].iloc[0].to_dict()
+    row = table[(table.joint == "LF_hip") & (table.quantity == "dead_time_s")].iloc[0].to_dict()
     assert row == {
         "joint": "LF_hip",
         "part": "actuator",
-        "quantity": "delay_s",
+        "quantity": "dead_time_s",
         "unit": "s",
         "value": 0.1 + 0.2,
         "low": 0.25,

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_servo_data import everything, recording, trial
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.command_network import CommandNetwork
@@ -22,6 +21,7 @@ from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.scores import tracks
 from pupper_sysid.sysid.servo_fit.training import Checkpoint, Recipe, train
 from pupper_sysid.sysid.servo_fit.windows import WINDOW, Samples, samples, training_sets
+from support.servo_recordings import everything, recording, trial
 
 P = 0.04  # with fewer taps than at 50 Hz, the same claims cost less
 JOINTS = ("LF_hip", "RB_calf")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_servo_data import JOINT, P, everything, ramp, recording, sine, trial
 
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.sysid.servo_fit.data import servo_data
@@ -20,6 +19,7 @@ from pupper_sysid.sysid.servo_fit.scores import (
     rms,
     tracks,
 )
+from support.servo_recordings import JOINT, P, everything, ramp, recording, sine, trial
 
 ONE, ZERO = np.ones(1), np.zeros(1)
 
