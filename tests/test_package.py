@@ -1,28 +1,30 @@
-"""The package as a whole: its examples run, its list of folders is complete."""
+"""The package as a whole: rooms, imports, wheel, examples in docstrings."""
 
 from __future__ import annotations
 
+import ast
 import doctest
-import importlib
-import tomllib
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-ROOMS = [folder for folder in SETUPTOOLS["package-dir"].values() if folder != "api"]
-MODULES = sorted(
-    "pupper_sysid." + path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
-    for room in ROOMS
-    for path in (ROOT / room).rglob("*.py")
-    if path.stem != "__init__"
-)
+from support.package import FILES, FOLDERS, MODULES, PROJECT, ROOMS, ROOT
+
+SETUPTOOLS = PROJECT["tool"]["setuptools"]
+MOST_MODULES = 14
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings_run(name):
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
+    assert doctest.testmod(import_module(name)).failed == 0
 
 
 def test_every_folder_with_modules_is_packaged():
@@ -33,3 +35,132 @@ def test_every_folder_with_modules_is_packaged():
     }
     packaged = {name.removeprefix("pupper_sysid.") for name in SETUPTOOLS["packages"]}
     assert folders == packaged - {"pupper_sysid"}
+
+
+def test_no_folder_holds_more_modules_than_a_reader_can_survey():
+    counts = {
+        path.parent: len(list(path.parent.glob("*.py")))
+        for room in FOLDERS.values()
+        for path in (ROOT / room).rglob("*.py")
+    }
+    assert {folder: n for folder, n in counts.items() if n > MOST_MODULES} == {}
+
+
+# ----- imports
+
+
+def test_rooms_import_as_the_contract_says(tmp_path):
+    """`[tool.importlinter]` in pyproject.toml; imports inside functions count."""
+    linter = Path(sys.executable).with_name("lint-imports")
+    if not linter.exists():
+        pytest.skip("import-linter is not installed")
+    links = tmp_path / "pupper_sysid"
+    links.mkdir()
+    for path in (ROOT / FOLDERS["pupper_sysid"]).glob("*.py"):
+        (links / path.name).symlink_to(path)
+    for room in ROOMS:
+        (links / room).symlink_to(ROOT / room)
+    done = subprocess.run(
+        [linter, "--no-cache", "--config", ROOT / "pyproject.toml"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_modules_import_each_other_without_circles():
+    graph = {name: set(imported_modules(path)) - {name} for name, path in FILES.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as circle:
+        pytest.fail(" -> ".join(circle.args[1]))
+
+
+def test_a_circle_would_be_found():
+    with pytest.raises(CycleError):
+        TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """Modules of the package that a file imports when it is imported itself."""
+    waiting: list[ast.AST] = [ast.parse(path.read_text())]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            yield from (name if name in FILES else node.module for name in names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        waiting += ast.iter_child_nodes(node)
+
+
+# ----- wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """The wheel, built from a copy of the sources."""
+    pytest.importorskip("build")
+    copy = tmp_path_factory.mktemp("sources")
+    no_caches = shutil.ignore_patterns("__pycache__")
+    for folder in (*FOLDERS.values(), "reproduction", "tests"):
+        shutil.copytree(ROOT / folder, copy / folder, ignore=no_caches)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    done = subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist", copy],
+        cwd=copy, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    (built,) = (copy / "dist").glob("*.whl")
+    return built
+
+
+def test_the_wheel_has_one_top_level_name_and_all_its_files(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        (top_level,) = (n for n in names if n.endswith(".dist-info/top_level.txt"))
+        assert archive.read(top_level).decode().split() == ["pupper_sysid"]
+    assert {name.split("/")[0] for name in names} == {"pupper_sysid", top_level.split("/")[0]}
+    data = {
+        path.relative_to(ROOT).as_posix()
+        for room in FOLDERS.values()
+        for path in (ROOT / room).rglob("*")
+        if path.is_file() and path.suffix not in (".py", ".pyc")
+    }
+    assert any(name.endswith(".j2") for name in data) and any("presets/" in n for n in data)
+    modules = {path.relative_to(ROOT).as_posix() for path in FILES.values()}
+    inside = {name.removeprefix("pupper_sysid/") for name in names}
+    assert {name.removeprefix("api/") for name in data | modules} <= inside
+
+
+def test_the_wheel_works_beside_folders_of_the_same_names(wheel, tmp_path):
+    """A user's `common.py`, `sim/` and `cli.py` lie where Python looks first."""
+    installed, user = tmp_path / "installed", tmp_path / "user"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(installed)
+    user.mkdir()
+    decoy = 'raise ImportError("the file of a user, not of pupper-sysid")\n'
+    for name in ("common", "cli", "hardware", "servo_models"):
+        (user / f"{name}.py").write_text(decoy)
+    for name in ("sim", "sysid", "policies"):
+        (user / name).mkdir()
+        (user / name / "__init__.py").write_text(decoy)
+
+    def run(code: str, *arguments: object) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *map(str, arguments)],
+            cwd=user, env=os.environ | {"PYTHONPATH": str(installed)},
+            capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    assert str(installed) in run("import pupper_sysid; print(pupper_sysid.__file__)")
+    program = "from pupper_sysid.cli.programs.pupper_sysid import main; main()"
+    assert run(program, "--version").startswith("pupper-sysid")
+    assert "LF_hip" in run(program, "doctor", ROOT / "data/samples/sweep.csv")

@@ -1,0 +1,79 @@
+"""Docstrings of every public name of the wheel follow numpydoc.
+
+The checks are those of `[tool.numpydoc_validation]` in pyproject.toml. Beyond them, a section
+named Parameters lists every parameter; names of the front door have all their sections.
+"""
+
+from __future__ import annotations
+
+import inspect
+import tomllib
+from collections.abc import Iterator
+from importlib import import_module
+
+import pytest
+
+import pupper_sysid
+from support.package import MODULES, ROOT
+
+validate = pytest.importorskip("numpydoc.validate").validate
+
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["numpydoc_validation"]
+CHECKS = set(SETTINGS["checks"])
+COMPLETE = CHECKS | {"PR01", "RT01", "YD01"}
+FRONT_DOOR = sorted(getattr(pupper_sysid, "__all__", []))
+
+
+def public_names(module: str) -> Iterator[str]:
+    """A module, its public classes and functions, and their public methods and properties."""
+    yield module
+    for name, item in vars(import_module(module)).items():
+        if name.startswith("_") or getattr(item, "__module__", None) != module:
+            continue
+        if inspect.isfunction(item):
+            yield f"{module}.{name}"
+        elif inspect.isclass(item):
+            yield f"{module}.{name}"
+            for member, value in vars(item).items():
+                value = getattr(value, "__func__", value)  # class and static methods
+                if not member.startswith("_") and isinstance(value, DOCUMENTED_MEMBERS):
+                    yield f"{module}.{name}.{member}"
+
+
+DOCUMENTED_MEMBERS = (type(public_names), property)
+
+
+def violations(name: str, checks: set[str]) -> list[str]:
+    """Sentences of numpydoc's validation of one name, for these checks only."""
+    found = validate(name)
+    listed = "\nParameters\n" in inspect.cleandoc(found["docstring"] or "")
+    wanted = checks | {"PR01"} if listed else checks
+    return [f"{name}: {code} {text}" for code, text in found["errors"] if code in wanted]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_public_docstrings_are_clean(module):
+    assert [v for name in public_names(module) for v in violations(name, CHECKS)] == []
+
+
+@pytest.mark.parametrize("name", FRONT_DOOR)
+def test_names_of_the_front_door_have_all_sections(name):
+    item = getattr(pupper_sysid, name)
+    if callable(item):
+        assert violations(f"{item.__module__}.{item.__qualname__}", COMPLETE) == []
+
+
+def test_a_missing_parameter_would_be_found(monkeypatch):
+    def measure(first: int, second: int) -> None:
+        """Measure.
+
+        Parameters
+        ----------
+        first : int
+            The first.
+        """
+
+    measure.__qualname__ = "measure"
+    monkeypatch.setattr(pupper_sysid, "measure", measure, raising=False)
+    (found,) = violations("pupper_sysid.measure", set())
+    assert "PR01" in found and "second" in found
