@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_paths import walked
 
 import reproduction.page
 from pupper_sysid.cli.commands.sweep import Sweep
@@ -27,6 +26,7 @@ from reproduction.evidence import DELAYS_MS, PolicyEvidence
 from reproduction.policies import judge
 from support.browser import looks_right
 from support.command_line import refused, run_program
+from support.walks import walked
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / "data/samples"

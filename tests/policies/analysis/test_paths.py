@@ -18,32 +18,9 @@ from pupper_sysid.policies.analysis.phase_reset import (
     rate_response,
 )
 from pupper_sysid.policies.analysis.robustness import scales, terrain
-from pupper_sysid.policies.analysis.rollouts import Rollout
+from support.walks import STEP, walked
 
 ROOT = Path(__file__).resolve().parents[3]
-STEP = 0.02
-
-
-def walked(command, forward, left, turn, seconds=6.0, robots=3, action=None) -> Rollout:
-    """Robots that move steadily in their own frames, from a heading of their own."""
-    steps = round(seconds / STEP)
-    heading = 0.7 + np.zeros(robots)
-    place = np.zeros((robots, 3))
-    place[:, 2] = heading
-    path = []
-    for _ in range(steps):
-        c, s = np.cos(place[:, 2]), np.sin(place[:, 2])
-        place = place + STEP * np.column_stack(
-            [c * forward - s * left, s * forward + c * left, np.full(robots, turn)]
-        )
-        path.append(place)
-    shape = (steps, robots)
-    return Rollout(
-        STEP, command, 0.5, np.zeros((*shape, 60), np.float32),
-        np.zeros((*shape, 12), np.float32) if action is None else action,
-        np.zeros((*shape, 4), np.float32), np.zeros((*shape, 12)), np.ones((*shape, 4), bool),
-        np.zeros((*shape, 3)), np.array(path), np.ones(shape, bool),
-    )  # fmt: skip
 
 
 def test_a_straight_walk_at_half_speed_has_half_the_share_and_neither_drift_nor_arc():

@@ -1,0 +1,32 @@
+"""Made-up walks of robots, for analyses whose answer is then known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pupper_sysid.policies.analysis.rollouts import Rollout
+
+STEP = 0.02
+"""Their control step [s]."""
+
+
+def walked(command, forward, left, turn, seconds=6.0, robots=3, action=None) -> Rollout:
+    """Robots that move steadily in their own frames, from a heading of their own."""
+    steps = round(seconds / STEP)
+    heading = 0.7 + np.zeros(robots)
+    place = np.zeros((robots, 3))
+    place[:, 2] = heading
+    path = []
+    for _ in range(steps):
+        c, s = np.cos(place[:, 2]), np.sin(place[:, 2])
+        place = place + STEP * np.column_stack(
+            [c * forward - s * left, s * forward + c * left, np.full(robots, turn)]
+        )
+        path.append(place)
+    shape = (steps, robots)
+    return Rollout(
+        STEP, command, 0.5, np.zeros((*shape, 60), np.float32),
+        np.zeros((*shape, 12), np.float32) if action is None else action,
+        np.zeros((*shape, 4), np.float32), np.zeros((*shape, 12)), np.ones((*shape, 4), bool),
+        np.zeros((*shape, 3)), np.array(path), np.ones(shape, bool),
+    )  # fmt: skip
