@@ -110,19 +110,19 @@ def main() -> None:
         with served(kind, options.seed) as (server, bus, folder):
             result = campaign(server, bus, folder, options.kills // len(kinds), options.seed)
             p, s = result["parked"], result["silence"]
-            delays = [1e3 * delay_s(load(path)) for path in result["complete"]]
+            delays = [1e3 * dead_time_s(load(path)) for path in result["complete"]]
             made = plan("sine", [JOINT], [2.0, 3.0, 5.0], duration_s=3.0)
             plain = load(record(in_process(kind, options.seed), made, folder / "plain.csv"))
             print(
                 f"| {kind} | {len(p)} | {np.median(p):.2f} | {p.max():.2f} "
                 f"| {max(result['away']):.3f} | {np.median(s):.2f} | {s.max():.2f} "
                 f"| {result['unreadable']} | {len(delays)} "
-                f"| {', '.join(f'{d:.1f}' for d in delays)} | {1e3 * delay_s(plain):.1f} |",
+                f"| {', '.join(f'{d:.1f}' for d in delays)} | {1e3 * dead_time_s(plain):.1f} |",
                 flush=True,
             )
 
 
-def delay_s(recording: Recording) -> float:
+def dead_time_s(recording: Recording) -> float:
     """Dead time of the calibrated model [s]."""
     return calibrate([recording], seed=0)[JOINT].dead_time.value
 

@@ -71,7 +71,7 @@ def parts(threads: int) -> None:
     late = servo_ranges(ACTUATOR)
     at_once = replace(
         late,
-        **{k: {**getattr(late, k), "delay_s": np.zeros(12)} for k in ("low", "value", "high")},
+        **{k: {**getattr(late, k), "dead_time_s": np.zeros(12)} for k in ("low", "value", "high")},
     )
     cases = {
         "delay, held feedback, flat": (Walking(), late),

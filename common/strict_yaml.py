@@ -80,8 +80,8 @@ def place_text(place: Place) -> str:
 
     Examples
     --------
-    >>> place_text(("joints", "LF_hip", "selection", "ladder", 2))
-    'joints.LF_hip.selection.ladder[2]'
+    >>> place_text(("joints", "LF_hip", "selection", "candidate_models", 2))
+    'joints.LF_hip.selection.candidate_models[2]'
     """
     words = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in place]
     return "".join(words).removeprefix(".")

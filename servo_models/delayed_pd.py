@@ -1,6 +1,6 @@
 """DelayedPD: a late, force-limited, speed-limited PD servo with dry friction, as MuJoCo steps it.
 
-One servo holds one joint whose inertia is `armature`. The goal reaches it `delay_s` late, its
+One servo holds one joint whose inertia is `armature`. The goal reaches it `dead_time_s` late, its
 set-point moves at `velocity_limit` at most, and the torque
 
     tau = clip(stiffness * (setpoint - position) - damping * velocity, ±effort_limit)
@@ -71,7 +71,7 @@ class DelayedPDParameters:
     armature : kg·m², all inertia the servo feels, its own included
     effort_limit : N·m
     velocity_limit : rad/s, rate limit of the set-point
-    delay_s : s, from a command's arrival to its first effect on the torque
+    dead_time_s : s, from a command's arrival to its first effect on the torque
     """
 
     stiffness: ArrayLike
@@ -80,7 +80,7 @@ class DelayedPDParameters:
     armature: ArrayLike
     effort_limit: ArrayLike
     velocity_limit: ArrayLike
-    delay_s: ArrayLike
+    dead_time_s: ArrayLike
 
     def per_inertia(self) -> DelayedPDParameters:
         """The same motion with an armature of 1: the ratios that free-air data identify."""
@@ -138,7 +138,7 @@ class DelayedPD:
         self.time_step_s = float(time_step_s)
         self._values = values
         self._own = np.broadcast_shapes(*(v.shape for v in values.values()))
-        self._delay_line = DelayLine(values["delay_s"], self.time_step_s)
+        self._delay_line = DelayLine(values["dead_time_s"], self.time_step_s)
         self.reset(np.zeros(self._own))
 
     def reset(self, position: ArrayLike) -> None:

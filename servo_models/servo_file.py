@@ -33,7 +33,7 @@ from pupper_sysid.servo_models.joint_arrays import same_rate
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 ARCHITECTURES = ("fir", "mlp", "lstm", "delayed-pd", "sindy")
 _LARGEST_BYTES = 50_000_000
@@ -100,7 +100,7 @@ class Contract(_Strict):
     schema_name: Annotated[Literal["pupper-servo-model"], Field(alias="schema")] = (
         "pupper-servo-model"
     )
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[1, 2] = SCHEMA_VERSION
     arch: Literal["fir", "mlp", "lstm", "delayed-pd", "sindy"]
     preset: str
     created: str
@@ -224,6 +224,9 @@ def load_servo_model(
         parameters = load_tensors(data)
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / WEIGHTS} is no safetensors file: {error}.") from error
+    if contract.schema_version == 1 and "delay_s" in parameters:
+        parameters["dead_time_s"] = parameters.pop("delay_s")  # its name until version 2
+    contract = contract.model_copy(update={"schema_version": SCHEMA_VERSION})
     model = _build(contract, parameters, folder)
     if wanted != names:
         index = [names.index(j) for j in wanted]
@@ -274,12 +277,12 @@ def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
             raise InputError(
                 f"{name} holds NaN or infinite numbers: its fit failed or the file was damaged."
             )
-    if (values["delay_s"] > _LONGEST_DELAY_S).any():
-        raise InputError(f"delay_s is more than {_LONGEST_DELAY_S:g} s. Fit again.")
+    if (values["dead_time_s"] > _LONGEST_DELAY_S).any():
+        raise InputError(f"dead_time_s is more than {_LONGEST_DELAY_S:g} s. Fit again.")
     offset = values.pop("offset_rad")
     if contract.arch == "delayed-pd":
         return AtControlRate(DelayedPD(DelayedPDParameters(**values), step / count), count, offset)
-    delay = values.pop("delay_s")
+    delay = values.pop("dead_time_s")
     return AtControlRate(SparseEquation(values, delay, offset, step / count), count)
 
 
@@ -296,7 +299,7 @@ def _check_names(arch: str, found: set[str]) -> None:
     if arch == "delayed-pd":
         required = {f.name for f in fields(DelayedPDParameters)} | {"offset_rad"}
     elif arch == "sindy":
-        required, optional = {"delay_s", "offset_rad"}, frozenset(COEFFICIENTS)
+        required, optional = {"dead_time_s", "offset_rad"}, frozenset(COEFFICIENTS)
     elif arch == "mlp":
         depth = sum(name.startswith("weight_") for name in found)
         required |= {f"{kind}_{n}" for kind in ("weight", "bias") for n in range(depth)}

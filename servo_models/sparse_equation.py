@@ -65,7 +65,7 @@ class SparseEquation:
     ----------
     coefficients : mapping of str to array_like
         Names of `COEFFICIENTS`; those left out are absent from the equation.
-    delay_s : array_like
+    dead_time_s : array_like
         From a command's arrival to its first effect [s].
     offset_rad : array_like
         Added to every position returned [rad]: what the servo's readings show beside the angle
@@ -81,7 +81,7 @@ class SparseEquation:
 
     Examples
     --------
-    >>> servo = SparseEquation({"stiffness_per_s2": 2500.0, "damping_per_s": 100.0}, delay_s=0.02)
+    >>> servo = SparseEquation({"stiffness_per_s2": 2500.0, "damping_per_s": 100.0}, 0.02)
     >>> servo.reset(0.0)
     >>> float(servo.rollout(np.ones(500))[-1].round(6))
     1.0
@@ -90,7 +90,7 @@ class SparseEquation:
     def __init__(
         self,
         coefficients: Mapping[str, ArrayLike],
-        delay_s: ArrayLike,
+        dead_time_s: ArrayLike,
         offset_rad: ArrayLike = 0.0,
         time_step_s: float = TIME_STEP_S,
     ):
@@ -104,9 +104,9 @@ class SparseEquation:
                 )
                 raise InputError(f"SparseEquation: there is no coefficient {name}; {hint}")
         values = {name: np.asarray(value, float) for name, value in coefficients.items()}
-        self.delay_s = np.asarray(delay_s, float)
+        self.dead_time_s = np.asarray(dead_time_s, float)
         self.offset_rad = np.asarray(offset_rad, float)
-        for name, value in [*values.items(), ("delay_s", self.delay_s)]:
+        for name, value in [*values.items(), ("dead_time_s", self.dead_time_s)]:
             infinite = np.isinf(value).any() and name not in _NEVER
             if np.isnan(value).any() or np.min(value) < 0 or infinite:
                 raise InputError(f"SparseEquation: {name} is {value}; it must be 0 or positive.")
@@ -122,9 +122,9 @@ class SparseEquation:
                 f"{np.max(spring):g} s⁻²; use {1e3 * TIME_STEP_S:g} ms."
             )
         self._own = np.broadcast_shapes(
-            *(v.shape for v in values.values()), self.delay_s.shape, self.offset_rad.shape
+            *(v.shape for v in values.values()), self.dead_time_s.shape, self.offset_rad.shape
         )
-        self._delay_line = DelayLine(self.delay_s, h)
+        self._delay_line = DelayLine(self.dead_time_s, h)
         self.reset(np.zeros(self._own))
 
     def reset(self, position: ArrayLike) -> None:
@@ -234,12 +234,12 @@ def integrate(
 # ------------------------------------------------------------------------------- in words
 
 
-def equation(coefficients: Mapping[str, float], delay_s: float) -> str:
+def equation(coefficients: Mapping[str, float], dead_time_s: float) -> str:
     """The equation with its numbers and units, on one line; all numbers are scalars.
 
     Examples
     --------
-    >>> equation({"stiffness_per_s2": 9120.0, "friction_rad_s2": 118.4}, delay_s=0.0246)
+    >>> equation({"stiffness_per_s2": 9120.0, "friction_rad_s2": 118.4}, dead_time_s=0.0246)
     'q̈ = 9 120 s⁻² · e − 118 rad/s² · sign(q̇),  e = u(t − 24.6 ms) − q'
     """
     limit = digits(coefficients.get("saturation_error_rad", np.inf))
@@ -256,24 +256,29 @@ def equation(coefficients: Mapping[str, float], delay_s: float) -> str:
         if coefficients.get(name)
     ]
     right = " ".join(parts).removeprefix("+ ")
-    return f"q̈ = {right or '0'},  e = u(t − {digits(1e3 * delay_s)} ms) − q"
+    return f"q̈ = {right or '0'},  e = u(t − {digits(1e3 * dead_time_s)} ms) − q"
 
 
 def explain(
     coefficients: Mapping[str, float],
-    delay_s: float,
+    dead_time_s: float,
     ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[str]:
     """One line per number: value, unit, meaning; `ranges` adds what it becomes on part of the data.
 
     Examples
     --------
-    >>> explain({"stiffness_per_s2": 9120.0}, delay_s=0.0246)[0]
+    >>> explain({"stiffness_per_s2": 9120.0}, dead_time_s=0.0246)[0]
     '9 120 s⁻²: stiffness: acceleration per radian of error'
     """
     lines = []
     rows = [(name, value, *COEFFICIENTS[name]) for name, value in coefficients.items()]
-    delay = ("delay_s", delay_s, "s", "delay from a command's arrival to its first effect")
+    delay = (
+        "dead_time_s",
+        dead_time_s,
+        "s",
+        "dead time from a command's arrival to its first effect",
+    )
     for name, value, unit, meaning in [*rows, delay]:
         low, high = (ranges or {}).get(name, (value, value))
         around = f" ({digits(low)} … {digits(high)} with one frequency left out)"

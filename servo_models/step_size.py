@@ -89,11 +89,11 @@ def tones_in_steps_of(
     with np.errstate(over="ignore", invalid="ignore"):  # one that is not stable may end anywhere
         for n, w in enumerate(turn):
             at, track = w * edge[1:][late], np.clip(moved[late, :, n], -_FAR_RAD, _FAR_RAD)
-            basis = np.stack([np.sin(at), np.cos(at), np.ones_like(at)], axis=1)
-            tone = np.linalg.lstsq(basis, track, rcond=None)[0]
-            lags.append(np.arctan2(-tone[1], tone[0]) / w)
-            rest = np.sqrt(np.mean((track - basis @ tone) ** 2, axis=0))
-            rests.append(rest / np.hypot(tone[0], tone[1]))
+            design = sine_design(at)
+            tone = least_squares(design, track)
+            lags.append(np.arctan2(-tone[1], tone[2]) / w)
+            rest = np.sqrt(np.mean((track - design @ tone) ** 2, axis=0))
+            rests.append(rest / np.hypot(tone[1], tone[2]))
     return np.mean(lags, axis=0), np.max(rests, axis=0)
 
 
@@ -123,7 +123,7 @@ def delay_at_step(
     InputError
         If the servo is not stable at this step.
     """
-    delay = np.atleast_1d(parameters.delay_s)
+    delay = np.atleast_1d(parameters.dead_time_s)
     if time_step_s == fitted_step_s and engine == MUJOCO:
         return delay
     fitted, usual = tones_in_steps_of(parameters, fitted_step_s)

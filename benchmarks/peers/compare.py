@@ -176,9 +176,9 @@ def theirs(
             ]
         )
     scores = score(tracks[0], data, held_out)
-    whole, span = answers[0], answers[0]["delay_interval_s"]
+    whole, span = answers[0], answers[0]["dead_time_interval_s"]
     true = case.dead_time_s(whole["step_s"])
-    off = float("nan") if whole["delay_s"] is None else whole["delay_s"] - true
+    off = float("nan") if whole["dead_time_s"] is None else whole["dead_time_s"] - true
     return Outcome(
         method, case.name, scores.naive, scores.held, scores.leave_one_out,
         off_truth(tracks[0], case), off,

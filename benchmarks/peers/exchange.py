@@ -53,10 +53,10 @@ class Fitted:
     """A fitted model: `predict(trial)` is its position on the trial's grid [rad]."""
 
     predict: Callable[[Trial], NDArray[np.float64]]
-    delay_s: float | None = None
+    dead_time_s: float | None = None
     step_s: float = STEP_S
     """Of the simulation that the delay is for: a longer step answers sooner."""
-    delay_interval_s: tuple[float, float] | None = None
+    dead_time_interval_s: tuple[float, float] | None = None
     """Of 90 %, where the method states one."""
 
 
@@ -84,9 +84,9 @@ def serve(fit: Callable[[list[Trial]], Fitted]) -> None:
         answers.append(
             {
                 "seconds": seconds,
-                "delay_s": made.delay_s,
+                "dead_time_s": made.dead_time_s,
                 "step_s": made.step_s,
-                "delay_interval_s": made.delay_interval_s,
+                "dead_time_interval_s": made.dead_time_interval_s,
                 "positions_rad": [np.asarray(made.predict(t)).tolist() for t in trials],
             }
         )

@@ -24,7 +24,7 @@ from pupper_sysid.sysid.report.json_objects import calibrate_json
 
 _SHOWN = {
     "lag_ms": ("lag ms", 1),
-    "delay_ms": ("dead time ms", 1),
+    "dead_time_ms": ("dead time ms", 1),
     "stiffness_per_s2": ("stiffness 1/s²", 0),
     "speed_rad_s": ("speed rad/s", 2),
     "loss": ("loss", 2),
@@ -123,7 +123,7 @@ class Calibrate:
             a, s = made.joint(name).actuator, r.rungs["delayed_pd"].scores
             paper = r.presets.get("paper")
             shown.add_row(
-                name, terminal.ms(a.delay_s.value), "{}–{}".format(*r.delay_steps),
+                name, terminal.ms(a.dead_time_s.value), "{}–{}".format(*r.delay_steps),
                 terminal.number(a.stiffness_nm_per_rad.value),
                 terminal.number(a.damping_nm_s_per_rad.value, 3),
                 terminal.number(a.friction_loss_nm.value, 3),

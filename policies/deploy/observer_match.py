@@ -217,7 +217,7 @@ def compare(
     --------
     >>> trained = DelayedPDParameters(
     ...     stiffness=70.0, damping=1.2, friction_loss=0.03, armature=0.005, effort_limit=5.0,
-    ...     velocity_limit=10.5, delay_s=0.076)
+    ...     velocity_limit=10.5, dead_time_s=0.076)
     >>> compare(SyntheticPD(trained, 0.02), trained, 0.02).fits
     True
     """

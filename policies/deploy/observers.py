@@ -180,7 +180,7 @@ class SyntheticPD:
             armature=inertia - damping * period_s / _PAPER_SUBSTEPS,
             effort_limit=np.inf,
             velocity_limit=np.inf,
-            delay_s=delay * period_s,
+            dead_time_s=delay * period_s,
         )
         found = cls(parameters, period_s, _PAPER_SUBSTEPS, limits_rad)
         found.name = "paper-pd"

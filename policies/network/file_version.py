@@ -8,7 +8,7 @@ from typing import Any
 from pupper_sysid.common.errors import InputError
 
 
-def refuse_other_version(path: Path, version: Any, known: int) -> None:
+def refuse_other_version(path: Path, version: Any, known: int, oldest: int | None = None) -> None:
     """Refuse a file of another version than the one that this code reads.
 
     Parameters
@@ -28,7 +28,7 @@ def refuse_other_version(path: Path, version: Any, known: int) -> None:
             f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
             f"this one reads {known}). Upgrade pupper-sysid."
         )
-    if type(version) is not int or version != known:
+    if type(version) is not int or not (oldest or known) <= version <= known:
         raise InputError(
             f"{path} has schema_version {version}; this version reads {known}. Put the file back "
             "as it was written."

@@ -60,7 +60,7 @@ def write_policy(
     network = PolicyNetwork(shape.kind, size, shape.hidden, shape.memory, run.learner.normalise)
     network.take(weights)
     source = Path(run.actuator)
-    delays = np.concatenate([servos.low["delay_s"], servos.high["delay_s"]])
+    delays = np.concatenate([servos.low["dead_time_s"], servos.high["dead_time_s"]])
     about = {
         "kind": shape.kind,
         "hidden": list(shape.hidden),
@@ -80,7 +80,7 @@ def write_policy(
         "actuator": source.name if source.exists() else run.actuator,
         "actuator_sha256": sha256(source) if source.is_file() else None,
         "feedback": run.feedback,
-        "delay_s": [float(delays.min()), float(delays.max())],
+        "dead_time_s": [float(delays.min()), float(delays.max())],
         "training": training,
     }
     save_policy(folder, network, about, force)

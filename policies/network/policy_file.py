@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
@@ -30,7 +30,7 @@ from pupper_sysid.policies.network.file_version import refuse_other_version
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
 from pupper_sysid.sim.walking.env import OBSERVATION, VELOCITY_STEPS
 
-SCHEMA, VERSION = "pupper-policy", 1
+SCHEMA, VERSION = "pupper-policy", 2
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 _MOST_BYTES = 200_000_000
 
@@ -51,7 +51,7 @@ class Contract(_Part):
     """What a policy must be given, and what it gives."""
 
     schema_name: Annotated[Literal["pupper-policy"], Field(alias="schema")]
-    schema_version: Literal[1]
+    schema_version: Literal[1, 2]
     kind: Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
     hidden: Annotated[list[Annotated[int, Field(gt=0, le=8192)]], Field(max_length=16)]
     memory: Annotated[int, Field(gt=0, le=8192)]
@@ -72,8 +72,10 @@ class Contract(_Part):
     actuator: str
     actuator_sha256: str | None
     feedback: str
-    delay_s: list[float]
-    """Shortest and longest dead time it was trained with."""
+    dead_time_s: Annotated[
+        list[float], Field(validation_alias=AliasChoices("dead_time_s", "delay_s"))
+    ]
+    """Shortest and longest dead time it was trained with; `delay_s` in version 1."""
     training: dict[str, Any]
     versions: dict[str, str]
     weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -174,6 +176,7 @@ def load_policy(folder: Path) -> Policy:
         first = error.errors()[0]
         place = ".".join(str(p) for p in first["loc"])
         raise InputError(f"{path}: {place or 'the file'}: {first['msg']}.") from error
+    contract = contract.model_copy(update={"schema_version": VERSION})
     if list(contract.default_pose_rad) != list(JOINT_NAMES):
         raise InputError(f"{path}: default_pose_rad must name the joints in this project's order.")
     if sha256(weights) != contract.weights_sha256:
@@ -197,7 +200,7 @@ def _refuse_other_version(path: Path) -> None:
     with suppress(OSError, ValueError, RecursionError):  # damaged: the contract's own check says so
         found = json.loads(path.read_bytes())
         version = found.get("schema_version") if isinstance(found, dict) else VERSION
-        refuse_other_version(path, version, VERSION)
+        refuse_other_version(path, version, VERSION, oldest=1)
 
 
 def refuse_other_observation(contract: Contract) -> None:

@@ -79,7 +79,7 @@ def action_history(run: Run, servos: ServoRanges) -> int:
     """How many past actions make the delayed system Markov: those still on their way, and one."""
     if run.architecture.kind != "mlp-actions":
         return 0
-    return int(np.ceil(servos.longest_delay_s / run.task.control_step_s)) + 1
+    return int(np.ceil(servos.longest_dead_time_s / run.task.control_step_s)) + 1
 
 
 def train(

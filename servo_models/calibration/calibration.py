@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
@@ -40,8 +40,11 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, Delayed
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 
 SCHEMA = "pupper-calibration"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 PRESETS = ("paper", "release")
+
+_RENAMED = {"delay_s": "dead_time_s", "ladder": "candidate_models"}
+"""Names of version 1 files, and what replaced them."""
 
 UNITS = (
     "SI: radians of the simulator frame, seconds, N·m, kg·m²; every name ends in its unit; "
@@ -84,7 +87,7 @@ class Calibration(Part):
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
     """What kind of file this is."""
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[2] = SCHEMA_VERSION
     """Version of the file's form."""
     robot: str
     """What was measured."""
@@ -270,7 +273,29 @@ def _load(path: Path) -> Calibration:
             f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
             f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
         )
+    if version == 1:
+        data, lines = _renamed(data), {tuple(map(_new_name, at)): n for at, n in lines.items()}
+        data["schema_version"] = SCHEMA_VERSION
     try:
         return Calibration.model_validate(data)
     except ValidationError as error:
-        raise InputError(explain(error, Calibration, path, lines)) from error
+        message = explain(error, Calibration, path, lines)
+        for old, new in _RENAMED.items() if version == 1 else ():
+            message = message.replace(new, old)  # the words of the file that is being read
+        raise InputError(message) from error
+
+
+def _new_name(name: str | int) -> str | int:
+    return _RENAMED.get(name, name) if isinstance(name, str) else name
+
+
+def _renamed(data: Any) -> Any:
+    """`data` of a version 1 file with the present names; one that is there twice stays."""
+    if isinstance(data, list):
+        return [_renamed(entry) for entry in data]
+    if not isinstance(data, dict):
+        return data
+    return {
+        key if _new_name(key) in data else _new_name(key): _renamed(entry)
+        for key, entry in data.items()
+    }

@@ -47,7 +47,7 @@ def unit_of(name: str) -> str:
 
     Examples
     --------
-    >>> unit_of("damping_nm_s_per_rad"), unit_of("delay_s"), unit_of("loss")
+    >>> unit_of("damping_nm_s_per_rad"), unit_of("dead_time_s"), unit_of("loss")
     ('N·m·s/rad', 's', '1')
     """
     if name in UNIT_OF_NAME:
@@ -182,7 +182,7 @@ PARAMETER_KEYS = {
     "armature": "armature_kg_m2",
     "effort_limit": "effort_limit_nm",
     "velocity_limit": "velocity_limit_rad_s",
-    "delay_s": "delay_s",
+    "dead_time_s": "dead_time_s",
 }
 """Field of `DelayedPDParameters` and its name in `Actuator`."""
 
@@ -204,7 +204,7 @@ class Actuator(Part):
     """Largest torque [N·m]."""
     velocity_limit_rad_s: Annotated[Quantity, AfterValidator(Band(0, 1000, "degrees per second"))]
     """Largest rate of the set-point [rad/s]."""
-    delay_s: Annotated[Quantity, _TIME]
+    dead_time_s: Annotated[Quantity, _TIME]
     """Dead time from a command's arrival to its first effect on the torque [s]."""
     delay_steps_min: Annotated[Whole, Field(ge=0)]
     """Smallest delay to train with, in whole physics steps."""
@@ -224,10 +224,10 @@ class Actuator(Part):
         return DelayedPDParameters(**values)
 
     @property
-    def delay_interval_s(self) -> tuple[float, float]:
-        """Delays to train with [s]: the interval, or the whole steps that a preset publishes."""
-        if self.delay_s.low is not None and self.delay_s.high is not None:
-            return self.delay_s.low, self.delay_s.high
+    def dead_time_interval_s(self) -> tuple[float, float]:
+        """Dead times to train with [s]: the interval, or whole steps, as presets publish."""
+        if self.dead_time_s.low is not None and self.dead_time_s.high is not None:
+            return self.dead_time_s.low, self.dead_time_s.high
         return (
             self.delay_steps_min * self.physics_step_s,
             self.delay_steps_max * self.physics_step_s,
@@ -287,8 +287,8 @@ class Scores(Part):
     """100 · (1 − RMSE / standard deviation of the reading) on fresh rows [%]."""
 
 
-class LadderRow(Part):
-    """One model of the ladder and how it did."""
+class CandidateModel(Part):
+    """One candidate model and its scores."""
 
     model: Annotated[str, Field(min_length=1)]
     """Name of the model."""
@@ -309,12 +309,12 @@ class LadderRow(Part):
 
 
 class Selection(Part):
-    """Which model of the ladder was chosen, and from what."""
+    """Which candidate model was chosen."""
 
     model: Annotated[str, Field(min_length=1)]
     """The chosen model."""
-    ladder: Annotated[tuple[LadderRow, ...], Field(strict=False)] = ()
-    """All models that were tried, simplest first; empty for a preset."""
+    candidate_models: Annotated[tuple[CandidateModel, ...], Field(strict=False)] = ()
+    """All candidate models, simplest first; empty for a preset."""
 
 
 class JointCalibration(Part):

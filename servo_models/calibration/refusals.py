@@ -106,7 +106,7 @@ def _say(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
 def _unknown_key(name: str, given: Any, fields: dict[str, FieldInfo]) -> str:
     stem = _stem(name)
     for known in fields:
-        # "delay_steps_min" is no other unit of "delay_s"; the stems must be the same word
+        # "delay_steps_min" is no other unit of "dead_time_s"; the stems must be the same word
         if name not in fields and stem == _stem(known) != known and name.lower() != known:
             unit = unit_of(known)
             had = "has no unit in its name" if stem == name.lower() else "is in another unit"

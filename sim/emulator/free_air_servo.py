@@ -31,7 +31,7 @@ class FreeAirServo:
     Parameters
     ----------
     parameters : DelayedPDParameters
-        Scalars; `delay_s` at least two physics steps.
+        Scalars; `dead_time_s` at least two physics steps.
     position_rad : float
         Where it rests at the start, commanded there for ever.
     time_step_s : float
@@ -49,14 +49,14 @@ class FreeAirServo:
         position_rad: float,
         time_step_s: float = PHYSICS_STEP_S,
     ):
-        delay = float(np.asarray(parameters.delay_s))
+        delay = float(np.asarray(parameters.dead_time_s))
         # MuJoCo would take what is left of a shorter delay for a whole step
         if not delay >= 2 * time_step_s:
             raise InputError(
-                f"emulated servo: delay_s is {delay}; it must be at least two physics "
+                f"emulated servo: dead_time_s is {delay}; it must be at least two physics "
                 f"steps of {time_step_s} s."
             )
-        native = replace(parameters, delay_s=delay - time_step_s)
+        native = replace(parameters, dead_time_s=delay - time_step_s)
         self._model = mujoco.MjModel.from_xml_string(free_air_xml([native], time_step_s))
         self._data = mujoco.MjData(self._model)
         rest_at(self._model, self._data, [position_rad])

@@ -30,7 +30,7 @@ SHORTEST_DELAY_S = 0.002
 class RobotSpec:
     """How emulated robots are made. Times in s, angles in rad, torques in N·m."""
 
-    delay_s: float = 0.025
+    dead_time_s: float = 0.025
     """Mean dead time of a servo, from the host's sending to the first torque. Its reading's way
     back to the host (about 3 ms on the robot) is counted here: a poll is seen at once."""
     stiffness_per_inertia: float = 12_700.0
@@ -49,7 +49,7 @@ class RobotSpec:
     """Standard deviation of the logarithm of each of the four ratios to inertia, per joint."""
     velocity_spread: float = 0.05
     """The same for the velocity limit."""
-    delay_sd_s: float = 0.0015
+    dead_time_sd_s: float = 0.0015
     """Standard deviation of the dead time from joint to joint."""
     offset_sd_rad: float = 0.005
     """Standard deviation of each joint's constant reading error."""
@@ -166,7 +166,7 @@ def draw_robot(
     ):
         kp, kd, friction, effort = np.exp(spec.gain_spread * rng.standard_normal(4))
         speed = np.exp(spec.velocity_spread * rng.standard_normal())
-        delay = spec.delay_s + spec.delay_sd_s * rng.standard_normal()
+        delay = spec.dead_time_s + spec.dead_time_sd_s * rng.standard_normal()
         armature = spec.stall_torque_nm / (spec.effort_per_inertia * effort)
         actuator = DelayedPDParameters(
             stiffness=float(spec.stiffness_per_inertia * kp * armature),
@@ -175,7 +175,7 @@ def draw_robot(
             armature=float(armature),
             effort_limit=spec.stall_torque_nm,
             velocity_limit=float(spec.velocity_limit_rad_s * speed),
-            delay_s=float(max(delay, SHORTEST_DELAY_S)),
+            dead_time_s=float(max(delay, SHORTEST_DELAY_S)),
         )
         feedback = HeldFeedback(
             poll_period_s=spec.poll_period_s,
@@ -219,7 +219,7 @@ def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
         return float(value * np.exp(rng.uniform(-spread, spread)))
 
     drawn = {
-        "delay_s": float(rng.uniform(0.010, 0.040)),
+        "dead_time_s": float(rng.uniform(0.010, 0.040)),
         "stiffness_per_inertia": around(base.stiffness_per_inertia, 0.4),
         "damping_per_inertia": around(base.damping_per_inertia, 0.3),
         "friction_per_inertia": around(base.friction_per_inertia, 0.5),

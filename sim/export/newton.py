@@ -83,7 +83,7 @@ def export_newton(
     write_text(folder / MODULE, _module(calibration, delays, physics_step_s), force)
 
 
-def servo_network(actuator: Actuator, delay_s: float, physics_step_s: float) -> bytes:
+def servo_network(actuator: Actuator, dead_time_s: float, physics_step_s: float) -> bytes:
     """The PD as ONNX: (N, 2) of position error [rad] and velocity [rad/s] to (N, 1) effort [N·m].
 
     Raises
@@ -113,7 +113,7 @@ def servo_network(actuator: Actuator, delay_s: float, physics_step_s: float) -> 
     contract = {
         "input_order": "pos_vel", "input_idx": [0], "pos_scale": 1.0, "vel_scale": 1.0,
         "effort_scale": 1.0, "sample_dt_s": physics_step_s,
-        "effort_limit_nm": actuator.effort_limit_nm.value, "delay_s": delay_s,
+        "effort_limit_nm": actuator.effort_limit_nm.value, "dead_time_s": dead_time_s,
     }  # fmt: skip
     entry = model.metadata_props.add()
     entry.key, entry.value = "metadata", json.dumps(contract)

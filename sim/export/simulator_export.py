@@ -69,10 +69,10 @@ def to_mjcf(calibration: Calibration, physics_step_s: float) -> str:
     delays = delays_at_step(calibration, physics_step_s)
     defaults, actuators, sensors = [], [], []
     for name, joint in calibration.joints.items():
-        servo = replace(joint.actuator.parameters, delay_s=delays[name].value_s)
+        servo = replace(joint.actuator.parameters, dead_time_s=delays[name].value_s)
         feedback = joint.feedback
         period, age = feedback.poll_period_s.value, feedback.mean_age_s.value
-        told = ", ".join(_said(joint.actuator, key) for key in (*_TORQUES, "delay_s"))
+        told = ", ".join(_said(joint.actuator, key) for key in (*_TORQUES, "dead_time_s"))
         defaults += [
             f"<!-- {_xml(name)}: {_xml(told)} -->",
             f'<default class="servo_{name}">'
@@ -240,7 +240,11 @@ def to_json(calibration: Calibration, physics_step_s: float) -> str:
         numbers = {key: _plain(getattr(a, key)) for key in (*_TORQUES, "velocity_limit_rad_s")}
         joints[name] = {
             "actuator": numbers
-            | {"delay_s": _plain(a.delay_s), "delay_steps_min": low, "delay_steps_max": high},
+            | {
+                "dead_time_s": _plain(a.dead_time_s),
+                "delay_steps_min": low,
+                "delay_steps_max": high,
+            },
             "feedback": {key: _plain(getattr(joint.feedback, key)) for key in FEEDBACK_KEYS},
             "torque_scale": a.scale.model_dump(mode="json"),
         }
@@ -295,8 +299,8 @@ def delays_at_step(
     for name, joint in calibration.joints.items():
         a = joint.actuator
         (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s, engine)
-        more = float(fitting) - a.delay_s.value
-        numbers = (max(t + more, 0.0) for t in (a.delay_s.value, *a.delay_interval_s))
+        more = float(fitting) - a.dead_time_s.value
+        numbers = (max(t + more, 0.0) for t in (a.dead_time_s.value, *a.dead_time_interval_s))
         found[name] = Delay(*numbers)
     return found
 
@@ -306,7 +310,7 @@ def step_note(
 ) -> Iterator[str]:
     """What was added to the delays for the length of a step, if anything was."""
     added = [
-        1e3 * (delays[name].value_s - joint.actuator.delay_s.value)
+        1e3 * (delays[name].value_s - joint.actuator.dead_time_s.value)
         for name, joint in calibration.joints.items()
     ]
     steps = {1e3 * joint.actuator.physics_step_s for joint in calibration.joints.values()}

@@ -84,7 +84,7 @@ class RobotBatch:
             servo_model.reset(np.zeros((environments, len(JOINT_NAMES))))
         # every buffer holds the longest delay that can be drawn
         longest = {
-            name: replace(own, delay_s=np.array(servos.longest_delay_s))
+            name: replace(own, dead_time_s=np.array(servos.longest_dead_time_s))
             for name, own in servos.nominal().items()
         }
         self.model = mujoco.MjModel.from_xml_string(
@@ -92,9 +92,9 @@ class RobotBatch:
         )
         ground.fill(self.model)
         room = self.model.actuator_history[:, 0].min() * config.physics_step_s
-        if servos.longest_delay_s > room:
+        if servos.longest_dead_time_s > room:
             raise InputError(
-                f"A delay of {servos.longest_delay_s} s does not fit the buffer of {room} s."
+                f"A delay of {servos.longest_dead_time_s} s does not fit the buffer of {room} s."
             )
         from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 
@@ -232,7 +232,7 @@ class RobotBatch:
         """New servos, friction and payload for some robots; `delay_share` of the drawn delays."""
         random, f = self.config.randomisation, self._fields
         drawn = self.servos.draw(len(ids), random.torque_scale, rng)
-        drawn["delay_s"] = drawn["delay_s"] * delay_share
+        drawn["dead_time_s"] = drawn["dead_time_s"] * delay_share
         for name, value in drawn.items():
             self.drawn[name][ids] = value
         f["actuator_biasprm"][ids, :, 1] = -drawn["stiffness"]
@@ -240,7 +240,7 @@ class RobotBatch:
         f["actuator_dynprm"][ids, :, 1] = drawn["velocity_limit"]
         effort = drawn["effort_limit"]
         f["actuator_forcerange"][ids] = np.stack([-effort, effort], axis=-1)
-        f["actuator_delay"][ids] = drawn["delay_s"]
+        f["actuator_delay"][ids] = drawn["dead_time_s"]
         joints = np.arange(len(JOINT_NAMES))
         if self.config.knee == "linkage":
             f["tendon_armature"][ids] = drawn["armature"][:, _CALVES]
@@ -341,7 +341,10 @@ class RobotBatch:
         # forward leaves its mark on what warm-starts the solver
         self.batch.state[:] = state["batch.state"]
         for k, v in self.drawn.items():
-            v[:] = state[f"drawn.{k}"]
+            name = (
+                "drawn.delay_s" if k == "dead_time_s" and "drawn.delay_s" in state else f"drawn.{k}"
+            )
+            v[:] = state[name]  # older checkpoints have the old name of the dead time
         self.friction[:] = state["friction"]
         if self.servo_model is not None:
             for k, v in self.servo_model.memory.items():

@@ -60,9 +60,11 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
     InputError
         If the delay is negative or not finite.
     """
-    delay = float(np.asarray(parameters.delay_s))
+    delay = float(np.asarray(parameters.dead_time_s))
     if not (np.isfinite(delay) and delay >= 0):
-        raise InputError(f"servo actuator: delay_s is {delay}; it must be a number of seconds ≥ 0.")
+        raise InputError(
+            f"servo actuator: dead_time_s is {delay}; it must be a number of seconds ≥ 0."
+        )
     effort = float(np.asarray(parameters.effort_limit))
     speed = float(np.asarray(parameters.velocity_limit))
     attributes = {

@@ -380,8 +380,8 @@ class PupperEnv:
             [
                 robots.velocity, robots.joints - self.default, 0.1 * robots.joint_velocity,
                 (z - self.ground.height(x, y))[:, None] * 10, self._air,
-                self._contact.clip(0, 1), robots.friction[:, None], robots.drawn["delay_s"] * 10,
-                left[:, None],
+                self._contact.clip(0, 1), robots.friction[:, None],
+                robots.drawn["dead_time_s"] * 10, left[:, None],
             ],
             axis=1, dtype=np.float32,
         )  # fmt: skip

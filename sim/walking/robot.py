@@ -97,16 +97,16 @@ class WalkingRobot:
         time_step_s: float = PHYSICS_STEP_S,
     ):
         self._rng, self._dt, self._lock = rng, time_step_s, RLock()
-        delays = {s.joint: float(np.asarray(s.actuator.delay_s)) for s in robot.servos}
+        delays = {s.joint: float(np.asarray(s.actuator.dead_time_s)) for s in robot.servos}
         for joint, delay in delays.items():
             # MuJoCo would take what is left of a shorter delay for a whole step
             if not delay >= 2 * time_step_s:
                 raise InputError(
-                    f"emulated {joint}: delay_s is {delay}; it must be at least two physics "
+                    f"emulated {joint}: dead_time_s is {delay}; it must be at least two physics "
                     f"steps of {time_step_s} s."
                 )
         native = {
-            s.joint: replace(s.actuator, delay_s=delays[s.joint] - time_step_s)
+            s.joint: replace(s.actuator, dead_time_s=delays[s.joint] - time_step_s)
             for s in robot.servos
         }
         self._model = mujoco.MjModel.from_xml_string(robot_xml(native, time_step_s))

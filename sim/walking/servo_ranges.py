@@ -52,16 +52,16 @@ class ServoRanges:
     borrowed: dict[str, str]
 
     @property
-    def longest_delay_s(self) -> float:
-        """The longest delay that can be drawn [s]."""
-        return float(self.high["delay_s"].max())
+    def longest_dead_time_s(self) -> float:
+        """The longest dead time that can be drawn [s]."""
+        return float(self.high["dead_time_s"].max())
 
-    def later(self, delay_s: ArrayLike) -> ServoRanges:
-        """The same servos with every delay longer by `delay_s` [s], one or twelve; none below 0."""
+    def later(self, extra_s: ArrayLike) -> ServoRanges:
+        """The same servos, every dead time longer by `extra_s` [s], one or twelve; none below 0."""
         moved = {}
         for name in ("low", "value", "high"):
             own = getattr(self, name)
-            moved[name] = {**own, "delay_s": np.maximum(own["delay_s"] + delay_s, 0.0)}
+            moved[name] = {**own, "dead_time_s": np.maximum(own["dead_time_s"] + extra_s, 0.0)}
         return replace(self, **moved)
 
     def in_steps_of(self, time_step_s: float) -> ServoRanges:
@@ -73,7 +73,7 @@ class ServoRanges:
             If a servo is not stable in such steps.
         """
         middle = DelayedPDParameters(**self.value)
-        return self.later(delay_at_step(middle, time_step_s) - self.value["delay_s"])
+        return self.later(delay_at_step(middle, time_step_s) - self.value["dead_time_s"])
 
     def nominal(self) -> dict[str, DelayedPDParameters]:
         """The middle of every interval, by joint."""
@@ -154,8 +154,8 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
         value[field] = np.array([q.value for q in found])
         low[field] = np.array([q.value if q.low is None else q.low for q in found])
         high[field] = np.array([q.value if q.high is None else q.high for q in found])
-    delays = np.array([p.actuator.delay_interval_s for p in parts])
-    low["delay_s"], high["delay_s"] = delays[:, 0], delays[:, 1]
+    delays = np.array([p.actuator.dead_time_interval_s for p in parts])
+    low["dead_time_s"], high["dead_time_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
     feedback = tuple(calibration.held_feedback(borrowed.get(n, n)) for n in JOINT_NAMES)
@@ -175,7 +175,7 @@ def _ideal(source: str) -> ServoRanges:
     """Servos that are where they are told to be, as nearly as a 2 ms step can hold."""
     own = {
         "stiffness": 20.0, "damping": 0.25, "friction_loss": 0.0, "armature": 8e-4,
-        "effort_limit": _NO_LIMIT_NM, "velocity_limit": _NO_LIMIT_RAD_S, "delay_s": 0.0,
+        "effort_limit": _NO_LIMIT_NM, "velocity_limit": _NO_LIMIT_RAD_S, "dead_time_s": 0.0,
     }  # fmt: skip
     value = {f: np.full(len(JOINT_NAMES), x) for f, x in own.items()}
     return ServoRanges(source, value, value, value, (HeldFeedback(),) * len(JOINT_NAMES), {})

@@ -276,7 +276,7 @@ def _score_preset(
     parameters: DelayedPDParameters, data: tuple[TrialData, ...], offset_rad: float
 ) -> Scores:
     one = parameters.per_inertia()
-    parts = (one.delay_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
+    parts = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
              one.velocity_limit, offset_rad)  # fmt: skip
     values = np.array([np.asarray(part, float).item() for part in parts])
     return score(positions(rung(PREFERRED), [(values[None], data)])[0][:, 0], data, {})

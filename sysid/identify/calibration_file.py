@@ -23,9 +23,9 @@ from pupper_sysid.servo_models.calibration.calibration import (
 )
 from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
+    CandidateModel,
     Feedback,
     JointCalibration,
-    LadderRow,
     Lag,
     Quantity,
     RatiosToArmature,
@@ -110,7 +110,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             value=stall, identified="no", why="the anchor itself: taken as known, see scale"
         ),
         velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
-        delay_s=_quantity(result.dead_time),
+        dead_time_s=_quantity(result.dead_time),
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
@@ -127,7 +127,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             fresh_lag_s=_quantity(budget.fresh),
         ),
         selection=Selection(
-            model=chosen.name, ladder=tuple(_ladder_row(r) for r in result.rungs.values())
+            model=chosen.name, candidate_models=tuple(_candidate(r) for r in result.rungs.values())
         ),
         scores=Scores(
             rmse_one_step_rad=_finite(s.one_step),
@@ -141,9 +141,9 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
     )
 
 
-def _ladder_row(rung: RungResult) -> LadderRow:
+def _candidate(rung: RungResult) -> CandidateModel:
     s = rung.scores
-    return LadderRow(
+    return CandidateModel(
         model=rung.name,
         parameter_count=len(rung.values),
         rmse_fresh_rad=_finite(s.fresh),

@@ -45,7 +45,7 @@ FEWEST = 5
 
 QUANTITIES = {
     "lag_ms": lambda joint: _ms(joint.lag.lag_s),
-    "delay_ms": lambda joint: _ms(joint.actuator.delay_s),
+    "dead_time_ms": lambda joint: _ms(joint.actuator.dead_time_s),
     "stiffness_per_s2": lambda joint: joint.actuator.ratios_to_armature.stiffness.value,
     "damping_per_s": lambda joint: joint.actuator.ratios_to_armature.damping.value,
     "friction_rad_s2": lambda joint: joint.actuator.ratios_to_armature.friction_loss.value,

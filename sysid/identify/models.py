@@ -137,7 +137,7 @@ def _delayed_pd_backlash(values: NDArray, track: NDArray) -> None:
         track[k] = y
 
 
-_DELAY = Parameter("delay_s", 0.02, 0.001, 0.12)
+_DELAY = Parameter("dead_time_s", 0.02, 0.001, 0.12)
 _OFFSET = Parameter("offset_rad", 0.0, -2.0, 2.0)
 _GAIN = Parameter("gain", 1.0, 0.5, 1.5)
 # The priors cover hobby servos. Speed: data sheets say 0.08 to 0.2 s per 60 degrees, 13 to 5 rad/s,

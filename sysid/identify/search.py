@@ -212,7 +212,7 @@ def dead_time_profile(
     Parameters
     ----------
     model : Rung
-        Its first parameter is `delay_s`.
+        Its first parameter is `dead_time_s`.
     data : tuple of TrialData
     noise : float
         Size of residuals beyond which one counts as an outlier [rad].
@@ -235,7 +235,7 @@ def dead_time_profile(
         spread = np.array([0.001, 0.002, 0.0035, 0.005, 0.0075, 0.010, 0.014])
         delays = np.concatenate([centre - spread[::-1], [centre], centre + spread])
         delays = delays[(delays >= model.parameters[0].low) & (delays <= model.parameters[0].high)]
-        problems = [replace(everything, frozen={"delay_s": float(d)}) for d in delays]
+        problems = [replace(everything, frozen={"dead_time_s": float(d)}) for d in delays]
         fits = fit(model, problems, np.tile(best.values, (len(delays), 1)), 10)
         # neighbours know better ways: pass each point's solution on, outward and back
         for shift in (1, -1):

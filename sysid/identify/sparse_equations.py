@@ -101,10 +101,10 @@ class EquationResult:
     ----------
     coefficients : dict of str to float
         Those present, by their names in `COEFFICIENTS`.
-    delay_s, offset_rad : float
+    dead_time_s, offset_rad : float
     ranges : dict of str to (float, float)
-        Least and greatest value of each number (`delay_s` too) when each frequency is left out in
-        turn; empty with one frequency only. Shows what the data do not settle.
+        Least and greatest value of each number (`dead_time_s` too) when each frequency is left out
+        in turn; empty with one frequency only. Shows what the data do not settle.
     scores : Scores
     delayed_pd : Scores
         `DelayedPD`, fitted and scored on the same readings.
@@ -114,7 +114,7 @@ class EquationResult:
 
     joint: str
     coefficients: dict[str, float]
-    delay_s: float
+    dead_time_s: float
     offset_rad: float
     ranges: dict[str, tuple[float, float]]
     scores: Scores
@@ -125,15 +125,15 @@ class EquationResult:
     @property
     def equation(self) -> str:
         """The equation with numbers and units."""
-        return equation(self.coefficients, self.delay_s)
+        return equation(self.coefficients, self.dead_time_s)
 
     def model(self, time_step_s: float = TIME_STEP_S) -> SparseEquation:
         """The servo model, whose positions include the readings' offset."""
-        return SparseEquation(self.coefficients, self.delay_s, self.offset_rad, time_step_s)
+        return SparseEquation(self.coefficients, self.dead_time_s, self.offset_rad, time_step_s)
 
     def explanation(self) -> list[str]:
         """One line per number: value, unit, meaning, and what it becomes on part of the data."""
-        return explain(self.coefficients, self.delay_s, self.ranges)
+        return explain(self.coefficients, self.dead_time_s, self.ranges)
 
 
 def identify(
@@ -212,7 +212,7 @@ def to_json(results: Mapping[str, EquationResult]) -> dict[str, Any]:
         joints[joint] = {
             "equation": r.equation,
             "terms": terms,
-            "delay_s": r.delay_s,
+            "dead_time_s": r.dead_time_s,
             "offset_rad": r.offset_rad,
             "rmse_fresh_rad": r.scores.fresh,
             "rmse_held_rad": r.scores.held,
@@ -273,7 +273,7 @@ def _fit_joint(joint: str, data: tuple[TrialData, ...], noise: float, seed: int)
         for name, column in zip(model.names, every.T, strict=True)
         if folds
     }
-    delay, offset = values.pop("delay_s"), values.pop("offset_rad")
+    delay, offset = values.pop("dead_time_s"), values.pop("offset_rad")
     ranges.pop("offset_rad", None)
     delayed_pd = _scores(pd, pd_fits, folds, data)
     result = EquationResult(
@@ -292,7 +292,7 @@ def equation_rung(support: Support) -> Rung:
         )
 
     parameters = (
-        _SHARED["delay_s"], *(_PARAMETERS[name] for name in support), _SHARED["offset_rad"]
+        _SHARED["dead_time_s"], *(_PARAMETERS[name] for name in support), _SHARED["offset_rad"]
     )  # fmt: skip
     return Rung("sparse_equation", parameters, simulate)
 
@@ -314,7 +314,7 @@ def _starts(model: Rung, pd_values: NDArray) -> list[list[float]]:
         (2.5, 0.008, 2.0 * effort / speed),
     ):
         guess = {
-            "delay_s": pd["delay_s"] + later,
+            "dead_time_s": pd["dead_time_s"] + later,
             "stiffness_per_s2": scale * kp,
             "saturated_stiffness_per_s2": scale * kp,
             "saturation_error_rad": effort / kp,

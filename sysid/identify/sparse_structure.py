@@ -57,7 +57,7 @@ def propose(data: Sequence[TrialData], delayed_pd: Mapping[str, float]) -> list[
     splines = [s for d in usable for s in _motion(d, delayed_pd["offset_rad"])]
     votes: Counter[Support] = Counter()
     for shift in (-0.005, 0.0, 0.005):  # what is delay and what dynamics is known to a few ms
-        delay = max(delayed_pd["delay_s"] + shift, 0.0) / TIME_STEP_S
+        delay = max(delayed_pd["dead_time_s"] + shift, 0.0) / TIME_STEP_S
         trials = []
         for trial, step, position, speed, acceleration in splines:
             middle = np.arange(len(trial.command)) + 0.5

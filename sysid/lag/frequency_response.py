@@ -60,9 +60,9 @@ class TransferFunction:
     at_bound: tuple[str, ...] = ()
 
     @property
-    def delay_s(self) -> float:
+    def dead_time_s(self) -> float:
         """The delay beside `rational()`; exact in `evaluate`, `control.pade` may approximate it."""
-        return self.parameters["delay_s"].value
+        return self.parameters["dead_time_s"].value
 
     def values(self) -> NDArray[np.float64]:
         """Parameters in the order of their names."""
@@ -81,7 +81,7 @@ class TransferFunction:
 
     def __str__(self) -> str:
         p = {name: interval.value for name, interval in self.parameters.items()}
-        delay = f"exp(-{p['delay_s']:.4f} s)"
+        delay = f"exp(-{p['dead_time_s']:.4f} s)"
         if self.name == "FOPDT":
             return f"{p['gain']:.3f} {delay} / ({p['time_constant_s']:.4f} s + 1)"
         w, z = p["natural_frequency_rad_s"], p["damping_ratio"]
@@ -294,12 +294,12 @@ def _sopdt(v: Sequence[Any] | NDArray, f: NDArray) -> NDArray[np.complex128]:
 
 _MODELS = {
     "FOPDT": _Model(
-        ("gain", "delay_s", "time_constant_s"),
+        ("gain", "dead_time_s", "time_constant_s"),
         (0.05, 0.0, 1e-4), (5.0, 0.5, 0.5), (1.0, 0.02, 0.02),
         ((1e-3, 3e-3, 0.01, 0.02, 0.04, 0.08, 0.2),), _fopdt,
     ),
     "SOPDT": _Model(
-        ("gain", "delay_s", "natural_frequency_rad_s", "damping_ratio"),
+        ("gain", "dead_time_s", "natural_frequency_rad_s", "damping_ratio"),
         (0.05, 0.0, 5.0, 0.1), (5.0, 0.5, 600.0, 4.0), (1.0, 0.02, 50.0, 0.5),
         ((10.0, 20.0, 35.0, 60.0, 100.0, 170.0, 300.0), (0.3, 0.6, 1.0, 1.8)), _sopdt,
     ),

@@ -90,7 +90,7 @@ def _calibrated(result: JointCalibrationResult) -> dict[str, Any]:
         "model": result.chosen,
         "parameters": chosen.values,
         **_scores(chosen),
-        "delay_s": result.dead_time.value,
+        "dead_time_s": result.dead_time.value,
         "delay_ci_s": [result.dead_time.low, result.dead_time.high],
         "delay_steps": list(result.delay_steps),
         PREFERRED: {

@@ -51,7 +51,7 @@ def delayed_pd_fits(
         v = np.array([f.values for f in best[own]]).T
         found.append(
             {
-                "delay_s": v[0],
+                "dead_time_s": v[0],
                 "stiffness": v[1],
                 "damping": v[2],
                 "friction_loss": v[3],
@@ -80,7 +80,7 @@ def sindy_fits(
     Returns
     -------
     list of dict of str to ndarray, shape (joints,)
-        Every name of `COEFFICIENTS` that some joint has, `delay_s` and `offset_rad`.
+        Every name of `COEFFICIENTS` that some joint has, `dead_time_s` and `offset_rad`.
     """
     from pupper_sysid.sysid.identify.sparse_equations import fit_equations
 
@@ -94,7 +94,7 @@ def sindy_fits(
             n: np.array([r.coefficients.get(n, absent.get(n, 0.0)) for r in results.values()])
             for n in names
         }
-        values["delay_s"] = np.array([r.delay_s for r in results.values()])
+        values["dead_time_s"] = np.array([r.dead_time_s for r in results.values()])
         values["offset_rad"] = np.array(
             [r.offset_rad + _truncation_shift(data, j) for j, r in results.items()]
         )
@@ -107,7 +107,9 @@ def sindy_model(values: dict[str, NDArray[np.float64]], period_s: float) -> AtCo
     count = substeps(period_s)
     own = {k: v for k, v in values.items() if k in COEFFICIENTS}
     step = period_s / count
-    return AtControlRate(SparseEquation(own, values["delay_s"], values["offset_rad"], step), count)
+    return AtControlRate(
+        SparseEquation(own, values["dead_time_s"], values["offset_rad"], step), count
+    )
 
 
 def part_trials(data: ServoData, joint: str, part: Part) -> tuple[TrialData, ...]:

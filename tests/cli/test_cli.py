@@ -53,13 +53,13 @@ def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys):
     assert code == 0 and found["elapsed_s"] > 0
     assert {
         "model", "parameters", "rmse_fresh_rad", "rmse_held_rad", "rmse_naive_rad",
-        "rmse_leave_one_frequency_out_rad", "delay_s", "delay_ci_s", "delay_steps",
+        "rmse_leave_one_frequency_out_rad", "dead_time_s", "delay_ci_s", "delay_steps",
     } <= set(joint)  # fmt: skip
     saved = load_calibration("c.yaml").joint("LF_hip")
-    assert saved.actuator.delay_s.value == pytest.approx(joint["delay_s"])
+    assert saved.actuator.dead_time_s.value == pytest.approx(joint["dead_time_s"])
     # the truth beside the sample
     truth = (SWEEP.parent / "sweep.truth.yaml").read_text()
-    assert "delay_s" in truth
+    assert "dead_time_s" in truth
     before = Path("c.yaml").read_bytes()
     code, out, err = run(capsys, *arguments)
     assert code == 2 and out == "" and "--force" in err

@@ -151,7 +151,7 @@ def test_an_emulator_says_what_to_type_and_ends_on_request(tmp_path, kind):
     assert process.returncode == 1 and "Stopped." in err and "Traceback" not in err
     assert not (tmp_path / "s").exists(), "it leaves nothing behind"
     truth = yaml.safe_load((tmp_path / "t.yaml").read_text())
-    assert truth["joints"]["LF_hip"]["actuator"]["delay_s"] > 0
+    assert truth["joints"]["LF_hip"]["actuator"]["dead_time_s"] > 0
 
 
 @pytest.mark.parametrize("kind", [("feetech", "--link"), ("esp32", "--socket")])

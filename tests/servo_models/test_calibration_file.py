@@ -15,8 +15,8 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
 from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
+    CandidateModel,
     Feedback,
-    LadderRow,
     Lag,
     Quantity,
     RatiosToArmature,
@@ -50,7 +50,7 @@ def test_an_ordinary_yaml_reader_sees_the_same_data(file):
 def test_the_file_explains_itself_and_keeps_a_number_on_one_line(file):
     lines = file.read_text().splitlines()
     assert lines[0].startswith("# Calibration") and any("interval" in line for line in lines[:12])
-    (delay,) = [line for line in lines if line.strip().startswith("delay_s:")]
+    (delay,) = [line for line in lines if line.strip().startswith("dead_time_s:")]
     assert "value: 0.025" in delay and "identified:" in delay
 
 
@@ -107,7 +107,7 @@ def test_asking_for_a_joint_that_was_not_calibrated_says_which_were():
 
 def test_a_calibration_cannot_be_changed():
     with pytest.raises(ValidationError, match="frozen"):
-        calibration().joints["LF_hip"].actuator.delay_s.value = 0.0  # pyright: ignore
+        calibration().joints["LF_hip"].actuator.dead_time_s.value = 0.0  # pyright: ignore
 
 
 # Numbers of the paper's text and of its authors' released training configuration.
@@ -143,8 +143,32 @@ def test_presets_hold_the_published_numbers_for_all_joints_and_call_none_a_measu
 
 
 def test_every_quantity_of_a_calibration_has_a_unit_and_a_description():
-    for part in (Actuator, Feedback, Lag, Scores, RatiosToArmature, Scale, LadderRow):
+    for part in (Actuator, Feedback, Lag, Scores, RatiosToArmature, Scale, CandidateModel):
         for name, field in part.model_fields.items():
             assert field.description, f"{part.__name__}.{name} is not documented"
             if "Quantity" in str(field.annotation) or "float" in str(field.annotation):
                 assert unit_of(name) or name == "parameters", f"{part.__name__}.{name}: no unit"
+
+
+def version_1(path: Path) -> Path:
+    """The file at `path` with the keys that it had in version 1."""
+    text = path.read_text().replace("schema_version: 2", "schema_version: 1")
+    text = text.replace("dead_time_s:", "delay_s:").replace("candidate_models:", "ladder:")
+    path.write_text(text)
+    return path
+
+
+def test_a_file_of_version_1_is_read_and_saved_in_version_2(file, tmp_path):
+    loaded = load_calibration(version_1(file))
+    assert loaded.joints == calibration().joints and loaded.schema_version == 2
+    loaded.save(tmp_path / "again.yaml")
+    assert " delay_s:" not in (tmp_path / "again.yaml").read_text()
+    assert load_calibration("data/samples/calibrated.yaml").joint_names[0] == "LF_hip"
+
+
+def test_faults_of_a_version_1_file_are_named_in_its_own_words_and_lines(file):
+    text = version_1(file).read_text().replace("delay_s: {value: 0.025,", "delay_s: {value: 25.0,")
+    file.write_text(text)
+    line = next(n for n, t in enumerate(text.splitlines(), 1) if "value: 25.0" in t)
+    with pytest.raises(InputError, match=rf"line {line}: joints\.LF_hip\.actuator\.delay_s is not"):
+        load_calibration(file)

@@ -81,8 +81,8 @@ def test_a_missing_file_is_refused_and_a_misspelt_preset_is_recognised(tmp_path)
         (b"[" * 1_000_000, "nested deeper"),
         (b"schema: pupper-calibration\n", "schema_version is None"),
         (b"schema: pupper-calibration\nschema_version: true\n", "schema_version is True"),
-        (b"schema: pupper-calibration\nschema_version: 0\n", "Write `schema_version: 1`"),
-        (b"schema: pupper-calibration\nschema_version: 2\nnew: 1\n", "newer version.*Upgrade"),
+        (b"schema: pupper-calibration\nschema_version: 0\n", "Write `schema_version: 2`"),
+        (b"schema: pupper-calibration\nschema_version: 3\nnew: 1\n", "newer version.*Upgrade"),
     ],
 )
 def test_what_is_no_calibration_is_refused_with_what_is_wrong(tmp_path, content, says):
@@ -133,15 +133,15 @@ def test_an_unknown_key_that_resembles_none_is_refused_with_the_list_of_keys(fil
 
 
 def test_an_unknown_key_inside_a_list_is_refused_with_its_place(file):
-    message = edited(file, *HIP, "selection", "ladder", 1, "rmse_fresh", value=0.1)
-    assert "joints.LF_hip.selection.ladder[1].rmse_fresh has no unit" in message
+    message = edited(file, *HIP, "selection", "candidate_models", 1, "rmse_fresh", value=0.1)
+    assert "joints.LF_hip.selection.candidate_models[1].rmse_fresh has no unit" in message
     assert "name it rmse_fresh_rad" in message
 
 
 @pytest.mark.parametrize(
     ("part", "right", "wrong", "unit"),
     [
-        ("actuator", "delay_s", "delay_ms", "in s"),
+        ("actuator", "dead_time_s", "dead_time_ms", "in s"),
         ("actuator", "stiffness_nm_per_rad", "stiffness_nm_per_deg", "in N·m/rad"),
         ("actuator", "velocity_limit_rad_s", "velocity_limit_rpm", "in rad/s"),
         ("actuator", "effort_limit_nm", "effort_limit", "in N·m"),
@@ -159,7 +159,7 @@ def test_a_key_in_another_unit_is_refused_with_the_unit_of_this_file(
 @pytest.mark.parametrize(
     ("part", "name", "value", "says"),
     [
-        ("actuator", "delay_s", 25, "looks like milliseconds: write 0.025"),
+        ("actuator", "dead_time_s", 25, "looks like milliseconds: write 0.025"),
         ("feedback", "poll_period_s", 26.85, "looks like milliseconds: write 0.02685"),
         ("feedback", "loss", 42, "looks like percent: write 0.42"),
         ("feedback", "quantum_rad", 0.33, "looks like degrees"),
@@ -178,12 +178,12 @@ def test_an_impossible_number_is_refused_with_what_it_probably_is(file, part, na
 
 
 def test_an_impossible_end_of_an_interval_is_refused(file):
-    message = edited(file, *HIP, "actuator", "delay_s", "high", value=32)
-    assert "joints.LF_hip.actuator.delay_s" in message and "milliseconds" in message
+    message = edited(file, *HIP, "actuator", "dead_time_s", "high", value=32)
+    assert "joints.LF_hip.actuator.dead_time_s" in message and "milliseconds" in message
 
 
 def test_a_bare_number_in_place_of_a_quantity_is_refused_with_the_form_to_write(file):
-    message = edited(file, *HIP, "actuator", "delay_s", value=25)
+    message = edited(file, *HIP, "actuator", "dead_time_s", value=25)
     assert "bare number" in message and "milliseconds" in message and "{value: …" in message
 
 
@@ -207,9 +207,9 @@ def test_a_value_that_is_no_finite_number_is_refused(file, value, says):
 @pytest.mark.parametrize(
     ("place", "value", "says"),
     [
-        (("actuator", "delay_s", "identified"), "maybe", "'yes', 'ratio only' or 'no'"),
-        (("actuator", "delay_s", "identified"), True, "'yes', 'ratio only' or 'no'"),
-        (("actuator", "delay_s", "low"), 0.5, "low must not exceed high"),
+        (("actuator", "dead_time_s", "identified"), "maybe", "'yes', 'ratio only' or 'no'"),
+        (("actuator", "dead_time_s", "identified"), True, "'yes', 'ratio only' or 'no'"),
+        (("actuator", "dead_time_s", "low"), 0.5, "low must not exceed high"),
         (("actuator", "velocity_limit_rad_s", "why"), None, "`why` must give the reason"),
         (("actuator", "delay_steps_min"), 20, "swap them"),
         (("actuator", "delay_steps_min"), 10.5, "Write a whole number"),

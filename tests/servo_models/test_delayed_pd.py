@@ -19,7 +19,7 @@ PAPER = DelayedPDParameters(
     armature=0.005,
     effort_limit=5.0,
     velocity_limit=10.5,
-    delay_s=0.076,
+    dead_time_s=0.076,
 )
 MEASURED = DelayedPDParameters(
     stiffness=10.3,
@@ -28,7 +28,7 @@ MEASURED = DelayedPDParameters(
     armature=8.08e-4,
     effort_limit=0.35,
     velocity_limit=7.6,
-    delay_s=0.025,
+    dead_time_s=0.025,
 )
 TIME = np.arange(1000) * H
 SINE = 0.3 * np.sin(2 * np.pi * 3 * TIME)
@@ -55,9 +55,9 @@ def ours(servo: DelayedPDParameters, commands: np.ndarray, start: float = 0.0) -
 
 SERVOS = {
     "measured": MEASURED,
-    "fractional delay": replace(MEASURED, delay_s=0.0273),
-    "one step of delay": replace(MEASURED, delay_s=H),
-    "no delay": replace(MEASURED, delay_s=0.0),
+    "fractional delay": replace(MEASURED, dead_time_s=0.0273),
+    "one step of delay": replace(MEASURED, dead_time_s=H),
+    "no delay": replace(MEASURED, dead_time_s=0.0),
     "no friction": replace(MEASURED, friction_loss=0.0),
     "paper": PAPER,
     "torque always saturated": replace(MEASURED, effort_limit=0.19),
@@ -76,7 +76,7 @@ def test_numpy_servo_equals_mujocos_native_servo(servo, commands, start):
 
 
 def test_mujoco_takes_a_delay_below_one_step_for_one_step():
-    short, one = replace(MEASURED, delay_s=0.3 * H), replace(MEASURED, delay_s=H)
+    short, one = replace(MEASURED, dead_time_s=0.3 * H), replace(MEASURED, dead_time_s=H)
     np.testing.assert_allclose(native(short, STEPS), native(one, STEPS), atol=1e-9)
 
 
@@ -101,19 +101,21 @@ def test_a_resting_servo_stays_because_its_delay_line_holds_the_start_pose():
 
 @pytest.mark.parametrize("delay", [0.0, 0.0019, 0.002, 0.02, 0.0273, 0.1])
 def test_mujocos_delay_line_is_long_enough_for_the_delay(delay):
-    attributes = actuator_attributes(replace(MEASURED, delay_s=delay), H)
+    attributes = actuator_attributes(replace(MEASURED, dead_time_s=delay), H)
     assert int(attributes["nsample"]) * H > float(attributes["delay"]) == delay
 
 
 def test_a_step_has_no_effect_before_the_delay_and_some_right_after():
     commands = np.full(50, 0.3)
-    moved = np.flatnonzero(np.abs(ours(replace(MEASURED, delay_s=0.03), commands)) > 1e-12)
+    moved = np.flatnonzero(np.abs(ours(replace(MEASURED, dead_time_s=0.03), commands)) > 1e-12)
     assert moved[0] == 0.03 / H
 
 
 def test_delay_between_two_steps_is_the_linear_mean_of_the_commands():
     linear = replace(MEASURED, friction_loss=0.0, effort_limit=np.inf, velocity_limit=np.inf)
-    early, late, between = (ours(replace(linear, delay_s=d * H), SINE) for d in (10.0, 11.0, 10.25))
+    early, late, between = (
+        ours(replace(linear, dead_time_s=d * H), SINE) for d in (10.0, 11.0, 10.25)
+    )
     np.testing.assert_allclose(between, 0.75 * early + 0.25 * late, atol=1e-12)
 
 
@@ -130,10 +132,10 @@ def test_step_by_step_equals_rollout_and_reset_forgets_everything():
 
 def test_a_batch_of_servos_moves_as_each_of_them_alone():
     delays, friction = np.array([0.0, 0.011, 0.0273]), np.array([[0.0], [0.1]])
-    batch = DelayedPD(replace(MEASURED, delay_s=delays, friction_loss=friction), H)
+    batch = DelayedPD(replace(MEASURED, dead_time_s=delays, friction_loss=friction), H)
     together = batch.rollout(np.broadcast_to(STEPS[:, None, None], (len(STEPS), 2, 3)))
     for i, j in np.ndindex(2, 3):
-        one = replace(MEASURED, delay_s=delays[j], friction_loss=friction[i, 0])
+        one = replace(MEASURED, dead_time_s=delays[j], friction_loss=friction[i, 0])
         np.testing.assert_array_equal(together[:, i, j], ours(one, STEPS))
 
 
@@ -162,7 +164,7 @@ def test_the_setpoints_rate_bounds_the_speed_of_a_long_move():
     [
         ("stiffness", -1.0),
         ("armature", 0.0),
-        ("delay_s", np.nan),
+        ("dead_time_s", np.nan),
         ("friction_loss", np.array([0.1, -0.1])),
         ("effort_limit", np.nan),
         ("velocity_limit", -7.5),
@@ -181,5 +183,5 @@ def test_impossible_time_steps_are_refused(step):
 
 @pytest.mark.parametrize("delay", [-0.001, np.nan, np.inf])
 def test_mujoco_is_not_given_an_impossible_delay(delay):
-    with pytest.raises(InputError, match="delay_s"):
-        actuator_attributes(replace(MEASURED, delay_s=delay), H)
+    with pytest.raises(InputError, match="dead_time_s"):
+        actuator_attributes(replace(MEASURED, dead_time_s=delay), H)

@@ -201,7 +201,7 @@ def test_a_delay_that_no_servo_has_is_refused_before_it_takes_all_memory(tmp_pat
 def test_a_contract_is_refused_that_says_what_the_model_is_not(tmp_path: Path):
     changes: list[tuple[dict[str, Any], str]] = [
         ({"colour": "red"}, "colour: unknown entry"),
-        ({"schema_version": 2}, "newer version"),
+        ({"schema_version": 3}, "newer version"),
         ({"schema_version": "one"}, "schema_version"),
         ({"schema": "pupper-calibration"}, "is no servo model's contract"),
         ({"arch": "transformer"}, "arch"),
@@ -305,3 +305,13 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path: Path):
         with pytest.raises(InputError, match=str(tmp_path / "a")):
             save_servo_model(tmp_path / "a", parameters, said)
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("kind", ["delayed-pd", "sindy"])
+def test_a_model_of_version_1_has_its_dead_time_under_the_old_name(tmp_path: Path, kind: str):
+    parameters = arrays(kind)
+    old = {k.replace("dead_time_s", "delay_s"): v for k, v in parameters.items()}
+    model = load_servo_model(crafted(tmp_path / kind, kind, old, schema_version=1))
+    assert model.contract.schema_version == 2
+    np.testing.assert_array_equal(model.parameters["dead_time_s"], parameters["dead_time_s"])
+    assert "_s is missing" in refusal(crafted(tmp_path / "new", kind, old))

@@ -7,9 +7,9 @@ import math
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile, utc_now
 from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
+    CandidateModel,
     Feedback,
     JointCalibration,
-    LadderRow,
     Lag,
     Quantity,
     RatiosToArmature,
@@ -39,7 +39,7 @@ def joint_calibration(stiffness: float = 11.0) -> JointCalibration:
             armature_kg_m2=scaled(1.1e-5),
             effort_limit_nm=scaled(0.35),
             velocity_limit_rad_s=Quantity(value=7.6, identified="no", why="peak speed: 5.7 # low"),
-            delay_s=measured(0.025),
+            dead_time_s=measured(0.025),
             delay_steps_min=10,
             delay_steps_max=15,
             physics_step_s=0.002,
@@ -61,9 +61,11 @@ def joint_calibration(stiffness: float = 11.0) -> JointCalibration:
         lag=Lag(lag_s=measured(0.041), naive_lag_s=measured(0.081)),
         selection=Selection(
             model="delayed_pd",
-            ladder=(
-                LadderRow(model="pure delay", parameter_count=3, rmse_fresh_rad=0.0254),
-                LadderRow(model="delayed_pd", parameter_count=8, parameters={"delay_s": 0.1 + 0.2}),
+            candidate_models=(
+                CandidateModel(model="pure delay", parameter_count=3, rmse_fresh_rad=0.0254),
+                CandidateModel(
+                    model="delayed_pd", parameter_count=8, parameters={"dead_time_s": 0.1 + 0.2}
+                ),
             ),
         ),
         scores=Scores(rmse_free_run_held_rad=0.0136, fit_percent=92.7),

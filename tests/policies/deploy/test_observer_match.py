@@ -27,7 +27,7 @@ LINEAR = DelayedPDParameters(
     armature=8e-4,
     effort_limit=np.inf,
     velocity_limit=np.inf,
-    delay_s=0.024,
+    dead_time_s=0.024,
 )
 TRAINED = replace(LINEAR, friction_loss=0.0167, effort_limit=0.35, velocity_limit=7.6)
 
@@ -41,7 +41,7 @@ def theory(servo: DelayedPDParameters, frequency_hz: np.ndarray, period_s: float
     s = 2j * np.pi * (np.asarray(frequency_hz) + np.arange(-100, 101)[:, None] / period_s)
     hold = (1 - np.exp(-s * period_s)) / (s * period_s)
     motion = k / (inertia * s**2 + d * s + k)
-    return (hold * np.exp(-s * float(np.asarray(servo.delay_s))) * motion).sum(axis=0)
+    return (hold * np.exp(-s * float(np.asarray(servo.dead_time_s))) * motion).sum(axis=0)
 
 
 # ---------------------------------------------------------------------------------- response
@@ -110,7 +110,7 @@ def test_readings_of_the_actuator_itself_fit():
 
 
 def test_readings_are_those_of_the_robot_not_of_the_training():
-    late = replace(TRAINED, delay_s=0.024 + 2 * P)
+    late = replace(TRAINED, dead_time_s=0.024 + 2 * P)
     match = compare(HeldEncoder(P, 4), TRAINED, P, late)
     assert not match.fits and "40 ms later than the trained actuator" in match.sentence()
     assert compare(HeldEncoder(P, 4), TRAINED, P, TRAINED).fits
@@ -129,7 +129,7 @@ def test_the_papers_observer_does_not_fit_and_the_sentence_names_its_resonance()
 
 
 def test_a_delay_of_two_hundred_milliseconds_is_unwrapped_and_named():
-    late = replace(TRAINED, delay_s=0.024 + 0.2)
+    late = replace(TRAINED, dead_time_s=0.024 + 0.2)
     match = compare(SyntheticPD(late, P), TRAINED, P)
     assert not match.fits
     assert match.worst_gain_ratio == pytest.approx(1, abs=1e-3)
@@ -141,7 +141,7 @@ def test_a_delay_of_two_hundred_milliseconds_is_unwrapped_and_named():
 def test_an_early_observer_is_called_early_and_the_one_joint_is_named():
     delays = np.full(12, 0.024)
     delays[7] = 0.0
-    match = compare(SyntheticPD(replace(TRAINED, delay_s=delays), P), TRAINED, P)
+    match = compare(SyntheticPD(replace(TRAINED, dead_time_s=delays), P), TRAINED, P)
     assert not match.fits
     assert match.worst_phase_difference_deg == pytest.approx(360 * 6 * 0.024, abs=0.5)
     assert "24 ms earlier" in match.sentence()
@@ -150,7 +150,7 @@ def test_an_early_observer_is_called_early_and_the_one_joint_is_named():
 
 @pytest.mark.parametrize(("shift_s", "fits"), [(0.008, True), (0.011, False)])
 def test_twenty_degrees_at_six_hertz_are_the_border(shift_s, fits):
-    shifted = replace(TRAINED, delay_s=0.024 + shift_s)
+    shifted = replace(TRAINED, dead_time_s=0.024 + shift_s)
     assert compare(SyntheticPD(shifted, P), TRAINED, P).fits is fits
 
 

@@ -29,7 +29,7 @@ CALIBRATED = DelayedPDParameters(
     armature=8.08e-4,
     effort_limit=0.35,
     velocity_limit=7.6,
-    delay_s=np.linspace(0.0201, 0.0287, 12),
+    dead_time_s=np.linspace(0.0201, 0.0287, 12),
 )
 UNKNOWN = np.full(12, np.nan)
 
@@ -166,7 +166,7 @@ def test_with_the_trained_parameters_it_is_the_trained_servo(period_s):
 
 
 def test_effort_is_the_torque_within_its_limit():
-    stiff = replace(CALIBRATED, stiffness=10.0, friction_loss=0.35, delay_s=0.0)
+    stiff = replace(CALIBRATED, stiffness=10.0, friction_loss=0.35, dead_time_s=0.0)
     observer = SyntheticPD(stiff, P)
     # dry friction as large as the limit: the joint cannot move, so torque = stiffness * target
     half = observer.step(np.full(12, 0.0175), UNKNOWN)
@@ -200,7 +200,7 @@ def test_a_servo_too_stiff_for_its_substeps_is_refused_with_how_many_it_needs():
         ({"stiffness": np.ones(11)}, "shape"),
         ({"damping": np.ones((2, 12))}, "shape"),
         ({"armature": 0.0}, "armature"),
-        ({"delay_s": -0.1}, "delay_s"),
+        ({"dead_time_s": -0.1}, "dead_time_s"),
     ],
 )
 def test_parameters_that_are_no_servos_are_refused(changes, message):

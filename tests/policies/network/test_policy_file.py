@@ -123,11 +123,19 @@ def test_weights_that_were_tampered_with_are_refused(tmp_path):
     assert "is not the file that contract.json describes" in refusal(tmp_path)
 
 
+def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(tmp_path):
+    write(tmp_path)
+    written = json.loads((tmp_path / CONTRACT).read_text())
+    found = {k.replace("dead_time_s", "delay_s"): v for k, v in written.items()}
+    (tmp_path / CONTRACT).write_text(json.dumps(found | {"schema_version": 1}))
+    assert load_policy(tmp_path).contract.model_dump(mode="json", by_alias=True) == written
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"schema": "pupper-servo"}, "schema"),
-        ({"schema_version": 2}, "Upgrade pupper-sysid"),
+        ({"schema_version": 3}, "Upgrade pupper-sysid"),
         ({"schema_version": 0}, "schema_version"),
         ({"kind": "perceptron"}, "kind"),
         ({"hidden": []}, "does not fit"),

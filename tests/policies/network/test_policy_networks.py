@@ -287,11 +287,11 @@ def test_a_file_that_acts_otherwise_is_not_written(policy, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("delay_s", "steps"), [(0.0, 1), (0.001, 2), (0.020, 2), (0.076, 5), (0.100, 6)]
+    ("dead_time_s", "steps"), [(0.0, 1), (0.001, 2), (0.020, 2), (0.076, 5), (0.100, 6)]
 )
-def test_past_actions_cover_the_longest_delay_and_one_step_more(delay_s, steps):
+def test_past_actions_cover_the_longest_delay_and_one_step_more(dead_time_s, steps):
     """k = ceil(delay / 20 ms) + 1."""
     servos = servo_ranges(CALIBRATION)
-    servos = servos.later(delay_s - servos.longest_delay_s)
+    servos = servos.later(dead_time_s - servos.longest_dead_time_s)
     assert action_history(tiny_run("mlp-actions"), servos) == steps
     assert action_history(tiny_run("lstm"), servos) == 0

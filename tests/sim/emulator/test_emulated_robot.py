@@ -34,7 +34,7 @@ SERVO = DelayedPDParameters(
     armature=8.08e-4,
     effort_limit=0.35,
     velocity_limit=7.6,
-    delay_s=0.025,
+    dead_time_s=0.025,
 )
 
 
@@ -76,7 +76,7 @@ def test_servo_moves_as_delayed_pd_when_commands_come_on_physics_steps():
 def test_a_command_between_physics_steps_keeps_its_timing():
     servo = FreeAirServo(SERVO, 0.0, 0.001)
     servo.command(0.0104, 0.3)
-    later = DelayedPD(replace(SERVO, delay_s=0.0254), 0.001)
+    later = DelayedPD(replace(SERVO, dead_time_s=0.0254), 0.001)
     later.reset(np.array(0.0))
     expected = later.rollout(np.where(np.arange(300) >= 10, 0.3, 0.0))
     got = [servo.position_at((k + 1) * 0.001) for k in range(300)]
@@ -108,8 +108,8 @@ def test_a_servo_that_was_left_alone_for_long_still_answers_on_time():
 
 
 def test_a_delay_too_short_for_the_emulator_is_refused():
-    with pytest.raises(InputError, match="delay_s"):
-        FreeAirServo(replace(SERVO, delay_s=0.0015), 0.0)
+    with pytest.raises(InputError, match="dead_time_s"):
+        FreeAirServo(replace(SERVO, dead_time_s=0.0015), 0.0)
 
 
 def test_readings_are_the_position_at_the_poll_rounded_to_counts_with_the_offset():
@@ -236,7 +236,7 @@ def test_the_mean_servo_is_the_published_one():
         # 480 servos: the mean's standard error is 0.5 %, the spread's 3 %
         assert logs.mean() == pytest.approx(np.log(mean), abs=0.02)
         assert logs.std() == pytest.approx(0.10, rel=0.15)
-    delays = np.array([float(np.asarray(s.delay_s)) for s in servos])
+    delays = np.array([float(np.asarray(s.dead_time_s)) for s in servos])
     assert delays.mean() == pytest.approx(0.025, abs=0.0003)
     assert delays.std() == pytest.approx(0.0015, rel=0.15)
     assert {s.effort_limit for s in servos} == {0.35}
@@ -246,13 +246,15 @@ def test_random_specs_span_their_range_and_keep_what_was_chosen():
     specs = [random_spec(np.random.default_rng(i), loss=0.3) for i in range(60)]
     assert {s.loss for s in specs} == {0.3}
     assert len({s.quantum_rad for s in specs}) == 3
-    delays = np.array([s.delay_s for s in specs])
+    delays = np.array([s.dead_time_s for s in specs])
     assert delays.min() < 0.014 and delays.max() > 0.036
     with pytest.raises(InputError, match="losses"):
         random_spec(np.random.default_rng(0), losses=0.1)
 
 
-@pytest.mark.parametrize(("name", "value"), [("loss", 1.0), ("loss", -0.1), ("delay_s", np.nan)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("loss", 1.0), ("loss", -0.1), ("dead_time_s", np.nan)]
+)
 def test_impossible_robots_are_refused(name, value):
     with pytest.raises(InputError, match=name):
         RobotSpec(**{name: value})
@@ -290,7 +292,7 @@ def test_truth_files_say_every_parameter_and_every_read(tmp_path):
     assert (numbers.name, rows.name) == ("sweep.truth.yaml", "sweep.truth.csv")
     truth = yaml.safe_load(numbers.read_text())
     hip = truth["joints"]["LF_hip"]
-    assert hip["actuator"]["delay_s"] == bus.robot.servos[0].actuator.delay_s
+    assert hip["actuator"]["dead_time_s"] == bus.robot.servos[0].actuator.dead_time_s
     assert hip["feedback"]["loss"] == 0.42 and "phase_s" in hip["feedback"]
     table = pd.read_csv(rows)
     assert tuple(table.columns) == TRUTH_COLUMNS

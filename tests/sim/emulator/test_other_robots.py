@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from test_simulator_export import in_free_air
 
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.joints import JOINT_NAMES
@@ -24,6 +23,7 @@ from pupper_sysid.sim.robot.robot_map import joint_map_of
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from pupper_sysid.sysid.recordings.recording import load
 from support.command_line import refused, run, run_program
+from support.exported_servos import in_free_air
 from support.servo_servers import on_a_port
 
 ARM = """<mujoco><worldbody>
@@ -116,7 +116,9 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
     truth = yaml.safe_load(Path("arm.truth.yaml").read_text())["joints"]
     for name in found.joint_names:
         own = found.joint(name).actuator
-        assert own.delay_s.value == pytest.approx(truth[name]["actuator"]["delay_s"], abs=4e-3)
+        assert own.dead_time_s.value == pytest.approx(
+            truth[name]["actuator"]["dead_time_s"], abs=4e-3
+        )
         assert found.joint(name).feedback.poll_period_s.value == 0.0
     model = load_servo_model(Path("servo"), joints=["gripper"]).model
     start = float(recording.trials("gripper")[0].command_rad[0])
@@ -143,8 +145,8 @@ def test_one_servo_on_a_bench_is_swept_over_a_serial_line_and_calibrated(capsys)
     code, _, err = run(capsys, "calibrate", "bench.csv", "--out", "bench.yaml")
     assert code == 0, err
     own = load_calibration(Path("bench.yaml")).joint("bench").actuator
-    true = float(np.asarray(robot.servos[0].actuator.delay_s))
-    assert own.delay_s.value == pytest.approx(true, abs=8e-3)
+    true = float(np.asarray(robot.servos[0].actuator.dead_time_s))
+    assert own.dead_time_s.value == pytest.approx(true, abs=8e-3)
 
 
 def test_what_is_no_robot_is_refused_in_a_sentence(capsys):

@@ -34,40 +34,15 @@ from pupper_sysid.sim.export.simulator_export import (
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, mujoco, rest_at
 from pupper_sysid.sysid.recordings.recording import load
 from support.command_line import refused, run_program
+from support.exported_servos import ISAACLAB, MJLAB, in_free_air
 
 ROOT = Path(__file__).resolve().parents[3]
 CALIBRATED = ROOT / "data/samples/calibrated.yaml"
-
-# as released: isaaclab 2.3.2.post1, mjlab 1.6.0 (benchmarks/peers/check_exports.py reads them)
-ISAACLAB = {
-    "class_type", "joint_names_expr", "effort_limit", "velocity_limit", "effort_limit_sim",
-    "velocity_limit_sim", "stiffness", "damping", "armature", "friction", "dynamic_friction",
-    "viscous_friction", "min_delay", "max_delay",
-}  # fmt: skip
-MJLAB = {
-    "target_names_expr", "transmission_type", "armature", "frictionloss", "viscous_damping",
-    "delay_min_lag", "delay_max_lag", "delay_hold_prob", "delay_update_period",
-    "delay_per_env_phase", "stiffness", "damping", "effort_limit",
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def calibration():
     return load_calibration(CALIBRATED)
-
-
-def in_free_air(snippet: str, names: tuple[str, ...]) -> Any:
-    """A model of hinges without load that includes an exported file."""
-    bodies = "".join(
-        f'<body><joint name="{n}" class="servo_{n}" type="hinge" axis="0 1 0"/>'
-        '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/></body>'
-        for n in names
-    )
-    text = (
-        '<mujoco><include file="servos.xml"/><option gravity="0 0 0"/>'
-        f"<worldbody>{bodies}</worldbody></mujoco>"
-    )
-    return mujoco.MjModel.from_xml_string(text, {"servos.xml": snippet.encode()})
 
 
 def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(calibration):
@@ -119,7 +94,7 @@ def test_an_export_for_longer_steps_lags_as_long_as_the_calibration_says(calibra
     # what the step of 5 ms alone would have done
     more = delays_at_step(calibration, 0.005)
     for name, joint in calibration.joints.items():
-        assert 0.0015 < more[name].value_s - joint.actuator.delay_s.value < 0.004
+        assert 0.0015 < more[name].value_s - joint.actuator.dead_time_s.value < 0.004
 
 
 @pytest.mark.parametrize("engine", [EXPLICIT_PD, MJLAB_PD])

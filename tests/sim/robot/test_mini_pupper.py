@@ -32,7 +32,7 @@ STIFF = DelayedPDParameters(
     armature=8e-4,
     effort_limit=1e3,
     velocity_limit=1e3,
-    delay_s=0.0,
+    dead_time_s=0.0,
 )
 
 # facts/hardware.md C4, left legs: mass [kg], centre [m], inertia xx yy zz xy xz yz [kg m²]

@@ -31,10 +31,10 @@ def ranges_of(tmp_path, found: Calibration | None = None, **options) -> ServoRan
 def test_an_interval_of_the_calibration_is_the_range(tmp_path):
     ranges = ranges_of(tmp_path)
     # calibration_examples: delay 0.025 ± 10 %, identified
-    assert ranges.low["delay_s"][0] == pytest.approx(0.0225)
-    assert ranges.value["delay_s"][0] == 0.025
-    assert ranges.high["delay_s"][0] == pytest.approx(0.0275)
-    assert ranges.longest_delay_s == pytest.approx(0.0275)
+    assert ranges.low["dead_time_s"][0] == pytest.approx(0.0225)
+    assert ranges.value["dead_time_s"][0] == 0.025
+    assert ranges.high["dead_time_s"][0] == pytest.approx(0.0275)
+    assert ranges.longest_dead_time_s == pytest.approx(0.0275)
 
 
 def test_a_number_without_an_interval_is_itself(tmp_path):
@@ -46,7 +46,7 @@ def test_a_number_without_an_interval_is_itself(tmp_path):
 
 def test_the_measured_sample_gives_its_own_intervals():
     ranges = servo_ranges("data/samples/calibrated.yaml")
-    for field in ("stiffness", "damping", "friction_loss", "delay_s"):
+    for field in ("stiffness", "damping", "friction_loss", "dead_time_s"):
         assert (ranges.low[field] < ranges.value[field]).all()
         assert (ranges.value[field] < ranges.high[field]).all()
     # the armature is the scale that torque_scale draws, not a range of its own
@@ -60,8 +60,8 @@ def test_the_measured_sample_gives_its_own_intervals():
 )
 def test_presets_delays_are_their_whole_physics_steps(preset, steps, stiffness, effort):
     ranges = servo_ranges(preset)
-    np.testing.assert_allclose(ranges.low["delay_s"], steps[0] * 0.002)
-    np.testing.assert_allclose(ranges.high["delay_s"], steps[1] * 0.002)
+    np.testing.assert_allclose(ranges.low["dead_time_s"], steps[0] * 0.002)
+    np.testing.assert_allclose(ranges.high["dead_time_s"], steps[1] * 0.002)
     np.testing.assert_array_equal(ranges.value["stiffness"], stiffness)
     np.testing.assert_array_equal(ranges.high["effort_limit"], effort)
     assert ranges.borrowed == {}
@@ -109,9 +109,9 @@ def test_feedback_comes_with_the_calibration_and_can_be_exchanged(tmp_path):
 def test_ideal_servos_are_immediate_and_free_of_friction_with_exact_feedback():
     ranges = servo_ranges("ideal")
     for end in (ranges.low, ranges.value, ranges.high):
-        assert not end["delay_s"].any()
+        assert not end["dead_time_s"].any()
         assert not end["friction_loss"].any()
-    assert ranges.longest_delay_s == 0.0
+    assert ranges.longest_dead_time_s == 0.0
     assert set(ranges.feedback) == {HeldFeedback()}
 
 
@@ -121,11 +121,11 @@ def test_later_moves_every_delay_and_nothing_else(actuator):
     after = before.later(0.04)
     for name in ("low", "value", "high"):
         old, new = getattr(before, name), getattr(after, name)
-        np.testing.assert_allclose(new["delay_s"], old["delay_s"] + 0.04)
-        for field in old.keys() - {"delay_s"}:
+        np.testing.assert_allclose(new["dead_time_s"], old["dead_time_s"] + 0.04)
+        for field in old.keys() - {"dead_time_s"}:
             np.testing.assert_array_equal(new[field], old[field])
-    assert after.longest_delay_s == pytest.approx(before.longest_delay_s + 0.04)
-    assert servo_ranges(actuator).longest_delay_s == before.longest_delay_s
+    assert after.longest_dead_time_s == pytest.approx(before.longest_dead_time_s + 0.04)
+    assert servo_ranges(actuator).longest_dead_time_s == before.longest_dead_time_s
 
 
 def test_drawn_numbers_fill_their_intervals_and_never_leave_them():
@@ -148,7 +148,7 @@ def test_the_torque_scale_is_one_factor_per_robot_on_all_torques_and_the_armatur
     for field in TORQUES:
         np.testing.assert_allclose(drawn[field], factor * ranges.value[field], err_msg=field)
     np.testing.assert_array_equal(drawn["velocity_limit"], 10.5)
-    assert drawn["delay_s"].max() <= 0.086
+    assert drawn["dead_time_s"].max() <= 0.086
 
 
 def test_drawing_leaves_the_ranges_as_they_were():
@@ -164,7 +164,7 @@ def test_the_nominal_servo_of_a_joint_is_the_middle_of_its_intervals(tmp_path):
     assert tuple(nominal) == JOINT_NAMES
     for i, name in enumerate(JOINT_NAMES):
         assert nominal[name].stiffness == 5.0 + i
-        assert nominal[name].delay_s == 0.025
+        assert nominal[name].dead_time_s == 0.025
 
 
 @pytest.mark.parametrize("actuator", ["paper", "release", "ideal", "data/samples/calibrated.yaml"])
@@ -193,4 +193,4 @@ def test_a_folder_without_a_model_is_refused(tmp_path):
 
 def test_no_delay_becomes_negative():
     ranges = servo_ranges("paper").later(-1.0)
-    assert not ranges.low["delay_s"].any() and not ranges.high["delay_s"].any()
+    assert not ranges.low["dead_time_s"].any() and not ranges.high["dead_time_s"].any()

@@ -96,7 +96,7 @@ def with_delay(low: float, high: float) -> ServoRanges:
     return replace(
         paper,
         **{
-            name: getattr(paper, name) | none | {"delay_s": np.full(12, seconds)}
+            name: getattr(paper, name) | none | {"dead_time_s": np.full(12, seconds)}
             for name, seconds in delay.items()
         },
     )
@@ -405,7 +405,7 @@ def test_a_command_acts_after_the_delay_that_was_drawn_and_in_part_between_steps
         env.robots.batch.bind("ctrl")[:, 0] += change
         moved.append(env.robots.batch.rollout(10, record=("qpos",))["qpos"][:, :, 7])
     effect = moved[1] - moved[0]
-    steps = env.robots.drawn["delay_s"][:, 0] / H
+    steps = env.robots.drawn["dead_time_s"][:, 0] / H
     assert np.ptp(steps) > 3
     first = (np.abs(effect) > 1e-9).argmax(axis=1)
     np.testing.assert_array_equal(first, np.floor(steps))
@@ -444,12 +444,12 @@ def test_the_delay_buffers_hold_the_longest_delay_that_can_be_drawn(more):
     for actuator in ACTUATORS:
         servos = servo_ranges(actuator).later(more)
         env = make(servos, count=1)
-        assert env.robots.model.actuator_history[:, 0].min() * H > servos.longest_delay_s
+        assert env.robots.model.actuator_history[:, 0].min() * H > servos.longest_dead_time_s
 
 
 def test_a_delay_that_does_not_fit_its_buffer_is_refused(monkeypatch):
     def short(servos, *rest):
-        return robot_xml({k: replace(v, delay_s=0.01) for k, v in servos.items()}, *rest)
+        return robot_xml({k: replace(v, dead_time_s=0.01) for k, v in servos.items()}, *rest)
 
     monkeypatch.setattr(pupper_sysid.sim.robot.robot_batch, "robot_xml", short)
     with pytest.raises(InputError, match=r"does not fit the buffer of 0\.014 s"):

@@ -110,7 +110,7 @@ def test_a_robot_left_alone_for_a_day_is_not_stepped_and_answers_on_time():
 
 
 def test_a_servo_begins_to_move_one_dead_time_after_its_command():
-    robot = make_robot(spec=RobotSpec(delay_s=0.025, delay_sd_s=0.0))
+    robot = make_robot(spec=RobotSpec(dead_time_s=0.025, dead_time_sd_s=0.0))
     start = robot.angle(HIP, 0.1)
     robot.command(HIP, 0.1, 0.3)
     assert robot.angle(HIP, 0.1245) == pytest.approx(start, abs=1e-6)
@@ -166,14 +166,14 @@ def test_a_limp_servo_ignores_goals_and_holds_where_it_is_when_switched_on_again
 
 def test_a_delay_too_short_for_the_emulator_is_refused():
     servos = draw_robot(np.random.default_rng(0))
-    short = replace(servos.servos[4].actuator, delay_s=0.0015)
+    short = replace(servos.servos[4].actuator, dead_time_s=0.0015)
     wrong = replace(
         servos,
         servos=tuple(
             replace(s, actuator=short) if i == 4 else s for i, s in enumerate(servos.servos)
         ),
     )
-    with pytest.raises(InputError, match="RF_thigh: delay_s"):
+    with pytest.raises(InputError, match="RF_thigh: dead_time_s"):
         WalkingRobot(wrong, np.random.default_rng(0))
 
 

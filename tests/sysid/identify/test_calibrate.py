@@ -16,7 +16,7 @@ from support.synthetic import LOOP_S, tone_trials
 
 TRUE = DelayedPDParameters(
     stiffness=12000.0, damping=100.0, friction_loss=150.0, armature=1.0, effort_limit=450.0,
-    velocity_limit=6.5, delay_s=0.025,
+    velocity_limit=6.5, dead_time_s=0.025,
 )  # fmt: skip
 
 
@@ -45,7 +45,7 @@ def result():
 def test_delayed_pd_is_recovered_from_lossy_readings(result):
     pd = result.rungs["delayed_pd"]
     assert result.chosen == "delayed_pd"
-    assert pd.values["delay_s"] == pytest.approx(0.025, abs=2e-3)
+    assert pd.values["dead_time_s"] == pytest.approx(0.025, abs=2e-3)
     assert pd.values["velocity_limit_rad_s"] == pytest.approx(6.5, rel=0.05)
     # the command's lag through a stiff PD is damping / stiffness
     ratio = pd.values["damping_per_s"] / pd.values["stiffness_per_s2"]
@@ -113,7 +113,7 @@ def test_the_fit_simulates_what_delayed_pd_simulates():
     data = prepare(trial, readings(trial, find_poll_lattice([trial], np.random.default_rng(0))))
     values = np.array([0.0273, 12000.0, 100.0, 150.0, 450.0, 6.5, 0.0])
     track = positions(rung("delayed_pd"), [(values[None], [data])])[0][1:, 0, 0]
-    model = DelayedPD(replace(TRUE, delay_s=0.0273))
+    model = DelayedPD(replace(TRUE, dead_time_s=0.0273))
     np.testing.assert_allclose(track, model.rollout(data.command), atol=1e-12)
 
 
@@ -136,7 +136,7 @@ def test_a_frozen_parameter_stays_where_it_was_put():
     data = tuple(prepare(t, readings(t, lattice)) for t in trials)
     model = rung("sopdt")
     start = np.array([[p.nominal for p in model.parameters]])
-    (found,) = fit(model, [Problem(data, (True, True), 0.01, {"delay_s": 0.033})], start, 10)
+    (found,) = fit(model, [Problem(data, (True, True), 0.01, {"dead_time_s": 0.033})], start, 10)
     assert found.values[0] == pytest.approx(0.033)
     assert found.covariance[0, 0] == 0
 

@@ -48,7 +48,7 @@ def test_a_folder_becomes_a_calibration_per_robot_and_one_table(sweeps, tmp_path
     assert code == 0, err
     table = two_made_and_one_failed(said, out)
     own = load_calibration(out / "r2.yaml").joint("LF_hip").actuator
-    assert table["delay_ms"].iloc[1] == pytest.approx(1e3 * own.delay_s.value)
+    assert table["dead_time_ms"].iloc[1] == pytest.approx(1e3 * own.dead_time_s.value)
 
     # nothing is calibrated twice, and what was edited is seen
     code, said, err = run(capsys, "calibrate", sweeps, "--out", out, "--json")

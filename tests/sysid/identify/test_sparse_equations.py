@@ -66,14 +66,15 @@ def with_friction(command):
 
 
 def test_dry_friction_holds_the_servo_where_the_drive_is_weaker():
-    servo = SparseEquation({"stiffness_per_s2": 1000.0, "friction_rad_s2": 100.0}, delay_s=0.0)
+    servo = SparseEquation({"stiffness_per_s2": 1000.0, "friction_rad_s2": 100.0}, dead_time_s=0.0)
     assert np.all(servo.rollout(np.full(200, 0.099)) == 0.0)  # 99 rad/s² against 100
     assert servo.rollout(np.full(200, 0.101))[-1] > 0.0
 
 
 def test_dry_friction_stops_the_servo_within_its_band_and_without_chatter():
     servo = SparseEquation(
-        {"stiffness_per_s2": 1000.0, "damping_per_s": 10.0, "friction_rad_s2": 100.0}, delay_s=0.0
+        {"stiffness_per_s2": 1000.0, "damping_per_s": 10.0, "friction_rad_s2": 100.0},
+        dead_time_s=0.0,
     )
     position = servo.rollout(np.full(1500, 1.0))
     assert np.all(np.diff(position[-200:]) == 0.0)
@@ -86,13 +87,13 @@ def test_dry_friction_stops_the_servo_within_its_band_and_without_chatter():
 )
 def test_a_saturated_drive_has_a_top_speed(brake, top_speed):
     drive = {"saturated_stiffness_per_s2": 10000.0, "saturation_error_rad": 0.05}
-    servo = SparseEquation({**drive, **brake, "friction_rad_s2": 80.0}, delay_s=0.0)
+    servo = SparseEquation({**drive, **brake, "friction_rad_s2": 80.0}, dead_time_s=0.0)
     position = servo.rollout(np.full(1000, 1000.0))
     assert np.diff(position)[-1] / TIME_STEP_S == pytest.approx(top_speed, rel=1e-6)
 
 
 def test_a_linear_servo_answers_a_tone_as_its_transfer_function_says():
-    servo = SparseEquation({"stiffness_per_s2": 3600.0, "damping_per_s": 84.0}, delay_s=0.0247)
+    servo = SparseEquation({"stiffness_per_s2": 3600.0, "damping_per_s": 84.0}, dead_time_s=0.0247)
     time, w = TIME_STEP_S * np.arange(4000), 2 * np.pi * 3.0
     position = servo.rollout(np.sin(w * time))[2000:]
     basis = np.exp(-1j * w * time[2000:])
@@ -177,7 +178,7 @@ def test_a_linear_servo_gets_a_linear_equation(found):
     r = found["LF_hip"]
     assert tuple(r.coefficients) == LINEAR
     stiffness, damping = r.coefficients.values()
-    delay = r.delay_s - TIME_STEP_S / 2  # half a step belongs to the integration
+    delay = r.dead_time_s - TIME_STEP_S / 2  # half a step belongs to the integration
     # three tones far below 10 Hz know the lag much better than its parts
     assert delay + damping / stiffness == pytest.approx(0.024 + 84 / 3600, abs=5e-4)
     assert delay == pytest.approx(0.024, abs=0.002)
@@ -191,7 +192,7 @@ def test_coulomb_friction_is_found_and_measured(found):
     assert r.coefficients["stiffness_per_s2"] == pytest.approx(6000 / inertia, rel=0.10)
     assert r.coefficients["damping_per_s"] == pytest.approx(60 / inertia, rel=0.10)
     assert r.coefficients["friction_rad_s2"] == pytest.approx(150 / inertia, rel=0.10)
-    assert r.delay_s == pytest.approx(0.020, abs=0.0015)
+    assert r.dead_time_s == pytest.approx(0.020, abs=0.0015)
 
 
 @pytest.mark.parametrize("joint", ["LF_hip", "LF_thigh"])
@@ -211,7 +212,7 @@ def test_friction_is_there_because_unseen_frequencies_need_it(found):
 def test_regression_proposes_servos_and_among_them_the_linear_one():
     data = trials(with_friction, np.random.default_rng(3))
     values = {
-        "delay_s": 0.02, "offset_rad": 0.0, "effort_rad_s2": 500.0, "stiffness_per_s2": 6000.0
+        "dead_time_s": 0.02, "offset_rad": 0.0, "effort_rad_s2": 500.0, "stiffness_per_s2": 6000.0
     }  # fmt: skip
     supports = propose(data, values)
     assert supports[0] == LINEAR and len(set(supports)) == len(supports) > 1

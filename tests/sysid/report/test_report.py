@@ -246,7 +246,7 @@ def test_frequency_csv_has_one_row_per_tone(written):
 
 def test_transfer_function_csv_has_every_fitted_number(written):
     rows = {r["parameter"]: r for r in rows_of(written, "transfer_functions")}
-    assert float(rows["delay_s"]["value_high"]) == pytest.approx(0.11)
+    assert float(rows["dead_time_s"]["value_high"]) == pytest.approx(0.11)
     assert float(rows["gain"]["chi2_per_dof"]) == 1.5
 
 
@@ -264,7 +264,7 @@ def test_the_page_says_whom_the_naive_score_would_have_chosen(page):
 
 def test_parameter_csv_carries_intervals_and_identifiability(written):
     rows = {(r["part"], r["parameter"]): r for r in rows_of(written, "parameters")}
-    delay = rows["actuator", "delay_s"]
+    delay = rows["actuator", "dead_time_s"]
     assert (float(delay["value"]), float(delay["low"]), delay["unit"]) == (0.024, 0.0205, "s")
     # stiffness = ratio × armature, and armature = stall torque / effort ratio: 9000 × 0.35 / 450
     stiffness = rows["actuator", "stiffness_nm_per_rad"]
@@ -376,7 +376,7 @@ def response_of() -> FrequencyResponse:
     )
     fit = TransferFunction(
         "FOPDT",
-        {"gain": interval(0.1), "delay_s": interval(0.1), "time_constant_s": interval(1e-3)},
+        {"gain": interval(0.1), "dead_time_s": interval(0.1), "time_constant_s": interval(1e-3)},
         1.5,
     )
     return FrequencyResponse(
