@@ -36,7 +36,7 @@ from pupper_sysid.sim.robot.servo_mjcf import (
 )
 
 SCHEMA = "pupper-actuators"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 ENDINGS = {"mjcf": ".xml", "isaaclab": "_isaaclab.py", "mjlab": "_mjlab.py", "json": ".json"}
 _LONGEST_STEP_S = 0.1
 EXPLICIT_PD, MJLAB_PD = Engine(slews=False, implicit=False), Engine(slews=False)
