@@ -27,7 +27,8 @@ import torch
 from emulators import KINDS, walking_servers
 
 from pupper_sysid.cli.commands.fit_servo import FitServo
-from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority

@@ -26,8 +26,9 @@ import numpy as np
 from emulators import KINDS, served
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import BusSample
-from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.sim.emulator.faults import ANSWER_KINDS, STATE_KINDS, BusFaults
 

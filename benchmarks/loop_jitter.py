@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.clock import HostClock
-from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.loop import FixedRateLoop, real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus
 

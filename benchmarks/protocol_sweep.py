@@ -22,7 +22,8 @@ import numpy as np
 from emulators import KINDS, in_process, served
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S

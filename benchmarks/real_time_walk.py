@@ -26,7 +26,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.policies.deploy.assembly import assemble

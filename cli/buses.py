@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 

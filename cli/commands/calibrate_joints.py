@@ -18,8 +18,9 @@ from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware import joint_calibration as jc
+from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 
 _PERIOD_S = 0.02

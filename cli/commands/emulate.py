@@ -17,7 +17,7 @@ import yaml
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
-from pupper_sysid.hardware.esp32.bus import SOCKET
+from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.feetech.registers import BAUD_RATES, SCS0009, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority

@@ -40,7 +40,7 @@ class InitRobot:
         target = self.out or Path(f"{self.model.stem}.joints.yaml")
         found.save(target, self.force)
         servos = found.per_servo()
-        room = servos.position_limits().room(servos.rest_pose())
+        room = servos.position_limits().margin(servos.rest_pose())
         plan = _plan(found.joint_names, room)
         sweeps = [
             f"pupper-sysid sweep --joint-map {target} --joints {','.join(names)} --freqs 1-6 "

@@ -15,8 +15,9 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import BusSample, ServoBus
-from pupper_sysid.hardware.connect import open_bus, parse_address
+from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.hardware.connect import parse_address
+from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.feetech.scan import ServoReport, scan_line
 

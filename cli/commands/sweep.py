@@ -211,7 +211,7 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
     pose = bus.metadata["rest_pose_rad"]
-    room = bus.limits.room(np.array([pose[name] for name in bus.joint_names]))
+    room = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
     return plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
         request["duration_s"], request["loop_period_s"], bus.metadata["speed_limit_rad_s"],

@@ -22,8 +22,9 @@ from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, trained_a
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.hardware.connect import open_guarded, parse_address
-from pupper_sysid.hardware.esp32.bus import SOCKET, Esp32Bus
+from pupper_sysid.hardware.address import SOCKET, parse_address
+from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority

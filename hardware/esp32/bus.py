@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.bus import BusSample, Sent
 from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.imu import ImuSample, from_chip
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 
-SOCKET = Path("/tmp/esp32-proxy.socket")
 TIMEOUT_S = 0.03
 VOLTAGE_BAND_V = (4.2, 8.7)
 """Below, the firmware soon cuts the servos off for good; above, no pack of this robot goes."""

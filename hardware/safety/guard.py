@@ -1,15 +1,15 @@
-"""The safety guard: it stands between whoever commands and any bus, and nobody gets past it.
+"""Wrapper around a ServoBus: limits commands, their speed and acceleration, and monitors readings.
 
     bus = GuardedBus(FeetechBus("/dev/ttyUSB0"))
 
-It is itself a `ServoBus`. Goals are kept inside the joints' limits, and inside a speed and an
-acceleration; the first one must be near to where the robot is. Readings are watched: a joint that
-is told to move and does not, that stays away from where it is held, that strains, overheats or
-starves, a servo that reports an error, a bus that has gone silent, all end in `SafetyStop`.
+It is itself a `ServoBus`, and every command passes through it. Commands are kept inside the joints'
+limits, a speed and an acceleration; the first one must be near the robot's pose. Readings are
+checked (`hardware.safety.monitor`): a joint that does not follow its command, is overloaded, too
+warm or short of voltage, a servo that reports an error, or a silent bus end in `SafetyStop`.
 
-`park` is the way out of everything: stop, return to the pose the robot was found in, torque off,
-each bounded in time; after a stop for safety the way back is left out. Because nothing on the
-robot notices that its host has died, `hardware.safety.watchdog` does the same from another process.
+`park` ends everything: stop, return to the pose in which the robot was found, torque off, each
+bounded in time; after a safety stop the way back is left out. Nothing on the robot notices that its
+host has died, so `hardware.safety.watchdog` does the same from another process.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ import numpy as np
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.moves import raised_cosine
-from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Watch
+from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 _HEARTBEAT_S = 0.1
 _PARK_PERIOD_S = 0.02
 _LONGEST_TICK_S = 0.06  # a pause does not save up for a jump
-_REST_S = 0.1  # longer since the last goal than any tick: the goal has been at rest
+_REST_S = 0.1  # longer than any tick: the command has been at rest
 _TORQUE_OFF_TRIES = 10
-_STALE_S = 0.1  # as old as what some buses say anyway
-_FIND_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
+_STALE_S = 0.1  # older than any feedback age
+_LOCATE_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
 
 
 @dataclass
 class GuardReport:
-    """What the guard had to do, for a recording's footer."""
+    """Interventions of the guard, for a recording's footer."""
 
     clipped: int = 0
-    """Goals that were moved into the limits."""
+    """Commands that were moved into the limits."""
     slowed: int = 0
-    """Goals that came later than asked because of the speed or acceleration limit."""
+    """Commands delayed by the speed or acceleration limit."""
     unsent: int = 0
     """Commands that could not be sent."""
     missing: int = 0
-    """Readings of single joints that did not come."""
+    """Missing readings of single joints."""
 
     def summary(self) -> dict[str, int]:
         """As plain numbers."""
@@ -59,7 +59,7 @@ class GuardedBus:
     bus : ServoBus
     limits : GuardLimits, optional
     watchdog : Watchdog, optional
-        Told when the torque is on and, often, that someone is in control.
+        Armed while the torque is on.
     """
 
     def __init__(
@@ -76,165 +76,171 @@ class GuardedBus:
         self._watchdog = watchdog
         self._on = False
         self._stopped_for_safety = self._left_on = False
-        self._found: Angles | None = None
+        self._home: Angles | None = None
         self._present = np.full(len(bus.joint_names), np.nan)
         self._present_s = np.full(len(bus.joint_names), -np.inf)
         self._sent: Angles | None = None
         self._sent_s = -np.inf
         self._velocity = np.zeros(len(bus.joint_names))
-        self._watch = Watch(bus, self.guard)
+        self._monitor = Monitor(bus, self.guard)
 
     def now(self) -> float:
         """Time of the bus's clock [s]."""
         return self.bus.now()
 
     def sleep_until(self, time_s: float) -> None:
-        """Sleep, and tell the watchdog now and then that this is meant."""
+        """Sleep until `now()` has reached `time_s`; the watchdog gets its beats meanwhile."""
         while self._on and (left := time_s - self.bus.now()) > _HEARTBEAT_S:
-            self._alive()
+            self._beat()
             self.bus.sleep_until(self.bus.now() + min(_HEARTBEAT_S, left))
         self.bus.sleep_until(time_s)
 
     def read(self) -> BusSample:
-        """Read, and watch.
+        """Read all joints once and check the readings.
 
         Raises
         ------
         SafetyStop
-            The sentence says which joint, what was seen, and what to check.
+            The sentence names the joint, the fault, and what to check.
         """
         sample = self.bus.read()
-        here = np.isfinite(sample.position_rad)
-        self._present = np.where(here, sample.position_rad, self._present)
-        self._present_s[here] = self.bus.now()
-        self.report.missing += int((~here).sum())
+        valid = np.isfinite(sample.position_rad)
+        self._present = np.where(valid, sample.position_rad, self._present)
+        self._present_s[valid] = self.bus.now()
+        self.report.missing += int((~valid).sum())
         if self._on:
-            self._alive()
+            self._beat()
             try:
-                self._watch.look(sample, self._sent)
+                self._monitor.check(sample, self._sent)
             except SafetyStop:
                 self._stopped_for_safety = True
                 raise
         return sample
 
     def write(self, position_rad: Angles) -> Sent:
-        """Send goals, after all limits; `Sent` says what they became.
+        """Send commands after all limits; `Sent` holds the limited ones.
 
         Raises
         ------
+        BusError
+            If a command is NaN.
         SafetyStop
-            If the first goal is far from where the robot is, or the robot outside its limits.
+            If the first command is far from the robot's pose, or the pose is outside the limits.
         """
-        goal = np.asarray(position_rad, float)
-        allowed = self.limits.clip(goal)
-        self.report.clipped += int(np.any(allowed != goal))
+        command = np.asarray(position_rad, float)
+        if np.isnan(command).any():  # it would stay in the velocity
+            raise BusError(f"{self.name}: commands must be numbers, got {command}.")
+        allowed = self.limits.clip(command)
+        self.report.clipped += int(np.any(allowed != command))
         now = self.bus.now()
         if self._sent is None:
-            self._refuse_far(allowed)
+            self._check_first(allowed)
             self._velocity[:] = 0.0
         else:
-            allowed = self._bounded(allowed, now - self._sent_s)
+            allowed = self._limit_rates(allowed, now - self._sent_s)
         sent = self.bus.write(allowed)
-        self._alive()
+        self._beat()
         if np.isfinite(sent.time_s):
             self._sent, self._sent_s = sent.position_rad, now
-            self._watch.commanded(now, sent.position_rad)
+            self._monitor.add_command(now, sent.position_rad)
         else:
             self.report.unsent += 1
         return sent
 
     def torque(self, on: bool) -> bool:
-        """Switch the torque; before it is switched on the robot must have said where it is.
+        """Switch the torque; on only after every joint has returned a valid position.
 
         Raises
         ------
         BusError
-            If it has not, or if a servo did not confirm that it is on; all are let go then.
+            If a position is missing, or a servo did not confirm that its torque is on; the torque
+            of all is switched off then.
         """
         if not on:
-            self._let_go()
+            self._torque_off()
             return not self._left_on
         if not self._on:
             # a limp robot may have been moved by hand since it was read
             self._present[self.bus.now() - self._present_s > _STALE_S] = np.nan
-            self._found = None
-        self._find()
-        if self._watchdog and self._found is not None:
-            # before the first servo is on: who is killed from here on leaves some that are
-            self._watchdog.arm(self.joint_names, self._found)
+            self._home = None
+        home = self._locate()
+        if self._watchdog:
+            # before the first servo is on: a driver killed from here on leaves some that are
+            self._watchdog.arm(self.joint_names, home)
         self._on = True
         if not self.bus.torque(True):
-            self._let_go()
+            self._torque_off()
             raise BusError(
-                f"{self.name}: not every servo confirmed that its torque is on, and so all were "
-                "told to go limp. Check cables and power, then try again."
+                f"{self.name}: not every servo confirmed that its torque is on, so the torque of "
+                "all was switched off. Check cables and power, then try again."
             )
-        self._alive()
-        self._watch.forget(self.bus.now())
+        self._beat()
+        self._monitor.reset(self.bus.now())
         return True
 
     def take_over(self) -> None:
-        """The torque is on, and whoever switched it on is gone: from here on it is ours.
+        """Continue after a driver that left the torque on.
 
-        As `torque`, but a servo that does not confirm does not cost the others their way back.
+        Like `torque(True)`, but a servo that does not confirm does not prevent the way back of the
+        others.
 
         Raises
         ------
         BusError
-            If a servo does not say where it is.
+            If a joint returns no position.
         """
         self._on = True
-        self._find()
+        self._locate()
         self.bus.torque(True)
-        self._watch.forget(self.bus.now())
+        self._monitor.reset(self.bus.now())
 
     @property
     def sent(self) -> Angles:
-        """The last goal that went out [rad], or where the robot is if none did."""
+        """Last command sent [rad], shape (joints,); the robot's pose before the first one."""
         return (self._present if self._sent is None else self._sent).copy()
 
     def limp(self) -> None:
-        """After a fault that the guard did not see itself: torque off, no way back."""
+        """Torque off without a way back, after a fault that the guard did not detect itself."""
         self._stopped_for_safety = True
         self.park()
 
     def park(self, pose_rad: Angles | None = None) -> None:
-        """Stop, go back to `pose_rad` (by default where the robot was found), torque off.
+        """Stop, return to `pose_rad` (by default where the robot was found), torque off.
 
-        Never raises for a bus in trouble: what can be done is done, and the torque is asked off
-        several times. The way back takes at most `GuardLimits.park_within_s`, and is left out
-        after a stop for safety or if the bus does not answer.
+        Never raises for a faulty bus; torque-off is tried several times. The way back takes at most
+        `GuardLimits.park_within_s`, and is left out after a safety stop or if the bus does not
+        answer.
         """
         if not self._on:
             return
         try:
-            pose = self._found if pose_rad is None else pose_rad
+            pose = self._home if pose_rad is None else pose_rad
             if pose is not None and not self._stopped_for_safety:
-                self._return(pose)
+                self._go_to(pose)
         except BusError:
             pass
         finally:
-            self._let_go()
+            self._torque_off()
 
     def close(self) -> None:
         """Park if that has not been done, and release the bus.
 
-        A robot that could not be told to go limp, such as one that was unplugged, is left to the
-        watchdog, which tries for some seconds more.
+        If torque-off was not confirmed (a robot that was unplugged), the watchdog keeps trying for
+        some seconds.
         """
         try:
             self.park()
         finally:
             self.bus.close()
             if self._watchdog and self._left_on:
-                self._watchdog.leave_limp()
+                self._watchdog.take_over()
             elif self._watchdog:
                 self._watchdog.close()
 
-    def _let_go(self) -> None:
-        """Torque off, asked for several times; the watchdog goes on if that does not help."""
+    def _torque_off(self) -> None:
+        """Switch the torque off, in several tries."""
         self._on, self._sent = False, None
-        self._left_on = True  # until a servo says otherwise, whatever ends the tries
+        self._left_on = True  # until it is confirmed, whatever ends the tries
         if self._watchdog:
             self._watchdog.only_limp()
         interrupted = None
@@ -243,10 +249,10 @@ class GuardedBus:
                 if self.bus.torque(False):
                     self._left_on = False
                     break
-                self._alive()  # a line in trouble takes its time
+                self._beat()  # a faulty line takes its time
             except KeyboardInterrupt as pressed:
                 interrupted = pressed
-            except Exception:  # of whatever kind: the robot is still on
+            except Exception:  # of whatever kind: the torque is still on
                 pass
             self.bus.sleep_until(self.bus.now() + _PARK_PERIOD_S)
         if self._watchdog and not self._left_on:
@@ -254,8 +260,7 @@ class GuardedBus:
         if interrupted:
             raise interrupted
 
-    def _alive(self) -> None:
-        """Tell the watchdog that someone is in control."""
+    def _beat(self) -> None:
         if self._watchdog:
             try:
                 self._watchdog.beat()
@@ -263,22 +268,22 @@ class GuardedBus:
                 self._stopped_for_safety = True
                 raise
 
-    def _find(self) -> None:
-        """Where the robot is, before anything is sent to it."""
-        for _ in range(_FIND_TRIES):
+    def _locate(self) -> Angles:
+        """Pose in which the robot was found, before anything is sent to it."""
+        for _ in range(_LOCATE_TRIES):
             if np.isfinite(self._present).all():
                 break
             self.read()
             self.bus.sleep_until(self.bus.now() + _PARK_PERIOD_S)
         if not np.isfinite(self._present).all():
             raise BusError(
-                f"{self.name}: {self._silent()} does not say where it is, and so nothing is sent "
-                "to it."
+                f"{self.name}: no position reading from {self._unread()}, so nothing is sent to it."
             )
-        if self._found is None:
-            self._found = self._present.copy()
+        if self._home is None:
+            self._home = self._present.copy()
+        return self._home
 
-    def _return(self, pose: Angles) -> None:
+    def _go_to(self, pose: Angles) -> None:
         origin = self.sent
         self.write(origin)
         way = self.limits.clip(pose) - origin
@@ -295,10 +300,10 @@ class GuardedBus:
             self.write(origin + raised_cosine(share) * way)
             self.read()
 
-    def _bounded(self, goal: Angles, since_s: float) -> Angles:
-        """`goal`, or as much of the way there as the servos' speed and acceleration allow."""
+    def _limit_rates(self, command: Angles, since_s: float) -> Angles:
+        """`command`, or a point towards it that the speed and acceleration limits allow."""
         assert self._sent is not None
-        wanted, here = self.limits.servo_angles(goal), self.limits.servo_angles(self._sent)
+        wanted, here = self.limits.servo_angles(command), self.limits.servo_angles(self._sent)
         dt = float(np.clip(since_s, 1e-4, _LONGEST_TICK_S))
         if since_s > _REST_S:
             self._velocity[:] = 0.0
@@ -307,35 +312,39 @@ class GuardedBus:
         low = np.maximum(np.minimum(self._velocity, 0.0) - gain, -self.guard.speed_rad_s)
         high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self.guard.speed_rad_s)
         self._velocity = np.clip(asked, low, high)
-        held = self._velocity != asked
-        if not held.any():
-            return goal
+        limited = self._velocity != asked
+        if not limited.any():
+            return command
         self.report.slowed += 1
-        slower = np.where(held, here + self._velocity * dt, wanted)
+        slower = np.where(limited, here + self._velocity * dt, wanted)
         return self.limits.clip(self.limits.from_servo_angles(slower))
 
-    def _refuse_far(self, allowed: Angles) -> None:
-        """Refuse a first goal, within the limits, that would make a joint jump."""
-        away = np.abs(allowed - self._present)
+    def _check_first(self, allowed: Angles) -> None:
+        """Refuse a first command, within the limits, that would make a joint jump."""
         if not np.isfinite(self._present).all():
             self._stopped_for_safety = True
-            raise SafetyStop(f"{self.name}: no first command, for {self._silent()} is not known.")
-        far = int(np.argmax(away))
-        if away[far] > self.guard.first_command_rad:
-            self._stopped_for_safety = True
-            name, here = self.joint_names[far], self._present[far]
-            outside = abs(here - self.limits.clip(self._present)[far])
-            if outside > self.guard.first_command_rad:
-                raise SafetyStop(
-                    f"{name} was found at {here:.2f} rad, {outside:.2f} rad outside its limits, "
-                    "and would jump to them. Move it by hand to where it may be, then start again."
-                )
             raise SafetyStop(
-                f"the first command would send {name} {away[far]:.2f} rad away at once (it is at "
-                f"{here:.2f} rad). Begin from where the robot is."
+                f"First command refused: no position reading from {self._unread()} yet."
             )
+        away = np.abs(allowed - self._present)
+        far = int(np.argmax(away))
+        if away[far] <= self.guard.first_command_rad:
+            return
+        self._stopped_for_safety = True
+        name, here = self.joint_names[far], self._present[far]
+        outside = abs(here - self.limits.clip(self._present)[far])
+        if outside > self.guard.first_command_rad:
+            raise SafetyStop(
+                f"{name} was found at {here:.2f} rad, {outside:.2f} rad outside its limits, and "
+                "would jump to them. Move it by hand into its limits, then start again."
+            )
+        raise SafetyStop(
+            f"First command refused: it would move {name} by {away[far]:.2f} rad at once (it is "
+            f"at {here:.2f} rad). Start from the present pose."
+        )
 
-    def _silent(self) -> str:
+    def _unread(self) -> str:
+        """Joints without a position reading."""
         names = [n for n, x in zip(self.joint_names, self._present, strict=True) if np.isnan(x)]
         return ", ".join(names[:3]) + (" …" if len(names) > 3 else "")
 

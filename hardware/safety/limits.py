@@ -1,8 +1,8 @@
-"""Where the joints of a bus may go: a box, and one more bound that the knee's push rod brings.
+"""Position limits of the joints of a bus: a box, and a bound that the knee's push rod adds.
 
-The calf's servo sets the calf's absolute angle, so two things can be too far: the angle between
-thigh and calf, and the servo itself. Whichever of the two a bus counts in, the other one is the
-calf's coordinate plus or minus the thigh's, and has a bound of its own.
+The calf's servo sets the calf's absolute angle. So both the angle between thigh and calf and the
+servo's own angle are limited: one of them is the bus's coordinate of the calf, the other is that
+coordinate plus or minus the thigh's.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Coupling:
 
 @dataclass(frozen=True)
 class PositionLimits:
-    """Bounds of the goals of a bus.
+    """Bounds of the commands of a bus.
 
     Attributes
     ----------
@@ -48,37 +48,38 @@ class PositionLimits:
     coupling: Coupling | None = None
 
     def clip(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The nearest allowed goals, shape (joints,); a thigh takes precedence over its calf."""
+        """Nearest allowed positions, shape (joints,); a thigh takes precedence over its calf."""
         allowed = np.clip(position_rad, self.low_rad, self.high_rad)
         c = self.coupling
         if c is not None:
             thigh = c.sign * allowed[c.thigh]
-            # where the two bounds of a calf contradict each other, the servo's own one wins
+            # where the two bounds of a calf contradict each other, the box wins
             wanted = np.clip(allowed[c.calf], c.low_rad - thigh, c.high_rad - thigh)
             allowed[c.calf] = np.clip(wanted, self.low_rad[c.calf], self.high_rad[c.calf])
         return allowed
 
     def servo_angles(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the servos turn by, up to a constant: a linked calf's servo moves with its thigh."""
-        return self._sheared(position_rad, +1)
+        """Angles of the servos, up to a constant: a linked calf's servo turns with its thigh."""
+        return self._linked(position_rad, +1)
 
     def from_servo_angles(self, servo_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `servo_angles`."""
-        return self._sheared(servo_rad, -1)
+        """Inverse of `servo_angles`."""
+        return self._linked(servo_rad, -1)
 
-    def _sheared(self, angles: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
-        sheared, c = np.array(angles, float), self.coupling
+    def _linked(self, angles: NDArray[np.float64], direction: int) -> NDArray[np.float64]:
+        linked, c = np.array(angles, float), self.coupling
         # with the other sign the bus itself counts in servo angles, and the joint is the sum
         if c is not None and c.sign > 0:
-            sheared[c.calf] += direction * sheared[c.thigh]
-        return sheared
+            linked[c.calf] += direction * linked[c.thigh]
+        return linked
 
-    def room(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far each joint alone may swing to both sides of a pose [rad]; 0 if it is outside."""
+    def margin(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Travel of each joint alone to the nearer limit [rad], shape (joints,); 0 if outside."""
         pose = np.asarray(position_rad, float)
-        room = np.minimum(pose - self.low_rad, self.high_rad - pose)
+        margin = np.minimum(pose - self.low_rad, self.high_rad - pose)
         c = self.coupling
         if c is not None:
             both = pose[c.calf] + c.sign * pose[c.thigh]
-            room[c.calf] = np.minimum(room[c.calf], np.minimum(both - c.low_rad, c.high_rad - both))
-        return np.maximum(room, 0.0)
+            own = np.minimum(both - c.low_rad, c.high_rad - both)
+            margin[c.calf] = np.minimum(margin[c.calf], own)
+        return np.maximum(margin, 0.0)

@@ -186,7 +186,7 @@ class Controller:
         grown = min(senses.elapsed_s / fade, 1.0) if fade > 0 else 1.0
         target = self._limits.clip(self.default + grown * self._scale * sent)
         self._told = target
-        return Decision(observation, action, target, self._limits.room(target))
+        return Decision(observation, action, target, self._limits.margin(target))
 
     def _estimate(self, senses: Senses) -> JointEstimate:
         """Where the joints are, as the policy is told, in joint coordinates."""

@@ -167,8 +167,8 @@ def test_counts_are_rounded_to_the_nearest_and_held_within_the_servos_limits(pup
 def test_a_box_clips_and_leaves_room_to_the_nearer_side():
     limits = PositionLimits(np.array([-1.0, 0.0]), np.array([2.0, 0.5]))
     assert limits.clip(np.array([-3.0, 0.7])).tolist() == [-1.0, 0.5]
-    assert limits.room(np.array([0.5, 0.4])) == pytest.approx([1.5, 0.1])
-    assert limits.room(np.array([5.0, 0.25])) == pytest.approx([0.0, 0.25])
+    assert limits.margin(np.array([0.5, 0.4])) == pytest.approx([1.5, 0.1])
+    assert limits.margin(np.array([5.0, 0.25])) == pytest.approx([0.0, 0.25])
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_a_thigh_far_forward_makes_its_calf_fold(pupper):
     assert limits.clip(pose)[at("LF_calf")] == pytest.approx(-QUARTER + 306 / K - 2.3)
     assert limits.clip(pose)[at("LF_thigh")] == 2.3
     pose[at("LF_thigh")], pose[at("LF_calf")] = 2.0, -1.2
-    assert limits.room(pose)[at("LF_calf")] == pytest.approx(-QUARTER + 306 / K - 0.8)
+    assert limits.margin(pose)[at("LF_calf")] == pytest.approx(-QUARTER + 306 / K - 0.8)
 
 
 def test_in_servo_coordinates_the_angle_between_thigh_and_calf_is_bounded(pupper):

@@ -68,23 +68,23 @@ class PlainBus:
         self.log.append("close")
 
 
-class Told(Watchdog):
-    """A watchdog that writes what it is told into the bus's log."""
+class RecordingWatchdog(Watchdog):
+    """A watchdog that writes its messages into the bus's log."""
 
     def __init__(self, bus: PlainBus):
         self.log = bus.log
 
-    def _say(self, message):
+    def _send(self, message):
         self.log += [f"watchdog {word}" for word in message]
 
     def beat(self):
         pass
 
     def close(self):
-        self._say({"bye": True})
+        self._send({"bye": True})
 
-    def leave_limp(self):
-        self._say({"leave": True})
+    def take_over(self):
+        self._send({"take over": True})
 
 
 def linked(bus: PlainBus) -> PlainBus:
@@ -133,7 +133,7 @@ def test_a_calf_is_kept_from_its_thigh_by_the_bound_they_share():
     np.testing.assert_allclose(limits.clip(np.array([0.4, 0.3])), [0.4, 0.1])
     np.testing.assert_allclose(limits.clip(np.array([0.4, -1.2])), [0.4, -0.9])
     # room to both sides: the thigh's is its own; the calf's ends where the sum does
-    np.testing.assert_allclose(limits.room(np.array([0.4, 0.0])), [0.6, 0.1])
+    np.testing.assert_allclose(limits.margin(np.array([0.4, 0.0])), [0.6, 0.1])
 
 
 def test_a_step_becomes_a_ramp_at_the_speed_limit():
@@ -166,7 +166,7 @@ def test_a_first_command_far_from_the_robot_is_refused_and_nothing_is_sent():
     guard = GuardedBus(bus)
     guard.read()
     guard.torque(True)
-    with pytest.raises(SafetyStop, match=r"LF_calf 0\.40 rad away"):
+    with pytest.raises(SafetyStop, match=r"would move LF_calf by 0\.40 rad at once"):
         guard.write(np.array([0.0, 0.4]))
     assert bus.written == []
 
@@ -238,7 +238,7 @@ def test_who_takes_over_goes_home_although_a_servo_does_not_confirm():
 
 def test_the_watchdog_stands_by_before_the_first_servo_is_on():
     bus = PlainBus()
-    GuardedBus(bus, watchdog=Told(bus)).torque(True)
+    GuardedBus(bus, watchdog=RecordingWatchdog(bus)).torque(True)
     assert bus.log == ["watchdog arm", "torque True"]
 
 
@@ -247,25 +247,31 @@ def test_servos_that_did_not_all_go_on_are_told_to_go_limp_until_they_are():
     told, answers = bus.torque, [False, False, False, True]
     bus.torque = lambda on: told(on) and answers.pop(0)
     with pytest.raises(BusError, match="confirm"):
-        GuardedBus(bus, watchdog=Told(bus)).torque(True)
+        GuardedBus(bus, watchdog=RecordingWatchdog(bus)).torque(True)
     off = ["torque False"] * 3
     assert bus.log == ["watchdog arm", "torque True", "watchdog limp", *off, "watchdog disarm"]
 
 
 def test_servos_that_do_not_confirm_that_they_are_limp_are_left_to_the_watchdog():
     bus = PlainBus()
-    guard = GuardedBus(bus, watchdog=Told(bus))
+    guard = GuardedBus(bus, watchdog=RecordingWatchdog(bus))
     guard.torque(True)
     bus.torque = lambda on: False
     assert not guard.torque(False)
     guard.close()
-    assert bus.log == ["watchdog arm", "torque True", "watchdog limp", "close", "watchdog leave"]
+    assert bus.log == [
+        "watchdog arm",
+        "torque True",
+        "watchdog limp",
+        "close",
+        "watchdog take over",
+    ]
 
 
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt(), ValueError("counts"), OSError("gone")])
 def test_torque_off_is_asked_for_again_whatever_comes_between(trouble):
     bus = PlainBus()
-    guard = GuardedBus(bus, watchdog=Told(bus))
+    guard = GuardedBus(bus, watchdog=RecordingWatchdog(bus))
     guard.torque(True)
     told, troubles = bus.torque, [trouble]
 
@@ -318,7 +324,7 @@ def test_a_joint_that_is_held_away_from_its_goal_stops_the_robot():
     bus = PlainBus()
     guard = ready(bus)
     bus.blocked = True
-    with pytest.raises(SafetyStop, match=r"LF_thigh is held at 0\.50 rad and stays"):
+    with pytest.raises(SafetyStop, match=r"LF_thigh is commanded to 0\.50 rad and stays"):
         drive(guard, 3.0, lambda t: np.array([0.5, 0.0]))
 
 
@@ -334,7 +340,7 @@ def test_a_stuck_calf_servo_is_seen_though_the_angle_of_its_joint_changes_with_t
         return sample
 
     bus.read = stuck
-    with pytest.raises(SafetyStop, match=r"LF_calf was told to move .* did not change once"):
+    with pytest.raises(SafetyStop, match=r"LF_calf was commanded to move .* did not change once"):
         drive(guard, 3.0, lambda t: np.full(2, 0.2 * np.sin(2 * np.pi * t)))
 
 
@@ -344,7 +350,9 @@ def test_a_calf_servo_away_from_its_goal_is_not_hidden_by_a_thigh_that_is_away_t
     read = bus.read
     # each joint is 0.2 rad away, and so the calf's servo 0.4
     bus.read = lambda: replace(read(), position_rad=np.full(2, 0.2))
-    with pytest.raises(SafetyStop, match=r"LF_calf is held at 0\.00 rad and stays 0\.40 rad away"):
+    with pytest.raises(
+        SafetyStop, match=r"LF_calf is commanded to 0\.00 .* stays 0\.40 rad away"
+    ):
         drive(guard, 3.0)
 
 

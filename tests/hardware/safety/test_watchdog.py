@@ -15,11 +15,11 @@ import pytest
 
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.hardware import connect
-from pupper_sysid.hardware.connect import BusAddress, open_guarded, parse_address
+from pupper_sysid.hardware.address import BusAddress, parse_address
+from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.safety import watchdog
+from pupper_sysid.hardware.safety import watchdog_process
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -35,7 +35,8 @@ DRIVER = """
 import sys, time
 import numpy as np
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.connect import open_guarded, parse_address
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
 bus = open_guarded(parse_address(sys.argv[1]))
 pose = bus.read().position_rad
 while not np.isfinite(pose).all():
@@ -163,7 +164,7 @@ def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
 def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monkeypatch):
     # the servos share this process and a busy machine
     monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(watchdog, "_GIVE_UP_S", 3.0)
+    monkeypatch.setattr(watchdog_process, "_GIVE_UP_S", 3.0)
     layout = load_joint_map("sts3215")
     there = [i for i in layout.ids if i != 5]  # LF_thigh, on which LF_calf hangs
     servos = still_servos(ids=there)
@@ -172,7 +173,7 @@ def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monke
             "kind": "feetech", "where": server.device, "baud": 1_000_000,
             "map": layout.file.model_dump(mode="json", by_alias=True), "coordinates": "joint",
         }  # fmt: skip
-        watchdog.park(orders, dict.fromkeys(layout.joint_names, 0.0))
+        watchdog_process.park(orders, dict.fromkeys(layout.joint_names, 0.0))
     assert dict(bench_of(servos).torques) == dict.fromkeys(there, False)
     assert bench_of(servos).goals == []
 
@@ -186,9 +187,9 @@ def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monke
             return super().torque(on) and (on or len(asked) > 45)
 
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(connect, "open_bus", lambda *of: Deaf(draw_robot(rng), rng))
+    monkeypatch.setattr(watchdog_process, "open_bus", lambda *of: Deaf(draw_robot(rng), rng))
     orders = {"kind": "esp32", "where": "", "baud": None, "map": None, "coordinates": "servo"}
-    watchdog.park(orders, DEFAULT_POSE)
+    watchdog_process.park(orders, DEFAULT_POSE)
     assert len(asked) > 45 and not asked[-1]
 
 

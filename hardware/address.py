@@ -1,0 +1,74 @@
+"""Addresses of servo buses, as written after `--bus`.
+
+`esp32` or `esp32:/path/to.socket` is the robot's own proxy; `feetech:/dev/ttyUSB0`, followed by
+`@500000` where the baud rate is known, is a serial line of Feetech servos; `emulated` is no address
+but a robot inside the program, which the commands make themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pupper_sysid.common.errors import InputError
+
+EMULATED = "emulated"
+"""The bus of the emulated robot."""
+SOCKET = Path("/tmp/esp32-proxy.socket")
+"""Socket of the robot's proxy."""
+
+
+def bus_name(text: str) -> str:
+    """`text` with the older word `sim` replaced by `emulated`.
+
+    Examples
+    --------
+    >>> bus_name("sim"), bus_name("esp32")
+    ('emulated', 'esp32')
+    """
+    return EMULATED if text == "sim" else text
+
+
+@dataclass(frozen=True)
+class BusAddress:
+    """Address of a bus.
+
+    Attributes
+    ----------
+    kind : {"esp32", "feetech"}
+    where : str
+        Socket or serial device.
+    baud : int or None
+        None: to be detected.
+    """
+
+    kind: str
+    where: str
+    baud: int | None = None
+
+
+def parse_address(text: str) -> BusAddress:
+    """Address of a bus outside this program.
+
+    Raises
+    ------
+    InputError
+        If `text` is no address.
+
+    Examples
+    --------
+    >>> parse_address("feetech:/dev/ttyUSB0@500000")
+    BusAddress(kind='feetech', where='/dev/ttyUSB0', baud=500000)
+    """
+    kind, _, where = text.partition(":")
+    if kind == "esp32":
+        return BusAddress(kind, where or str(SOCKET))
+    if kind != "feetech" or not where:
+        raise InputError(
+            f"bus {text}: write emulated, esp32, esp32:SOCKET or feetech:DEVICE, such as "
+            "feetech:/dev/ttyUSB0."
+        )
+    device, at, baud = where.partition("@")
+    if at and not baud.isdecimal():
+        raise InputError(f"bus {text}: '{baud}' is no baud rate; write for example @500000.")
+    return BusAddress(kind, device, int(baud) if at else None)

@@ -1,0 +1,140 @@
+"""The watchdog process: waits for beats of the driver, and parks the robot if they end.
+
+When the pipe closes without a message, or no beat comes for a second, it kills what is left of the
+driver, opens the bus itself, stops the joints, takes them back to the pose in which the robot was
+found, and switches the torque off.
+
+    python -P -m pupper_sysid.hardware.safety.watchdog_process    (started by `watchdog.Watchdog`)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+# everything that parking needs is loaded at the start, not when it is urgent
+from pupper_sysid.common.errors import BusError, PupperError
+from pupper_sysid.hardware.address import BusAddress
+from pupper_sysid.hardware.connect import open_bus
+from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.monitor import GuardLimits
+
+HANG_S = 1.0
+"""Without a beat for so long, the driver counts as hung."""
+SWITCH_ON_S = 5.0
+"""Longest time to switch the torque on, servo by servo on a line with faults."""
+PARK_WITHIN_S = 0.5
+"""Longest way back, so that all is over within a second."""
+
+_OPEN_WITHIN_S = 0.4
+_GIVE_UP_S = 10.0  # time to put a cable back, or to reach the switch
+
+
+def main() -> None:
+    """Wait for messages of the driver; park the robot if it is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    orders = json.loads(sys.stdin.buffer.readline())
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    pipe, received, pose, only_limp = sys.stdin.fileno(), b"", None, False
+    last, patience_s = time.monotonic(), HANG_S
+    while True:
+        ready, _, _ = select.select([pipe], [], [], 0.1)
+        if ready:
+            data = os.read(pipe, 65_536)
+            last = time.monotonic()
+            *lines, received = (received + data).split(b"\n")
+            for line in lines:
+                message = json.loads(line)
+                if "bye" in message:
+                    return
+                patience_s = SWITCH_ON_S if "arm" in message else HANG_S
+                if "arm" in message:
+                    pose, only_limp = message["arm"], False
+                if "disarm" in message:
+                    pose = None
+                only_limp |= "limp" in message
+            if not data:
+                break
+        elif pose is not None and time.monotonic() - last > patience_s:
+            with contextlib.suppress(OSError):
+                os.kill(orders["driver"], signal.SIGKILL)
+            break
+    if pose is not None:
+        park(orders, pose, only_limp)
+
+
+def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = False) -> None:
+    """Open the bus that the driver has left; park the robot, or only switch its torque off.
+
+    All joints go back together if they answer soon; those that do not are tried again by
+    themselves. Where a joint's angle takes two servos (joint coordinates), a servo that does not
+    answer prevents the way back of the others: only the torque of all is switched off then.
+
+    Parameters
+    ----------
+    orders : dict
+        First message of `Watchdog`: address and joint map.
+    pose_rad : dict of str to float
+        Joints whose torque is on, and where they were found.
+    only_limp : bool
+        Leave the way back out.
+    """
+    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
+    joint_map = joint_map_from(orders["map"], "the joint map") if orders["map"] else None
+    servo_map = joint_map.per_servo() if joint_map else None
+    if orders["coordinates"] == "servo":
+        joint_map = servo_map
+    left, start = list(pose_rad), time.monotonic()
+    while left and time.monotonic() - start < _GIVE_UP_S:
+        try:
+            answering = left
+            if time.monotonic() - start > _OPEN_WITHIN_S:
+                answering = _answering(address, servo_map, left)
+                only_limp |= joint_map is not servo_map and len(answering) < len(left)
+            bus = open_bus(address, servo_map if only_limp else joint_map, answering)
+        except PupperError:
+            # the driver's lock goes with its last thread, which can take a moment
+            time.sleep(0.02)
+            continue
+        guard = GuardedBus(bus, GuardLimits(park_within_s=PARK_WITHIN_S))
+        try:
+            if not only_limp:
+                _go_home(guard, pose_rad)
+            if guard.torque(False):  # else the servos that did not confirm are tried again
+                left = [name for name in left if name not in guard.joint_names]
+        finally:
+            guard.close()
+
+
+def _go_home(guard: GuardedBus, pose_rad: dict[str, float]) -> None:
+    """Park the joints of this bus where they were found; torque off where that is impossible."""
+    try:
+        guard.take_over()
+        guard.park(np.array([pose_rad[name] for name in guard.joint_names]))
+    except PupperError:
+        guard.limp()
+
+
+def _answering(address: BusAddress, servo_map: JointMap | None, joints: list[str]) -> list[str]:
+    """Those of `joints` whose servos answer."""
+    bus = open_bus(address, servo_map)
+    bus.close()
+    found = [name for name in joints if name in bus.joint_names]
+    if not found:
+        raise BusError("None of the joints answers.")
+    return found
+
+
+if __name__ == "__main__":
+    main()
