@@ -1,4 +1,4 @@
-"""Fixtures: the recordings of a real robot, where they are at hand, and a policy that walks."""
+"""Fixtures: recordings of a real robot, where they are at hand, and a policy that walks."""
 
 import os
 from pathlib import Path
@@ -7,25 +7,28 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import hypothesis
 import pytest
 
+from support.real_recordings import real_recording
 
-@pytest.fixture(scope="session")
-def real_data() -> Path:
-    """Folder of the real recordings: $PUPPER_REAL_DATA, else ../shared/real; skips without."""
-    folder = Path(
-        os.environ.get("PUPPER_REAL_DATA")
-        or Path(__file__).resolve().parents[2] / "shared" / "real"
-    )
-    if not (folder / "real_motor_0_LF_hip_amp0.3.csv").exists():
-        pytest.skip("no recordings of a real robot here (set PUPPER_REAL_DATA)")
-    return folder
+# the same examples on every machine; `--hypothesis-profile search` looks for new ones
+hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
+hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
+hypothesis.settings.load_profile("repeatable")
 
 
 @pytest.fixture(scope="session")
-def real_sweeps(real_data: Path) -> list[Path]:
-    """The hip and thigh sweeps."""
-    return sorted(real_data.glob("real_motor_*.csv"))
+def real_sweeps() -> list[Path]:
+    """The hip and thigh sweeps of a Mini Pupper 2."""
+    names = ("real_motor_0_LF_hip_amp0.3.csv", "real_motor_1_LF_thigh_amp0.3.csv")
+    return [real_recording(name) for name in names]
+
+
+@pytest.fixture(scope="session")
+def real_playback() -> Path:
+    """Three loops of a walking policy's actions on a Mini Pupper 2, at 25 Hz."""
+    return real_recording("playback_lstm_25hz.csv")
 
 
 @pytest.fixture(scope="module")

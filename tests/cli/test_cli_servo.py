@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,6 @@ from pupper_sysid.sysid.servo_fit.training import Recipe
 from support.command_line import run
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples"
-REAL = Path(os.environ.get("PUPPER_REAL_DATA", Path(__file__).parents[3] / "shared" / "real"))
-PLAYBACK = REAL / "playback_lstm_25hz.csv"
-
-needs_real = pytest.mark.skipif(not PLAYBACK.exists(), reason="the real recordings are not here")
 
 
 @pytest.fixture(autouse=True)
@@ -52,10 +47,9 @@ def playback(path: str, loops: int = 3, rows: int = 60, step_s: float = 0.04, st
     return path
 
 
-@needs_real
-def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys):
+def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys, real_playback):
     code, out, err = run(
-        capsys, "fit-servo", PLAYBACK, "--train-loops", "0,1", "--test-loops", "2", "--json",
+        capsys, "fit-servo", real_playback, "--train-loops", "0,1", "--test-loops", "2", "--json",
     )  # fmt: skip
     assert code == 0, err
     found = json.loads(out)
@@ -74,10 +68,9 @@ def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys):
     assert saved.contract.inputs[0] == "command_rad[t]" and not saved.contract.feedback
 
 
-@needs_real
-def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys):
+def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real_sweeps):
     code, out, err = run(
-        capsys, "fit-servo", *sorted(REAL.glob("real_motor*.csv")), "--train-before", "2",
+        capsys, "fit-servo", *real_sweeps, "--train-before", "2",
         "--test-after", "2", "--json",
     )  # fmt: skip
     assert code == 0, err

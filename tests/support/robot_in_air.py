@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.servo_mjcf import mujoco
@@ -84,9 +85,8 @@ def lags_in_air(model: Any, control_step_s: float) -> np.ndarray:
         moved[:, 2::3] += moved[:, 1::3]
     half = len(moved) // 2  # whole periods, from the middle on
     time = step * np.arange(1, len(moved) + 1)[half:]
-    basis = np.stack([np.sin(turn * time), np.cos(turn * time), np.ones_like(time)], axis=1)
-    sine, cosine, _ = np.linalg.lstsq(basis, moved[half:], rcond=None)[0]
-    return np.arctan2(-cosine, sine) / turn
+    phasor = fit_sine(turn * time, moved[half:]).phasor
+    return np.arctan2(-phasor.real, -phasor.imag) / turn
 
 
 def _weightless(model: Any) -> None:
