@@ -22,14 +22,13 @@ import torch
 from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
 
-from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.errors import FileExistsRefusal, InputError, PupperError
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model, save_servo_model
 from pupper_sysid.sysid.export.servo_networks import (
     ENDINGS,
     export_servo_model,
     parameter_table,
-    to_onnx,
 )
 from support.command_line import run
 from support.saved_servo_models import JOINTS, KINDS, P, arrays, commands, contract, saved
@@ -82,6 +81,11 @@ def own(model: SavedModel) -> NDArray:
     return np.stack([model.model.step(c) for c in given_commands])
 
 
+def read_onnx(model: SavedModel, path: Path) -> onnx.ModelProto:
+    export_servo_model(model, "onnx", path)
+    return onnx.load(str(path))
+
+
 def read_torchscript(path: Path) -> tuple[Any, dict, dict]:
     extra: dict = {"contract.json": "", "metadata.json": ""}
     with warnings.catch_warnings():
@@ -93,9 +97,7 @@ def read_torchscript(path: Path) -> tuple[Any, dict, dict]:
 @pytest.mark.parametrize("kind", LEARNED)
 def test_onnx_computes_what_the_model_computes(tmp_path: Path, kind: str):
     model = saved(tmp_path / "a", kind)
-    export_servo_model(model, "onnx", tmp_path / "a.onnx")
-    made = onnx.load(str(tmp_path / "a.onnx"))
-    runtime = ReferenceEvaluator(made)
+    runtime = ReferenceEvaluator(read_onnx(model, tmp_path / "a.onnx"))
     found = driven(lambda state: runtime.run(None, state), runtime.input_names, model)
     np.testing.assert_allclose(found, own(model), rtol=0, atol=CLOSE_RAD)
 
@@ -138,7 +140,7 @@ def saved_linear(folder: Path, kind: str) -> SavedModel:
 
 
 def test_onnx_takes_any_number_of_environments_and_is_for_old_runtimes(tmp_path: Path):
-    made = to_onnx(saved(tmp_path / "a", "lstm"))
+    made = read_onnx(saved(tmp_path / "a", "lstm"), tmp_path / "a.onnx")
     assert made.opset_import[0].version <= 17 and made.ir_version <= 8
     for port in [*made.graph.input, *made.graph.output]:
         first, second = port.type.tensor_type.shape.dim[:2]
@@ -149,7 +151,7 @@ def test_onnx_takes_any_number_of_environments_and_is_for_old_runtimes(tmp_path:
 def test_an_export_says_what_it_is(tmp_path: Path):
     model = saved(tmp_path / "a", "lstm")
     written = json.loads((tmp_path / "a" / "contract.json").read_text())
-    onnx_says = {p.key: p.value for p in to_onnx(model).metadata_props}
+    onnx_says = {p.key: p.value for p in read_onnx(model, tmp_path / "a.onnx").metadata_props}
     export_servo_model(model, "torchscript", tmp_path / "a.pt")
     _, in_archive, torch_says = read_torchscript(tmp_path / "a.pt")
     assert onnx_says == torch_says and in_archive == json.loads(onnx_says["contract"]) == written
@@ -186,7 +188,9 @@ def test_a_table_gives_every_number_back(tmp_path: Path, kind: str):
 @pytest.mark.parametrize("kind", ["delayed-pd", "sindy"])
 @pytest.mark.parametrize("to", ["onnx", "torchscript"])
 def test_a_physical_model_becomes_no_network(tmp_path: Path, kind: str, to):
-    with pytest.raises(InputError, match=rf"{kind} model, which steps physics.*sysid calibrate"):
+    with pytest.raises(
+        InputError, match=rf"{kind} model, which integrates.*sysid calibrate"
+    ):
         export_servo_model(saved(tmp_path / "a", kind), to, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -202,7 +206,18 @@ def test_without_the_package_onnx_a_sentence_says_what_to_install(tmp_path: Path
     model = saved(tmp_path / "a")
     monkeypatch.setattr(builtins, "__import__", without_onnx)
     with pytest.raises(InputError, match=r"pip install 'pupper-sysid\[onnx\]'"):
-        to_onnx(model)
+        export_servo_model(model, "onnx", tmp_path / "a.onnx")
+    assert not (tmp_path / "a.onnx").exists()
+
+
+@pytest.mark.parametrize("to", ["onnx", "torchscript"])
+def test_a_file_that_computes_something_else_is_not_written(tmp_path: Path, monkeypatch, to):
+    model = saved(tmp_path / "a")
+    own_step = model.model.step
+    monkeypatch.setattr(model.model, "step", lambda command: own_step(command) + 1e-4)
+    with pytest.raises(PupperError, match=rf"{to} file differs .* by 1.0e-04"):
+        export_servo_model(model, to, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("to", list(ENDINGS))
@@ -241,7 +256,7 @@ def test_the_command_names_its_output_after_the_folder(tmp_path: Path, monkeypat
         (("servo/contract.json", "--to", "onnx"), "give its folder"),
         (("empty", "--to", "onnx"), "holds no servo model"),
         (("missing/", "--to", "onnx"), "neither a calibration"),
-        (("sindy", "--to", "onnx"), "steps physics between commands"),
+        (("sindy", "--to", "onnx"), "integrates physics between commands"),
     ],
 )
 def test_what_is_no_network_is_refused_in_a_sentence(
