@@ -67,6 +67,7 @@ def test_b5_1_both_series_in_one_process_are_read_right():
         scservo_def.SCS_SETEND(before)
 
 
+@pytest.mark.wall_clock
 def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
     monkeypatch.undo()
     assert feetech_line.REPLY_TIMEOUT_S == 0.003
@@ -300,6 +301,7 @@ def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
     ]
 
 
+@pytest.mark.wall_clock
 def test_b5_13_waiting_does_not_keep_the_processor_busy():
     with on_a_port(still_servos(ids=[1])) as server:
         line = FeetechLine(server.device, 1_000_000)
@@ -350,6 +352,7 @@ def test_an_answer_of_a_servo_that_was_not_asked_is_no_answer():
         line.close()
 
 
+@pytest.mark.wall_clock
 def test_the_time_of_a_reply_lies_within_its_exchange():
     with on_a_port(still_servos()) as server:
         line = FeetechLine(server.device, 1_000_000)

@@ -29,6 +29,8 @@ from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.recordings.recording import load
 from support.servo_servers import bench_of, moving_servos, on_a_port, on_a_socket, still_servos
 
+pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second
+
 ROOT = Path(__file__).resolve().parents[3]
 
 DRIVER = """

@@ -304,6 +304,7 @@ def test_truth_files_say_every_parameter_and_every_read(tmp_path):
     bus.write_truth(tmp_path / "sweep", force=True)
 
 
+@pytest.mark.wall_clock
 def test_a_minute_in_virtual_time_takes_seconds_and_in_real_time_as_long_as_it_says():
     bus = make_bus(RobotSpec())
     began = time.monotonic()

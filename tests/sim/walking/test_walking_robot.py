@@ -92,6 +92,7 @@ def test_its_servos_carry_its_weight():
     assert 0 < np.abs(loads).max() < 0.2
 
 
+@pytest.mark.wall_clock
 def test_a_robot_left_alone_for_a_day_is_not_stepped_and_answers_on_time():
     rested, fresh = make_robot(), make_robot()
     began = time.monotonic()
