@@ -3,11 +3,11 @@
     .venv/bin/python benchmarks/peers/check_exports.py
 
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
-fields of their configuration classes, and compares them with what `tests/test_simulator_export.py`
-holds the exports against. mjlab's delay buffer is run with the exported settings, and with the ones
-that its documentation suggests. Where `install.sh` has been run, Newton, mjlab and Isaac Lab's
-actuators run their exports: a tone through servos behind a floating base, against our own
-simulation.
+fields of their configuration classes, and compares them with those of
+`tests/support/exported_servos.py`, which the tests hold the exports against. mjlab's delay buffer
+is run with the exported settings, and with the ones that its documentation suggests. Where
+`install.sh` has been run, Newton, mjlab and Isaac Lab's actuators run their exports: a tone through
+servos behind a floating base, against our own simulation.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def print_tones(folder: Path) -> None:
 
 def main() -> None:
     """Print what was found; ends with 1 if a name is unknown."""
-    import test_simulator_export as ours
+    from support import exported_servos as ours
 
     bad = 0
     with tempfile.TemporaryDirectory() as name:

@@ -21,7 +21,7 @@ from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.robot_map import joint_map_of
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run, run_program
 from support.exported_servos import in_free_air
 from support.servo_servers import on_a_port

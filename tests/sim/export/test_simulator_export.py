@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
@@ -32,7 +33,7 @@ from pupper_sysid.sim.export.simulator_export import (
     to_mjlab,
 )
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, mujoco, rest_at
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
 from support.exported_servos import ISAACLAB, MJLAB, in_free_air
 
@@ -81,10 +82,8 @@ def lags_s(calibration, step_s: float, changed: Callable[[str], str] = str) -> n
         mujoco.mj_step(model, data)
         moved.append(data.qpos.copy())
     late = at > 1.0
-    angle = turn * (at[late] + step_s)
-    basis = np.stack([np.sin(angle), np.cos(angle), np.ones_like(angle)], axis=1)
-    sine, cosine, _ = np.linalg.lstsq(basis, np.array(moved)[late], rcond=None)[0]
-    return np.arctan2(-cosine, sine) / turn
+    phasor = fit_sine(turn * (at[late] + step_s), np.array(moved)[late]).phasor
+    return np.arctan2(-phasor.real, -phasor.imag) / turn
 
 
 def test_an_export_for_longer_steps_lags_as_long_as_the_calibration_says(calibration):
