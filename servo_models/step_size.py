@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.tones import least_squares, sine_design
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, integrate
 
 _TONES_HZ, _AMPLITUDE_RAD = (1.0, 2.0, 4.0), 0.2  # a walk's speeds, below most servos' limits

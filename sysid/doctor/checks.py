@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.sysid.feedback.poll_lattice import fresh_rows
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -205,9 +206,7 @@ def _tone_offset(trial: Trial) -> tuple[float, int] | None:
         return None
 
     def constant(time: NDArray[np.float64], value: NDArray[np.float64]) -> float:
-        angle = 2 * np.pi * trial.frequency_hz * time
-        design = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
-        return float(np.linalg.lstsq(design, value, rcond=None)[0][0])
+        return float(fit_sine(2 * np.pi * trial.frequency_hz * time, value).offset)
 
     sent = trial.send_time_s > start
     command = constant(trial.send_time_s[sent], trial.command_rad[sent])

@@ -1,9 +1,8 @@
-"""Many tones at once: the response at every line of a multisine, from one trial.
+"""Response at every line of a multisine, from one trial.
 
-The lines are read off the command itself: the strongest is fitted and taken out, again and again,
-until next to nothing is left. A chirp, steps or a walking robot leave too much: no multisine. All
-lines are then fitted to the fresh readings together, for readings at irregular times do not
-keep sines of different frequencies apart by themselves.
+The lines are found in the command: the strongest is fitted and subtracted until next to nothing is
+left. A chirp, steps or a walk leave too much and are no multisine. All lines are then fitted to the
+fresh readings together, because sines at irregular times are not orthogonal.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.lag.tone import ToneResponse
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -51,8 +51,8 @@ def multisine_responses(
         return []
     grid = np.arange(start, send[-1], 1e-3)
     held = trial.command_rad[np.searchsorted(send, grid, side="right") - 1]
-    command_held = _phasors(_solve(grid, held, lines))
-    command_rows = _phasors(_solve(send[rows], trial.command_rad[rows], lines))
+    command_held = _phasors(grid, held, lines)
+    command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
     naive = _draw(send[rows], trial.position_rad[rows], lines, rng, draws)
     measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
     shift = rng.normal(0.0, reading.time_sd_s, draws)
@@ -89,52 +89,39 @@ def _lines(time: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[n
 def _sharpened(
     time: NDArray[np.float64], command: NDArray[np.float64], lines: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lines after two Gauss-Newton steps on their frequencies, and what they leave."""
+    """Lines after two Gauss-Newton steps on their frequencies, and the residual."""
     clock, farthest = time - time.mean(), 0.25 / float(np.ptp(time))
     for _ in range(2):
-        phasor = _phasors(_solve(clock, command, lines))
-        turning = phasor * np.exp(2j * np.pi * np.outer(clock, lines))
+        turning = _phasors(clock, command, lines) * np.exp(2j * np.pi * np.outer(clock, lines))
         slopes = (2j * np.pi * clock[:, None] * turning).real
         design = np.hstack([_design(clock, lines), slopes])
-        step = np.linalg.lstsq(design, command, rcond=None)[0][1 + 2 * len(lines) :]
+        step = least_squares(design, command)[1 + 2 * len(lines) :]
         lines = lines + np.clip(step, -farthest, farthest)
-    return lines, command - _design(clock, lines) @ _solve(clock, command, lines)
+    design = _design(clock, lines)
+    return lines, command - design @ least_squares(design, command)
 
 
-def _design(time: NDArray[np.float64], lines: NDArray[np.float64]) -> NDArray[np.float64]:
-    angle = 2 * np.pi * np.outer(time, lines)
-    return np.hstack([np.ones((len(time), 1)), np.cos(angle), np.sin(angle)])
+def _design(time: NDArray, lines: NDArray) -> NDArray[np.float64]:
+    return sine_design(*(2 * np.pi * np.outer(lines, time)))
 
 
-def _solve(time: NDArray, value: NDArray, lines: NDArray) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.lstsq(_design(time, lines), value, rcond=None)[0], np.float64)
-
-
-def _phasors(solution: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Phasors P of `Re(P exp(2πj f t))`, from offset, cosines and sines along the last axis."""
-    count = solution.shape[-1] // 2
-    return solution[..., 1 : 1 + count] - 1j * solution[..., 1 + count :]
+def _phasors(time: NDArray, value: NDArray, lines: NDArray) -> NDArray[np.complex128]:
+    return phasors(least_squares(_design(time, lines), value))
 
 
 def _draw(
     time: NDArray, value: NDArray, lines: NDArray, rng: np.random.Generator, draws: int
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], float]:
-    """Phasors at all lines, draws of them, and the RMS of what they leave."""
+    """Phasors at all lines, draws of them, and the RMS about the fit."""
     design = _design(time, lines)
-    block = np.floor((time - time[0]) / _BLOCK_S).astype(int)
-    names, block = np.unique(block, return_inverse=True)
-    gram = np.zeros((len(names), design.shape[1], design.shape[1]))
-    moment = np.zeros((len(names), design.shape[1]))
-    np.add.at(gram, block, design[:, :, None] * design[:, None, :])
-    np.add.at(moment, block, design * value[:, None])
-    solution = np.linalg.solve(gram.sum(0), moment.sum(0))
-    weights = rng.exponential(size=(draws, len(names)))
-    drawn = np.linalg.solve(np.tensordot(weights, gram, axes=1), (weights @ moment)[..., None])
-    left = design @ solution - value
+    fit = block_bootstrap(
+        design, value, np.floor((time - time[0]) / _BLOCK_S).astype(int), rng, draws
+    )
+    left = design @ fit.solution - value
     # what was fitted away from the residuals is missing from their spread
     inflate = np.sqrt(len(value) / (len(value) - design.shape[1]))
     return (
-        _phasors(solution),
-        _phasors(solution + inflate * (drawn[..., 0] - solution)),
+        phasors(fit.solution),
+        phasors(fit.inflated(inflate)),
         float(inflate * np.sqrt(np.mean(left**2))),
     )

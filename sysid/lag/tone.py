@@ -1,9 +1,8 @@
-"""What a servo does to one tone: phasors of command and position, with honest uncertainty.
+"""Response of a servo to one tone: phasors of command and position, with their uncertainty.
 
-A tone `offset + Re(P exp(2πj f t))`, with a third harmonic for friction's flat tops, is fitted by
-least squares to readings at irregular times. Because the normal equations of a trial are sums over
-periods, weighting the periods at random (a Bayesian bootstrap) repeats the fit a thousand times
-for the price of one.
+A tone `offset + Re(P exp(2πj f t))`, with a third harmonic for the flat tops that friction makes,
+is fitted by least squares to readings at irregular times; a bootstrap over its periods gives the
+uncertainty (`common.tones`).
 """
 
 from __future__ import annotations
@@ -13,17 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.recordings.recording import Trial
 
-HARMONICS = (1, 3)
 _ALIASED = 30.0  # condition number beyond which a harmonic looks like the tone or the offset
 _SETTLE_S = 0.2  # after the tone is at full amplitude: several times the servo's slowest pole
 
 
 @dataclass(frozen=True)
 class ToneResponse:
-    """One trial's tone, seen three ways. Phasors are of `Re(P exp(2πj f t))`.
+    """Phasors of one trial's tone, of `Re(P exp(2πj f t))`.
 
     Attributes
     ----------
@@ -33,7 +32,7 @@ class ToneResponse:
     command_rows, command_held : complex
         Command at the rows' send times, and as the bus holds it between them.
     naive : complex
-        Position of all rows, each at its row's send time: what a spreadsheet would do.
+        Position of all rows, each at its row's send time.
     fresh : complex
         Position of fresh rows at the times they were measured.
     naive_draws, fresh_draws : ndarray of complex, shape (draws,)
@@ -60,7 +59,7 @@ class ToneResponse:
 
     @property
     def response(self) -> complex:
-        """Frequency response from the held command to the motion the host sees."""
+        """Frequency response from the held command to the measured motion."""
         return self.fresh / self.command_held
 
     @property
@@ -108,15 +107,15 @@ def tone_response(
     if np.linalg.cond(_design(send[rows], frequency)) > _ALIASED:  # two rows per period
         return None
 
-    def phasors(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
+    def fitted(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
         return _fit(time, value, frequency, start, rng, draws)
 
-    naive, naive_draws, _ = phasors(send[rows], trial.position_rad[rows])
-    result, fresh_draws, residual = phasors(reading.time_s[fresh], reading.position_rad[fresh])
+    naive, naive_draws, _ = fitted(send[rows], trial.position_rad[rows])
+    result, fresh_draws, residual = fitted(reading.time_s[fresh], reading.position_rad[fresh])
     grid = np.arange(start, stop, 5e-4)
     row = np.clip(np.searchsorted(send, grid, side="right") - 1, 0, None)
-    held = fit_phasor(grid, trial.command_rad[row], frequency)
-    sent = fit_phasor(send[window], trial.command_rad[window], frequency)
+    held = _phasor(grid, trial.command_rad[row], frequency)
+    sent = _phasor(send[window], trial.command_rad[window], frequency)
     # an error of the poll's phase shifts all times of the trial together
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     fresh_draws = fresh_draws * np.exp(2j * np.pi * frequency * shift)
@@ -126,21 +125,15 @@ def tone_response(
     )  # fmt: skip
 
 
-def fit_phasor(time_s: NDArray, value: NDArray, frequency_hz: float) -> complex:
-    """Least-squares phasor of `value` at `frequency_hz`, beside an offset and a third harmonic."""
-    design = _design(time_s, frequency_hz)
-    solution = np.linalg.lstsq(design, value, rcond=None)[0]
-    return complex(solution[1], -solution[2])
-
-
 def _design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:
-    """Offset, tone and, where the sampling lets it be seen, its third harmonic."""
+    """Offset, tone and, where the sampling tells it apart, its third harmonic."""
     angle = 2 * np.pi * frequency_hz * time_s
-    columns = [np.ones_like(time_s)]
-    for n in HARMONICS:
-        columns += [np.cos(n * angle), np.sin(n * angle)]
-    design = np.stack(columns, axis=1)
+    design = sine_design(angle, 3 * angle)
     return design if np.linalg.cond(design) < _ALIASED else design[:, :3]
+
+
+def _phasor(time_s: NDArray, value: NDArray, frequency_hz: float) -> complex:
+    return complex(phasors(least_squares(_design(time_s, frequency_hz), value))[0])
 
 
 def _fit(
@@ -151,49 +144,15 @@ def _fit(
     rng: np.random.Generator,
     draws: int,
 ) -> tuple[complex, NDArray[np.complex128], float]:
+    """Phasor, its draws, and the RMS about the fit; blocks are periods."""
     design = _design(time, frequency)
-    block = np.floor((time - start) * frequency).astype(int)
-    names, block = np.unique(block, return_inverse=True)
-    gram = np.zeros((len(names), design.shape[1], design.shape[1]))
-    moment = np.zeros((len(names), design.shape[1]))
-    np.add.at(gram, block, design[:, :, None] * design[:, None, :])
-    np.add.at(moment, block, design * value[:, None])
-    solution = np.linalg.solve(gram.sum(0), moment.sum(0))
-    residual = float(np.sqrt(np.mean((design @ solution - value) ** 2)))
-    # Rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
-    if len(names) < 8:
-        return (*_fit_blocks(design, value, solution, 8, rng, draws), residual)
-    weights = rng.exponential(size=(draws, len(names)))
-    return (*_weighted(gram, moment, weights, solution), residual)
-
-
-def _fit_blocks(
-    design: NDArray,
-    value: NDArray,
-    solution: NDArray,
-    count: int,
-    rng: np.random.Generator,
-    draws: int,
-) -> tuple[complex, NDArray[np.complex128]]:
-    """As `_fit`, over `count` runs of neighbouring rows where there are too few periods."""
-    parts = np.array_split(np.arange(len(value)), count)
-    gram = np.stack([design[p].T @ design[p] for p in parts])
-    moment = np.stack([design[p].T @ value[p] for p in parts])
-    weights = rng.exponential(size=(draws, count))
-    return _weighted(gram, moment, weights, solution)
-
-
-def _weighted(
-    gram: NDArray, moment: NDArray, weights: NDArray, solution: NDArray
-) -> tuple[complex, NDArray[np.complex128]]:
-    grams = np.tensordot(weights, gram, axes=1)
-    moments = weights @ moment
-    drawn = np.linalg.solve(grams, moments[..., None])[..., 0]
-    blocks, columns = len(gram), gram.shape[1]
+    period = np.floor((time - start) * frequency).astype(int)
+    # rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
+    fit = block_bootstrap(design, value, period, rng, draws, fewest=8)
+    residual = float(np.sqrt(np.mean((design @ fit.solution - value) ** 2)))
     # the spread of few blocks around their own fit is too small by their lost degrees of freedom
-    inflate = np.sqrt(blocks / max(blocks - columns / 2, 1.0))
-    drawn = solution + inflate * (drawn - solution)
-    return complex(solution[1], -solution[2]), drawn[:, 1] - 1j * drawn[:, 2]
+    drawn = fit.inflated(np.sqrt(fit.blocks / max(fit.blocks - design.shape[1] / 2, 1.0)))
+    return complex(phasors(fit.solution)[0]), phasors(drawn)[:, 0], residual
 
 
 def _command_frequency(trial: Trial) -> float:
@@ -203,12 +162,10 @@ def _command_frequency(trial: Trial) -> float:
     time, value = time[half:], value[half:]
     middle = time.mean()
     for _ in range(4):
-        angle = 2 * np.pi * frequency * (time - middle)
-        c, s = np.cos(angle), np.sin(angle)
-        linear = np.linalg.lstsq(np.stack([np.ones_like(c), c, s], 1), value, rcond=None)[0]
-        slope = 2 * np.pi * (time - middle) * (-linear[1] * s + linear[2] * c)
-        design = np.stack([np.ones_like(c), c, s, slope], 1)
-        step = np.linalg.lstsq(design, value, rcond=None)[0][3]
+        tone = sine_design(2 * np.pi * frequency * (time - middle))
+        _, cosine, sine = least_squares(tone, value)
+        slope = 2 * np.pi * (time - middle) * (-cosine * tone[:, 2] + sine * tone[:, 1])
+        step = least_squares(np.column_stack([tone, slope]), value)[3]
         frequency += float(np.clip(step, -0.02 * frequency, 0.02 * frequency))
     # a command that is no tone at all must not run away
     return frequency if abs(frequency / trial.frequency_hz - 1) < 0.05 else trial.frequency_hz
@@ -219,7 +176,7 @@ def _steady_from(trial: Trial, frequency: float) -> float:
     time, value = trial.send_time_s, trial.command_rad
     half = len(time) // 2
     design = _design(time, frequency)[:, :3]
-    solution = np.linalg.lstsq(design[half:], value[half:], rcond=None)[0]
+    solution = least_squares(design[half:], value[half:])
     wrong = np.abs(design @ solution - value) > 0.05 * np.hypot(solution[1], solution[2])
     last = np.flatnonzero(wrong[:half])
     return float(time[min(last[-1] + 1, len(time) - 1)]) if len(last) else float(time[0])

@@ -1,0 +1,141 @@
+"""Sines by linear least squares at irregular times, and the block bootstrap of such a fit.
+
+`Re(P exp(jφ))` at angles φ [rad] is linear in the phasor P: `sine_design` has the columns,
+`fit_sine` solves for one sine beside an offset, `block_bootstrap` repeats a fit under random
+weights of its blocks. Normal equations are sums over blocks, so that a thousand repetitions cost
+little more than one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def sine_design(*angles_rad: NDArray) -> NDArray[np.float64]:
+    """Columns of a least-squares fit: one, then cosine and sine of each angle.
+
+    Parameters
+    ----------
+    *angles_rad : ndarray, shape (rows,)
+        One per tone: `2π f t` [rad].
+
+    Returns
+    -------
+    ndarray, shape (rows, 1 + 2 tones)
+    """
+    columns = [np.ones_like(angles_rad[0])]
+    for angle in angles_rad:
+        columns += [np.cos(angle), np.sin(angle)]
+    return np.stack(columns, axis=1)
+
+
+def least_squares(design: NDArray, value: NDArray) -> NDArray[np.float64]:
+    """Coefficients of `design` that fit `value`; a column of `value` is a fit of its own.
+
+    Parameters
+    ----------
+    design : ndarray, shape (rows, columns)
+    value : ndarray, shape (rows,) or (rows, channels)
+    """
+    return np.linalg.lstsq(design, value, rcond=None)[0]
+
+
+def phasors(solution: NDArray) -> NDArray[np.complex128]:
+    """Phasors P of `Re(P exp(jφ))` from coefficients of `sine_design` on the last axis."""
+    return solution[..., 1::2] - 1j * solution[..., 2::2]
+
+
+class Sine(NamedTuple):
+    """`offset + Re(phasor exp(jφ))`, a number or an array over channels each."""
+
+    offset: NDArray[np.float64]
+    phasor: NDArray[np.complex128]
+
+
+def fit_sine(angle_rad: NDArray, value: NDArray) -> Sine:
+    """Sine and offset that fit `value` best.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (rows,)
+    value : ndarray, shape (rows,) or (rows, channels)
+
+    Examples
+    --------
+    >>> angle = np.linspace(0.0, 9.0, 50)
+    >>> found = fit_sine(angle, 3.0 + 2.0 * np.cos(angle - 0.5))
+    >>> [round(float(x), 9) for x in (found.offset, abs(found.phasor), -np.angle(found.phasor))]
+    [3.0, 2.0, 0.5]
+    """
+    offset, cosine, sine = least_squares(sine_design(angle_rad), value)
+    return Sine(offset, cosine - 1j * sine)
+
+
+class BlockFit(NamedTuple):
+    """A least-squares fit with its bootstrap.
+
+    Attributes
+    ----------
+    solution : ndarray, shape (columns,)
+    drawn : ndarray, shape (draws, columns)
+        The same under random weights of the blocks.
+    blocks : int
+        How many blocks were weighted.
+    """
+
+    solution: NDArray[np.float64]
+    drawn: NDArray[np.float64]
+    blocks: int
+
+    def inflated(self, factor: float) -> NDArray[np.float64]:
+        """The draws, their distance from the solution multiplied by `factor`."""
+        return self.solution + factor * (self.drawn - self.solution)
+
+
+def block_bootstrap(
+    design: NDArray,
+    value: NDArray,
+    block: NDArray,
+    rng: np.random.Generator,
+    draws: int,
+    fewest: int = 1,
+) -> BlockFit:
+    """Least squares, repeated with exponential random weights of the blocks (Bayesian bootstrap).
+
+    Parameters
+    ----------
+    design : ndarray, shape (rows, columns)
+    value : ndarray, shape (rows,)
+    block : ndarray of int, shape (rows,)
+        Label of each row's block: rows of one block keep together.
+    rng : numpy.random.Generator
+    draws : int
+    fewest : int
+        Fewer blocks are replaced by this many runs of neighbouring rows.
+
+    References
+    ----------
+    D. Rubin, "The Bayesian bootstrap", Annals of Statistics 9 (1981).
+    """
+    gram, moment = _normal_equations(design, value, block)
+    solution = np.linalg.solve(gram.sum(0), moment.sum(0))
+    if len(gram) < fewest:
+        runs = np.array_split(np.arange(len(value)), fewest)
+        block = np.repeat(np.arange(fewest), [len(run) for run in runs])
+        gram, moment = _normal_equations(design, value, block)
+    weights = rng.exponential(size=(draws, len(gram)))
+    drawn = np.linalg.solve(np.tensordot(weights, gram, axes=1), (weights @ moment)[..., None])
+    return BlockFit(solution, drawn[..., 0], len(gram))
+
+
+def _normal_equations(design: NDArray, value: NDArray, block: NDArray) -> tuple[NDArray, NDArray]:
+    """Gram matrix and right-hand side of every block."""
+    names, block = np.unique(block, return_inverse=True)
+    gram = np.zeros((len(names), design.shape[1], design.shape[1]))
+    moment = np.zeros((len(names), design.shape[1]))
+    np.add.at(gram, block, design[:, :, None] * design[:, None, :])
+    np.add.at(moment, block, design * value[:, None])
+    return gram, moment
