@@ -35,11 +35,11 @@ from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.policies.deploy.assembly import assemble, reassemble
 from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.deployment import deploy
-from pupper_sysid.policies.deploy.stack_trials import walk_once
+from pupper_sysid.policies.deploy.emulated_walk import walk_once
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 from pupper_sysid.policies.network.policy_file import load_policy
-from pupper_sysid.sysid.recordings.recording import RecordingWriter
+from pupper_sysid.sysid.recordings.files import RecordingWriter
 
 CALIBRATION = "data/samples/calibrated.yaml"
 POLICIES = Path("data/samples/policies")

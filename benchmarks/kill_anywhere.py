@@ -22,7 +22,8 @@ from emulators import KINDS, in_process, served
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
 

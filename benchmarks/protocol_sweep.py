@@ -33,7 +33,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.lag.lag_budget import tone_lags, tone_weights
 from pupper_sysid.sysid.lag.tone import tone_response
-from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
 

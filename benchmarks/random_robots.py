@@ -16,7 +16,8 @@ from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S, FreeAirServ
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot, random_spec
 from pupper_sysid.sim.emulator.servo_plant import FreeAirServos
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.recordings.recording import Recording, Trial, load
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
 from pupper_sysid.sysid.sweep.recorder import record
 

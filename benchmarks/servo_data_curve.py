@@ -26,7 +26,8 @@ from emulators import in_process
 from pupper_sysid.common.figure_style import save
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report.data_curve import FILE, data_curve_figure, measured
 from pupper_sysid.sysid.report.data_curve import MODELS as CURVES
 from pupper_sysid.sysid.servo_fit import scores

@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
 
 REAL = Path(os.environ.get("PUPPER_REAL_DATA", Path(__file__).parents[2] / "shared" / "real"))

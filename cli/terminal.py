@@ -21,11 +21,10 @@ from rich.text import Text
 from pupper_sysid.cli.flags import spell
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
-from pupper_sysid.common.results import plain
-from pupper_sysid.sysid.recordings.recording import Recording, load, newest_recording
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.identify.fleet import Fleet
+    from pupper_sysid.sysid.recordings.recording import Recording
 
 # no markup: names of files and joints may have brackets; `Text` where something is to stand out
 out = Console(highlight=False, markup=False)
@@ -34,6 +33,8 @@ err = Console(stderr=True, highlight=False, markup=False)
 
 def load_all(paths: Sequence[Path]) -> list[Recording]:
     """The recordings at `paths`, or the newest in `recordings/`; their warnings are shown."""
+    from pupper_sysid.sysid.recordings.files import load, newest_recording
+
     chosen = list(paths)
     if not chosen:
         chosen = [newest_recording()]
@@ -54,6 +55,8 @@ def pick_joints(recordings: Sequence[Recording], text: str) -> list[str]:
 
 def print_json(value: Any) -> None:
     """One JSON object on stdout; non-finite numbers become null."""
+    from pupper_sysid.common.results import plain
+
     print(json.dumps(plain(value), indent=2, ensure_ascii=False))
 
 

@@ -38,7 +38,8 @@ from pupper_sysid.sysid.identify.models import rung
 from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.scores import rms, score
 from pupper_sysid.sysid.identify.search import leave_one_out_folds
-from pupper_sysid.sysid.recordings.recording import Recording, load
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
 
 HERE = Path(__file__).parent
 if STEP_S != TIME_STEP_S:

@@ -14,7 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
 from pupper_sysid.sysid.export.tidy_csv import to_csv
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 
 _MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
 

@@ -16,18 +16,17 @@ from pupper_sysid.cli.buses import JOINTS_FILE, connect
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
+from pupper_sysid.hardware.address import EMULATED, bus_name
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import directly_read, draw_robot
-from pupper_sysid.sysid.recordings.recording import FOLDER
+from pupper_sysid.sysid.recordings.files import FOLDER
 from pupper_sysid.sysid.sweep.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan
 from pupper_sysid.sysid.sweep.playback import playback
 from pupper_sysid.sysid.sweep.recorder import LOOP_PERIOD_S, record
 from pupper_sysid.sysid.sweep.resume import footer, header_of, resume_point
-
-EMULATED = "emulated"
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ class Sweep:
     def _request(self) -> dict[str, Any]:
         """All that decides what will be done; the recording keeps it, so that it can go on."""
         terminal.need_positive("--rate", self.rate)
-        bus = self.bus
+        bus = bus_name(self.bus)
         if self.loops < 1:
             raise InputError(f"--loops is {self.loops}; it must be at least 1.")
         if self.real_time and bus != EMULATED:
@@ -154,7 +153,7 @@ class Sweep:
 
     def _joints_there(self) -> tuple[str, ...]:
         """Joints to choose from: of the joint map, if one was named or lies here."""
-        here = JOINTS_FILE if self.bus != EMULATED and JOINTS_FILE.exists() else None
+        here = JOINTS_FILE if bus_name(self.bus) != EMULATED and JOINTS_FILE.exists() else None
         chosen = self.joint_map or here
         return load_joint_map(chosen).joint_names if chosen else JOINT_NAMES
 

@@ -334,7 +334,7 @@ def _walked(folder: Path, options: Analyze) -> Path:
     """A recording of the servos of an emulated robot that a policy walks."""
     from pupper_sysid.policies.deploy.stack_trials import walk_once
     from pupper_sysid.policies.deploy.stacks import STACKS
-    from pupper_sysid.sysid.recordings.recording import RecordingWriter
+    from pupper_sysid.sysid.recordings.files import RecordingWriter
 
     policy, run = policy_at(folder)
     actuator = chosen_actuator(folder, policy, run, options.actuator)

@@ -17,12 +17,12 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
-from pupper_sysid.cli.commands.sweep import EMULATED, Sweep
+from pupper_sysid.cli.commands.sweep import Sweep
 from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, trained_actuator
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.hardware.address import SOCKET, parse_address
+from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
@@ -30,7 +30,7 @@ from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, StackName, suited
-from pupper_sysid.sysid.recordings.recording import RecordingWriter
+from pupper_sysid.sysid.recordings.files import RecordingWriter
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -50,8 +50,8 @@ class Deploy:
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """A run (`runs/<name>`) or a policy folder."""
-    bus: str = "sim"
-    """`sim` (an emulated robot, as fast as it goes), `esp32`, `esp32:SOCKET`, `feetech:DEVICE`."""
+    bus: str = EMULATED
+    """`emulated` (no robot, as fast as it goes), `esp32`, `esp32:SOCKET` or `feetech:DEVICE`."""
     imu: Path | None = None
     """Socket of the proxy whose IMU to read, for a Feetech line, which has none."""
     joint_map: str | None = None
@@ -105,11 +105,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: Deploy) -> None:
     end_politely()
+    options = replace(options, bus=bus_name(options.bus))
     need_positive("--seconds", options.seconds)
     if options.playback:
         Sweep(
             playback=options.playback, loops=PLAYBACK_LOOPS, joint_map=options.joint_map,
-            bus=EMULATED if options.bus == "sim" else options.bus, seed=options.seed,
+            bus=options.bus, seed=options.seed,
             rate=options.rate or PLAYBACK_HZ, json=options.json, force=options.force,
         ).run()  # fmt: skip
         return
@@ -178,7 +179,7 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
 
 def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:
     """Bus, IMU, joint map, and the emulated robot if it is one."""
-    if options.bus == "sim":
+    if options.bus == EMULATED:
         from pupper_sysid.sim.emulator.robot import draw_robot
         from pupper_sysid.sim.walking.bus import WalkingBus
 
@@ -237,7 +238,7 @@ def _walk(
     from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.commands import constant, script
     from pupper_sysid.policies.deploy.deployment import deploy
-    from pupper_sysid.policies.deploy.walk_score import WalkScore
+    from pupper_sysid.policies.deploy.emulated_walk import ERRORS, WalkScore
 
     told = script(options.script) if options.script else constant(options.command)
     score = WalkScore(bus, truth) if truth else None
@@ -245,7 +246,7 @@ def _walk(
     about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
     with ExitStack() as open_things:
         priority = open_things.enter_context(real_time_priority())
-        if options.bus != "sim":
+        if options.bus != EMULATED:
             err.print(f"Running with {priority}.")
         watchers: list[Any] = [score] if score else []
         if options.keyboard:
@@ -258,7 +259,7 @@ def _walk(
         rows.close({"stop_reason": outcome.stop_reason})
     steps = outcome.steps
     # only an emulated robot says where it really went
-    motion: dict[str, Any] = score.summary() if score else dict.fromkeys(WalkScore.NAMES)
+    motion: dict[str, Any] = score.summary() if score else dict.fromkeys(ERRORS)
     found = {
         "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),
         "seconds": outcome.seconds,

@@ -29,7 +29,7 @@ from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import Contract, SavedModel
-from pupper_sysid.sysid.export.tidy_csv import comments
+from pupper_sysid.sysid.recordings.table import comments
 
 ENDINGS: dict[str, str] = {"csv": ".csv", "onnx": ".onnx", "torchscript": ".pt"}
 _ENVIRONMENTS, _STEPS = 3, 20  # of the free run in which a file is compared with its model

@@ -10,23 +10,17 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
-from pupper_sysid.common.files import versions, write_text
+from pupper_sysid.common.files import write_text
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import JointCalibration, Quantity, unit_of
-from pupper_sysid.sysid.recordings.recording import (
-    OPTIONAL_COLUMNS,
-    REQUIRED_COLUMNS,
-    SCHEMA_VERSION,
-    TITLE,
-    Recording,
-)
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.recordings.table import comments
 
 CALIBRATION_COLUMNS = (
     "joint",
@@ -62,7 +56,7 @@ def to_csv(source: Calibration | Recording, path: Path | None = None, force: boo
     InputError
         If `path` exists and `force` is not given, or if it cannot be written.
     """
-    text = _calibration(source) if isinstance(source, Calibration) else _recording(source)
+    text = _calibration(source) if isinstance(source, Calibration) else source.to_csv()
     if path is not None:
         write_text(path, text, force)
     return text
@@ -101,33 +95,3 @@ def _rows(joint: JointCalibration) -> Iterator[list[Any]]:
 
 def _cell(number: float | None) -> float | str:
     return "" if number is None else number
-
-
-def _recording(recording: Recording) -> str:
-    columns = [c for c in (*REQUIRED_COLUMNS, *OPTIONAL_COLUMNS) if c in recording.table]
-    header = {"schema_version": SCHEMA_VERSION, "versions": versions()} | recording.metadata
-    completed = header.pop("completed", None)
-    if completed is None and "imported_from" in header:
-        # foreign layouts have no footer; without one the export would pass for a cut recording
-        completed = {"rows": len(recording.table)}
-    header["exported_from"] = {"name": recording.name, "sha256": recording.sha256}
-    if recording.warnings:
-        header["warnings_when_exported"] = list(recording.warnings)
-    text = comments(TITLE.removeprefix("# "), header)
-    table = recording.table.astype({"trial": int})
-    text += table.to_csv(columns=columns, index=False, lineterminator="\n")
-    return text + (f"# completed: {_json(completed)}\n" if completed is not None else "")
-
-
-def comments(title: str, entries: dict[str, Any]) -> str:
-    """Comment lines that open a table: a title, then `# key: JSON value` of each entry."""
-    return "\n".join([f"# {title}", *(f"# {k}: {_json(v)}" for k, v in entries.items()), ""])
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, default=_plain)
-
-
-def _plain(value: Any) -> Any:
-    """NumPy numbers and arrays as JSON holds them, anything else as text."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)

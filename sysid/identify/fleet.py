@@ -35,7 +35,7 @@ from pupper_sysid.sysid.identify.calibration_file import (
     STALL_TORQUE_SOURCE,
     to_calibration,
 )
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 
 TABLE = "fleet.csv"
 UNLIKE = 5.0

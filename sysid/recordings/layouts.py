@@ -4,8 +4,8 @@
   command_rad, actual_rad`, angles relative to the standing pose (the SpotDMouse sweep script);
 * twelve joints played back: `time_s, loop`, then `<joint>_command_rad, <joint>_position_rad`.
 
-Both say when the loop turned, not when the position was read; reading is taken to follow sending
-by `READ_AFTER_SEND_S`, and the metadata say so.
+Both log the time of the loop, not of the read; a read is assumed `READ_AFTER_SEND_S` after the
+command was sent, and the metadata say so.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import pandas as pd
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.sysid.recordings.table import Parsed, require
+from pupper_sysid.sysid.recordings.table import REQUIRED_COLUMNS, Parsed, require
 
 READ_AFTER_SEND_S = 0.0005
 PAUSE_S = 0.5
@@ -27,12 +27,9 @@ PAUSE_S = 0.5
 
 _SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
 _PLAYBACK = ("time_s", "loop")
-_TIDY = (
-    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
-)  # fmt: skip
 
 
-def convert(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+def convert(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
     """Tidy table, metadata and warnings of a parsed file of any known layout.
 
     Raises
@@ -42,7 +39,7 @@ def convert(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], l
     """
     columns = set(parsed.table.columns)
     if "send_time_s" in columns or "read_time_s" in columns:
-        require(path, parsed.table, _TIDY)
+        require(path, parsed.table, REQUIRED_COLUMNS)
         return parsed.table, parsed.metadata, []
     if {"actual_rad", "freq_hz"} & columns and "motor_idx" in columns:
         require(path, parsed.table, _SWEEP)
@@ -50,7 +47,7 @@ def convert(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], l
     if any(f"{j}_command_rad" in columns or f"{j}_position_rad" in columns for j in JOINT_NAMES):
         require(path, parsed.table, _PLAYBACK)
         return _playback(path, parsed)
-    require(path, parsed.table, _TIDY)
+    require(path, parsed.table, REQUIRED_COLUMNS)
     raise AssertionError("a table with all tidy columns was taken above")
 
 
@@ -74,7 +71,7 @@ def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> 
     return metadata
 
 
-def _sweep(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+def _sweep(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
     table = parsed.table
     index = table["motor_idx"].to_numpy()
     if not np.isin(index, np.arange(len(JOINT_NAMES))).all():
@@ -107,7 +104,7 @@ def _sweep(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], li
     return tidy, metadata, []
 
 
-def _playback(path: Path, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+def _playback(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
     table = parsed.table
     joints = [j for j in JOINT_NAMES if f"{j}_command_rad" in table.columns]
     parts = []

@@ -1,20 +1,13 @@
-"""Recording: what was sent, what was read, and when, as one CSV file that opens in a spreadsheet.
+"""Recording: commands sent, positions read, and their times, as a tidy table with metadata.
 
-The file starts with comment lines: `# pupper-sysid recording`, then one `# key: JSON` per line
-(schema version, bus, excitation, start pose, seed, versions). Then comes one row per control tick
-and joint. Rows are flushed as they are written, so a recording cut short by a power failure is a
-recording up to there. A completed one ends with `# completed: {...}`.
-
-`load` reads this form and the layouts of `sysid.recordings.layouts`, validates everything, and
-refuses in one sentence what cannot be used. Time stamps are kept as they are, never resampled.
+Time stamps are kept as they are, never resampled. `sysid.recordings.files.load` reads a recording
+from a file; `Recording.from_arrays` and `Recording.from_frame` take it from memory.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,21 +15,24 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import SyncedText, versions
+from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
-
-SCHEMA_VERSION = 1
-TITLE = "# pupper-sysid recording"
-REQUIRED_COLUMNS = (
-    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
-)  # fmt: skip
-OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
-FOLDER = Path("recordings")
-
-_ADVICE = "; what is there can be continued with `pupper-sysid sweep --resume`"
+from pupper_sysid.sysid.recordings.layouts import READ_AFTER_SEND_S, convert
+from pupper_sysid.sysid.recordings.table import (
+    OPTIONAL_COLUMNS,
+    REQUIRED_COLUMNS,
+    SCHEMA_VERSION,
+    TEXT_COLUMNS,
+    TITLE,
+    Parsed,
+    check,
+    check_metadata,
+    comment,
+    comments,
+)
 
 
 @dataclass(frozen=True)
@@ -105,16 +101,25 @@ class Recording:
     Attributes
     ----------
     table : pandas.DataFrame
-        Columns `REQUIRED_COLUMNS` and those of `OPTIONAL_COLUMNS` the bus had.
+        Columns `table.REQUIRED_COLUMNS`, and those of `table.OPTIONAL_COLUMNS` the bus had.
     metadata : dict
         The file's header (and footer, under `completed`).
     name : str
         Of the file, without folder and ending.
     path : Path or None
     sha256 : str
-        Of the file as it was read.
+        Of the file as it was read, or of the table if there was no file.
     warnings : tuple of str
         What was repaired or is missing, in sentences.
+
+    Examples
+    --------
+    >>> time_s = 0.02 * np.arange(100)
+    >>> command = {"LF_hip": 0.3 * np.sin(2 * np.pi * time_s)}
+    >>> position = {"LF_hip": 0.3 * np.sin(2 * np.pi * (time_s - 0.05))}
+    >>> recording = Recording.from_arrays(time_s, command, position, frequency_hz=1.0)
+    >>> recording.joints, round(recording.loop_period_s, 6)
+    (['LF_hip'], 0.02)
     """
 
     table: pd.DataFrame
@@ -123,6 +128,151 @@ class Recording:
     path: Path | None
     sha256: str
     warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def from_arrays(
+        cls,
+        send_time_s: ArrayLike,
+        command_rad: Mapping[str, ArrayLike],
+        position_rad: Mapping[str, ArrayLike],
+        *,
+        read_time_s: ArrayLike | None = None,
+        trial: ArrayLike = 0,
+        frequency_hz: ArrayLike = float("nan"),
+        metadata: Mapping[str, Any] | None = None,
+        name: str = "arrays",
+    ) -> Recording:
+        """A recording from arrays over time, validated like a file.
+
+        Parameters
+        ----------
+        send_time_s : array_like, shape (n,)
+            When each command was sent [s], increasing within a trial.
+        command_rad, position_rad : mapping of joint to array_like, shape (n,)
+            Absolute angles [rad]; a missing reading is NaN.
+        read_time_s : array_like, shape (n,), optional
+            When the positions were read [s]; by default `READ_AFTER_SEND_S` after each command.
+        trial : int or array_like of int, shape (n,)
+            Number of the trial each row belongs to. Nothing is computed across trials.
+        frequency_hz : float or array_like, shape (n,)
+            Of the commanded tone, one per trial; NaN where the command is not a tone.
+        metadata : mapping, optional
+            Header entries, such as `bus` and `start_pose_rad`.
+        name : str
+            For messages, tables and figures.
+
+        Raises
+        ------
+        InputError
+            If lengths differ, a joint is unknown, or the rows would be refused in a file.
+
+        See Also
+        --------
+        from_frame : The same from a table.
+        """
+        if set(command_rad) != set(position_rad) or not command_rad:
+            raise InputError(
+                f"{name}: command_rad has joints {', '.join(command_rad)}, position_rad has "
+                f"{', '.join(position_rad)}; they must be the same, at least one."
+            )
+        time_s = np.asarray(send_time_s, float)
+        shared: dict[str, Any] = {"trial": trial, "frequency_hz": frequency_hz}
+        shared |= {} if read_time_s is None else {"read_time_s": read_time_s}
+        parts = []
+        for joint, command in command_rad.items():
+            own = shared | {"command_rad": command, "position_rad": position_rad[joint]}
+            columns: dict[str, Any] = {"send_time_s": time_s, "joint": joint}
+            for key, values in own.items():
+                columns[key] = np.asarray(values)
+                free = key in ("trial", "frequency_hz") and columns[key].ndim == 0
+                if not free and columns[key].shape != time_s.shape:
+                    raise InputError(
+                        f"{name}, {joint}: {key} has shape {columns[key].shape}, send_time_s "
+                        f"{time_s.shape}; they must have the same number of values."
+                    )
+            parts.append(pd.DataFrame(columns, index=range(len(time_s))))
+        return cls.from_frame(pd.concat(parts, ignore_index=True), metadata=metadata, name=name)
+
+    @classmethod
+    def from_frame(
+        cls, table: pd.DataFrame, *, metadata: Mapping[str, Any] | None = None, name: str = "frame"
+    ) -> Recording:
+        """A recording from a table, validated like a file.
+
+        Parameters
+        ----------
+        table : pandas.DataFrame
+            Columns of a recording file or of another layout that `load` reads. Of the former,
+            `read_time_s`, `trial` and `frequency_hz` may be absent: reads then follow
+            `READ_AFTER_SEND_S` after the command, all rows are one trial, and no tone is assumed.
+        metadata : mapping, optional
+            Header entries, such as `bus` and `start_pose_rad`.
+        name : str
+            For messages, tables and figures.
+
+        Raises
+        ------
+        InputError
+            If a column is missing or is not numeric, times run backwards, angles cannot be
+            radians, or too few rows are left.
+        """
+        given = {"imported_from": "a table in memory"} | dict(metadata or {})
+        check_metadata(name, given)
+        table = table.copy()
+        if "send_time_s" in table:
+            if "read_time_s" not in table:
+                table["read_time_s"] = table["send_time_s"] + READ_AFTER_SEND_S
+                given.setdefault("read_after_send_s", READ_AFTER_SEND_S)
+            for column, value in (("trial", 0), ("frequency_hz", np.nan)):
+                table[column] = table.get(column, value)
+        for column in table.columns.difference(TEXT_COLUMNS):
+            try:
+                table[column] = table[column].astype(float)
+            except (TypeError, ValueError):
+                raise InputError(f"{name}, column {column}: its values are not numbers.") from None
+            if np.isinf(table[column]).any():
+                raise InputError(f"{name}, column {column}: a value is infinite.")
+        tidy, known, warnings = convert(name, Parsed(given, table))
+        tidy = tidy[[*REQUIRED_COLUMNS, *tidy.columns.difference(REQUIRED_COLUMNS, sort=False)]]
+        tidy, more = check(name, tidy)
+        digest = hashlib.sha256(tidy.to_csv(index=False).encode()).hexdigest()
+        return cls(tidy, given | known, name, None, digest, (*warnings, *more))
+
+    def to_frame(self) -> pd.DataFrame:
+        """A copy of `table`."""
+        return self.table.copy()
+
+    def to_csv(self) -> str:
+        """The recording as text of a recording file."""
+        columns = [c for c in (*REQUIRED_COLUMNS, *OPTIONAL_COLUMNS) if c in self.table]
+        header = {"schema_version": SCHEMA_VERSION, "versions": versions()} | self.metadata
+        completed = header.pop("completed", None)
+        if completed is None and "imported_from" in header:
+            # other layouts have no footer; without one the file would pass for a cut recording
+            completed = {"rows": len(self.table)}
+        header["exported_from"] = {"name": self.name, "sha256": self.sha256}
+        if self.warnings:
+            header["warnings_when_exported"] = list(self.warnings)
+        text = comments(TITLE.removeprefix("# "), header)
+        table = self.table.astype({"trial": int})
+        text += table.to_csv(columns=columns, index=False, lineterminator="\n")
+        return text + (f"{comment('completed', completed)}\n" if completed is not None else "")
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write a recording file, which `load` reads back.
+
+        Parameters
+        ----------
+        path : Path or str
+        force : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        InputError
+            If the file exists and `force` is not given, or if it cannot be written.
+        """
+        write_text(Path(path), self.to_csv(), force)
 
     @property
     def joints(self) -> list[str]:
@@ -173,157 +323,3 @@ class Recording:
                 )
             )
         return found
-
-
-def load(path: Path) -> Recording:
-    """Read and validate the recording at `path`, in any known layout.
-
-    Raises
-    ------
-    InputError
-        If it is no recording, or cannot be used; the sentence says where and what to do.
-    """
-    from pupper_sysid.sysid.recordings.layouts import convert
-    from pupper_sysid.sysid.recordings.table import check, parse
-
-    path = Path(path)
-    if path.name.endswith(".truth.csv"):
-        raise InputError(
-            f"{path} is the truth that belongs to {path.name.removesuffix('.truth.csv')}.csv, "
-            "not a recording; give that one."
-        )
-    data = read_bytes(path)
-    parsed = parse(path, as_text(path, data))
-    table, metadata, warnings = convert(path, parsed)
-    table, more = check(path, table)
-    digest = hashlib.sha256(data).hexdigest()
-    found = [*parsed.warnings, *warnings, *more]
-    return Recording(table, metadata, path.stem, path, digest, tuple(found))
-
-
-def newest_recording(folder: Path = FOLDER) -> Path:
-    """The newest recording in `folder`.
-
-    Raises
-    ------
-    InputError
-        If there is none; the sentence says how to make one.
-    """
-    found = [p for p in folder.glob("*.csv") if not p.name.endswith(".truth.csv")]
-    if not found:
-        raise InputError(
-            f"No recording was named and there is none in {folder}/. "
-            "Make one with `pupper-sysid sweep --freqs 1-10`, or name a file."
-        )
-    return max(found, key=lambda p: p.stat().st_mtime)
-
-
-def read_bytes(path: Path) -> bytes:
-    """What is in the file, if it can be a recording at all."""
-    largest = 500e6
-    try:
-        if path.stat().st_size > largest:
-            raise InputError(f"{path} has more than {largest / 1e6:.0f} MB; split it by joint.")
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist. Check the name, or run a sweep first.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    if not data.strip():
-        raise InputError(f"{path} is empty: the recording never started. Record it again.")
-    return data
-
-
-def as_text(path: Path, data: bytes) -> str:
-    """The file's text, without a byte order mark."""
-    try:
-        if b"\0" in data:
-            raise ValueError
-        return data.decode("utf-8-sig")
-    except ValueError:
-        raise InputError(f"{path} is not a text file; a recording is CSV.") from None
-
-
-class RecordingWriter:
-    """Writes a recording row by row; what has been appended survives the death of the process.
-
-    Parameters
-    ----------
-    path : Path
-    metadata : dict
-        Header entries; each value must be JSON.
-    force : bool
-        Replace an existing file.
-
-    Examples
-    --------
-    >>> with RecordingWriter(path, {"seed": 1}) as writer:  # doctest: +SKIP
-    ...     writer.append({"send_time_s": 0.0, ...})
-    ...     writer.close({"rows": 1})
-    """
-
-    def __init__(self, path: Path, metadata: dict[str, Any], force: bool = False):
-        self._file = SyncedText(path, force, advice=_ADVICE)
-        self._columns: tuple[str, ...] = ()
-        created = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
-        header = {"schema_version": SCHEMA_VERSION, "created": created, "versions": versions()}
-        lines = [
-            f"# {k}: {json.dumps(v, ensure_ascii=False)}" for k, v in (header | metadata).items()
-        ]
-        self._file.write([TITLE, *lines])
-
-    @classmethod
-    def resumed(cls, path: Path, trial: int) -> RecordingWriter:
-        """Go on writing an unfinished recording, from its trial `trial` on.
-
-        Rows of that trial that stand there already are kept and cancelled by a comment line; a
-        torn last line, which is no row, makes room.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read or written.
-        """
-        text = as_text(path, read_bytes(path))
-        whole = text[: text.rfind("\n") + 1]
-        lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
-        made = cls.__new__(cls)
-        made._columns = tuple(lines[0].split(",")) if lines else ()
-        made._file = SyncedText(path, append_at=len(whole.encode()), advice=_ADVICE)
-        at = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
-        made._file.write([f"# resumed: {json.dumps({'trial': trial, 'at': at})}"])
-        return made
-
-    def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
-        """Write rows, each a dict of columns; the first decides which optional ones there are."""
-        rows = [rows] if isinstance(rows, dict) else rows
-        lines = []
-        if rows and not self._columns:
-            optional = [c for c in OPTIONAL_COLUMNS if c in rows[0]]
-            self._columns = (*REQUIRED_COLUMNS, *optional)
-            lines.append(",".join(self._columns))
-        self._file.write(
-            [*lines, *(",".join(_cell(c, row[c]) for c in self._columns) for row in rows)]
-        )
-
-    def close(self, completed: dict[str, Any] | None = None) -> None:
-        """Close the file; `completed` becomes its footer. May be called twice."""
-        footer = f"# completed: {json.dumps(completed, ensure_ascii=False)}"
-        self._file.close([] if completed is None else [footer])
-
-    def __enter__(self) -> RecordingWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-_DECIMALS = {"send_time_s": 6, "read_time_s": 6, "command_rad": 7, "position_rad": 7}
-
-
-def _cell(column: str, value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    if value is None or not np.isfinite(value):
-        return ""
-    return f"{value:.{_DECIMALS[column]}f}" if column in _DECIMALS else f"{value:.7g}"

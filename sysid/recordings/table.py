@@ -1,4 +1,4 @@
-"""Validation of recording files: text becomes a table of numbers, or a sentence about why not."""
+"""Validation of recordings: CSV text to a table of numbers, or an error that names the place."""
 
 from __future__ import annotations
 
@@ -15,16 +15,22 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
-from pupper_sysid.sysid.recordings.recording import TITLE
+
+SCHEMA_VERSION = 1
+TITLE = "# pupper-sysid recording"
+REQUIRED_COLUMNS = (
+    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
+)  # fmt: skip
+OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
 
 _LEAST_ROWS = 20
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
-_TEXT_COLUMNS = ("joint", "signal")
+TEXT_COLUMNS = ("joint", "signal")
 
 
 class Bus(BaseModel):
-    """What numbers are computed from, of what a bus says of itself; other keys are kept."""
+    """Entries of the header's `bus` that computations use; other keys are kept."""
 
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
@@ -37,7 +43,7 @@ class Bus(BaseModel):
 
 
 class Header(BaseModel):
-    """What is known of a recording's header; other keys are kept as they are."""
+    """Known entries of a recording's header; other keys are kept."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 
@@ -50,7 +56,7 @@ class Header(BaseModel):
 
 @dataclass(frozen=True)
 class Parsed:
-    """A file's header, column names and cells, before anyone knows which layout it is.
+    """Header and table of a file of yet unknown layout.
 
     Attributes
     ----------
@@ -121,8 +127,20 @@ def parse(path: Path, text: str) -> Parsed:
     return Parsed(metadata, pd.DataFrame(data), warnings)
 
 
-def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Refuse or repair a tidy table; returns it in time order with what was repaired.
+def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Refuse or repair a tidy table.
+
+    Parameters
+    ----------
+    path : Path or str
+        Name of the source, for messages.
+    table : pandas.DataFrame
+
+    Returns
+    -------
+    table : pandas.DataFrame
+    warnings : list of str
+        One sentence per repair.
 
     Raises
     ------
@@ -183,8 +201,8 @@ def check(path: Path, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     return table.loc[usable].reset_index(drop=True), warnings
 
 
-def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
-    """Raise a sentence that names the columns `table` lacks, and what they may be called there."""
+def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
+    """Refuse a table that lacks columns; the message names them and similar names."""
     lacking = [c for c in columns if c not in table.columns]
     if not lacking:
         return
@@ -198,6 +216,13 @@ def require(path: Path, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
 
 
 def header(path: Path, lines: list[str]) -> dict[str, Any]:
+    """Validated entries of a file's comment lines.
+
+    Raises
+    ------
+    InputError
+        If a value is not JSON or not of its type, or a newer version wrote the file.
+    """
     metadata: dict[str, Any] = {}
     for n, line in enumerate(lines, 1):
         if not line.startswith("# ") or ": " not in line:
@@ -210,6 +235,12 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
                 raise InputError(
                     f"{path}, line {n}: the value of '{key}' is not JSON. Mend or remove the line."
                 ) from None
+    check_metadata(path, metadata)
+    return metadata
+
+
+def check_metadata(path: Path | str, metadata: dict[str, Any]) -> None:
+    """Refuse header entries of the wrong type, or of a newer version."""
     try:
         header = Header.model_validate(metadata)
     except ValidationError as error:
@@ -223,7 +254,20 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
             f"{path} has schema_version {header.schema_version}, written by a newer pupper-sysid; "
             "this one reads up to 1. Upgrade."
         )
-    return metadata
+
+
+def comments(title: str, entries: dict[str, Any]) -> str:
+    """Comment lines that open a table: a title, then `# key: JSON value` of each entry."""
+    return "\n".join([f"# {title}", *(comment(k, v) for k, v in entries.items()), ""])
+
+
+def comment(key: str, value: Any) -> str:
+    """One comment line; NumPy values become plain ones, other objects text."""
+
+    def plain(found: Any) -> Any:
+        return found.tolist() if hasattr(found, "tolist") else str(found)
+
+    return f"# {key}: {json.dumps(value, ensure_ascii=False, default=plain)}"
 
 
 def _cells(path: Path, number: int, line: str) -> list[str]:
@@ -238,7 +282,7 @@ def _cells(path: Path, number: int, line: str) -> list[str]:
 def _cancelled(
     lines: list[str], columns: list[str], rows: list[tuple[int, str]]
 ) -> list[tuple[int, int, int]]:
-    """Trial, first and last line of rows that a line `# resumed` below them says are void."""
+    """Trial, first and last line of rows that a later line `# resumed` cancels."""
     found = []
     at = columns.index("trial") if "trial" in columns else -1
     for n, line in enumerate(lines, 1):
@@ -258,7 +302,7 @@ def _cancelled(
 
 
 def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
-    if name in _TEXT_COLUMNS:
+    if name in TEXT_COLUMNS:
         return [c.strip() for c in cells]
     values = np.full(len(cells), np.nan)
     for k, cell in enumerate(cells):

@@ -15,7 +15,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.identify.fleet import Fleet, robots_in, run_fleet
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split, fit_servo
 from pupper_sysid.sysid.servo_fit.save import save_fit

@@ -21,7 +21,7 @@ from pupper_sysid.hardware.bus import BusSample, ServoBus
 from pupper_sysid.hardware.loop import FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
-from pupper_sysid.sysid.recordings.recording import RecordingWriter
+from pupper_sysid.sysid.recordings.files import RecordingWriter
 from pupper_sysid.sysid.sweep.excitation import Plan, TrialPlan
 from pupper_sysid.sysid.sweep.resume import Resume
 

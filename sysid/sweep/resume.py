@@ -17,8 +17,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.recording import TITLE, as_text, read_bytes
-from pupper_sysid.sysid.recordings.table import header, parse
+from pupper_sysid.sysid.recordings.files import as_text, read_bytes
+from pupper_sysid.sysid.recordings.table import TITLE, header, parse
 from pupper_sysid.sysid.sweep.excitation import Plan
 
 _LEAST_PAUSE_S = 0.5

@@ -18,7 +18,7 @@ from rich.console import Console
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run, run_program
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ import yaml
 
 from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy, pupper_eval, pupper_play
 from pupper_sysid.policies.deploy.walk_log import read_walk
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -135,7 +135,7 @@ def test_the_shipped_policies_are_tried_from_any_folder(capsys, here):
         (("nowhere",), "neither a run nor a policy"),
         ((POLICY, "--actuator", "nowhere.yaml"), "no such file"),
         ((POLICY, "--actuator", CALIBRATION, "--bus", "feetech:/dev/none"), "no IMU"),
-        ((POLICY, "--actuator", CALIBRATION, "--bus", "serial"), "--bus serial"),
+        ((POLICY, "--actuator", CALIBRATION, "--bus", "serial"), "bus serial"),
         ((POLICY, "--actuator", CALIBRATION, "--stack", "lstm-servo"), "--servo"),
         ((POLICY, "--actuator", CALIBRATION, "--command", "9", "0", "0"), "--command"),
         ((POLICY, "--actuator", CALIBRATION, "--lowpass-hz", "40"), "half the rate"),

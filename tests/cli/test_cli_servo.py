@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
 from support.command_line import run

@@ -18,7 +18,7 @@ from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.files import sha256
 from pupper_sysid.policies.analysis.phase_reset import NUDGE_M_S, PUSH_M_S
 from pupper_sysid.policies.analysis.rhythm import Estimate
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
 from reproduction import servos as servo_claims
 from reproduction.claims import Claim

@@ -26,7 +26,7 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from support.servo_servers import bench_of, moving_servos, on_a_port, on_a_socket, still_servos
 
 pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second

@@ -15,7 +15,7 @@ from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, Scores
 from pupper_sysid.sysid.export.tidy_csv import CALIBRATION_COLUMNS, to_csv
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 
 QUANTITIES_PER_JOINT = 7 + 4 + 5
 """Of the actuator, of its ratios to the armature, of the feedback."""
@@ -88,7 +88,7 @@ def test_the_table_of_a_calibration_says_where_it_comes_from():
     lines = [line[2:] for line in to_csv(paper).splitlines() if line.startswith("# ")]
     assert lines[0] == "pupper-sysid calibration table"
     said = {key: json.loads(value) for key, _, value in (s.partition(": ") for s in lines[1:])}
-    assert said["schema"] == "pupper-calibration" and said["schema_version"] == 1
+    assert said["schema"] == "pupper-calibration" and said["schema_version"] == 2
     assert said["created"] == paper.created and said["units"] == paper.units
     assert said["notes"] == list(paper.notes)
 

@@ -11,7 +11,8 @@ from pupper_sysid.sysid.identify.calibrate import _calibrate_joint, _dead_time, 
 from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.identify.models import LADDER, rung
 from pupper_sysid.sysid.identify.output_error import Problem, fit, positions, prepare
-from pupper_sysid.sysid.recordings.recording import Truncation, load
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Truncation
 from support.synthetic import LOOP_S, tone_trials
 
 TRUE = DelayedPDParameters(

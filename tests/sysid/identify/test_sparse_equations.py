@@ -18,7 +18,7 @@ from pupper_sysid.servo_models.sparse_equation import (
 from pupper_sysid.sysid.identify.output_error import TrialData, positions
 from pupper_sysid.sysid.identify.sparse_equations import equation_rung, fit_equations, identify
 from pupper_sysid.sysid.identify.sparse_structure import LINEAR, PULLS, ordered, propose
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 
 SERVO = {

@@ -5,16 +5,13 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.files import sha256
-from pupper_sysid.sysid.recordings.recording import (
-    RecordingWriter,
-    Truncation,
-    load,
-    newest_recording,
-)
+from pupper_sysid.sysid.recordings.files import RecordingWriter, load, newest_recording
+from pupper_sysid.sysid.recordings.recording import Recording, Truncation
 
 HEADER = "send_time_s,read_time_s,trial,joint,frequency_hz,command_rad,position_rad"
 
@@ -243,3 +240,93 @@ def test_header_values_are_json_and_nothing_else(tmp_path):
     top = ("# pupper-sysid recording", "# seed: __import__('os')")
     with pytest.raises(InputError, match="not JSON"):
         load(write(tmp_path, rows(), top=top))
+
+
+# ------------------------------------------------------------------------------- from memory
+
+TIME = 0.02 * np.arange(60)
+COMMAND, POSITION = 0.3 * np.sin(6 * TIME), 0.3 * np.sin(6 * (TIME - 0.04))
+
+
+def from_arrays(**changes) -> Recording:
+    given = {
+        "send_time_s": TIME, "command_rad": {"LF_hip": COMMAND, "RB_calf": -COMMAND},
+        "position_rad": {"LF_hip": POSITION, "RB_calf": -POSITION},
+    }  # fmt: skip
+    return Recording.from_arrays(**(given | changes))
+
+
+def test_a_recording_from_arrays_has_each_joints_own_values():
+    recording = from_arrays(
+        read_time_s=TIME + 0.003, trial=np.repeat([0, 1], 30), frequency_hz=np.repeat([1.0, 2], 30),
+        metadata={"start_pose_rad": {"RB_calf": -0.1}},
+    )  # fmt: skip
+    assert recording.joints == ["LF_hip", "RB_calf"] and recording.warnings == ()
+    first, second = recording.trials("RB_calf")
+    np.testing.assert_array_equal(second.command_rad, -COMMAND[30:])
+    np.testing.assert_array_equal(second.position_rad, -POSITION[30:])
+    np.testing.assert_array_equal(second.read_time_s, TIME[30:] + 0.003)
+    assert (first.frequency_hz, second.frequency_hz) == (1.0, 2.0)
+    assert first.initial_command_rad == -0.1
+
+
+def test_without_read_times_reading_follows_sending_and_the_metadata_say_so():
+    recording = from_arrays()
+    (trial,) = recording.trials("LF_hip")
+    np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.0005)
+    assert recording.metadata["read_after_send_s"] == 0.0005
+    assert np.isnan(trial.frequency_hz) and trial.number == 0
+
+
+def test_what_is_saved_is_read_back_and_nothing_is_overwritten(tmp_path):
+    made = from_arrays(frequency_hz=2.0, metadata={"robot": "mine"})
+    made.save(tmp_path / "a.csv")
+    again = load(str(tmp_path / "a.csv"))
+    pd.testing.assert_frame_equal(again.to_frame(), made.to_frame(), check_dtype=False)
+    assert again.metadata["robot"] == "mine" and again.warnings == ()
+    assert again.metadata["exported_from"]["sha256"] == made.sha256
+    with pytest.raises(FileExistsRefusal):
+        made.save(tmp_path / "a.csv")
+
+
+def test_a_frame_of_a_file_is_the_same_recording(tmp_path):
+    recording = load(write(tmp_path, rows()))
+    again = Recording.from_frame(recording.to_frame())
+    pd.testing.assert_frame_equal(again.table, recording.table)
+
+
+def test_the_hash_of_a_recording_in_memory_is_that_of_its_numbers():
+    assert from_arrays().sha256 == from_arrays(name="other").sha256
+    moved = {"LF_hip": POSITION + 1e-6, "RB_calf": -POSITION}
+    assert from_arrays().sha256 != from_arrays(position_rad=moved).sha256
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"send_time_s": TIME[::-1]}, "arrays, column send_time_s: time runs backwards"),
+        ({"send_time_s": TIME[:-1]}, "LF_hip: command_rad has shape .60,., send_time_s .59"),
+        ({"position_rad": {"LF_hip": POSITION}}, "position_rad has LF_hip; they must be the same"),
+        ({"command_rad": {}, "position_rad": {}}, "at least one"),
+        ({"frequency_hz": np.linspace(1, 2, 60)}, "Give each frequency its own trial"),
+        ({"read_time_s": np.full(60, np.inf)}, "column read_time_s: a value is infinite"),
+        ({"trial": ["a"] * 60}, "column trial: its values are not numbers"),
+        ({"metadata": {"bus": {"speed_limit_rad_s": -1.0}}}, "bus.speed_limit_rad_s"),
+        (
+            {"command_rad": {"LF_hipp": COMMAND}, "position_rad": {"LF_hipp": POSITION}},
+            "did you mean LF_hip",
+        ),
+        (
+            {"command_rad": {"LF_hip": 60 * COMMAND}, "position_rad": {"LF_hip": 60 * POSITION}},
+            "looks like degrees",
+        ),
+    ],
+)
+def test_arrays_are_refused_for_the_same_reasons_as_files(changes, message):
+    with pytest.raises(InputError, match=message):
+        from_arrays(**changes)
+
+
+def test_a_frame_without_a_position_is_refused_by_column():
+    with pytest.raises(InputError, match="mine: column position_rad is missing"):
+        Recording.from_frame(from_arrays().table.drop(columns="position_rad"), name="mine")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid import main
-from pupper_sysid.sysid.recordings.recording import load
+from pupper_sysid.cli.programs.pupper_sysid import main
+from pupper_sysid.sysid.recordings.files import load
 
 FREQUENCIES = "2,3,5"
 

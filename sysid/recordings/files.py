@@ -1,0 +1,199 @@
+"""Recording files: reading, and writing row by row.
+
+A file starts with comment lines: `# pupper-sysid recording`, then one `# key: JSON` per line
+(schema version, bus, excitation, start pose, seed, versions). Then comes one row per control tick
+and joint. Rows are flushed as they are written, so an interrupted recording can be read up to its
+last row. A completed one ends with `# completed: {...}`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import SyncedText, versions
+from pupper_sysid.sysid.recordings.layouts import convert
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.recordings.table import (
+    OPTIONAL_COLUMNS,
+    REQUIRED_COLUMNS,
+    SCHEMA_VERSION,
+    TITLE,
+    check,
+    comment,
+    parse,
+)
+
+FOLDER = Path("recordings")
+
+_ADVICE = "; what is there can be continued with `pupper-sysid sweep --resume`"
+_LARGEST_BYTES = 500e6
+
+
+def load(path: Path | str) -> Recording:
+    """Read and validate a recording in any known layout.
+
+    Parameters
+    ----------
+    path : Path or str
+        CSV file: this project's form, or a layout of `sysid.recordings.layouts`.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    InputError
+        If it is not a recording or cannot be used; the message names the line and column.
+    """
+    path = Path(path)
+    if path.name.endswith(".truth.csv"):
+        raise InputError(
+            f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
+            "not a recording; load that file instead."
+        )
+    data = read_bytes(path)
+    parsed = parse(path, as_text(path, data))
+    table, metadata, warnings = convert(path, parsed)
+    table, more = check(path, table)
+    digest = hashlib.sha256(data).hexdigest()
+    found = [*parsed.warnings, *warnings, *more]
+    return Recording(table, metadata, path.stem, path, digest, tuple(found))
+
+
+def newest_recording(folder: Path = FOLDER) -> Path:
+    """The newest recording in `folder`.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    found = [p for p in folder.glob("*.csv") if not p.name.endswith(".truth.csv")]
+    if not found:
+        raise InputError(
+            f"No recording was named and there is none in {folder}/. "
+            "Make one with `pupper-sysid sweep`, or name a file."
+        )
+    return max(found, key=lambda p: p.stat().st_mtime)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a recording file; an unreadable, empty or huge file is refused."""
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise InputError(
+                f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB; split it by joint."
+            )
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist. Check the name, or run a sweep first.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if not data.strip():
+        raise InputError(f"{path} is empty: the recording never started. Record it again.")
+    return data
+
+
+def as_text(path: Path, data: bytes) -> str:
+    """The file's text, without a byte order mark."""
+    try:
+        if b"\0" in data:
+            raise ValueError
+        return data.decode("utf-8-sig")
+    except ValueError:
+        raise InputError(f"{path} is not a text file; a recording is CSV.") from None
+
+
+class RecordingWriter:
+    """Writer of a recording, row by row; appended rows survive the end of the process.
+
+    Parameters
+    ----------
+    path : Path
+    metadata : dict
+        Header entries; each value must be JSON.
+    force : bool
+        Replace an existing file.
+
+    Examples
+    --------
+    >>> with RecordingWriter(path, {"seed": 1}) as writer:  # doctest: +SKIP
+    ...     writer.append({"send_time_s": 0.0, ...})
+    ...     writer.close({"rows": 1})
+    """
+
+    def __init__(self, path: Path, metadata: dict[str, Any], force: bool = False):
+        self._file = SyncedText(path, force, advice=_ADVICE)
+        self._columns: tuple[str, ...] = ()
+        header = {"schema_version": SCHEMA_VERSION, "created": _now(), "versions": versions()}
+        self._file.write([TITLE, *(comment(k, v) for k, v in (header | metadata).items())])
+
+    @classmethod
+    def resumed(cls, path: Path, trial: int) -> RecordingWriter:
+        """Writer that continues an unfinished recording.
+
+        Parameters
+        ----------
+        path : Path
+        trial : int
+            First trial to write. Its rows that are in the file stay and are cancelled by a comment
+            line; an incomplete last line is removed.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read or written.
+        """
+        text = as_text(path, read_bytes(path))
+        whole = text[: text.rfind("\n") + 1]
+        lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
+        made = cls.__new__(cls)
+        made._columns = tuple(lines[0].split(",")) if lines else ()
+        made._file = SyncedText(path, append_at=len(whole.encode()), advice=_ADVICE)
+        made._file.write([comment("resumed", {"trial": trial, "at": _now()})])
+        return made
+
+    def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
+        """Write rows, each a dict of columns; the first row sets which optional columns exist."""
+        rows = [rows] if isinstance(rows, dict) else rows
+        lines = []
+        if rows and not self._columns:
+            optional = [c for c in OPTIONAL_COLUMNS if c in rows[0]]
+            self._columns = (*REQUIRED_COLUMNS, *optional)
+            lines.append(",".join(self._columns))
+        self._file.write(
+            [*lines, *(",".join(_cell(c, row[c]) for c in self._columns) for row in rows)]
+        )
+
+    def close(self, completed: dict[str, Any] | None = None) -> None:
+        """Close the file, with `completed` as its footer. May be called twice."""
+        self._file.close([] if completed is None else [comment("completed", completed)])
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
+
+
+_DECIMALS = {"send_time_s": 6, "read_time_s": 6, "command_rad": 7, "position_rad": 7}
+
+
+def _cell(column: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if value is None or not np.isfinite(value):
+        return ""
+    return f"{value:.{_DECIMALS[column]}f}" if column in _DECIMALS else f"{value:.7g}"
