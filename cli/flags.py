@@ -36,6 +36,11 @@ def remember(options: Any) -> None:
     _flags.set(_flags_of(options))
 
 
+def forget() -> None:
+    """Spell nothing from now on: the command has ended."""
+    _flags.set({})
+
+
 def spell(text: str) -> str:
     """`text` with the arguments in back-quotes replaced by the running command's options."""
     known = _flags.get({})

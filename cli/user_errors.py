@@ -18,7 +18,7 @@ from typing import TypeVar
 import tyro
 from rich.text import Text
 
-from pupper_sysid.cli.flags import remember, spell
+from pupper_sysid.cli.flags import forget, remember, spell
 from pupper_sysid.cli.terminal import err, out
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import versions
@@ -98,6 +98,8 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
             "--debug and report what it prints."
         )
         sys.exit(1)
+    finally:
+        forget()
 
 
 def _tell(error: str) -> None:

@@ -5,21 +5,38 @@ from __future__ import annotations
 import io
 import os
 import re
+import shutil
+import sys
+import tomllib
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
+from types import GenericAlias
 from typing import get_args
 from unittest.mock import patch
 
+from pupper_sysid.cli.dispatch import words
+
 HERE = Path(__file__).resolve().parent
+REFERENCE = HERE / "reference"  # written by `setup`
 _PLAIN = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
 
 project = "pupper-sysid"
 copyright = "the pupper-sysid developers, Apache-2.0"
-extensions = ["myst_parser", "sphinx.ext.mathjax"]
+sys.path.insert(0, str(HERE))
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "mathml"]
+html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
+default_role = "code"  # docstrings write code in single back quotes
+add_module_names = False
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+autosummary_generate = False
+# two classes of one name, in two rooms, are told apart by the page that is linked to
+suppress_warnings = ["ref.python"]
 html_theme = "furo"
 html_title = "pupper-sysid"
 # code that no highlighter knows is shown as it is
@@ -42,16 +59,8 @@ def _help(module: str, *words: str) -> str:
 
 def subcommands(module: str) -> list[str]:
     """Names of a program's commands, those of a command's own as two words; empty without any."""
-    return _names(getattr(import_module(f"pupper_sysid.cli.programs.{module}"), "Command", None))
-
-
-def _names(command: object, *before: str) -> list[str]:
-    found = []
-    for one in get_args(command):
-        inner, how = get_args(one)
-        words = (*before, how.name)
-        found += [" ".join(words), *_names(inner, *words)]
-    return found
+    program = import_module(f"pupper_sysid.cli.programs.{module}")
+    return words(program.COMMANDS) if hasattr(program, "COMMANDS") else []
 
 
 def reference() -> str:
@@ -71,6 +80,68 @@ def reference() -> str:
     return "\n".join(lines)
 
 
+def write_api_pages() -> None:
+    """A page of the Python reference per folder of the package, and their table of contents."""
+    project = tomllib.loads((HERE.parent / "pyproject.toml").read_text())
+    shutil.rmtree(REFERENCE, ignore_errors=True)
+    REFERENCE.mkdir()
+    pages = []
+    for package in project["tool"]["setuptools"]["packages"]:
+        if package == "pupper_sysid":
+            continue
+        folder = HERE.parent / package.removeprefix("pupper_sysid.").replace(".", "/")
+        modules = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
+        if modules:
+            title = package.removeprefix("pupper_sysid.")
+            (REFERENCE / f"{title}.rst").write_text(_api_page(package, modules))
+            pages.append(title)
+    (REFERENCE / "index.rst").write_text(_front_door(pages))
+
+
+def _titled(text: str, line: str) -> list[str]:
+    return [text, line * len(text), ""]
+
+
+def _api_page(package: str, modules: list[str]) -> str:
+    """All modules of one folder."""
+    summary = (import_module(package).__doc__ or "").strip()
+    lines = [*_titled(f"``{package}``", "="), summary, ""]
+    for name in modules:
+        lines += [
+            *_titled(f"``{name}``", "-"),
+            f".. automodule:: {package}.{name}", "   :members:", "",
+        ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def _front_door(pages: list[str]) -> str:
+    """The names of `pupper_sysid` itself, and the pages of the folders."""
+    front = import_module("pupper_sysid")
+    lines = [*_titled("Python", "="), ".. automodule:: pupper_sysid", ""]
+    for name in getattr(front, "__all__", ()):
+        kind = "autoclass" if isinstance(getattr(front, name), type) else "autofunction"
+        lines += [f".. {kind}:: pupper_sysid.{name}", "   :no-index:", ""]
+    lines += [*_titled("By folder", "-"), ".. toctree::", "   :maxdepth: 1", ""]
+    return "\n".join([*lines, *(f"   {page}" for page in pages), ""])
+
+
+def _escape(app, what, name, item, options, lines: list[str]) -> None:
+    """Stars and bars of a docstring are text, for reStructuredText, except within code."""
+    for i, line in enumerate(lines):
+        if not line.lstrip().startswith((">>>", "...", "..", "|", "*")):
+            parts = re.split(r"(`[^`]*`)", line)
+            parts[::2] = [re.sub(r"(?<!\\)([*|])(?=\S)", r"\\\1", part) for part in parts[::2]]
+            lines[i] = "".join(parts)
+
+
+def _skip_aliases(app, what, name, item, skip, options) -> bool | None:
+    """Names of types have no docstring of their own."""
+    return True if isinstance(item, GenericAlias) or get_args(item) else None
+
+
 def setup(app) -> None:
-    """Write the reference before the pages are read."""
+    """Write the generated pages before any page is read."""
     (HERE / "commands.md").write_text(reference())
+    write_api_pages()
+    app.connect("autodoc-process-docstring", _escape, priority=100)  # before numpydoc
+    app.connect("autodoc-skip-member", _skip_aliases)

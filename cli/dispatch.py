@@ -1,0 +1,117 @@
+"""Programs with subcommands: find the command by the first word and import only its module.
+
+A program has a table of `Command`s, by word. `run_command` parses the options of the one that the
+first argument names and runs it; without one it prints the table, grouped.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import operator
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Annotated, Any, NamedTuple, get_args
+
+import tyro
+
+from pupper_sysid.cli.flags import remember
+from pupper_sysid.cli.user_errors import end_politely, need_seed, user_errors
+from pupper_sysid.common.errors import InputError
+
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+
+
+class Command(NamedTuple):
+    """One word of a program."""
+
+    group: str
+    summary: str
+    """What it does, in one line."""
+    where: str
+    """`module:Class` below `pupper_sysid.cli.commands`: a dataclass with a method `run`, or a union
+    of such dataclasses as subcommands."""
+
+    def load(self) -> Any:
+        """Import the class."""
+        module, name = self.where.split(":")
+        return getattr(import_module(f"pupper_sysid.cli.commands.{module}"), name)
+
+
+def run_command(
+    program: str,
+    description: str,
+    commands: Mapping[str, Command],
+    arguments: Sequence[str] | None = None,
+) -> None:
+    """Run the command that the first argument names.
+
+    Ends the process with 0, 2 (bad input, one sentence) or 1.
+
+    Parameters
+    ----------
+    program : str
+    description : str
+        What the program is for, above its table of commands.
+    commands : mapping of str to Command
+    arguments : sequence of str, optional
+        Without the program's name; those of the process by default.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(given, program) as left:
+        first, rest = (left[0], left[1:]) if left else ("--help", [])
+        if first in ("-h", "--help"):
+            print(overview(program, description, commands))
+            return
+        if first.startswith("--tyro-"):  # completion, of all words and their options
+            every = (Annotated[c.load(), tyro.conf.subcommand(w)] for w, c in commands.items())
+            tyro.cli(functools.reduce(operator.or_, every), prog=program, args=left, config=CONFIG)
+        chosen = _chosen(first, program, commands)
+        kind = chosen.load()
+        command = tyro.cli(
+            kind, prog=f"{program} {first}", args=rest, config=CONFIG,
+            # a union has no docstring of its own, and Python's would be shown
+            description=None if isinstance(kind, type) else chosen.summary,
+        )  # fmt: skip
+        remember(command)
+        need_seed(command)
+        end_politely()
+        command.run()
+
+
+def overview(program: str, description: str, commands: Mapping[str, Command]) -> str:
+    """A program's help: its commands, by group, one line each."""
+    group_width = 2 + max(len(c.group) for c in commands.values())
+    width = 2 + max(map(len, commands))
+    lines, last = [f"usage: {program} COMMAND [OPTIONS]", "", description.strip(), ""], None
+    for word, (group, summary, _) in commands.items():
+        shown = "" if group == last else group
+        lines.append(f"{shown:{group_width}}{word:{width}}{summary}")
+        last = group
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"`{program} COMMAND --help` lists the options of a command. Every command takes",
+            "--debug (show an error's traceback). --install-completion completes in the shell.",
+        ]
+    )
+
+
+def words(commands: Mapping[str, Command]) -> list[str]:
+    """All commands, those of a command's own as two words."""
+    found = []
+    for word, command in commands.items():
+        inner = (get_args(one)[1].name for one in get_args(command.load()))
+        found += [word, *(f"{word} {name}" for name in inner)]
+    return found
+
+
+def _chosen(word: str, program: str, commands: Mapping[str, Command]) -> Command:
+    """The command of this name; refuses another with the nearest."""
+    if word not in commands:
+        near = difflib.get_close_matches(word, commands, n=1, cutoff=0.5)
+        hint = f" Did you mean `{program} {near[0]}`?" if near else ""
+        raise InputError(f"{program} has no command {word}.{hint} `{program} --help` lists all.")
+    return commands[word]
