@@ -2,14 +2,12 @@
 
 A message below `cli/` names an argument in back-quotes, as Python spells it; `spell` replaces it by
 the option of the running command, and leaves every other word alone. So a message reads right both
-for a caller of the library and at the command line:
+for a caller of the library and at the command line::
 
-| in the library's message          | at the command line    |
-|-----------------------------------|------------------------|
-| `` `stall_torque_nm` ``           | --stall-torque         |
-| `` `force=True` ``                | --force                |
-| `` `preset='paper'` ``            | --preset paper         |
-| `` `learning_rate` ``             | --learner.learning-rate |
+    `stall_torque_nm`    --stall-torque
+    `force=True`         --force
+    `preset='paper'`     --preset paper
+    `learning_rate`      --learner.learning-rate
 
 An option is found by the argument's name, by its name without the unit, or by `_OTHER_NAMES`.
 Errors (`user_errors`) and warnings (`terminal.warn`) are spelled so; a command need not call this.
