@@ -233,7 +233,8 @@ class Recording:
             if np.isinf(table[column]).any():
                 raise InputError(f"{name}, column {column}: a value is infinite.")
         tidy, known, warnings = convert(name, Parsed(given, table))
-        tidy = tidy[[*REQUIRED_COLUMNS, *tidy.columns.difference(REQUIRED_COLUMNS, sort=False)]]
+        others = tidy.columns.difference(REQUIRED_COLUMNS, sort=False)
+        tidy = tidy.reindex(columns=[*REQUIRED_COLUMNS, *others])
         tidy, more = check(name, tidy)
         digest = hashlib.sha256(tidy.to_csv(index=False).encode()).hexdigest()
         return cls(tidy, given | known, name, None, digest, (*warnings, *more))

@@ -321,7 +321,7 @@ def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
     return values
 
 
-def _refuse_degrees(path: Path, column: str, values: np.ndarray) -> None:
+def _refuse_degrees(path: Path | str, column: str, values: np.ndarray) -> None:
     largest = float(np.nanmax(np.abs(values)))
     if largest > _LARGEST_RAD:
         raise InputError(
