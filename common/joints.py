@@ -21,6 +21,11 @@ DEFAULT_POSE: dict[str, float] = {
     name: {"hip": 0.0, "thigh": 0.785, "calf": -1.57}[name.split("_")[1]] for name in JOINT_NAMES
 }
 
+STALL_TORQUE_NM = 0.35
+STALL_TORQUE_SOURCE = (
+    "data sheet of the Mini Pupper servo, 3.5 kg·cm; another data sheet of this servo class says "
+    "0.23 N·m at 6 V, so take torques as good to a factor of 1.5 at best"
+)
 
 # names become names of files, of XML elements and of columns
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")

@@ -5,22 +5,18 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
-from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, calibrate
-from pupper_sysid.sysid.identify.calibration_file import (
-    STALL_TORQUE_NM,
-    STALL_TORQUE_SOURCE,
-    preset_parameters,
-    to_calibration,
-)
-from pupper_sysid.sysid.report.json_objects import calibrate_json
+from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
+
+if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.calibration import Calibration
+    from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
 
 _SHOWN = {
     "lag_ms": ("lag ms", 1),
@@ -63,6 +59,10 @@ class Calibrate:
 
     def run(self) -> None:
         """Calibrate, print, write."""
+        from pupper_sysid.sysid.identify.calibrate import calibrate
+        from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
+        from pupper_sysid.sysid.report.json_objects import calibrate_json
+
         started = time.perf_counter()
         terminal.need_positive("--stall-torque", self.stall_torque)
         if len(self.recordings) == 1 and self.recordings[0].is_dir():

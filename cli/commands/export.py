@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.policy_choice import is_policy, policy_at
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
-from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
-from pupper_sysid.sysid.export.tidy_csv import to_csv
-from pupper_sysid.sysid.recordings.files import load
+
+if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.calibration import Calibration
 
 _MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
 
@@ -51,6 +50,9 @@ class Export:
 
     def run(self) -> None:
         """Convert and write."""
+        from pupper_sysid.cli.policy_choice import is_policy
+        from pupper_sysid.servo_models.calibration.calibration import PRESETS
+
         path = Path(self.source)
         if self.source not in PRESETS and path.is_dir():
             target = self._policy(path) if is_policy(path) else self._servo_model(path)
@@ -66,6 +68,7 @@ class Export:
             raise InputError(
                 f"{folder} is a policy: export it with `--to onnx` or `--to torchscript`."
             )
+        from pupper_sysid.cli.policy_choice import policy_at
         from pupper_sysid.policies.network.policy_export import ENDINGS, export_policy
 
         policy, _ = policy_at(folder)
@@ -91,6 +94,10 @@ class Export:
         return target
 
     def _table(self, path: Path) -> Path:
+        from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
+        from pupper_sysid.sysid.export.tidy_csv import to_csv
+        from pupper_sysid.sysid.recordings.files import load
+
         if path.name in ("contract.json", "weights.safetensors"):
             raise InputError(f"{self.source} is part of a servo model; give its folder.")
         kind = path.suffix.lower()
@@ -123,7 +130,7 @@ class Export:
     def _simulator(self, path: Path, calibration: Calibration) -> Path:
         """The calibration for another simulator."""
         from pupper_sysid.sim.export.newton import export_newton
-        from pupper_sysid.sim.export.simulator_export import ENDINGS, SIMULATORS
+        from pupper_sysid.sim.export.targets import ENDINGS, SIMULATORS
 
         step = self.physics_step
         if step is None:

@@ -14,7 +14,6 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
-from pupper_sysid.servo_models.servo_file import CONTRACT
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
@@ -74,6 +73,7 @@ class FitServo:
 
     def run(self) -> None:
         """Fit, score, save, print."""
+        from pupper_sysid.servo_models.servo_file import CONTRACT
         from pupper_sysid.sysid.recordings.recording import Recording
         from pupper_sysid.sysid.servo_fit.fit import ServoFit, fit_servo
         from pupper_sysid.sysid.servo_fit.save import save_fit, to_json
@@ -189,6 +189,8 @@ class FitServo:
 
 def _free_folder() -> Path:
     """`servo`, or the next name that is free: trying another model must not cost the last one."""
+    from pupper_sysid.servo_models.servo_file import CONTRACT
+
     n = 1
     while (Path(f"servo-{n}" if n > 1 else "servo") / CONTRACT).exists():
         n += 1

@@ -5,16 +5,17 @@ from __future__ import annotations
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
-from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.sysid.identify import calibrate as calibration
-from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
-from pupper_sysid.sysid.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.calibration import Calibration
+    from pupper_sysid.sysid.recordings.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class Report:
         """Examine, measure, calibrate, write."""
         # here, because drawing and python-control take a second that --help should not
         from pupper_sysid.sysid.doctor.examination import examine
+        from pupper_sysid.sysid.identify import calibrate as calibration
+        from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
         from pupper_sysid.sysid.lag.frequency_response import frequency_response
         from pupper_sysid.sysid.report.report import write_report
 
@@ -103,6 +106,8 @@ class Report:
         """The calibration given, if it belongs to the recordings."""
         if self.calibration is None:
             return None
+        from pupper_sysid.servo_models.calibration.calibration import load_calibration
+
         stored = load_calibration(self.calibration)
         if {i.sha256 for i in stored.inputs} != {r.sha256 for r in recordings}:
             made_from = ", ".join(i.name for i in stored.inputs) or "no recording"

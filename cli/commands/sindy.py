@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.sysid.identify.sparse_equations import EquationResult, identify, to_json
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.identify.sparse_equations import EquationResult
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class Sindy:
 
     def run(self) -> None:
         """Find the equations and print them."""
+        from pupper_sysid.sysid.identify.sparse_equations import identify, to_json
+
         started = time.perf_counter()
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)

@@ -20,13 +20,13 @@ from pupper_sysid.hardware.address import EMULATED, bus_name
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
-from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.robot import directly_read, draw_robot
-from pupper_sysid.sysid.recordings.files import FOLDER
-from pupper_sysid.sysid.sweep.excitation import POLL_RATE_HZ, Plan, parse_frequencies, plan
-from pupper_sysid.sysid.sweep.playback import playback
-from pupper_sysid.sysid.sweep.recorder import LOOP_PERIOD_S, record
-from pupper_sysid.sysid.sweep.resume import footer, header_of, resume_point
+from pupper_sysid.sysid.sweep.excitation import (
+    LOOP_PERIOD_S,
+    POLL_RATE_HZ,
+    Plan,
+    parse_frequencies,
+    plan,
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,11 @@ class Sweep:
 
     def run(self) -> None:
         """Plan, record, and say what to run next."""
+        from pupper_sysid.sim.emulator.bus import EmulatedBus
+        from pupper_sysid.sysid.recordings.files import FOLDER
+        from pupper_sysid.sysid.sweep.recorder import record
+        from pupper_sysid.sysid.sweep.resume import header_of, resume_point
+
         if self.resume:
             path = self.resume
             request = dict(header_of(path)["sweep"])
@@ -191,6 +196,9 @@ class Sweep:
 def _open(request: dict[str, Any]) -> ServoBus:
     """The bus that a request names."""
     if request["bus"] == EMULATED:
+        from pupper_sysid.sim.emulator.bus import EmulatedBus
+        from pupper_sysid.sim.emulator.robot import directly_read, draw_robot
+
         rng = np.random.default_rng(request["seed"])
         real_time = bool(request["real_time"])
         own = load_joint_map(request["joint_map"]) if request["joint_map"] else None
@@ -207,6 +215,8 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
     """The plan that a request describes, within the limits of the bus."""
     joints = request["joints"]
     if request["playback"]:
+        from pupper_sysid.sysid.sweep.playback import playback
+
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
     pose = bus.metadata["rest_pose_rad"]
@@ -231,6 +241,8 @@ def _priority(request: dict[str, Any]) -> Iterator[str]:
 
 def _guard_warnings(path: Path) -> list[str]:
     """What a user should know of what the guard did to the commands."""
+    from pupper_sysid.sysid.sweep.resume import footer
+
     did = footer(path).get("guard", {})
     found = []
     if did.get("clipped"):

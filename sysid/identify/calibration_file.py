@@ -13,7 +13,7 @@ import numpy as np
 
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.calibration.calibration import (
     PRESETS,
     Calibration,
@@ -39,11 +39,6 @@ from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, RungRe
 from pupper_sysid.sysid.identify.search import PREFERRED
 from pupper_sysid.sysid.recordings.recording import Recording
 
-STALL_TORQUE_NM = 0.35
-STALL_TORQUE_SOURCE = (
-    "data sheet of the Mini Pupper servo, 3.5 kg·cm; another data sheet of this servo class says "
-    "0.23 N·m at 6 V, so take torques as good to a factor of 1.5 at best"
-)
 _Z90 = 1.645
 
 

@@ -28,11 +28,10 @@ from joblib import Parallel, delayed, parallel_config
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import sha256, write_text
+from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.identify.calibration_file import (
-    STALL_TORQUE_NM,
-    STALL_TORQUE_SOURCE,
     to_calibration,
 )
 from pupper_sysid.sysid.recordings.files import load

@@ -35,6 +35,9 @@ LEAD_IN_S = 0.2
 SPEED_MARGIN = 0.9
 """Share of the speed limit that an excitation may ask for."""
 
+LOOP_PERIOD_S = 0.019
+"""Default time between commands [s]: the rate of the recordings this project starts from."""
+
 POLL_RATE_HZ = 1 / 0.02685
 """Feedback polls of a Mini Pupper 2, as far as is known before the recording [Hz]."""
 

@@ -22,11 +22,8 @@ from pupper_sysid.hardware.loop import FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.sysid.recordings.files import RecordingWriter
-from pupper_sysid.sysid.sweep.excitation import Plan, TrialPlan
+from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan, TrialPlan
 from pupper_sysid.sysid.sweep.resume import Resume
-
-LOOP_PERIOD_S = 0.019
-"""Default time between commands [s]: the rate of the recordings this project starts from."""
 
 REST_S = 0.5
 """Rest at the start pose before every trial [s], not recorded: servo and bus forget the last."""
