@@ -31,7 +31,8 @@ myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 default_role = "code"  # docstrings write code in single back quotes
 add_module_names = False
-autodoc_typehints = "description"
+autodoc_typehints = "signature"
+toc_object_entries = False
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 autosummary_generate = False
@@ -125,13 +126,21 @@ def _front_door(pages: list[str]) -> str:
     return "\n".join([*lines, *(f"   {page}" for page in pages), ""])
 
 
-def _escape(app, what, name, item, options, lines: list[str]) -> None:
-    """Stars and bars of a docstring are text, for reStructuredText, except within code."""
-    for i, line in enumerate(lines):
+def _as_rst(app, what, name, item, options, lines: list[str]) -> None:
+    """Docstrings are plain text for reStructuredText: stars and bars, indented code of modules."""
+    code = False
+    for i, line in enumerate(list(lines)):
+        indented = line.startswith("    ")
+        code = indented if line.strip() else code
+        if what == "module" and code:
+            continue
         if not line.lstrip().startswith((">>>", "...", "..", "|", "*")):
             parts = re.split(r"(`[^`]*`)", line)
             parts[::2] = [re.sub(r"(?<!\\)([*|])(?=\S)", r"\\\1", part) for part in parts[::2]]
             lines[i] = "".join(parts)
+    if what == "module":
+        text = re.sub(r"(?<=[^:\n])\n\n(?=    \S)", "\n\n::\n\n", "\n".join(lines))
+        lines[:] = text.split("\n")
 
 
 def _skip_aliases(app, what, name, item, skip, options) -> bool | None:
@@ -143,5 +152,5 @@ def setup(app) -> None:
     """Write the generated pages before any page is read."""
     (HERE / "commands.md").write_text(reference())
     write_api_pages()
-    app.connect("autodoc-process-docstring", _escape, priority=100)  # before numpydoc
+    app.connect("autodoc-process-docstring", _as_rst, priority=100)  # before numpydoc
     app.connect("autodoc-skip-member", _skip_aliases)
