@@ -60,6 +60,11 @@ def parse_address(text: str) -> BusAddress:
     >>> parse_address("feetech:/dev/ttyUSB0@500000")
     BusAddress(kind='feetech', where='/dev/ttyUSB0', baud=500000)
     """
+    if bus_name(text) == EMULATED:
+        raise InputError(
+            f"bus {text}: this needs a bus outside the program. Start `pupper-sysid emulate` in "
+            "another terminal and use the bus that it names."
+        )
     kind, _, where = text.partition(":")
     if kind == "esp32":
         return BusAddress(kind, where or str(SOCKET))

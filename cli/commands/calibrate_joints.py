@@ -18,7 +18,7 @@ from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware import joint_calibration as jc
-from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
@@ -64,7 +64,7 @@ class CalibrateJoints:
                 f"--scale-deg {self.scale_deg:g}: give the angle in degrees, 5 to 300; the larger "
                 "it is, the better."
             )
-        if self.bus == "emulated":
+        if bus_name(self.bus) == EMULATED:
             raise InputError(
                 "--bus emulated: nobody can move that one by hand. Start `pupper-sysid emulate "
                 "feetech --by-hand` in another terminal and use the bus that it names."

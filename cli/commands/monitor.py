@@ -15,14 +15,12 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import BusSample, ServoBus
 from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
-
-EMULATED = "emulated"
 
 _ONCE_S = 0.3  # voltage and temperature come with every other answer only
 _GOALS_EVERY_S = 1.0  # one question per servo, and only another program could change them
@@ -221,7 +219,7 @@ class Watched:
 
 def _open(bus: str, joint_map: str | None) -> ServoBus:
     """The bus to read, without guard and watchdog: nothing will move."""
-    if bus == EMULATED:
+    if bus_name(bus) == EMULATED:
         if joint_map:
             raise InputError("--joint-map: the emulated robot has its own; leave it out.")
         rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""`--bus sim`: the robot that walks, as a controller of a real one would meet it.
+"""The emulated robot that walks, behind the same bus as a real one.
 
     bus = GuardedBus(WalkingBus(draw_robot(rng), rng))
 
@@ -49,7 +49,7 @@ class WalkingBus:
         If a servo's delay is too short to emulate.
     """
 
-    name = "sim"
+    name = "emulated"
     joint_names: tuple[str, ...] = JOINT_NAMES
 
     def __init__(self, truth: EmulatedRobot, rng: np.random.Generator, real_time: bool = False):
@@ -81,7 +81,7 @@ class WalkingBus:
         """
         goal = np.asarray(position_rad, float)
         if goal.shape != (len(JOINT_NAMES),):
-            raise BusError(f"sim: goals must be {len(JOINT_NAMES)} finite angles, got {goal}.")
+            raise BusError(f"{self.name}: commands must be 12 finite angles, got {goal}.")
         sent = self._bus.write(self._servo_map.to_angles(self._map.to_counts(goal)))
         return Sent(sent.time_s, goal)
 

@@ -9,8 +9,8 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.programs.pupper_sysid import main
 from pupper_sysid.cli.commands.calibrate_joints import Guide
+from pupper_sysid.cli.programs.pupper_sysid import main
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample
@@ -199,8 +199,10 @@ def run(monkeypatch, capsys, script, *arguments):
         return words in _flat("".join(said))
 
     def person():
-        script(lambda text: os.write(write_end, f"{text}\n".encode()), heard)
-        os.close(write_end)
+        try:
+            script(lambda text: os.write(write_end, f"{text}\n".encode()), heard)
+        finally:  # or a failure here would leave the command waiting for ever
+            os.close(write_end)
 
     thread = threading.Thread(target=person)
     with os.fdopen(read_end) as keyboard:
@@ -232,17 +234,17 @@ def test_a_whole_calibration_over_a_port_writes_what_was_done_by_hand(
             ("Hold it still", lambda: None),
             ("Step 2 of 3", lambda: None),
         ):
-            assert wait_until(lambda words=words: heard(words))
+            assert wait_until(lambda words=words: heard(words), 20.0)
             if words == "Step 2 of 3":
                 for count in (1100, 3100):
                     all_to(count)
                     threading.Event().wait(0.2)
             act()
             enter("")
-        assert wait_until(lambda: heard("first position"))
+        assert wait_until(lambda: heard("first position"), 20.0)
         all_to(2000)
         enter("")
-        assert wait_until(lambda: heard("Now move LF_thigh"))
+        assert wait_until(lambda: heard("Now move LF_thigh"), 20.0)
         all_to(2000 + 1024)
         enter("")
 

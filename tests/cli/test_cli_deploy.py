@@ -165,15 +165,15 @@ def analyze(capsys, what, *arguments) -> dict:
 
 def test_the_gait_of_the_shipped_policy_is_a_trot(capsys, here):
     gait = analyze(capsys, "gait")["gaits"]["lstm"]
-    assert gait["frequency_hz"][0] == pytest.approx(3.25, abs=0.15)
-    assert gait["diagonal"][0] > 0.6 and gait["rhythmic"] == 1.0
+    assert gait["frequency_hz"]["value"] == pytest.approx(3.25, abs=0.15)
+    assert gait["diagonal"]["value"] > 0.6 and gait["rhythmic"] == 1.0
 
 
 def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
     capsys, here, monkeypatch
 ):
-    monkeypatch.setattr("pupper_sysid.policies.analysis.phase_reset._PUSHES", 1)
-    monkeypatch.setattr("pupper_sysid.policies.analysis.phase_reset.RATES_HZ", (50.0,))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy._PUSHES", 1)
+    monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy.RATES_HZ", (50.0,))
     found = analyze(capsys, "autonomy")["autonomy"]["lstm"]
     rows = {r["test"]: r for r in found["frozen"]}
     assert rows["nothing frozen"]["share"] == pytest.approx(1.0, abs=0.1)
