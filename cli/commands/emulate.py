@@ -28,7 +28,6 @@ from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
-from pupper_sysid.sim.walking.robot import WalkingRobot
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,11 @@ def _bench(
     if options.walking and options.by_hand:
         raise InputError("--by-hand swings legs in free air: leave out --walking.")
     own, imu = rng.spawn(2)
-    plant = WalkingRobot(robot, imu) if options.walking else None
+    plant = None
+    if options.walking:
+        from pupper_sysid.sim.walking.robot import WalkingRobot
+
+        plant = WalkingRobot(robot, imu)
     return ServoBench(robot, layout, own, options.by_hand, keep_log=False, plant=plant)
 
 

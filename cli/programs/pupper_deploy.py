@@ -30,7 +30,6 @@ from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, StackName, suited
-from pupper_sysid.sysid.recordings.files import RecordingWriter
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
