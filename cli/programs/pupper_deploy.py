@@ -238,6 +238,7 @@ def _walk(
     from pupper_sysid.policies.deploy.commands import constant, script
     from pupper_sysid.policies.deploy.deployment import deploy
     from pupper_sysid.policies.deploy.emulated_walk import ERRORS, WalkScore
+    from pupper_sysid.sysid.recordings.files import RecordingWriter
 
     told = script(options.script) if options.script else constant(options.command)
     score = WalkScore(bus, truth) if truth else None
