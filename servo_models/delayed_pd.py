@@ -14,7 +14,7 @@ native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with 
   continuous function of the delay;
 * speed limit: `slewmax`, a limit on the set-point's rate (a servo's goal speed);
 * friction: a constraint that removes the whole velocity in one time step if `friction_loss`
-  allows it (`FRICTION_SOLREF`, `FRICTION_SOLIMP`). MuJoCo's default friction is far softer than
+  allows it (`sim.robot.servo_mjcf`). MuJoCo's default friction is far softer than
   a servo's gears: it would still creep at 1 rad/s;
 * damping is integrated implicitly, except while the torque is clipped.
 
@@ -36,15 +36,6 @@ TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""
 
 FRICTION_IMPEDANCE = 0.9999
-FRICTION_SOLIMP = (FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
-
-
-def friction_solref(time_step_s: float) -> tuple[float, float]:
-    """MuJoCo `solreffriction` in its direct form: stop within one time step, no spring.
-
-    MuJoCo divides a direct damping by the impedance, hence the factor.
-    """
-    return 0.0, -FRICTION_IMPEDANCE / time_step_s
 
 
 def whole_steps(low_s: float, high_s: float, time_step_s: float) -> tuple[int, int]:

@@ -26,14 +26,12 @@ import torch
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.servo_models.delayed_pd import FRICTION_SOLIMP, TIME_STEP_S, friction_solref
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sim.export.mjlab import MJLAB_PD
 from pupper_sysid.sim.export.newton import export_newton
-from pupper_sysid.sim.export.simulator_export import (
-    EXPLICIT_PD,
-    MJLAB_PD,
-    SIMULATORS,
-    delays_at_step,
-)
+from pupper_sysid.sim.export.shared import EXPLICIT_PD, delays_at_step
+from pupper_sysid.sim.export.targets import SIMULATORS
+from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 from pupper_sysid.sysid.lag.tone import fit_phasor
 
 HERE = Path(__file__).resolve().parent

@@ -9,13 +9,16 @@ instant. A servo that has come to rest is not stepped until it is told to move.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.robot.servo_mjcf import free_air_xml, mujoco, rest_at
+from pupper_sysid.sim.robot.servo_mjcf import (
+    for_commands_between_steps,
+    free_air_xml,
+    rest_at,
+    switch_torque,
+)
 
 PHYSICS_STEP_S = 0.001
 """Half the step of fitting, so that the truth is not made by the model that is fitted."""
@@ -49,21 +52,17 @@ class FreeAirServo:
         position_rad: float,
         time_step_s: float = PHYSICS_STEP_S,
     ):
-        delay = float(np.asarray(parameters.dead_time_s))
-        # MuJoCo would take what is left of a shorter delay for a whole step
-        if not delay >= 2 * time_step_s:
-            raise InputError(
-                f"emulated servo: dead_time_s is {delay}; it must be at least two physics "
-                f"steps of {time_step_s} s."
-            )
-        native = replace(parameters, dead_time_s=delay - time_step_s)
+        from pupper_sysid.sim.robot.engine import mujoco
+
+        self._mj_step = mujoco.mj_step
+        native = for_commands_between_steps(parameters, time_step_s, "servo")
         self._model = mujoco.MjModel.from_xml_string(free_air_xml([native], time_step_s))
         self._data = mujoco.MjData(self._model)
         rest_at(self._model, self._data, [position_rad])
         self._gains = self._model.actuator_biasprm.copy()
         self._effort = float(np.asarray(parameters.effort_limit))
         self._dt = time_step_s
-        self._settled_after = int(delay / time_step_s) + 3
+        self._settled_after = int(float(np.asarray(parameters.dead_time_s)) / time_step_s) + 3
         self._step = 0
         self._changed = -self._settled_after - 1
         self._goal = float(position_rad)
@@ -99,7 +98,7 @@ class FreeAirServo:
         """Hold the present position, or go limp, from `time_s` on."""
         position = self.position_at(time_s)
         self._limp = not on
-        self._model.actuator_biasprm[:] = self._gains if on else 0.0
+        switch_torque(self._model, self._gains, on)
         velocity = float(self._data.qvel[0])
         rest_at(self._model, self._data, [position])
         self._data.qvel[0] = velocity
@@ -118,11 +117,11 @@ class FreeAirServo:
                 if not self._resting():
                     steps = min(steps, _STEPS_BETWEEN_LOOKS)
                     self._data.ctrl[0] = self._goal
-                    mujoco.mj_step(self._model, self._data, nstep=steps)
+                    self._mj_step(self._model, self._data, nstep=steps)
                 self._step += steps
             else:
                 self._data.ctrl[0] = self._mean_of_last_step()
-                mujoco.mj_step(self._model, self._data)
+                self._mj_step(self._model, self._data)
                 self._changed = self._step
                 self._step += 1
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from textwrap import indent
 from typing import Any
 
 import numpy as np
@@ -22,12 +21,13 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator
-from pupper_sysid.sim.export.simulator_export import (
+from pupper_sysid.sim.export.shared import (
     EXPLICIT_PD,
-    FEEDBACK_KEYS,
     Delay,
+    block,
     delays_at_step,
     docstring,
+    feedback_block,
     origin,
     step_note,
 )
@@ -122,7 +122,7 @@ def servo_network(actuator: Actuator, dead_time_s: float, physics_step_s: float)
 
 
 def _module(calibration: Calibration, delays: dict[str, Delay], physics_step_s: float) -> str:
-    servos, feedback = [], []
+    servos = []
     for name, joint in calibration.joints.items():
         actuator, delay = joint.actuator, delays[name]
         low, high = delay.steps(physics_step_s)
@@ -136,8 +136,6 @@ def _module(calibration: Calibration, delays: dict[str, Delay], physics_step_s: 
             "friction_loss": actuator.friction_loss_nm.value,
         }
         servos.append(f'"{name}": {json.dumps(row)},')
-        held = {key: getattr(joint.feedback, key).value for key in FEEDBACK_KEYS}
-        feedback.append(f'"{name}": {json.dumps(held)},')
     notes = (
         *origin(calibration),
         f"Delays are whole physics steps of {1e3 * physics_step_s:g} ms: the nearest one, and the "
@@ -151,8 +149,9 @@ def _module(calibration: Calibration, delays: dict[str, Delay], physics_step_s: 
         f"{docstring('Servos for Newton.', notes)}\n"
         "from pathlib import Path\n\n"
         "from newton.actuators import ClampingMaxEffort, DriveNeuralMLP\n\n"
-        "SERVOS = {\n" + indent("\n".join(servos), "    ") + "\n}\n"
-        '"""Units: N·m, kg·m², physics steps."""\n\n'
-        "FEEDBACK = {\n" + indent("\n".join(feedback), "    ") + "\n}\n"
-        '"""What makes each joint\'s readings old, coarse and off."""\n\n' + _CODE
+        + block("SERVOS", servos)
+        + '"""Units: N·m, kg·m², physics steps."""\n\n'
+        + feedback_block(calibration)
+        + '"""What makes each joint\'s readings old, coarse and off."""\n\n'
+        + _CODE
     )

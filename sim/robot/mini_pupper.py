@@ -19,12 +19,7 @@ import numpy as np
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.robot.servo_mjcf import (
-    INTEGRATOR,
-    actuator_attributes,
-    attributes,
-    joint_attributes,
-)
+from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, attributes, joint_attributes, pid_element
 
 Knee = Literal["linkage", "serial"]
 
@@ -104,9 +99,7 @@ def robot_xml(
     for name in JOINT_NAMES:
         at = "tendon" if knee == "linkage" and name.endswith("calf") else "joint"
         own = {"name": name, at: name if at == "joint" else f"{name}_servo"}
-        actuators.append(
-            f"<pid {attributes(own | actuator_attributes(servos[name], time_step_s))}/>"
-        )
+        actuators.append(pid_element(own, servos[name], time_step_s))
     sensors = "".join(
         [f'<touch name="{leg}_foot_touch" site="{leg}_foot"/>' for leg in LEGS]
         + [f'<touch name="{body}_touch" site="{body}_touch"/>' for body in CONTACT_BODIES]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     CONTACT_BODIES,
     FOOT_RADIUS_M,
@@ -25,7 +26,13 @@ from pupper_sysid.sim.robot.mini_pupper import (
     limits,
     robot_xml,
 )
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.servo_mjcf import (
+    BATCH_FIELDS,
+    TENDON_FIELDS,
+    delay_lines,
+    empty_delay_lines,
+    write_servos,
+)
 from pupper_sysid.sim.robot.terrain import Ground
 from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
@@ -91,27 +98,27 @@ class RobotBatch:
             robot_xml(longest, config.physics_step_s, config.knee, ground.xml, ground.assets)
         )
         ground.fill(self.model)
-        room = self.model.actuator_history[:, 0].min() * config.physics_step_s
-        if servos.longest_dead_time_s > room:
+        buffer = self.model.actuator_history[:, 0].min() * config.physics_step_s
+        if servos.longest_dead_time_s > buffer:
             raise InputError(
-                f"A delay of {servos.longest_dead_time_s} s does not fit the buffer of {room} s."
+                f"A dead time of {servos.longest_dead_time_s} s does not fit the buffer of "
+                f"{buffer} s."
             )
         from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 
         self.batch = Batch(self.model, environments, threads)
-        self._fields = {
-            name: self.batch.expand(name)
-            for name in (
-                "actuator_biasprm", "actuator_dynprm", "actuator_forcerange", "actuator_delay",
-                "dof_armature", "dof_frictionloss", "geom_friction", "body_mass",
-                *(("tendon_armature", "tendon_frictionloss") if config.knee == "linkage" else ()),
-            )
-        }  # fmt: skip
+        joints = range(len(JOINT_NAMES))
+        on_tendons = _CALVES.tolist() if config.knee == "linkage" else []
+        self._dof_of = {i: 6 + i for i in joints if i not in on_tendons}
+        self._tendon_of = {i: k for k, i in enumerate(on_tendons)}
+        names = (*BATCH_FIELDS, "geom_friction", "body_mass")
+        names += TENDON_FIELDS if on_tendons else ()
+        self._fields = {name: self.batch.expand(name) for name in names}
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._control, self._activation = self.batch.bind("ctrl"), self.batch.bind("act")
         self._history = self.batch.bind("history")
         self._site_position = self.batch.bind("site_xpos")
-        self._full_line = _full_delay_lines(self.model)
+        self._empty_lines = empty_delay_lines(self.model)
         self._feet_geoms = np.array([self.model.geom(f"{leg}_foot").id for leg in LEGS])
         self._feet_sites = np.array([self.model.site(f"{leg}_foot").id for leg in LEGS])
         self._trunk = self.model.body("trunk").id
@@ -235,22 +242,9 @@ class RobotBatch:
         drawn["dead_time_s"] = drawn["dead_time_s"] * delay_share
         for name, value in drawn.items():
             self.drawn[name][ids] = value
-        f["actuator_biasprm"][ids, :, 1] = -drawn["stiffness"]
-        f["actuator_biasprm"][ids, :, 2] = -drawn["damping"]
-        f["actuator_dynprm"][ids, :, 1] = drawn["velocity_limit"]
-        effort = drawn["effort_limit"]
-        f["actuator_forcerange"][ids] = np.stack([-effort, effort], axis=-1)
-        f["actuator_delay"][ids] = drawn["dead_time_s"]
-        joints = np.arange(len(JOINT_NAMES))
-        if self.config.knee == "linkage":
-            f["tendon_armature"][ids] = drawn["armature"][:, _CALVES]
-            f["tendon_frictionloss"][ids] = drawn["friction_loss"][:, _CALVES]
-            joints = np.setdiff1d(joints, _CALVES)
-        rows = ids[:, None]
-        f["dof_armature"][rows, 6 + joints] = drawn["armature"][:, joints]
-        f["dof_frictionloss"][rows, 6 + joints] = drawn["friction_loss"][:, joints]
+        write_servos(f, ids, drawn, self._dof_of, self._tendon_of)
         self.friction[ids] = rng.uniform(*random.friction, len(ids))
-        f["geom_friction"][rows, self._feet_geoms, 0] = self.friction[ids, None]
+        f["geom_friction"][ids[:, None], self._feet_geoms, 0] = self.friction[ids, None]
         payload = rng.uniform(*random.payload_kg, len(ids))
         f["body_mass"][ids, self._trunk] = self.model.body_mass[self._trunk] + payload
         self.batch.set_const(ids)
@@ -296,10 +290,7 @@ class RobotBatch:
         self._control[ids] = told
         self._activation[ids] = told
         # MuJoCo empties delay lines to zeros, which would throw the robot on its back
-        lines = np.repeat(self._full_line[None], n, axis=0)
-        values = (lines.shape[2] - 2) // 2
-        lines[:, :, -values:] = told[:, :, None]
-        self._history[ids] = lines.reshape(n, -1)
+        self._history[ids] = delay_lines(self._empty_lines, told)
         if self.servo_model is not None:
             self.servo_model.reset_some(ids, told - self._bend)
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)
@@ -358,19 +349,10 @@ class RobotBatch:
         if not same_rate(model.time_step_s, span):
             raise InputError(
                 f"The servo model steps every {model.time_step_s} s, the policy every {span} s. "
-                "Refit it at this rate, or set --task.control-step-s."
+                "Refit it at this rate, or change `control_step_s`."
             )
 
     def _highest_under(self, place: Array) -> Array:
         """Highest ground under a robot at `place`, shape (n,) [m]."""
         x, y = np.meshgrid([-0.1, 0.0, 0.1], [-0.1, 0.0, 0.1])
         return self.ground.height(place[:, :1] + x.ravel(), place[:, 1:] + y.ravel()).max(axis=1)
-
-
-def _full_delay_lines(model: Any) -> Array:
-    """Delay lines as they are when a command has been held for long, shape (actuators, length)."""
-    data = mujoco.MjData(model)
-    for i in range(model.nu):
-        samples = int(model.actuator_history[i][0])
-        mujoco.mj_initCtrlHistory(model, data, i, None, np.zeros((samples, 1)))
-    return data.history.reshape(model.nu, -1).copy()

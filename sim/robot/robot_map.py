@@ -19,7 +19,7 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.hardware.joint_map import SCHEMA, SCHEMA_VERSION, JointMap, joint_map_from
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.engine import mujoco
 
 SERVOS = {"sts3215": (4096, 2 * np.pi), "scs0009": (1024, np.radians(300))}
 """Counts of the encoder, and the angle that they span [rad]."""

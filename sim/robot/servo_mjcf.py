@@ -1,37 +1,48 @@
-"""MuJoCo's native actuator and joint for a DelayedPD servo: the same physics, in C.
+"""The one place where a DelayedPD servo becomes MuJoCo's: the same physics, in C.
 
-`servo_models.DelayedPD` is what is fitted; this module writes the attributes with which MuJoCo
-steps the same servo, so that a fitted calibration can be simulated without change. The time step
-must be chosen here, because dry friction is a constraint that stops the joint within one step and
-because the delay line holds one value per step. Integrate with `implicitfast`.
+`servo_models.DelayedPD` is what is fitted. `joint_attributes` and `actuator_attributes` give the
+MJCF with which MuJoCo steps the same servo, so that a calibration is simulated without change;
+integrate with `implicitfast`. The time step is chosen here: dry friction is a constraint that stops
+the joint within one step, and the delay line holds one value per step. A compiled model is changed
+through `write_servos` (other parameters, per environment), `hold` (a command held for long, delay
+line included) and `switch_torque`.
 
-`joint_attributes` and `actuator_attributes` are for any model; `free_air_xml` is the smallest one,
-hinges without load or gravity; `rest_at` fills the delay lines, which MuJoCo zeroes on reset.
+`free_air_xml` is the smallest model, hinges without load or gravity. MuJoCo itself is imported only
+where a model is stepped or filled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delayed_pd import (
-    FRICTION_SOLIMP,
-    DelayedPDParameters,
-    friction_solref,
-)
-
-# imported by name: type checkers cannot see into the compiled module
-mujoco: Any = import_module("mujoco")
+from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, DelayedPDParameters
 
 INTEGRATOR = "implicitfast"
+FRICTION_SOLIMP = (FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
+BATCH_FIELDS = (
+    "actuator_biasprm", "actuator_dynprm", "actuator_forcerange", "actuator_delay",
+    "dof_armature", "dof_frictionloss",
+)  # fmt: skip
+"""Model fields that `write_servos` writes; with servos on tendons `TENDON_FIELDS`, too."""
+TENDON_FIELDS = ("tendon_armature", "tendon_frictionloss")
+
+
+def friction_solref(time_step_s: float) -> tuple[float, float]:
+    """MuJoCo `solreffriction` in its direct form: stop within one time step, no spring.
+
+    MuJoCo divides a direct damping by the impedance, hence the factor.
+    """
+    return 0.0, -FRICTION_IMPEDANCE / time_step_s
 
 
 def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
-    """Attributes of the `<joint>` that the servo turns: inertia and dry friction.
+    """Attributes of the `<joint>` (or tendon) that the servo turns: inertia and dry friction.
 
     Parameters
     ----------
@@ -40,13 +51,11 @@ def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dic
     time_step_s : float
         Physics step of the model [s].
     """
-    # MuJoCo divides a direct damping by the impedance
-    solref = friction_solref(time_step_s)
     return {
         "armature": _number(parameters.armature),
         "frictionloss": _number(parameters.friction_loss),
-        "solreffriction": " ".join(_number(x) for x in solref),
-        "solimpfriction": " ".join(_number(x) for x in FRICTION_SOLIMP),
+        "solreffriction": " ".join(map(_number, friction_solref(time_step_s))),
+        "solimpfriction": " ".join(map(_number, FRICTION_SOLIMP)),
     }
 
 
@@ -58,7 +67,7 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
     Raises
     ------
     InputError
-        If the delay is negative or not finite.
+        If the dead time is negative or not finite.
     """
     delay = float(np.asarray(parameters.dead_time_s))
     if not (np.isfinite(delay) and delay >= 0):
@@ -67,20 +76,28 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
         )
     effort = float(np.asarray(parameters.effort_limit))
     speed = float(np.asarray(parameters.velocity_limit))
-    attributes = {
+    found = {
         "kp": _number(parameters.stiffness),
         "kv": _number(parameters.damping),
         "input": "pos",
-        # two more than whole steps: MuJoCo truncates a delay beyond its buffer without a word
+        # two more than whole steps: MuJoCo silently truncates a delay beyond its buffer
         "nsample": str(int(delay / time_step_s) + 2),
         "delay": _number(delay),
         "interp": "linear",
     }
     if np.isfinite(speed):
-        attributes["slewmax"] = _number(speed)
+        found["slewmax"] = _number(speed)
     if np.isfinite(effort):
-        attributes["forcerange"] = f"{_number(-effort)} {_number(effort)}"
-    return attributes
+        found["forcerange"] = f"{_number(-effort)} {_number(effort)}"
+    return found
+
+
+def pid_element(
+    names: Mapping[str, str], parameters: DelayedPDParameters, time_step_s: float
+) -> str:
+    """The `<pid>` actuator with its `names`: `name`, and `joint` or `tendon`."""
+    own = actuator_attributes(parameters, time_step_s)
+    return f"<pid {attributes({**names, **own})}/>"
 
 
 def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> str:
@@ -88,12 +105,11 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
     bodies, actuators = [], []
     for i, servo in enumerate(servos):
         joint = attributes({"name": f"joint{i}"} | joint_attributes(servo, time_step_s))
-        pid = attributes({"joint": f"joint{i}"} | actuator_attributes(servo, time_step_s))
         bodies.append(
             f'<body><joint type="hinge" axis="0 1 0" {joint}/>'
             '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/></body>'
         )
-        actuators.append(f"<pid {pid}/>")
+        actuators.append(pid_element({"joint": f"joint{i}"}, servo, time_step_s))
     option = (
         f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 0"/>'
     )
@@ -103,29 +119,125 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
     )
 
 
+def attributes(values: Mapping[str, str]) -> str:
+    """As they stand in an MJCF element."""
+    return " ".join(f'{name}="{value}"' for name, value in values.items())
+
+
+def for_commands_between_steps(
+    parameters: DelayedPDParameters, time_step_s: float, name: str
+) -> DelayedPDParameters:
+    """The servo for a caller that gives MuJoCo the mean command over the step before.
+
+    That keeps the timing of commands that come between steps, and delays them by one step, which is
+    taken off the dead time here.
+
+    Raises
+    ------
+    InputError
+        If the dead time is shorter than two steps: MuJoCo takes the rest for a whole step.
+    """
+    delay = float(np.asarray(parameters.dead_time_s))
+    if not delay >= 2 * time_step_s:
+        raise InputError(
+            f"emulated {name}: dead_time_s is {delay}; it must be at least two physics "
+            f"steps of {time_step_s} s."
+        )
+    return replace(parameters, dead_time_s=delay - time_step_s)
+
+
+# ------------------------------------------------------------------------ a compiled model
+
+
+def hold(model: Any, data: Any, index: int, position_rad: float) -> None:
+    """Set actuator `index` as if it had been commanded to `position_rad` for long.
+
+    A reset zeroes the delay line, which would drive the servo to 0 rad for one dead time.
+    """
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    data.ctrl[index] = position_rad
+    if model.actuator_actnum[index]:
+        data.act[model.actuator_actadr[index]] = position_rad
+    line = np.full((int(model.actuator_history[index][0]), 1), float(position_rad))
+    mujoco.mj_initCtrlHistory(model, data, index, None, line)
+
+
 def rest_at(model: Any, data: Any, position_rad: Sequence[float]) -> None:
-    """Rest every servo of a `free_air_xml` model at `position_rad`, commanded there for ever.
+    """Reset a `free_air_xml` model to rest at `position_rad`, one per servo, commanded for long."""
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    mujoco.mj_resetData(model, data)
+    data.qpos[:] = position_rad
+    for i, position in enumerate(position_rad):
+        hold(model, data, i, position)
+
+
+def switch_torque(
+    model: Any, gains: NDArray[np.float64], on: bool, index: int | slice = slice(None)
+) -> None:
+    """Switch servos on, with the `gains` that `actuator_biasprm` had, or limp, without any."""
+    model.actuator_biasprm[index] = gains[index] if on else 0.0
+
+
+def write_servos(
+    fields: Mapping[str, NDArray[np.float64]],
+    ids: NDArray[np.intp],
+    servos: Mapping[str, NDArray[np.float64]],
+    dof_of: Mapping[int, int],
+    tendon_of: Mapping[int, int],
+) -> None:
+    """Write servos into the expanded fields of a `mujoco.batch.Batch`, for environments `ids`.
 
     Parameters
     ----------
-    model, data : mujoco.MjModel, mujoco.MjData
-    position_rad : sequence of float
-        One per servo.
+    fields : mapping of str to ndarray
+        `BATCH_FIELDS`, and `TENDON_FIELDS` if a servo turns a tendon; environments first.
+    ids : ndarray of int
+    servos : mapping of str to ndarray, shape (len(ids), servos)
+        By field of `DelayedPDParameters`.
+    dof_of, tendon_of : mapping of int to int
+        The degree of freedom, or the tendon, that a servo turns.
     """
-    mujoco.mj_resetData(model, data)
-    for i, position in enumerate(position_rad):
-        data.qpos[i] = data.ctrl[i] = position
-        if model.actuator_actnum[i]:
-            data.act[model.actuator_actadr[i]] = position
-        # a reset zeroes the delay line, which would drive the servo to 0 rad for one delay
-        count = int(model.actuator_history[i][0])
-        mujoco.mj_initCtrlHistory(model, data, i, None, np.full((count, 1), float(position)))
+    fields["actuator_biasprm"][ids, :, 1] = -servos["stiffness"]
+    fields["actuator_biasprm"][ids, :, 2] = -servos["damping"]
+    fields["actuator_dynprm"][ids, :, 1] = servos["velocity_limit"]
+    effort = servos["effort_limit"]
+    fields["actuator_forcerange"][ids] = np.stack([-effort, effort], axis=-1)
+    fields["actuator_delay"][ids] = servos["dead_time_s"]
+    for kind, places in (("dof", dof_of), ("tendon", tendon_of)):
+        if places:
+            own, at = list(places), list(places.values())
+            fields[f"{kind}_armature"][ids[:, None], at] = servos["armature"][:, own]
+            fields[f"{kind}_frictionloss"][ids[:, None], at] = servos["friction_loss"][:, own]
 
 
-def _number(value) -> str:
+def empty_delay_lines(model: Any) -> NDArray[np.float64]:
+    """Delay lines after a command of 0 held for long, shape (actuators, length)."""
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    data = mujoco.MjData(model)
+    for i in range(model.nu):
+        hold(model, data, i, 0.0)
+    return data.history.reshape(model.nu, -1).copy()
+
+
+def delay_lines(
+    empty: NDArray[np.float64], position_rad: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Delay lines after commands held for long, shape (n, actuators · length), for `history`.
+
+    Parameters
+    ----------
+    empty : ndarray, shape (actuators, length)
+        From `empty_delay_lines`.
+    position_rad : ndarray, shape (n, actuators)
+    """
+    lines = np.repeat(empty[None], len(position_rad), axis=0)
+    # a line is two numbers, the times and the values, as many of each
+    lines[:, :, -((lines.shape[2] - 2) // 2) :] = position_rad[:, :, None]
+    return lines.reshape(len(lines), -1)
+
+
+def _number(value: Any) -> str:
     return repr(float(np.asarray(value)))
-
-
-def attributes(values: dict[str, str]) -> str:
-    """As they stand in an MJCF element."""
-    return " ".join(f'{name}="{value}"' for name, value in values.items())

@@ -16,19 +16,19 @@ robot could.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import RLock
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, SAMPLE_RATE_HZ, ImuSample, as_words, from_chip
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.robot import EmulatedRobot
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.servo_mjcf import for_commands_between_steps, hold, switch_torque
 
 PHYSICS_STEP_S = 0.001
 """Half the step of training, so that a policy is not judged in the simulator that it learnt in."""
@@ -97,16 +97,8 @@ class WalkingRobot:
         time_step_s: float = PHYSICS_STEP_S,
     ):
         self._rng, self._dt, self._lock = rng, time_step_s, RLock()
-        delays = {s.joint: float(np.asarray(s.actuator.dead_time_s)) for s in robot.servos}
-        for joint, delay in delays.items():
-            # MuJoCo would take what is left of a shorter delay for a whole step
-            if not delay >= 2 * time_step_s:
-                raise InputError(
-                    f"emulated {joint}: dead_time_s is {delay}; it must be at least two physics "
-                    f"steps of {time_step_s} s."
-                )
         native = {
-            s.joint: replace(s.actuator, dead_time_s=delays[s.joint] - time_step_s)
+            s.joint: for_commands_between_steps(s.actuator, time_step_s, s.joint)
             for s in robot.servos
         }
         self._model = mujoco.MjModel.from_xml_string(robot_xml(native, time_step_s))
@@ -124,7 +116,8 @@ class WalkingRobot:
         layout = load_joint_map("mini_pupper_2")
         # servo coordinates of absolute angles: a calf's is told as if its thigh stood at neutral
         self._shift = layout.per_servo().to_angles(layout.to_counts(np.zeros(_SERVOS)))
-        self._settled_after = int(max(delays.values()) / time_step_s) + 3
+        delays = [float(np.asarray(s.actuator.dead_time_s)) for s in robot.servos]
+        self._settled_after = int(max(delays) / time_step_s) + 3
         self._goal = default_pose()
         self._goal[2::3] += self._goal[1::3]  # a calf's servo holds thigh + calf
         self._queue: deque[tuple[float, int, float]] = deque()
@@ -153,7 +146,7 @@ class WalkingRobot:
         """Hold the present position, or go limp, from `time_s` on."""
         with self._lock:
             held = self.angle(index, time_s) - self._shift[index]
-            self._model.actuator_biasprm[index] = self._gains[index] if on else 0.0
+            switch_torque(self._model, self._gains, on, index)
             self._queue = deque(e for e in self._queue if e[1] != index)
             self._hold(index, held)
             self._changed = self._step
@@ -229,13 +222,8 @@ class WalkingRobot:
 
     def _hold(self, index: int, held: float) -> None:
         """Let a servo have been commanded to `held` [rad, absolute] for ever."""
-        self._goal[index] = self._data.ctrl[index] = held
-        if self._model.actuator_actnum[index]:
-            self._data.act[self._model.actuator_actadr[index]] = held
-        # what has been commanded before must not come out of the delay line
-        samples = int(self._model.actuator_history[index][0])
-        line = np.full((samples, 1), held)
-        mujoco.mj_initCtrlHistory(self._model, self._data, index, None, line)
+        self._goal[index] = held
+        hold(self._model, self._data, index, held)
 
     def _steps(self, time_s: float) -> int:
         """Physics steps after which `time_s` is reached."""

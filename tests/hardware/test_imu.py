@@ -16,8 +16,8 @@ from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.imu import ImuSample, as_words, from_chip, to_chip
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
 from support.servo_servers import ScriptedProxy, StillBench, on_a_socket
 
 G = 9.80665

@@ -9,7 +9,8 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.sim.robot.servo_mjcf import actuator_attributes, free_air_xml, mujoco, rest_at
+from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.servo_mjcf import actuator_attributes, free_air_xml, rest_at
 
 H = 0.002
 PAPER = DelayedPDParameters(

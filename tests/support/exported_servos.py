@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.engine import mujoco
 
 # as released: isaaclab 2.3.2.post1, mjlab 1.6.0 (benchmarks/peers/check_exports.py reads them)
 ISAACLAB = {

@@ -10,8 +10,9 @@ import numpy as np
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import default_pose
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
+from pupper_sysid.sim.robot.servo_mjcf import hold
 
 
 def standing(model: Any) -> Any:
@@ -21,10 +22,8 @@ def standing(model: Any) -> Any:
     told = default_pose()
     if model.ntendon:
         told[2::3] += told[1::3]
-    data.ctrl[:] = data.act[:] = told
     for i in range(model.nu):
-        samples = model.actuator_history[i][0]
-        mujoco.mj_initCtrlHistory(model, data, i, None, np.full((samples, 1), told[i]))
+        hold(model, data, i, told[i])
     mujoco.mj_forward(model, data)
     return data
 

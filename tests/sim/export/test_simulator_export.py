@@ -20,19 +20,16 @@ from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.sim.export import simulator_export
+from pupper_sysid.sim.export import mjcf
+from pupper_sysid.sim.export.isaaclab import to_isaaclab
+from pupper_sysid.sim.export.json_file import to_json
+from pupper_sysid.sim.export.mjcf import to_mjcf
+from pupper_sysid.sim.export.mjlab import MJLAB_PD, to_mjlab
 from pupper_sysid.sim.export.newton import export_newton
-from pupper_sysid.sim.export.simulator_export import (
-    EXPLICIT_PD,
-    MJLAB_PD,
-    SIMULATORS,
-    delays_at_step,
-    to_isaaclab,
-    to_json,
-    to_mjcf,
-    to_mjlab,
-)
-from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, mujoco, rest_at
+from pupper_sysid.sim.export.shared import EXPLICIT_PD, delays_at_step
+from pupper_sysid.sim.export.targets import SIMULATORS
+from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, rest_at
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
 from support.exported_servos import ISAACLAB, MJLAB, in_free_air
@@ -101,7 +98,7 @@ def test_simulators_without_limited_set_points_get_the_lag_that_these_make(
     calibration, engine, monkeypatch
 ):
     expected = lags_s(calibration, TIME_STEP_S)
-    monkeypatch.setattr(simulator_export, "delays_at_step", lambda *of: delays_at_step(*of, engine))
+    monkeypatch.setattr(mjcf, "delays_at_step", lambda *of: delays_at_step(*of, engine))
 
     def as_they_do(text: str) -> str:
         text = re.sub(r' slewmax="[^"]*"', "", text)

@@ -11,6 +11,7 @@ import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     FOOT_RADIUS_M,
     STANDING_HEIGHT_M,
@@ -20,7 +21,6 @@ from pupper_sysid.sim.robot.mini_pupper import (
     limits,
     robot_xml,
 )
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.robot_in_air import error_in_air, in_free_space, standing
 

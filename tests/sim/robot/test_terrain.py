@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
 from pupper_sysid.sim.robot.terrain import SPACING_M, TILE_M, Ground, make_ground
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 

@@ -13,6 +13,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     STANDING_HEIGHT_M,
     default_pose,
@@ -21,7 +22,6 @@ from pupper_sysid.sim.robot.mini_pupper import (
     limits,
     robot_xml,
 )
-from pupper_sysid.sim.robot.servo_mjcf import mujoco
 from pupper_sysid.sim.walking.config import (
     Commands,
     Curriculum,

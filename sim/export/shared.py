@@ -1,0 +1,178 @@
+"""What the exports share: delays for a physics step, notes, refusals, and texts of Python modules.
+
+Every export says where its numbers come from (`origin`), how well each is known, and what the
+target cannot hold: most simulators have no delay shorter than a physics step, no limit on the speed
+of a set-point, and none models stale readings. The feedback stands beside the actuator in every
+one; for simulators on torch with code that applies it (`sim.export.held_feedback_torch`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from textwrap import indent, wrap
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import versions
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
+from pupper_sysid.servo_models.delayed_pd import whole_steps
+from pupper_sysid.servo_models.step_size import MUJOCO, Engine, delay_at_step
+
+FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
+TORQUE_KEYS = (
+    "stiffness_nm_per_rad", "damping_nm_s_per_rad", "friction_loss_nm", "armature_kg_m2",
+    "effort_limit_nm",
+)  # fmt: skip
+EXPLICIT_PD = Engine(slews=False, implicit=False)
+"""Isaac Lab and Newton: torque computed before each step, set-points of unlimited speed."""
+NOT_CARRIED = (
+    "The feedback is no part of an actuator, and without it the simulated robot sees more than the "
+    "real one does: its readings are old, lost at times, coarse and off. See FEEDBACK below."
+)
+KNOWN = {"yes": "measured", "ratio only": "ratio measured, scale assumed", "no": "not measured"}
+"""How well a number is known, by `Quantity.identified`."""
+_LONGEST_STEP_S = 0.1
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A joint's delay for one physics step: its value and the interval to train with [s]."""
+
+    value_s: float
+    low_s: float
+    high_s: float
+
+    def steps(self, physics_step_s: float) -> tuple[int, int]:
+        """The interval in whole steps, rounded outward."""
+        return whole_steps(self.low_s, self.high_s, physics_step_s)
+
+
+def delays_at_step(
+    calibration: Calibration, physics_step_s: float, engine: Engine = MUJOCO
+) -> dict[str, Delay]:
+    """Delay of each joint for another physics step or engine than the calibration's (`step_size`).
+
+    Raises
+    ------
+    InputError
+        If the step is not a physics step of a simulator, or too long for the servos.
+    """
+    if not 0 < physics_step_s <= _LONGEST_STEP_S:
+        raise InputError(
+            f"`physics_step_s` is {physics_step_s:g} s; give the simulator's own, between 0 and "
+            f"{_LONGEST_STEP_S:g}, such as 0.005."
+        )
+    found = {}
+    for name, joint in calibration.joints.items():
+        a = joint.actuator
+        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s, engine)
+        more = float(fitting) - a.dead_time_s.value
+        numbers = (max(t + more, 0.0) for t in (a.dead_time_s.value, *a.dead_time_interval_s))
+        found[name] = Delay(*numbers)
+    return found
+
+
+def step_note(
+    calibration: Calibration, delays: dict[str, Delay], physics_step_s: float
+) -> Iterator[str]:
+    """What was added to the delays for the length of a step, if anything was."""
+    added = [
+        1e3 * (delays[name].value_s - joint.actuator.dead_time_s.value)
+        for name, joint in calibration.joints.items()
+    ]
+    steps = {1e3 * joint.actuator.physics_step_s for joint in calibration.joints.values()}
+    if np.any(added):
+        yield (
+            f"Measured delays are for steps of {' or '.join(f'{s:g}' for s in sorted(steps))} ms "
+            f"in MuJoCo with set-points of limited speed; steps of {1e3 * physics_step_s:g} ms "
+            f"here give another lag, so {np.mean(added):+.1f} ms (mean of the joints) are in the "
+            "delays below."
+        )
+
+
+def origin(calibration: Calibration) -> Iterator[str]:
+    """Where the numbers come from, in sentences."""
+    made = ", ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in calibration.inputs)
+    yield (
+        f"Servos of {calibration.robot}, calibrated {calibration.created}"
+        + (f" from {made}" if made else "")
+        + f", exported by pupper-sysid {versions()['pupper-sysid']}."
+    )
+    yield from calibration.notes
+    scales = {j.actuator.scale.source: j.actuator.scale for j in calibration.joints.values()}
+    for source, scale in scales.items():
+        yield f"Torques are scaled by {scale.anchor} {scale.value_nm:g} N·m: {source}."
+
+
+# --------------------------------------------------------------------------- Python modules
+
+
+def docstring(title: str, notes: Sequence[str]) -> str:
+    """A module's docstring of paragraphs; names that a user chose cannot end it."""
+    text = "\n\n".join("\n".join(wrap(note, 98, break_on_hyphens=False)) for note in notes)
+    text = text.replace("\\", "/").replace('"', "'")
+    return f'"""{title}\n\n{text}\n"""\n'
+
+
+def block(name: str, rows: Sequence[str], brackets: str = "{}") -> str:
+    """`NAME = {…}` with a row per line."""
+    return f"{name} = {brackets[0]}\n" + indent("\n".join(rows), "    ") + f"\n{brackets[1]}\n"
+
+
+def call(function: str, *arguments: tuple[str, Any] | tuple[str, Quantity, str]) -> str:
+    """A call with a keyword argument per line.
+
+    An argument is its name and value; a quantity also has its key in the calibration, and is
+    followed by a comment: unit, how well it is known, interval.
+    """
+    lines = []
+    for name, value, *key in arguments:
+        comment = ""
+        if key:
+            comment = f"  # {unit_of(key[0])}, {KNOWN[value.identified]}"
+            if value.low is not None and value.high is not None:
+                comment += f", 90 % interval {value.low:.4g} to {value.high:.4g}"
+            value = value.value
+        lines.append(f"{name}={value!r},{comment}\n")
+    return f"{function}(\n{indent(''.join(lines), '    ')}),"
+
+
+def feedback_block(calibration: Calibration) -> str:
+    """`FEEDBACK = {…}`: the numbers of each joint's feedback."""
+    return block("FEEDBACK", [
+        f'"{name}": '
+        + json.dumps({key: getattr(joint.feedback, key).value for key in FEEDBACK_KEYS})
+        + ","
+        for name, joint in calibration.joints.items()
+    ])  # fmt: skip
+
+
+def torch_module(
+    calibration: Calibration,
+    target: str,
+    notes: Sequence[str],
+    import_line: str,
+    physics_step_s: float,
+    actuators: str,
+) -> str:
+    """A Python module: what it is, the actuators, the feedback and the code that applies it."""
+    # read, not imported: that would load torch
+    code = (resources.files("pupper_sysid.sim.export") / "held_feedback_torch.py").read_text()
+    return (
+        f"{docstring(f'Servos for {target}.', notes)}\n"
+        "from __future__ import annotations\n\n"
+        "from collections.abc import Mapping, Sequence\n\n"
+        f"import torch\n{import_line}\n\n"
+        f"PHYSICS_DT = {physics_step_s!r}\n"
+        '"""Physics step that the delays below are counted in [s]."""\n\n'
+        f"{actuators}\n"
+        f"{feedback_block(calibration)}"
+        '"""What makes each joint\'s readings old, coarse and off; `HeldFeedback` applies it."""\n'
+        f"\n\n{code[code.index('class HeldFeedback') :]}"
+    )
