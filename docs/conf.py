@@ -49,7 +49,7 @@ _PROGRAMS = (
 )  # fmt: skip
 
 
-def _help(module: str, *words: str) -> str:
+def help_text(module: str, *words: str) -> str:
     """What `--help` prints, without colours and without the lines' empty ends."""
     said, plain = io.StringIO(), patch.dict(os.environ, _PLAIN)
     with plain, redirect_stdout(said), redirect_stderr(said), suppress(SystemExit):
@@ -74,9 +74,9 @@ def reference() -> str:
     ]  # fmt: skip
     for module in _PROGRAMS:
         program = module.replace("_", "-")
-        lines += [f"## {program}", "", "```text", _help(module), "```", ""]
+        lines += [f"## {program}", "", "```text", help_text(module), "```", ""]
         for name in subcommands(module):
-            shown = _help(module, *name.split())
+            shown = help_text(module, *name.split())
             lines += [f"### {program} {name}", "", "```text", shown, "```", ""]
     return "\n".join(lines)
 

@@ -7,7 +7,8 @@ set-point moves at `velocity_limit` at most, and the torque
 
 works against a dry friction of `friction_loss`. This module is the same arithmetic as MuJoCo's
 native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with `armature` and
-`frictionloss`, integrated with `implicitfast` (`tests/test_delayed_pd.py` holds the two together):
+`frictionloss`, integrated with `implicitfast`; `tests/servo_models/test_delayed_pd.py` holds the
+two together:
 
 * delay: the command of the past, linearly interpolated between time steps. For a command that
   changes on time steps this is the mean of the held command over the step, so the trajectory is a

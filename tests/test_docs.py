@@ -1,30 +1,46 @@
-"""What the documentation says is what happens: examples run, pages build without a warning."""
+"""The documentation holds: its examples run, its pages build, what it refers to exists."""
 
 from __future__ import annotations
 
+import html
 import importlib
 import re
+import runpy
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from support import docs_conf
 from support.command_line import run_program
+from support.package import MODULES, ROOMS, ROOT, public_names
 
-ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+WRITTEN = [  # pages written by hand
+    path
+    for path in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))
+    if path.name not in ("commands.md", "example.md") and "_build" not in path.parts
+]
+SOURCES = [
+    path
+    for folder in ("api", *ROOMS, "reproduction", "tests", "benchmarks", "docs")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+]
+
+
+def console(page: Path) -> list[str]:
+    """Lines of a page's console blocks."""
+    blocks = re.findall(r"```console\n(.*?)```", page.read_text(), re.DOTALL)
+    return [line for block in blocks for line in block.splitlines()]
+
+
 EXAMPLES = {
-    path: [
-        shlex.split(line[2:])
-        for block in re.findall(r"```console\n(.*?)```", path.read_text(), re.DOTALL)
-        for line in block.splitlines()
-        if line.startswith("$ ")
-    ]
-    for path in sorted(DOCS.rglob("*.md"))
-    if "```console" in path.read_text()
+    page: [shlex.split(line[2:]) for line in console(page) if line.startswith("$ ")]
+    for page in WRITTEN
+    if console(page)
 }
 
 
@@ -40,20 +56,66 @@ def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeyp
         assert all((tmp_path / name).exists() for name in made)
 
 
-def test_the_tutorial_is_among_the_examples():
-    assert len(EXAMPLES[DOCS / "tutorial.md"]) == 9
+def test_the_tutorial_leads_from_a_sweep_to_a_servo_model_and_is_run_as_it_stands():
+    steps = [words[1] for words in EXAMPLES[DOCS / "tutorial.md"]]
+    order = ["sweep", "doctor", "delay", "calibrate", "compare", "report", "export", "fit-servo"]
+    assert list(dict.fromkeys(steps)) == order
+    for page in EXAMPLES:
+        unrun = [line for line in console(page) if "pupper-" in line and line[:2] != "$ "]
+        assert unrun == [], page
 
 
-def test_the_pages_build_without_a_warning_and_name_every_command(tmp_path):
+def test_python_examples_run_in_the_repository(tmp_path, monkeypatch):
+    """Of the README and the pages; each page's blocks in turn, in one name space."""
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    ran = 0
+    for page in WRITTEN:
+        names: dict[str, object] = {}
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+            exec(compile(block, str(page), "exec"), names)
+            ran += 1
+    assert ran > 0
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """The documentation as HTML, built without a warning."""
     pytest.importorskip("sphinx")
+    pages = tmp_path_factory.mktemp("html")
     done = subprocess.run(
-        [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", DOCS, tmp_path],
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", DOCS, pages],
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    commands = (tmp_path / "commands.html").read_text()
-    for name in ("pupper-sysid sweep", "pupper-sysid export", "pupper-train", "pupper-analyze"):
-        assert name in commands
+    assert done.returncode == 0, done.stderr[-4000:]
+    return pages
+
+
+def test_the_page_of_commands_names_every_command(site):
+    commands = (site / "commands.html").read_text()
+    for program in ("pupper-sysid", "pupper-train", "pupper-analyze"):
+        assert program in commands
+        for name in docs_conf.subcommands(program.replace("-", "_")):
+            assert f">{program} {name}<" in commands
+
+
+def test_every_public_name_is_in_the_reference(site):
+    anchors: set[str] = set()
+    for page in (site / "reference").glob("*.html"):
+        anchors |= set(re.findall(r'id="([^"]+)"', page.read_text()))
+    wanted = {name for module in MODULES for name in public_names(module)}
+    assert sorted(name for name in wanted if name not in anchors) == []
+
+
+def test_pages_need_no_network(site):
+    """No script, style or picture comes from elsewhere, and formulas are MathML."""
+    tag = re.compile(r'<(?:script|link|img|iframe)\b[^>]*?(?:src|href)="(?:https?:)?//([^"]+)"')
+    for page in site.rglob("*.html"):
+        assert tag.findall(page.read_text()) == [], page
+    theory = (site / "theory/lag.html").read_text()
+    formulas = re.findall(r"<math\b.*?</math>", theory, re.DOTALL)
+    assert len(formulas) > 5
+    assert not any("\\" in html.unescape(re.sub("<[^>]+>", "", f)) for f in formulas)
 
 
 def test_a_commands_own_commands_are_on_the_page_of_all_commands():
@@ -62,13 +124,106 @@ def test_a_commands_own_commands_are_on_the_page_of_all_commands():
     assert docs_conf.subcommands("pupper_play") == []
 
 
+def command_lines() -> Iterator[tuple[Path, str]]:
+    """Lines of the pages that begin with a command, those that are not run here, too."""
+    for page in WRITTEN:
+        for line in re.findall(r"^(?:\$ )?(pupper-[a-z]+ .*)$", page.read_text(), re.MULTILINE):
+            yield page, line
+
+
 def test_pages_name_commands_and_options_that_exist():
     """Also those that need a robot, and so cannot be run here."""
-    for path in [*DOCS.rglob("*.md"), ROOT / "README.md"]:
-        if path.name == "commands.md":
-            continue
-        for line in re.findall(r"^(?:\$ )?(pupper-[a-z]+ .*)$", path.read_text(), re.MULTILINE):
-            words = shlex.split(line, comments=True)
-            known = docs_conf.subcommands(words[0].replace("-", "_"))
-            if known and words[1:] and not words[1].startswith("-"):
-                assert words[1] in known, f"{path.name}: {line}"
+    for page, line in command_lines():
+        program, *words = shlex.split(line, comments=True)
+        module = program.replace("-", "_")
+        known = docs_conf.subcommands(module)
+        command: list[str] = []
+        while known and words and not words[0].startswith("-"):
+            if " ".join([*command, words[0]]) not in known:
+                break
+            command.append(words.pop(0))
+        assert command or not known or words[0].startswith("-"), f"{page.name}: {line}"
+        shown = docs_conf.help_text(module, *command) + " --version --install-completion --debug"
+        for word in words:
+            if word.startswith("--"):
+                option = word.split("=")[0]
+                assert re.search(rf"{option}(?![\w-])", shown), f"{page.name}: {line}: {option}"
+
+
+def test_options_that_do_not_exist_would_be_found():
+    assert "--amplitude" in docs_conf.help_text("pupper_sysid", "sweep")
+    assert "--no-such-option" not in docs_conf.help_text("pupper_sysid", "sweep")
+
+
+# ----- references
+
+FOLDERS = {path.name for path in ROOT.iterdir() if path.is_dir() and path.name[0] != "."}
+PATH = re.compile(r"`([\w.-]+/[\w./*<>-]*)`")
+DOTTED = re.compile(rf"`(?:pupper_sysid\.)?((?:{'|'.join(ROOMS)})(?:\.\w+)+)(?:\(\))?`")
+
+
+def dangling(text: str, folder: Path) -> list[str]:
+    """Paths and modules in back quotes that are not in the repository."""
+    found = []
+    for name in PATH.findall(text):
+        here = name.split("/")[0] in FOLDERS
+        if here and not any(ROOT.glob(name)) and not any(folder.glob(name)):
+            found.append(name)
+    for name in DOTTED.findall(text):
+        path, rest = ROOT, name.split(".")
+        while rest and (path / rest[0]).is_dir():
+            path, rest = path / rest[0], rest[1:]
+        module = path / f"{rest[0]}.py" if rest else path / "__init__.py"
+        inside = module.exists() and all(
+            re.search(rf"\b{name}\b", module.read_text()) for name in rest[1:]
+        )
+        if not inside and name.split(".")[-1] not in ("py", "md", "csv", "yaml"):
+            found.append(name)
+    return found
+
+
+@pytest.mark.parametrize(
+    "text, missing",
+    [
+        ("see `common/errors.py` and `common.errors.InputError`", []),
+        ("see `common/gone.py`", ["common/gone.py"]),
+        ("see `common.gone`", ["common.gone"]),
+        ("see `common.errors.gone`", ["common.errors.gone"]),
+        ("written to `runs/NAME` and `report/report.html`", []),
+    ],
+)
+def test_what_is_not_in_the_repository_would_be_found(text, missing):
+    assert dangling(text, ROOT) == missing
+
+
+def test_pages_and_docstrings_refer_to_files_that_are_in_the_repository():
+    others = [*(ROOT / "benchmarks").rglob("*.md"), ROOT / "data/samples/README.md"]
+    missing = {
+        str(path.relative_to(ROOT)): names
+        for path in (*WRITTEN, *others, *SOURCES)
+        if path != Path(__file__) and (names := dangling(path.read_text(), path.parent))
+    }
+    assert missing == {}
+
+
+def test_links_and_pictures_of_the_readme_exist():
+    for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text()):
+        assert target.startswith("https://") or (ROOT / target).exists(), target
+
+
+# ----- benchmarks
+
+BENCHMARKS = sorted((ROOT / "benchmarks").rglob("*.py"))
+ELSEWHERE = re.compile(r"^(from|import) (bam|mjlab|newton|warp|cmaes|isaaclab|exchange)\b", re.M)
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda p: p.stem)
+def test_benchmarks_import(path, monkeypatch):
+    """Programs that run in the environments of other projects are compiled only."""
+    source = path.read_text()
+    compile(source, str(path), "exec")
+    if path.parent.name == "peers" and ELSEWHERE.search(source) and "pupper_sysid" not in source:
+        return
+    for folder in (ROOT / "benchmarks", path.parent):
+        monkeypatch.syspath_prepend(str(folder))
+    runpy.run_path(str(path), run_name=path.stem)

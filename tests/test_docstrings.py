@@ -7,40 +7,17 @@ named Parameters lists every parameter; names of the front door have all their s
 from __future__ import annotations
 
 import inspect
-import tomllib
-from collections.abc import Iterator
-from importlib import import_module
 
 import pytest
 
 import pupper_sysid
-from support.package import MODULES, ROOT
+from support.package import MODULES, PROJECT, public_names
 
 validate = pytest.importorskip("numpydoc.validate").validate
 
-SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["numpydoc_validation"]
-CHECKS = set(SETTINGS["checks"])
+CHECKS = set(PROJECT["tool"]["numpydoc_validation"]["checks"])
 COMPLETE = CHECKS | {"PR01", "RT01", "YD01"}
 FRONT_DOOR = sorted(getattr(pupper_sysid, "__all__", []))
-
-
-def public_names(module: str) -> Iterator[str]:
-    """A module, its public classes and functions, and their public methods and properties."""
-    yield module
-    for name, item in vars(import_module(module)).items():
-        if name.startswith("_") or getattr(item, "__module__", None) != module:
-            continue
-        if inspect.isfunction(item):
-            yield f"{module}.{name}"
-        elif inspect.isclass(item):
-            yield f"{module}.{name}"
-            for member, value in vars(item).items():
-                value = getattr(value, "__func__", value)  # class and static methods
-                if not member.startswith("_") and isinstance(value, DOCUMENTED_MEMBERS):
-                    yield f"{module}.{name}.{member}"
-
-
-DOCUMENTED_MEMBERS = (type(public_names), property)
 
 
 def violations(name: str, checks: set[str]) -> list[str]:

@@ -37,7 +37,7 @@ _IN_USE_S = 5.0
 
 
 class EmulatedBus:
-    """A `hardware.ServoBus` of emulated servos.
+    """A `hardware.bus.ServoBus` of emulated servos.
 
     Parameters
     ----------

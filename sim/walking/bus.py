@@ -27,7 +27,7 @@ from pupper_sysid.sim.walking.robot import WalkingRobot
 
 
 class WalkingBus:
-    """A `hardware.ServoBus` with an IMU (`hardware.imu.Imu`) of an emulated robot that walks.
+    """A `hardware.bus.ServoBus` with an IMU (`hardware.imu.Imu`) of an emulated robot that walks.
 
     Parameters
     ----------

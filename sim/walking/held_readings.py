@@ -1,10 +1,10 @@
 """Held feedback of many robots at once: what a controller reads while the bus polls its own way.
 
-The same feedback as `servo_models.HeldFeedback`, vectorised over environments and advanced one
-control step at a time: the simulator hands over the positions after each physics step, and each
-poll that falls between them is looked up there. A poll that fails leaves the old reading. Servo `i`
-of twelve is polled a share `i / 12` of a round after the first, in the order of the joints (the
-robot's firmware, and so the emulated bus, goes by the servos' ids).
+The same feedback as `servo_models.held_feedback.HeldFeedback`, vectorised over environments and
+advanced one control step at a time: the simulator hands over the positions after each physics step,
+and each poll that falls between them is looked up there. A poll that fails leaves the old reading.
+Servo `i` of twelve is polled a share `i / 12` of a round after the first, in the order of the
+joints (the robot's firmware, and so the emulated bus, goes by the servos' ids).
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
+from functools import cache
 from pathlib import Path
 
 _spec = importlib.util.spec_from_file_location(
@@ -10,5 +12,9 @@ _spec = importlib.util.spec_from_file_location(
 )
 assert _spec is not None and _spec.loader is not None
 _conf = importlib.util.module_from_spec(_spec)
+_path = list(sys.path)
 _spec.loader.exec_module(_conf)
-subcommands = _conf.subcommands
+sys.path[:] = _path  # conf.py adds the folder of its extensions
+
+subcommands = cache(_conf.subcommands)
+help_text = cache(_conf.help_text)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import tomllib
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from types import FunctionType
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -16,3 +20,19 @@ FILES = {
     if path.stem != "__init__"
 }
 MODULES = list(FILES)
+
+
+def public_names(module: str) -> Iterator[str]:
+    """A module, its public classes and functions, and their public methods and properties."""
+    yield module
+    for name, item in vars(import_module(module)).items():
+        if name.startswith("_") or getattr(item, "__module__", None) != module:
+            continue
+        if inspect.isfunction(item):
+            yield f"{module}.{name}"
+        elif inspect.isclass(item):
+            yield f"{module}.{name}"
+            for member, value in vars(item).items():
+                value = getattr(value, "__func__", value)  # class and static methods
+                if not member.startswith("_") and isinstance(value, (FunctionType, property)):
+                    yield f"{module}.{name}.{member}"
