@@ -1,11 +1,11 @@
 """The one place where a DelayedPD servo becomes MuJoCo's: the same physics, in C.
 
 `servo_models.delayed_pd.DelayedPD` is what is fitted. `joint_attributes` and `actuator_attributes`
-give the MJCF with which MuJoCo steps the same servo, so that a calibration is simulated without change;
-integrate with `implicitfast`. The time step is chosen here: dry friction is a constraint that stops
-the joint within one step, and the delay line holds one value per step. A compiled model is changed
-through `write_servos` (other parameters, per environment), `hold` (a command held for long, delay
-line included) and `switch_torque`.
+give the MJCF with which MuJoCo steps the same servo, so that a calibration is simulated without
+change; integrate with `implicitfast`. The time step is chosen here: dry friction is a constraint
+that stops the joint within one step, and the delay line holds one value per step. A compiled model
+is changed through `write_servos` (other parameters, per environment), `hold` (a command held for
+long, delay line included) and `switch_torque`.
 
 `free_air_xml` is the smallest model, hinges without load or gravity. MuJoCo itself is imported only
 where a model is stepped or filled.

@@ -41,7 +41,7 @@ class Commands:
 
 @dataclass(frozen=True)
 class Observation:
-    """What the policy sees: 60 numbers in the order of `sim.walking.env.OBSERVATION`."""
+    """What the policy sees: 60 numbers in the order of `sim.walking.observation.OBSERVATION`."""
 
     noise: bool = True
     """Whether the published uniform noise is added."""

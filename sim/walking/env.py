@@ -1,14 +1,9 @@
-"""PupperEnv: many robots that are told to walk, stepped together by `mujoco.batch`.
+"""PupperEnv: many robots on a walking task, stepped together by `mujoco.batch`.
 
-`reset` once, then `step(actions)` at 50 Hz. Arrays are (environments, …) NumPy. One call steps all
-physics in C++ (`Batch.rollout`, ten steps of 2 ms); servo delay, gains, limits and friction are
-MuJoCo's own, per environment and joint, drawn per episode from the calibration. What the policy
-sees of its joints has passed through the measured feedback (`sim.walking.held_readings`).
-
-After a step, environments that ended have been reset: `StepResult.observation` is the first of the
-new episode, `StepResult.terminal` holds the last one of those whose time was up, whose value a
-learner needs. MuJoCo resets a simulation that becomes NaN and only counts a warning; here its
-episode ends, `nan_resets` counts it, and its state is drawn anew.
+One call steps all physics in C++ (`Batch.rollout`, ten steps of 2 ms). Servo delay, gains, limits
+and friction are MuJoCo's own, per environment and joint, drawn per episode from the calibration.
+The joint angles that a policy sees have passed through the measured feedback
+(`sim.walking.held_readings`). Arrays are (environments, …) NumPy.
 """
 
 from __future__ import annotations
@@ -28,40 +23,20 @@ from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking import rewards as walking_rewards
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.held_readings import HeldReadings
+from pupper_sysid.sim.walking.observation import FALLEN_TILT, VELOCITY_STEPS, observed
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]
-
-OBSERVATION = (
-    ("base_linear_velocity", 3, 0.1),
-    ("base_angular_velocity", 3, 0.2),
-    ("projected_gravity", 3, 0.05),
-    ("command", 3, 0.0),
-    ("joint_position_relative", 12, 0.01),
-    ("joint_velocity", 12, 1.5),
-    ("joint_effort", 12, 0.1),
-    ("last_action", 12, 0.0),
-)
-"""Name, size and half width of the published uniform noise of each part of an observation."""
-OBSERVATION_SIZE = sum(size for _, size, _ in OBSERVATION)
-_ENDS = np.cumsum([size for _, size, _ in OBSERVATION])
-OBSERVATION_PARTS = {
-    name: slice(int(end) - size, int(end))
-    for (name, size, _), end in zip(OBSERVATION, _ENDS, strict=True)
-}
-"""Where each part of an observation is."""
-
-FALLEN_TILT = 0.6
-"""Cosine of the tilt from which a robot has fallen: 53 degrees."""
-
-VELOCITY_STEPS = 4
-"""Joint velocity is the difference of readings this many control steps apart: polls are too rare
-for less."""
 
 _TOUCH_N = 1.0  # published; of what must not touch the ground
 _FOOT_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
 _STRIDE_S = 0.2  # time constant of the average over a stride
 _EDGE_M = 0.5
+_ARRAYS = (
+    "command", "episode_step", "action", "last_action", "earlier_action", "_until_command",
+    "_until_push", "_air", "_contact", "_last_air", "_last_contact", "_foot_at", "_seen",
+    "_average",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,7 +56,7 @@ class StepResult:
     terminal : dict of str to ndarray
         `ids` of environments whose time was up, and their last `observation` and `privileged`.
     facts : Step
-        What happened, before anyone's new episode.
+        What happened, before any new episode.
     """
 
     observation: NDArray[np.float32]
@@ -95,25 +70,59 @@ class StepResult:
 
 
 class PupperEnv:
-    """Vectorised walking environment.
+    """Vectorised walking environment of the Mini Pupper 2: a batch of actions in, a batch out.
 
     Parameters
     ----------
     config : Walking
+        The task: `Walking()`, or one of `sim.walking.config.PRESETS`.
     servos : ServoRanges
-        Actuators and feedback.
+        Actuators and feedback, from `sim.walking.servo_ranges.servo_ranges(calibration)`.
     environments : int
+        How many robots, n.
     seed : int
+        Of everything random. The terrain of a seed is the same for every number of robots.
     threads : int
-        Of the physics; 0 for all cores.
+        Of the physics; 0 for all cores. Results do not depend on it.
     servo_model : JointArrays, optional
         Stands in for the actuators: a learned model of all twelve joints at the control rate. The
-        position it predicts is what stiff, immediate servos are told, moving over the step.
+        position it predicts is the command of stiff, immediate servos, moving over the step.
+
+    Attributes
+    ----------
+    command : ndarray, shape (n, 3)
+        Forward and sideways speed [m/s] and turn rate [rad/s] that each robot is to follow.
+    robots : RobotBatch
+        The physics: positions, velocities, the servos that were drawn.
+    steps, nan_resets : int
+        Control steps since the start; simulations that became NaN, and were drawn anew.
 
     Raises
     ------
     InputError
-        If a delay does not fit its buffer, or the servo model has another rate.
+        If there is no environment, a servo is not stable in such physics steps, a delay does not
+        fit its buffer, or the servo model is of other joints or another rate.
+
+    Notes
+    -----
+    An action a, shape (n, 12), is the set-point default pose + `action_scale` · a [rad] in the
+    order of `JOINT_NAMES`, within the joint limits, held for one control step (20 ms). The
+    observation, shape (n, 60), is laid out in `sim.walking.observation`.
+
+    Environments that end in a step are reset in it: `StepResult.observation` is the first of the
+    new episode, `StepResult.terminal` holds the last one of those whose time was up, whose value a
+    learner needs. MuJoCo resets a simulation that becomes NaN and only counts a warning; here its
+    episode ends.
+
+    Examples
+    --------
+    >>> from pupper_sysid.sim.walking.config import Walking
+    >>> from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+    >>> env = PupperEnv(Walking(), servo_ranges("paper"), environments=4, threads=1)
+    >>> observation, privileged = env.reset()
+    >>> result = env.step(np.zeros((4, 12)))
+    >>> result.observation.shape, result.reward.shape, bool(result.done.any())
+    ((4, 60), (4,), False)
     """
 
     def __init__(
@@ -173,7 +182,20 @@ class PupperEnv:
 
         Draws noise, but does not let time pass.
         """
-        return self._observation(), self._privileged()
+        config, robots = self.config.observation, self.robots
+        blind = np.zeros((self.environments, 3))
+        span = VELOCITY_STEPS * self.config.control_step_s
+        seen = [
+            robots.velocity if config.base_velocity == "true" else blind,
+            robots.rate,
+            robots.gravity,
+            self.command,
+            self._seen[:, 0] - self.default,
+            (self._seen[:, 0] - self._seen[:, -1]) / span,
+            self._readings.load,
+            self.action,
+        ]
+        return observed(config, seen, self.rng), self._privileged()
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Let every robot act for one control step.
@@ -181,7 +203,7 @@ class PupperEnv:
         Parameters
         ----------
         action : ndarray, shape (n, 12)
-            Outputs of the policy: target = default pose + scale · action, within joint limits.
+            Outputs of the policy: set-point = default pose + scale · action, within joint limits.
         """
         config, span = self.config, self.config.control_step_s
         self.steps += 1
@@ -194,18 +216,23 @@ class PupperEnv:
         self._seen = np.concatenate([self._read()[:, None], self._seen[:, :-1]], axis=1)
         self.episode_step += 1
         contact, fallen = self._contacts(touch)
-        what = self._step_facts(velocity, load[:, -1], contact)
+        facts = self._step_facts(velocity, load[:, -1], contact)
         broken = self.robots.broken()
         self.nan_resets += int(broken.sum())
-        terms = walking_rewards.weighted(what, config.rewards, self._easy(self.level))
+        terms = walking_rewards.weighted(facts, config.rewards, self._easy(self.level))
         terms = {k: v * span for k, v in terms.items()}
         if broken.any():
             terms = {k: np.where(broken, 0.0, v) for k, v in terms.items()}
         reward = np.sum(list(terms.values()), axis=0)
-        timed_out = (self.episode_step >= config.episode_steps) | self._outside()
+        away = np.abs(self.robots.qpos[:, :2]).max(axis=1)
+        timed_out = self.episode_step >= config.episode_steps
+        timed_out |= away > self.ground.half_size_m - _EDGE_M
         timed_out &= ~(fallen | broken)
         done = fallen | broken | timed_out
-        self._tell(span)
+        self._until_command -= span
+        due = np.flatnonzero(self._until_command <= 0)
+        if len(due):
+            self._draw_commands(due)
         self._push(span)
         self.level = config.curriculum.level(self.steps)
         late = np.flatnonzero(timed_out)
@@ -217,10 +244,10 @@ class PupperEnv:
         if len(over):
             self._restart(over)
         observation, privileged = self.observe()
-        return StepResult(observation, privileged, reward, done, timed_out, terms, terminal, what)
+        return StepResult(observation, privileged, reward, done, timed_out, terms, terminal, facts)
 
     def set_command(self, command: NDArray[np.floating]) -> None:
-        """Tell all robots what to do, shape (3,) or (n, 3), until the end of their episodes."""
+        """Give all robots a command, shape (3,) or (n, 3), until the end of their episodes."""
         self.command[:] = command
         self._until_command[:] = np.inf
 
@@ -248,9 +275,7 @@ class PupperEnv:
         for name in _ARRAYS:
             getattr(self, name)[:] = state[name]
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
-        own, readings = json.loads(state["rng"])
-        self.rng.bit_generator.state = own
-        self._readings.rng_state = readings
+        self.rng.bit_generator.state, self._readings.rng_state = json.loads(state["rng"])
         self.level = self.config.curriculum.level(self.steps)
 
     # ------------------------------------------------------------------------- one step
@@ -278,7 +303,7 @@ class PupperEnv:
         now = np.column_stack([velocity[:, :2], robots.rate[:, 2]])
         share = self.config.control_step_s / _STRIDE_S
         self._average = self._average + share * (now - self._average)
-        # copies: whoever ends its episode in this step is moved before anyone looks
+        # copies: robots whose episode ends in this step are moved before the facts are read
         return walking_rewards.Step(
             self.command.copy(), velocity, robots.rate.copy(), robots.gravity,
             robots.joints - self.default, robots.joint_velocity.copy(),
@@ -287,16 +312,6 @@ class PupperEnv:
             self._air.copy(), self._contact.copy(), self._last_air.copy(),
             self._last_contact.copy(), height, speed, self._average.copy(),
         )  # fmt: skip
-
-    def _outside(self) -> NDArray[np.bool_]:
-        away = np.abs(self.robots.qpos[:, :2]).max(axis=1)
-        return away > self.ground.half_size_m - _EDGE_M
-
-    def _tell(self, span: float) -> None:
-        self._until_command -= span
-        due = np.flatnonzero(self._until_command <= 0)
-        if len(due):
-            self._draw_commands(due)
 
     def _push(self, span: float) -> None:
         most = self.config.randomisation.push_m_s
@@ -349,28 +364,6 @@ class PupperEnv:
 
     # ------------------------------------------------------------------------- what is seen
 
-    def _observation(self) -> NDArray[np.float32]:
-        config, n = self.config.observation, self.environments
-        speed = self.robots.velocity if config.base_velocity == "true" else np.zeros((n, 3))
-        span = VELOCITY_STEPS * self.config.control_step_s
-        parts = [
-            speed,
-            self.robots.rate,
-            self.robots.gravity,
-            self.command,
-            self._seen[:, 0] - self.default,
-            (self._seen[:, 0] - self._seen[:, -1]) / span,
-            self._readings.load,
-            self.action,
-        ]
-        whole = np.concatenate(parts, axis=1, dtype=np.float32)
-        if config.noise:
-            noise = self.rng.random(whole.shape, np.float32)
-            noise *= 2
-            noise -= 1
-            whole += noise * (_NOISE if config.base_velocity == "true" else _NOISE_BLIND)
-        return whole
-
     def _privileged(self) -> NDArray[np.float32]:
         """The truth: what a critic in the simulator may know."""
         robots = self.robots
@@ -398,12 +391,3 @@ class PupperEnv:
         """Share of delay, penalties and commands at a level of the curriculum."""
         easiest = self.config.curriculum.easiest
         return easiest + (1 - easiest) * level
-
-
-_NOISE = np.concatenate([np.full(size, half, np.float32) for _, size, half in OBSERVATION])
-_NOISE_BLIND = np.where(np.arange(OBSERVATION_SIZE) < 3, np.float32(0), _NOISE)
-_ARRAYS = (
-    "command", "episode_step", "action", "last_action", "earlier_action", "_until_command",
-    "_until_push", "_air", "_contact", "_last_air", "_last_contact", "_foot_at", "_seen",
-    "_average",
-)  # fmt: skip

@@ -335,12 +335,14 @@ def test_it_walks_on_a_line_of_feetech_servos():
         ServoBench(truth, layout, rng, keep_log=False, plant=robot), STS3215, rng
     )
     answers = []
-    goal, position = (STS3215.registers[name].address for name in ("goal", "position"))
+    goal, position = (
+        STS3215.registers[name].address for name in ("goal_position", "present_position")
+    )
     for k in range(150):
         now = k * PERIOD_S
         counts = layout.clip_counts(layout.to_counts(trot(now, FORWARD)))
         words = b"".join(
-            bytes([i]) + STS3215.encode("goal", int(c))
+            bytes([i]) + STS3215.encode("goal_position", int(c))
             for i, c in zip(layout.ids, counts, strict=True)
         )
         line.receive(Frame(BROADCAST_ID, SYNC_WRITE, bytes([goal, 2]) + words).encode(), now)

@@ -1,0 +1,64 @@
+"""What a policy of the walking task sees: 60 numbers, their order and their noise.
+
+The order, the sizes and the noise are those of the published task. Nothing here needs MuJoCo, so
+that policies can be loaded, exported and deployed without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sim.walking.config import Observation
+
+OBSERVATION = (
+    ("base_linear_velocity", 3, 0.1),
+    ("base_angular_velocity", 3, 0.2),
+    ("projected_gravity", 3, 0.05),
+    ("command", 3, 0.0),
+    ("joint_position_relative", 12, 0.01),
+    ("joint_velocity", 12, 1.5),
+    ("joint_effort", 12, 0.1),
+    ("last_action", 12, 0.0),
+)
+"""Name, size and half width of the published uniform noise of each part of an observation."""
+OBSERVATION_SIZE = sum(size for _, size, _ in OBSERVATION)
+_ENDS = np.cumsum([size for _, size, _ in OBSERVATION])
+OBSERVATION_PARTS = {
+    name: slice(int(end) - size, int(end))
+    for (name, size, _), end in zip(OBSERVATION, _ENDS, strict=True)
+}
+"""Where each part of an observation is."""
+_NOISE = np.concatenate([np.full(size, half, np.float32) for _, size, half in OBSERVATION])
+_NOISE_BLIND = np.where(np.arange(OBSERVATION_SIZE) < 3, np.float32(0), _NOISE)
+
+FALLEN_TILT = 0.6
+"""Cosine of the tilt from which a robot has fallen: 53 degrees."""
+
+VELOCITY_STEPS = 4
+"""Joint velocity is the difference of readings this many control steps apart: polls are too rare
+for less."""
+
+
+def observed(
+    config: Observation, parts: Sequence[NDArray[np.floating]], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Observations of n robots, shape (n, 60), with noise if it is on.
+
+    Parameters
+    ----------
+    config : Observation
+    parts : sequence of ndarray
+        True values in the order of `OBSERVATION`, each of shape (n, size of the part).
+    rng : numpy.random.Generator
+        Draws the noise.
+    """
+    whole = np.concatenate(parts, axis=1, dtype=np.float32)
+    if config.noise:
+        noise = rng.random(whole.shape, np.float32)
+        noise *= 2
+        noise -= 1
+        whole += noise * (_NOISE if config.base_velocity == "true" else _NOISE_BLIND)
+    return whole
