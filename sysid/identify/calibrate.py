@@ -18,7 +18,7 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.joints import JOINT_NAMES, in_order
@@ -298,7 +298,7 @@ def _result(
     # soft-L1 works in units of the noise; its covariance is for residuals of that size
     inflation = integrated_autocorrelation_time(residual) * max(1.0, rms(residual) ** 2 / noise**2)
     sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
-    z = norm.ppf((1 + LEVEL) / 2)
+    z = ndtri((1 + LEVEL) / 2)
     speed = max(_command_speed(d) for d in data)
     values, intervals, undecided = {}, {}, {}
     for j, p in enumerate(model.parameters):

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
-from scipy.stats import qmc
 
 from pupper_sysid.servo_models.delay_line import fractional_shift
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
@@ -357,6 +356,8 @@ def global_starts(
     ndarray, shape (problems, keep, parameters)
     """
     par = rung.parameters
+    from scipy.stats import qmc  # half a second to import
+
     unit = qmc.Sobol(len(par), rng=rng).random(candidates)
     columns = []
     for p, u in zip(par, unit.T, strict=True):

@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.special import gammaincinv, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
@@ -228,7 +228,8 @@ def dead_time_profile(
     """
     everything = Problem(data, (True,) * len(data), noise, {})
     residual = fresh_residuals(model, best.values, data)
-    threshold = 0.5 * float(chi2.ppf(LEVEL, 1)) * integrated_autocorrelation_time(residual)
+    # half of the quantile of chi² with one degree of freedom
+    threshold = float(gammaincinv(0.5, LEVEL)) * integrated_autocorrelation_time(residual)
     fits, lowest, delays = [best], best, np.array([best.values[0]])
     for _ in range(3):
         centre = best.values[0]
@@ -247,7 +248,7 @@ def dead_time_profile(
         best = min(*fit(model, [everything], lowest.values[None], 25), best, key=lambda f: f.cost)
     cost = np.array([f.cost for f in fits]) - min(best.cost, lowest.cost)
     low, high = _crossings(delays, cost, best.values[0], threshold)
-    centre, grain = float(best.values[0]), norm.ppf(0.5 + LEVEL / 2) * STEPPING_SD_S
+    centre, grain = float(best.values[0]), ndtri(0.5 + LEVEL / 2) * STEPPING_SD_S
     ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
     return Interval(centre, max(float(ends[0]), 0.0), float(ends[1])), best
 

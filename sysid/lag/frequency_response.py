@@ -19,9 +19,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -33,6 +32,9 @@ from pupper_sysid.sysid.lag.lag_budget import tone_lags
 from pupper_sysid.sysid.lag.multisine import multisine_responses
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
+
+if TYPE_CHECKING:
+    import control
 
 _DRAWS = 60  # refits behind the intervals of the transfer functions
 _STARTS = 4
@@ -74,6 +76,8 @@ class TransferFunction:
 
     def rational(self) -> control.TransferFunction:
         """The part without the delay, for python-control."""
+        import control  # brings pyplot, a second to import
+
         v = self.values()
         if self.name == "FOPDT":
             return control.TransferFunction([v[0]], [v[2], 1.0])
@@ -127,6 +131,8 @@ class FrequencyResponse:
 
     def frd(self) -> control.FrequencyResponseData:
         """The measurement as python-control holds it, over rad/s."""
+        import control
+
         return control.frd(self.response, 2 * np.pi * self.frequency_hz)
 
     def bandwidth_text(self) -> str:

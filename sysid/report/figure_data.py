@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
@@ -179,7 +179,7 @@ def response_errors(response: FrequencyResponse) -> tuple[NDArray, NDArray]:
     for direction in (along, 1j * along):
         u = np.stack([direction.real, direction.imag], axis=-1)
         sd.append(np.sqrt(np.einsum("ni,nij,nj->n", u, response.covariance, u)))
-    relative = norm.ppf((1 + LEVEL) / 2) * np.array(sd) / np.abs(response.response)
+    relative = ndtri((1 + LEVEL) / 2) * np.array(sd) / np.abs(response.response)
     return 20 / np.log(10) * relative[0], np.degrees(relative[1])
 
 
