@@ -1,12 +1,11 @@
-"""What every servo bus can do, real or emulated, and all that the recorder knows of one.
+"""Interface of a servo bus, real or emulated.
 
-A bus owns its clock. A real bus uses the host's monotonic clock; an emulated one may live in
-virtual time, where `sleep_until` costs nothing. All times are seconds of that clock; all arrays
-are over `joint_names`, in that order; all angles are radians of the simulator frame, absolute.
+A bus owns its clock. A real bus uses the host's monotonic clock; an emulated one may run in virtual
+time, where `sleep_until` costs nothing. All times are seconds of that clock; all arrays are over
+`joint_names`, in that order; all angles are radians of the simulator frame, absolute.
 
-A bus that has trouble says so in what it returns, not by raising: a reading that did not come is
-missing (NaN), a command that could not be sent has no send time (NaN). `hardware.safety.guard`
-decides when trouble has lasted too long.
+Faults of a bus are returned, not raised: a missing reading is NaN, and so is the send time of a
+command that could not be sent. `hardware.safety.guard` stops the robot when a fault lasts.
 """
 
 from __future__ import annotations
@@ -17,12 +16,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.safety.limits import PositionLimits
 
 
 @dataclass(frozen=True)
 class BusSample:
-    """One reading of all joints, as the host received it: possibly old, and not saying so.
+    """One reading of all joints, as the host received it; it may be stale.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class BusSample:
     voltage_v, temperature_c, load : ndarray, shape (joints,), or None
         Where the bus has them; load is a fraction of full duty, signed.
     status : ndarray of int, shape (joints,), or None
-        Error bits that the servo reported with the reading (`feetech_registers.ERROR_BITS`).
+        Error bits of the servo (`hardware.feetech.registers.ERROR_BITS`).
     """
 
     time_s: NDArray[np.float64]
@@ -49,14 +49,14 @@ class BusSample:
 
 @dataclass(frozen=True)
 class Sent:
-    """What went out with one `write`.
+    """What one `write` sent.
 
     Attributes
     ----------
     time_s : float
-        Host time of sending [s]; NaN if it could not be sent, and the servos keep the last goal.
+        Host time of sending [s]; NaN if it failed, and the servos keep the last command.
     position_rad : ndarray, shape (joints,)
-        The goals after all limits, before the bus rounds them to counts.
+        The commands after all limits, before the bus rounds them to counts.
     """
 
     time_s: float
@@ -70,7 +70,7 @@ class ServoBus(Protocol):
     joint_names: tuple[str, ...]
     limits: PositionLimits
     metadata: dict[str, Any]
-    """What a reader of a recording should know of this bus: kind, model, quantum, truncation."""
+    """For the header of a recording: kind, model, quantisation step, rounding."""
 
     def now(self) -> float:
         """Time of the bus's clock [s]."""
@@ -81,7 +81,7 @@ class ServoBus(Protocol):
         ...
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
-        """Send goal positions, shape (joints,)."""
+        """Send commands, shape (joints,)."""
         ...
 
     def read(self) -> BusSample:
@@ -89,9 +89,23 @@ class ServoBus(Protocol):
         ...
 
     def torque(self, on: bool) -> bool:
-        """Switch all servos' torque on or off; whether every servo was told."""
+        """Switch the torque of all servos; whether it is confirmed for every servo."""
         ...
 
     def close(self) -> None:
         """Release the bus. May be called twice."""
         ...
+
+
+def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> NDArray[np.float64]:
+    """`position_rad` as an array of shape (joints,).
+
+    Raises
+    ------
+    BusError
+        If it has another shape, or a value is not finite.
+    """
+    angles = np.asarray(position_rad, float)
+    if angles.shape != (joints,) or not np.isfinite(angles).all():
+        raise BusError(f"{bus}: commands must be {joints} finite angles, got {angles}.")
+    return angles

@@ -1,4 +1,4 @@
-"""The host's own clock, by which a bus of real servos lives."""
+"""The clock of a bus of real servos."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ class HostClock:
         self._start = time.monotonic()
 
     def now(self) -> float:
-        """Time [s]."""
+        """Time [s], from 0 at construction."""
         return self.at(time.monotonic())
 
     def at(self, monotonic_s: float) -> float:
-        """This clock's time of a reading of `time.monotonic()` [s]; NaN of NaN."""
+        """Time of this clock at a time of `time.monotonic()` [s]; NaN for NaN."""
         return round(monotonic_s - self._start, 6)
 
     def sleep_until(self, time_s: float) -> None:
-        """Sleep until `time_s`."""
+        """Sleep until `now()` has reached `time_s`."""
         while (left := time_s - self.now()) > 0:
             time.sleep(left)

@@ -1,4 +1,4 @@
-"""The IMU of the robot: what its chip says, in the trunk's axes and in SI units.
+"""The IMU of the robot: the chip's readings in the trunk's axes and in SI units.
 
 The trunk's axes are x forward, y left, z up. The Mini Pupper 2's chip, a QMI8658C, is mounted
 upside down and with x and y exchanged (vendor's ROS driver, `imu_interface.py`): its z points down,
@@ -6,9 +6,9 @@ its x to the left and its y forward, so
 
     x = y_chip,  y = x_chip,  z = -z_chip
 
-for both of its sensors, which is a rotation and its own inverse. The accelerometer measures the
-*specific force*, acceleration minus gravity: standing still it points up with 9.81 m/s², which the
-chip reports as about -1 g on its z. It ends at ±2 g, and walking gets there.
+for both of its sensors (a rotation, and its own inverse). The accelerometer measures the *specific
+force*, acceleration minus gravity: at rest it points up with 9.81 m/s², which the chip reports as
+about -1 g on its z. Its range is ±2 g, which walking exceeds.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class ImuSample:
     Attributes
     ----------
     time_s : float
-        When it was read, on the clock of the bus that read it [s].
+        Time of the read on the clock of the bus [s].
     rate_rad_s : ndarray, shape (3,)
         Angular velocity: rolling to the right, nose going down, turning to the left [rad/s].
     acceleration_m_s2 : ndarray, shape (3,)
         Specific force; (0, 0, 9.81) while standing level.
     clipped : bool
-        Whether a number is at the end of its range, so that the truth may lie beyond it.
+        Whether a value is at the end of its range and may be larger in truth.
     """
 
     time_s: float
@@ -55,7 +55,7 @@ class ImuSample:
 
 @runtime_checkable
 class Imu(Protocol):
-    """Whatever has an IMU: a bus, real or emulated."""
+    """A bus with an IMU, real or emulated."""
 
     def imu(self) -> ImuSample | None:
         """The latest reading; None if there is none."""
@@ -63,7 +63,7 @@ class Imu(Protocol):
 
 
 def from_chip(time_s: float, raw: NDArray[np.float64]) -> ImuSample | None:
-    """The sample behind the chip's six numbers.
+    """Sample from the chip's six numbers.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def from_chip(time_s: float, raw: NDArray[np.float64]) -> ImuSample | None:
     Returns
     -------
     ImuSample or None
-        None if all six are 0: so the firmware reports a read that failed.
+        None if all six are 0, which is how the firmware reports a failed read.
 
     Examples
     --------
@@ -91,12 +91,12 @@ def from_chip(time_s: float, raw: NDArray[np.float64]) -> ImuSample | None:
 
 
 def to_chip(sample: ImuSample) -> NDArray[np.float64]:
-    """The chip's six numbers behind a sample, shape (6,): the inverse of `from_chip`."""
+    """The chip's six numbers of a sample, shape (6,): the inverse of `from_chip`."""
     acceleration = _TRUNK_FROM_CHIP.T @ sample.acceleration_m_s2 / GRAVITY_M_S2
     rate = np.degrees(_TRUNK_FROM_CHIP.T @ sample.rate_rad_s)
     return np.concatenate([acceleration, rate])
 
 
 def as_words(raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the chip's 16-bit words leave of six true numbers [g, °/s], shape (6,)."""
+    """Six true numbers [g, °/s], shape (6,), quantised to the chip's 16-bit words."""
     return np.clip(np.rint(raw / _QUANTA), _LOWEST, _HIGHEST) * _QUANTA

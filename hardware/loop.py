@@ -1,12 +1,11 @@
-"""A control loop at a fixed rate that does not drift, and the account of how well it kept it.
+"""A control loop at a fixed rate that does not drift, with statistics of its timing.
 
     loop = FixedRateLoop(bus, period_s=0.02)
     for elapsed_s in loop.ticks(duration_s=5.0):
         ...
 
-Tick `k` is due `k` periods after the start, whatever happened before; a tick that cannot start in
-time is left out and counted. `real_time_priority` asks the system to run this process first, and
-says in words whether it does.
+Tick `k` is due `k` periods after the start; a tick that cannot start in time is left out and
+counted. `real_time_priority` asks the system to run this process first.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from pupper_sysid.common.durations import Durations
 from pupper_sysid.common.errors import InputError, SafetyStop
 
 MOST_MISSES_IN_A_ROW = 10
-"""After so many ticks in a row without a timely one, nobody is in control of the robot."""
+"""So many missed deadlines in a row mean that the robot is out of control."""
 
 
 class Timed(Protocol):
-    """What a loop needs of a bus."""
+    """A clock that a loop can wait for."""
 
     def now(self) -> float:
         """Time [s]."""
@@ -45,14 +44,14 @@ class FixedRateLoop:
     Attributes
     ----------
     timed : Timed
-        Whose clock counts.
     period_s : float
-        The rate that is asked for.
+    most_misses : int
+        Missed deadlines in a row after which the loop stops.
     ticks_done : int
     missed_deadlines : int
         Ticks left out because the one before took too long.
     periods, jitter : Durations
-        From one tick to the next, and how far that was from `period_s`.
+        Time from one tick to the next, and its distance from `period_s`.
     """
 
     timed: Timed
@@ -93,33 +92,32 @@ class FixedRateLoop:
             if late >= self.most_misses:
                 raise SafetyStop(
                     f"the loop missed {late} deadlines of {1e3 * self.period_s:.1f} ms in a row: "
-                    "this host is too slow or too busy to be in control. Stop other programs, or "
-                    "choose a lower --rate."
+                    "this host is too slow or too busy. Stop other programs, or use a lower rate."
                 )
             tick = max(tick + 1, due)
 
     def summary(self) -> dict[str, float]:
-        """Numbers for the recording's footer, in seconds."""
-        counts = {"ticks": self.ticks_done, "missed_deadlines": self.missed_deadlines}
-        if not self.periods.count:
-            return {"period_s": self.period_s} | counts
-        return (
-            {"period_s": self.period_s}
-            | counts
-            | {
+        """Statistics for the recording's footer."""
+        found = {
+            "period_s": self.period_s,
+            "ticks": self.ticks_done,
+            "missed_deadlines": self.missed_deadlines,
+        }
+        if self.periods.count:
+            found |= {
                 "mean_period_s": round(self.periods.mean_s, 7),
                 "sd_period_s": round(self.periods.sd_s, 7),
                 "longest_period_s": round(self.periods.largest_s, 7),
                 "jitter_p99_s": round(self.jitter.quantile(0.99), 7),
             }
-        )
+        return found
 
 
 @contextmanager
 def real_time_priority() -> Iterator[str]:
-    """Real-time scheduling of this process for as long as the block; yields what came of it.
+    """Real-time scheduling of this process during the block; yields the result in words.
 
-    Processes that it starts are scheduled normally: a busy one would starve the whole machine.
+    Child processes are scheduled normally: a busy one would starve the whole machine.
     """
     if not hasattr(os, "sched_setscheduler"):
         yield "normal priority: this system has no real-time scheduling"

@@ -1,4 +1,4 @@
-"""Where a robot is at the start, and gentle ways from pose to pose."""
+"""Gentle motions between poses, and the pose at the start."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.loop import FixedRateLoop
 
 GENTLE_RAD_S = 1.0
-"""Highest speed of a joint on the way."""
+"""Highest speed of a joint in a gentle motion."""
 
 _FIRST_READING_S = 2.0
 
 
 def raised_cosine(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """From 0 to 1, starting and ending at rest, for a share of the way's time."""
+    """Ramp from 0 to 1 over `share` 0 to 1 of a motion's time, at rest at both ends."""
     return 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
 
 
 def first_pose(bus: ServoBus, period_s: float) -> NDArray[np.float64]:
-    """Where the robot is, shape (joints,) [rad]; waits a little for the first polls.
+    """Pose of the robot, shape (joints,) [rad]; waits up to 2 s for the first readings.
 
     Raises
     ------
     BusError
-        If a joint does not say.
+        If a joint returns no position.
     """
     until = bus.now() + _FIRST_READING_S
     pose = np.full(len(bus.joint_names), np.nan)
@@ -53,15 +53,16 @@ def glide(
     goal: NDArray[np.float64],
     least_s: float,
 ) -> None:
-    """Go from `origin` to `goal` [rad] on a raised cosine, in `least_s` or longer.
+    """Move from `origin` to `goal` [rad], shape (joints,), on a raised cosine.
 
     Parameters
     ----------
     loop : FixedRateLoop
     send : callable
-        Is given the pose of each tick.
+        Called with the pose of each tick.
     origin, goal : ndarray, shape (joints,)
     least_s : float
+        Shortest duration; longer if `GENTLE_RAD_S` asks for it.
     """
     way = goal - origin
     farthest = float(np.max(np.abs(way)))

@@ -1,12 +1,12 @@
 """A `ServoBus` through the Mini Pupper 2's own proxy: `esp32-proxy`, a socket on the robot.
 
-The proxy shares one block of memory among all who connect: the last writer wins, nothing watches
-over a client that died, and the feedback in it was polled some 20 to 100 ms ago without saying so.
-Hence: one owner at a time (a lock file beside the socket), a time-out on every exchange, a new
-connection after anything unexpected, and every position read twice, because the datagrams have no
-checksum. Old readings are passed on as they come; `sysid` finds out how old they are.
+The proxy shares one block of memory among all its clients: the last writer wins, a client that died
+goes unnoticed, and the feedback is 20 to 100 ms old without a time stamp. Hence one owner at a time
+(a lock file beside the socket), a time-out on every exchange, a new connection after anything
+unexpected, and every position read twice, because the datagrams have no checksum. Stale readings
+are passed on as they come; `sysid` estimates their feedback age.
 
-The counts are those of the firmware's stored calibration, not raw ones.
+Counts are those of the firmware's stored calibration, not raw ones.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import SOCKET
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.imu import ImuSample, from_chip
@@ -33,13 +33,13 @@ from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 
 TIMEOUT_S = 0.03
 VOLTAGE_BAND_V = (4.2, 8.7)
-"""Below, the firmware soon cuts the servos off for good; above, no pack of this robot goes."""
+"""Below, the firmware soon switches the servos off for good; no pack of this robot exceeds it."""
 SPEED_LIMIT_RAD_S = 7.5
 
 _POWER_EVERY_S = 0.5
 _RECONNECT_S = 0.01
 _LARGEST_REPLY = 64
-_MOST_STALE = 16
+_MOST_OLD_REPLIES = 16
 _SAME_READINGS = 3
 _TORQUE_TRIES = 5
 _ANY_COUNT = 512
@@ -47,7 +47,7 @@ _ANY_COUNT = 512
 Answer = TypeVar("Answer")
 
 
-class Esp32Bus:
+class Esp32Bus(HostClock):
     """The twelve servos behind the proxy.
 
     Parameters
@@ -55,7 +55,7 @@ class Esp32Bus:
     path : Path
         The proxy's socket.
     joint_map : JointMap, optional
-        Of the proxy's counts; by default the preset mini_pupper_2, in servo coordinates.
+        For the proxy's counts; by default the preset mini_pupper_2, in servo coordinates.
 
     Raises
     ------
@@ -68,11 +68,12 @@ class Esp32Bus:
     name = "esp32"
 
     def __init__(self, path: Path = SOCKET, joint_map: JointMap | None = None):
+        super().__init__()
         self.path = Path(path)
         self._map = joint_map or load_joint_map("mini_pupper_2").per_servo()
         if self._map.frame != "proxy":
             raise InputError(
-                f"the joint map {self._map.file.name} holds raw counts, and the proxy speaks "
+                f"the joint map {self._map.file.name} holds raw counts, and the proxy uses "
                 "calibrated ones. Make a map with `pupper-sysid calibrate-joints --bus esp32`."
             )
         if self._map.file.counts != datagrams.HIGHEST_COUNT + 1:
@@ -90,11 +91,10 @@ class Esp32Bus:
         self._owner = _own(self.path)
         self._socket: socket.socket | None = None
         self._retry_s = 0.0
-        self._clock = HostClock()
         self._power: datagrams.Power | None = None
         self._power_s = -np.inf
         self._on = np.ones(datagrams.SERVOS, bool)
-        self._goal = np.full(datagrams.SERVOS, datagrams.NO_COUNT)  # which cannot be sent
+        self._command = np.full(datagrams.SERVOS, datagrams.NO_COUNT)  # which cannot be sent
         self.joint_names = self._map.joint_names
         self.limits = self._map.position_limits()
         self.metadata: dict[str, Any] = {
@@ -107,30 +107,19 @@ class Esp32Bus:
         if not self._connected():
             self.close()
             raise BusError(
-                f"{self.path}: nobody answers there. On the robot, check `systemctl status "
+                f"{self.path}: no answer. On the robot, check `systemctl status "
                 "esp32-proxy`; without a robot, start one with `pupper-sysid emulate esp32`."
             )
 
-    def now(self) -> float:
-        """Time of the host's clock [s], from 0 at construction."""
-        return self._clock.now()
-
-    def sleep_until(self, time_s: float) -> None:
-        """Sleep until `now()` has reached `time_s`."""
-        self._clock.sleep_until(time_s)
-
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
-        """Send goals; the proxy's answer means that it has them, not that a servo does."""
-        goal = np.asarray(position_rad, float)
-        if goal.shape != (datagrams.SERVOS,) or not np.isfinite(goal).all():
-            raise BusError(f"{self.path}: goals must be 12 finite angles, got {goal}.")
-        counts = self._map.clip_counts(self._map.to_counts(goal))
-        self._goal[self._by_id] = counts
-        sent = time.monotonic()
-        return Sent(self._clock.at(sent) if self._send_goals() else float("nan"), goal)
+        """Send commands; the proxy's acknowledgement does not mean that a servo has them."""
+        command = finite_angles(position_rad, datagrams.SERVOS, str(self.path))
+        self._command[self._by_id] = self._map.clip_counts(self._map.to_counts(command))
+        sent_s = self.now()
+        return Sent(sent_s if self._send_command() else float("nan"), command)
 
     def read(self) -> BusSample:
-        """Whatever the proxy's block holds; NaN where it holds nothing yet or did not answer."""
+        """Contents of the proxy's block; NaN where it is empty or the proxy did not answer."""
         before = self.now()
         by_id = self._settled_counts()
         at = round((before + self.now()) / 2, 6)
@@ -150,9 +139,9 @@ class Esp32Bus:
         )
 
     def imu(self) -> ImuSample | None:
-        """The IMU, of at most some milliseconds ago; None if it or the proxy did not answer.
+        """Reading of the IMU, some milliseconds old; None if it or the proxy did not answer.
 
-        As with positions, an answer counts when another one agrees.
+        As with positions, an answer is valid when a second one agrees.
         """
         before = self.now()
         seen: list[list[float]] = []
@@ -166,26 +155,26 @@ class Esp32Bus:
         return None
 
     def torque(self, on: bool) -> bool:
-        """Hold the present pose, or let all servos go limp.
+        """Hold the present pose, or switch the torque off.
 
-        While a servo does not say where it is, nothing is sent: all goals go out together, and its
-        own would be a guess.
+        Nothing is sent while a position is missing: all commands go out together, and that servo's
+        would be a guess.
         """
         if on and not self._hold_present():
             return False
         self._on[:] = on
         for _ in range(_TORQUE_TRIES):
-            if self._send_goals():
+            if self._send_command():
                 return True
             time.sleep(_RECONNECT_S)
         return False
 
     def goals(self) -> NDArray[np.float64]:
-        """Unknown: the proxy does not tell what it was last told."""
+        """NaN: the proxy does not report its set-points."""
         return np.full(len(self.joint_names), np.nan)
 
     def close(self) -> None:
-        """Let go of the socket; the servos keep what they were told."""
+        """Release the socket; the servos keep their last command."""
         self._retry_s = float("inf")
         self._disconnect()
         if self._owner is not None:
@@ -193,13 +182,13 @@ class Esp32Bus:
             self._owner = None
 
     def _hold_present(self) -> bool:
-        """Make the present counts the goals; False if not all became known in time."""
+        """Make the present counts the command; False if not all became known in time."""
         present = np.full(datagrams.SERVOS, datagrams.NO_COUNT)
         for _ in range(_TORQUE_TRIES):
             counts = self._settled_counts()
             present = np.where(counts > 0, counts, present)
             if (present > 0).all():
-                self._goal = present
+                self._command = present
                 return True
             time.sleep(_RECONNECT_S)
         return False
@@ -220,10 +209,10 @@ class Esp32Bus:
             last = counts
         return settled
 
-    def _send_goals(self) -> bool:
-        # what stands beside a torque byte of 0 goes to no servo, but must be a count
-        goal = np.where(self._on | (self._goal > 0), self._goal, _ANY_COUNT)
-        request = datagrams.set_position(self._on, goal)
+    def _send_command(self) -> bool:
+        # with a torque byte of 0 the count is not used, but must be valid
+        counts = np.where(self._on | (self._command > 0), self._command, _ANY_COUNT)
+        request = datagrams.set_position(self._on, counts)
         acknowledged = self._exchange(request) == datagrams.ACKNOWLEDGED
         if not acknowledged:
             self._disconnect()
@@ -233,19 +222,19 @@ class Esp32Bus:
         reply = self._exchange(datagrams.request(opcode))
         parsed = None if reply is None else parse(reply)
         if parsed is None:
-            # what else it might still say belongs to no question of ours
+            # a further answer would belong to no request
             self._disconnect()
         return parsed
 
     def _exchange(self, request: bytes) -> bytes | None:
-        """One question, one answer; None if there was none in time."""
+        """Reply to one request; None if there was none in time."""
         if not self._connected():
             return None
         assert self._socket is not None
         reply = b""
         try:
-            # what is there already answers an earlier question
-            for _ in range(_MOST_STALE):
+            # what is there already answers an earlier request
+            for _ in range(_MOST_OLD_REPLIES):
                 if not select.select([self._socket], [], [], 0)[0]:
                     break
                 self._socket.recv(_LARGEST_REPLY)
@@ -259,7 +248,7 @@ class Esp32Bus:
         return reply
 
     def _connected(self) -> bool:
-        """Whether there is a connection; makes a new one if it is time to try."""
+        """Whether there is a connection; tries to make one."""
         if self._socket is not None:
             return True
         if time.monotonic() < self._retry_s:
@@ -276,34 +265,33 @@ class Esp32Bus:
         return True
 
     def _disconnect(self) -> None:
-        """Drop the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
 
 def _own(path: Path) -> int:
-    """Descriptor of the lock file beside the socket; held until closed, or until death."""
+    """Descriptor of the lock file beside the socket, locked until it is closed."""
     if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
         raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
     lock = path.with_name(path.name + ".lock")
     try:
         try:
-            # reading is enough to lock it, so that one which root has left keeps nobody out
+            # reading is enough to lock it, also a file that root has left
             descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError:
             descriptor = os.open(lock, os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
     except OSError as error:
         advice = ""
         if lock.exists():
-            advice = f" Run this as its owner, or, while nobody drives the robot, `sudo rm {lock}`."
+            advice = f" Run this as its owner, or, while no program drives it, `sudo rm {lock}`."
         raise BusError(f"{lock} cannot be opened: {error.strerror}.{advice}") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(descriptor)
         raise BusError(
-            f"{path}: another pupper-sysid is driving this robot. Stop it first; the servos obey "
-            "the last writer, so there must be only one."
+            f"{path}: another pupper-sysid is driving this robot. Stop it first: servos execute "
+            "whichever command arrived last, so only one program may command them."
         ) from None
     return descriptor

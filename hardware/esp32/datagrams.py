@@ -1,8 +1,8 @@
 """Datagrams of the robot's proxy: one message each, little endian, `length, opcode, payload`.
 
-`AF_UNIX` datagrams have no checksum; what can be checked is checked here (length, opcode, range),
-and `hardware.esp32.bus` reads twice. Layouts are those of the vendor's proxy; servos stand in the
-order of their ids, 1 to 12.
+`AF_UNIX` datagrams have no checksum. Length, opcode and range are checked here;
+`hardware.esp32.bus` reads everything twice. Layouts are those of the vendor's proxy; servos are in
+the order of their ids, 1 to 12.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Power:
 
 
 def set_position(on: NDArray[np.bool_], counts: NDArray[np.int64]) -> bytes:
-    """Request to drive the servos, in order of id, to `counts`, or to let them go limp.
+    """Request to drive the servos, in order of id, to `counts`, or to switch their torque off.
 
     Raises
     ------
@@ -58,21 +58,21 @@ def set_position(on: NDArray[np.bool_], counts: NDArray[np.int64]) -> bytes:
         raise ValueError(f"set_position: {len(on)} and {len(counts)} values instead of {SERVOS}.")
     if np.min(counts) < 0 or np.max(counts) > HIGHEST_COUNT:
         raise ValueError(f"set_position: counts {list(counts)} leave 0..{HIGHEST_COUNT}.")
-    # only the two constants can stand here, so never the byte that stores a calibration
+    # one of two constants, so never the byte that stores a calibration
     torque = [TORQUE_ON if x else TORQUE_OFF for x in on]
     return _SET.pack(_SET.size, SET_POSITION, *torque, *(int(c) for c in counts))
 
 
 def request(opcode: int) -> bytes:
-    """Any of the requests that carry nothing."""
+    """A request without payload."""
     return bytes([2, opcode])
 
 
 def parse_counts(reply: bytes) -> NDArray[np.int64] | None:
-    """Counts by id, `NO_COUNT` where the servo has never answered; None if it is no such reply.
+    """Counts by id, `NO_COUNT` where there is no reading; None if `reply` is another message.
 
     The proxy starts with zeros and keeps a zero for a servo that never answers, so a zero is no
-    reading; neither is a count that no encoder has.
+    reading; neither is a count beyond the encoder.
     """
     if not _is(reply, GET_POSITION):
         return None
@@ -81,7 +81,7 @@ def parse_counts(reply: bytes) -> NDArray[np.int64] | None:
 
 
 def parse_load(reply: bytes) -> NDArray[np.float64] | None:
-    """Signed share of full duty by id; NaN where it is impossible; None if no such reply."""
+    """Signed fraction of full duty by id, NaN where impossible; None if another message."""
     if not _is(reply, GET_LOAD):
         return None
     load = np.array(_LOADS.unpack(reply)[2:], float) / 1000.0
@@ -89,18 +89,19 @@ def parse_load(reply: bytes) -> NDArray[np.float64] | None:
 
 
 def parse_imu(reply: bytes) -> NDArray[np.float64] | None:
-    """Acceleration [g] and rate [°/s] along the chip's axes, shape (6,); None if it is no such
-    reply or the numbers are beyond what the chip can say. Six zeros are a read that failed.
+    """Acceleration [g] and rate [°/s] along the chip's axes, shape (6,).
+
+    None if it is another message or a number is beyond the chip's range. Six zeros are a failed
+    read.
     """
     if not _is(reply, GET_IMU):
         return None
     raw = np.array(_IMU.unpack(reply)[2:], float)
-    # NaN is beyond everything
-    return raw if np.all(np.abs(raw) <= _IMU_FULL_SCALE) else None
+    return raw if np.all(np.abs(raw) <= _IMU_FULL_SCALE) else None  # refuses NaN, too
 
 
 def parse_power(reply: bytes) -> Power | None:
-    """Voltage and current; None if it is no such reply or the numbers are none."""
+    """Voltage and current; None if it is another message or a number is impossible."""
     if not _is(reply, GET_POWER):
         return None
     volts, amperes = _POWER.unpack(reply)[2:]

@@ -1,11 +1,11 @@
 """Frames of the Feetech bus: `FF FF ID LEN X ... CHK`, found in a stream that may hold anything.
 
 Instruction and status frames have one layout; `X` is the instruction or the error byte, `LEN`
-counts it, the parameters and the checksum, which is the inverted sum of all from ID on.
+counts it, the parameters and the checksum, which is the inverted sum of all bytes from ID on.
 
-`FrameReader` is the only parser: the bus reads replies with it, the emulator reads requests. A
-frame that is not whole, or whose checksum is wrong, costs its first byte and the search goes on
-behind it, so that garbage before, between or around frames is skipped.
+`FrameReader` is the only parser: the bus reads replies with it, the emulator reads requests. Where
+a frame is incomplete or its checksum wrong, its first byte is dropped and the search goes on, so
+garbage before, between or around frames is skipped.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _HIGHEST_LENGTH = 252
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame whose checksum was right.
+    """A frame with a correct checksum.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Frame:
 
 
 def checksum(body: bytes | bytearray) -> int:
-    """Of all bytes from ID to the last parameter."""
+    """Checksum of the bytes from ID to the last parameter."""
     return ~sum(body) & 0xFF
 
 
@@ -58,7 +58,7 @@ class FrameReader:
     Parameters
     ----------
     plausible : callable
-        `(id, length byte) -> bool`: which frames can come at all. Garbage that claims to be a
+        `(id, length byte) -> bool`: frames that can occur. Garbage that looks like the start of a
         long frame would otherwise hide the true ones behind it.
     """
 
@@ -66,10 +66,10 @@ class FrameReader:
         self._plausible = plausible
         self._buffer = bytearray()
         self.rejected_bytes = 0
-        """Bytes that belonged to no good frame."""
+        """Bytes outside valid frames."""
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Frames that are complete now."""
+        """Frames completed by `data`."""
         self._buffer += data
         found: list[Frame] = []
         buffer, start, end = self._buffer, 0, len(self._buffer)

@@ -1,17 +1,16 @@
-"""A serial line with Feetech servos: requests go out through the vendor's SDK, replies come to us.
+"""A serial line of Feetech servos: the vendor's SDK sends the requests, replies are read here.
 
-The SDK (`scservo_sdk`) builds and sends every frame. Its port and its receiver are replaced, for
-reasons that were measured on version 1.0.0: it keeps byte order in a module global, waits 34 ms
-for a servo that is not there, takes a late reply for the answer to the next question, does not
-check a reply's length, lets one silent servo swallow the others' replies in a group read, stays
-"busy" after an error, takes an adapter's echo for an answer, spins while it waits, and lets two
-programs open one port. Here
+The SDK (`scservo_sdk`) builds and sends every frame. Its port and its receiver are replaced for
+faults that were measured on version 1.0.0: it keeps byte order in a module global, waits 34 ms for
+a missing servo, takes a late reply for the answer to the next request, does not check a reply's
+length, loses the replies of a group read after one silent servo, stays "busy" after an error, takes
+an adapter's echo for a reply, spins while it waits, and lets two programs open one port. Here
 
-* every exchange has its own deadline, and ends as soon as all who were asked have answered;
-* what arrived before the question is thrown away, and an answer must have the asked length and
-  come from one who was asked; two different answers from one servo count as none;
-* an adapter that echoes is recognised when the port is opened, and its echo is taken out;
-* trouble with the port (unplugged) closes it; the next exchange tries to open it again.
+* every exchange has its own deadline, and ends as soon as all addressed servos have answered;
+* bytes that arrived before the request are discarded; a reply must have the requested length and
+  come from an addressed servo; two different replies of one servo count as none;
+* an adapter that echoes is detected when the port is opened, and its echo is removed;
+* an error of the port (unplugged) closes it; the next exchange tries to open it again.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.registers import (
     BROADCAST_ID,
+    MODEL_ADDRESS,
     PING,
     SERIES,
     Series,
@@ -43,29 +43,28 @@ except ImportError:  # Windows
 PORT_ERRORS = (OSError, serial.SerialException, _TermiosError)
 
 REPLY_TIMEOUT_S = 0.003
-"""Patience beyond the time that bytes and servos need: the host's own delays."""
+"""Allowance for the host's own delays, beyond the time that bytes and servos need."""
 
 RETURN_DELAY_S = 0.00051
-"""Longest that a servo may be set to wait before it answers (254 units of 2 µs)."""
+"""Longest return delay of a servo (254 units of 2 µs)."""
 
 FRAME_BYTES = 6
-"""Of an answer, beside its data."""
+"""Length of a reply without its data."""
 
 _POLL_S = 0.001
 _REOPEN_S = 0.01
-_MODEL = 3
 _ATTEMPTS = 4
 
 
 @dataclass(frozen=True)
 class Reply:
-    """A servo's answer.
+    """Reply of a servo.
 
     Attributes
     ----------
     frame : Frame
     before_s, after_s : float
-        `time.monotonic()` around the part of the exchange that was its own.
+        `time.monotonic()` around its own part of the exchange.
     """
 
     frame: Frame
@@ -99,7 +98,7 @@ class FeetechLine:
             self._port.openPort()
         except PORT_ERRORS as error:
             raise BusError(_cannot_open(device, error)) from error
-        # a USB adapter that collects bytes for 16 ms must be waited for
+        # a USB adapter may collect bytes for 16 ms
         self.patience_s += _latency_s(device)
 
     def ping(self, servo: int) -> Frame | None:
@@ -110,13 +109,13 @@ class FeetechLine:
         return reply.frame if reply else None
 
     def read(self, servo: int, address: int, size: int) -> Reply | None:
-        """`size` bytes of the memory of `servo`, or None if they did not come whole."""
+        """`size` bytes of the memory of `servo`, or None if they did not come complete."""
         return self._exchange(
             lambda: self._packets.readTx(self._port, servo, address, size), [servo], 8, size
         ).get(servo)
 
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
-        """The same bytes of several servos with one question (not on the SCS series)."""
+        """The same bytes of several servos with one request (not on the SCS series)."""
         ids = list(servos)
         return self._exchange(
             lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids)),
@@ -132,9 +131,17 @@ class FeetechLine:
         return servo in sent
 
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
-        """Write to several servos at once, unacknowledged; time of sending, NaN if not sent.
+        """Write to several servos at once, unacknowledged.
 
-        All values must have the same length.
+        Returns
+        -------
+        float
+            `time.monotonic()` of sending; NaN if it failed.
+
+        Raises
+        ------
+        ValueError
+            If the values differ in length.
         """
         sizes = {len(v) for v in values.values()}
         if len(sizes) != 1:
@@ -142,28 +149,28 @@ class FeetechLine:
         size = sizes.pop()
         params = [byte for servo, value in values.items() for byte in (servo, *value)]
         before = time.monotonic()
-        ok = self._guarded(
+        ok = self._sent(
             lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
         )
-        # the port takes the bytes at once; the wire does not
+        # the port accepts the bytes at once; the wire takes longer
         self._busy_s = before + len(self._port.sent) * self._byte_s()
-        if ok and self.echoes:  # or the echo would come between the next question and its answer
+        if ok and self.echoes:  # or the echo would come between the next request and its reply
             self._arrived(len(self._port.sent))
         return before if ok else float("nan")
 
     def model(self, servo: int) -> int | Series | None:
-        """Series of `servo`; its model number (little endian) if unknown; None if silent."""
-        reply = self.read(servo, _MODEL, 2)
+        """Series of `servo`; its model number (little endian) if unknown; None if no reply."""
+        reply = self.read(servo, MODEL_ADDRESS, 2)
         if reply is None:
             return None
         raw = reply.frame.data
         return series_of_model_bytes(raw) or int.from_bytes(raw, "little")
 
     def detect_echo(self) -> bool:
-        """Whether the adapter sends our own bytes back; the port then strips them."""
+        """Whether the adapter echoes requests; the echo is removed from then on."""
         request = Frame(BROADCAST_ID - 1, PING, b"").encode()
         self.echoes = False
-        if not self._guarded(lambda: self._send_raw(request)):
+        if not self._sent(lambda: self._send_raw(request)):
             return False
         self.echoes = self._arrived(len(request)).startswith(request)
         return self.echoes
@@ -172,7 +179,7 @@ class FeetechLine:
         """Those of `servos` that answer, with their series or unknown model number."""
         found: dict[int, int | Series] = {}
         for servo in servos:
-            # a first frame can be lost to whatever was on the line before us
+            # a first frame can be lost to earlier bytes on the line
             for _ in range(_ATTEMPTS):
                 model = self.model(servo)
                 if model is not None:
@@ -189,8 +196,13 @@ class FeetechLine:
     def _byte_s(self) -> float:
         return 10.0 / self.baud
 
+    def _drop_port(self) -> None:
+        with contextlib.suppress(*PORT_ERRORS):
+            self._port.shut()
+        self._port.is_open = False
+
     def _arrived(self, count: int) -> bytes:
-        """Up to about `count` bytes, as far as they come in time."""
+        """About `count` bytes, as far as they arrive in time."""
         until, got = time.monotonic() + 2 * count * self._byte_s() + self.patience_s, b""
         with contextlib.suppress(*PORT_ERRORS):
             while len(got) < count and time.monotonic() < until:
@@ -202,8 +214,8 @@ class FeetechLine:
         self._port.writePort(packet)
         return 0
 
-    def _guarded(self, send: Callable[[], int]) -> bool:
-        """Send; True if it went out. Opens the port again if it was lost."""
+    def _sent(self, send: Callable[[], int]) -> bool:
+        """Send; whether that succeeded. Opens the port again if it was lost."""
         port = self._port
         try:
             if not port.is_open:
@@ -213,9 +225,7 @@ class FeetechLine:
                 port.openPort()
             return send() == 0
         except PORT_ERRORS:
-            with contextlib.suppress(*PORT_ERRORS):
-                port.shut()
-            port.is_open = False
+            self._drop_port()
             return False
         finally:
             port.is_using = False  # the SDK leaves it set after an error
@@ -223,9 +233,9 @@ class FeetechLine:
     def _exchange(
         self, send: Callable[[], int], servos: Sequence[int], asked: int, size: int
     ) -> dict[int, Reply]:
-        """Ask, and collect one answer of `size` parameter bytes from each of `servos`."""
+        """Send, and collect one reply of `size` parameter bytes from each of `servos`."""
         before = time.monotonic()
-        if not self._guarded(send):
+        if not self._sent(send):
             return {}
         wanted = set(servos)
         reader = FrameReader(lambda frame_id, length: frame_id in wanted and length == size + 2)
@@ -245,10 +255,8 @@ class FeetechLine:
                     if first[0] != frame:
                         contradicted.add(frame.id)
         except PORT_ERRORS:
-            with contextlib.suppress(*PORT_ERRORS):
-                self._port.shut()
-            self._port.is_open = False
-        # answers come in the order of asking, evenly; each arrival is blurred by the host's buffers
+            self._drop_port()
+        # replies come evenly, in the order of the request; the host's buffers blur each arrival
         begin = max(before, self._busy_s) + asked * self._byte_s()
         last = max((k for k, servo in enumerate(servos) if servo in found), default=0)
         after = max((arrived for _, arrived in found.values()), default=begin)
@@ -261,15 +269,15 @@ class FeetechLine:
 
 
 def _strip(data: bytes, owed: bytes) -> tuple[bytes, bytes]:
-    """Take the echo that is still owed off the front of `data`."""
+    """Remove the echo that is still expected from the front of `data`."""
     n = min(len(data), len(owed))
     if data[:n] == owed[:n]:
         return data[n:], owed[n:]
-    return data, b""  # not our echo: let the frames' checksums decide
+    return data, b""  # no echo: the checksums of the frames decide
 
 
 def _sdk() -> Any:
-    """The vendor's SDK, or a sentence about the one that took its place."""
+    """The vendor's SDK; refuses another package of the same module name."""
     try:
         import scservo_sdk
     except ImportError as error:
@@ -286,10 +294,10 @@ def _sdk() -> Any:
 
 
 def _sdk_port(device: str, baud: int) -> Any:
-    """An SDK port with what it lacks."""
+    """Port of the SDK, exclusive and without busy waiting."""
 
     class Port(_sdk().PortHandler):
-        """Exclusive, sleeps while it waits, forgets old bytes before it sends."""
+        """Exclusive; sleeps while it waits; discards old bytes before it sends."""
 
         def __init__(self) -> None:
             super().__init__(device)
@@ -301,7 +309,7 @@ def _sdk_port(device: str, baud: int) -> Any:
             self.ser = serial.Serial(
                 self.port_name, cflag_baud, timeout=_POLL_S, write_timeout=0.5, exclusive=True
             )
-            # a help where the adapter's driver has it; an emulated line and some adapters do not
+            # some adapters and an emulated line do not have it
             with contextlib.suppress(ValueError, NotImplementedError, *PORT_ERRORS):
                 self.ser.set_low_latency_mode(True)
             self.is_open = True
@@ -316,10 +324,10 @@ def _sdk_port(device: str, baud: int) -> Any:
             return self.ser.write(self.sent) or 0
 
         def setPacketTimeout(self, packet_length: int) -> None:
-            """Not used: each exchange of `FeetechLine` has its own deadline."""
+            """Without effect: each exchange of `FeetechLine` has its own deadline."""
 
         def read_some(self) -> bytes:
-            """What has arrived, or what arrives within a millisecond."""
+            """Bytes that have arrived, or arrive within a millisecond."""
             return self.ser.read(max(1, self.ser.in_waiting))
 
         def shut(self) -> None:
@@ -343,7 +351,7 @@ def _cannot_open(device: str, error: BaseException) -> str:
     if "permission denied" in text:
         hint = "You may not use it: add yourself to the group dialout and log in again."
     elif "exclusively" in text or "busy" in text or "resource temporarily" in text:
-        hint = "Another program has it open; stop that first, only one may drive the servos."
+        hint = "Another program has it open; stop that first, only one may command the servos."
     elif not Path(device).exists():
         hint = "There is no such device: check the cable and the name (ls /dev/tty*)."
     else:
@@ -352,7 +360,7 @@ def _cannot_open(device: str, error: BaseException) -> str:
 
 
 def _latency_s(device: str) -> float:
-    """For how long a USB adapter may keep bytes back, if the system tells."""
+    """Latency timer of a USB adapter; 0 if unknown."""
     timer = Path("/sys/class/tty") / Path(device).resolve().name / "device" / "latency_timer"
     try:
         return float(timer.read_text()) / 1e3

@@ -1,18 +1,15 @@
-"""Feetech servo series, by model number: what stands at which address, and in which byte order.
+"""Memory tables of the Feetech servo series, by model number: addresses, sizes and byte order.
 
-Two series that look alike differ where it hurts: address 48 locks the EEPROM of one and limits the
-torque of the other. So nothing is addressed before a servo has said its model number, which both
-series keep at address 3 in their own byte order.
+The series differ: address 48 locks the EEPROM of one and limits the torque of the other. So a
+servo's model number, at address 3 in both, is read before anything else.
 
 Sources: the vendor's memory tables (wiki and ST3215 sheet), the Mini Pupper's firmware, LeRobot's
-tables; facts that disagree are left out. Current is only told by the STS series.
+tables; entries on which they disagree are left out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import numpy as np
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST_ID = 0xFE
@@ -20,8 +17,8 @@ HIGHEST_ID = 253
 
 ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+"""By the value of the servo's baud register."""
 RETURN_DELAY_UNIT_S = 2e-6
-"""By the number in the servo's baud register."""
 
 MODEL_ADDRESS = 3
 _SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
@@ -29,14 +26,14 @@ _SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
 
 @dataclass(frozen=True)
 class Register:
-    """A value in a servo's memory.
+    """An entry of a memory table.
 
     Attributes
     ----------
     address, size : int
         Decimal address; 1 or 2 bytes.
     sign_bit : int or None
-        Bit that says "negative" of a value stored as sign and magnitude.
+        Sign bit of a value stored as sign and magnitude.
     """
 
     address: int
@@ -68,10 +65,10 @@ _COMMON = {
     "acceleration": Register(41),
     "goal_time": Register(44, 2),
     "goal_speed": Register(46, 2),
-    "speed": Register(58, 2, _SPEED_SIGN),
-    "load": Register(60, 2, _LOAD_SIGN),
-    "voltage": Register(62),
-    "temperature": Register(63),
+    "present_speed": Register(58, 2, _SPEED_SIGN),
+    "present_load": Register(60, 2, _LOAD_SIGN),
+    "present_voltage": Register(62),
+    "present_temperature": Register(63),
     "registered": Register(64),
     "status": Register(65),
     "moving": Register(66),
@@ -86,11 +83,11 @@ class Series:
     ----------
     name : str
     model : int
-        Model number that the servo reports.
+        Model number.
     big_endian : bool
         Byte order inside a two-byte register.
     counts : int
-        Of the whole range.
+        Of the encoder's whole range.
     has_sync_read : bool
     lock_address : int
     registers : dict of str to Register
@@ -105,11 +102,11 @@ class Series:
     registers: dict[str, Register]
 
     def word(self, value: int) -> bytes:
-        """Two bytes of a register, in this series' order; `value` must fit."""
+        """Two bytes of a register in this series' byte order; `value` must fit."""
         return int(value).to_bytes(2, "big" if self.big_endian else "little")
 
     def decode(self, name: str, memory: bytes, start: int = 0) -> int:
-        """Value of register `name` in `memory`, a copy of the servo's from address `start`."""
+        """Value of register `name` in `memory`, which starts at address `start`."""
         register = self.registers[name]
         at = register.address - start
         raw = memory[at : at + register.size]
@@ -119,12 +116,12 @@ class Series:
         return signed(value, register.sign_bit)
 
     def encode(self, name: str, value: int) -> bytes:
-        """Bytes of register `name`; the value must fit.
+        """Bytes of register `name`.
 
         Raises
         ------
         OverflowError
-            If it does not.
+            If the value does not fit.
         """
         register = self.registers[name]
         if value < 0 and register.sign_bit is not None:
@@ -133,7 +130,7 @@ class Series:
 
 
 def signed(value: int, sign_bit: int | None) -> int:
-    """Number of a sign-and-magnitude value.
+    """Value of a number stored as sign and magnitude.
 
     Examples
     --------
@@ -147,7 +144,7 @@ def signed(value: int, sign_bit: int | None) -> int:
 
 SCS0009 = Series(
     "SCS0009", 1284, True, 1024, False, 48,
-    _COMMON | {"goal": Register(42, 2), "position": Register(56, 2)},
+    _COMMON | {"goal_position": Register(42, 2), "present_position": Register(56, 2)},
 )  # fmt: skip
 STS3215 = Series(
     "STS3215", 777, False, 4096, True, 55,
@@ -155,9 +152,9 @@ STS3215 = Series(
     | {
         "homing_offset": Register(31, 2, _OFFSET_SIGN),
         "mode": Register(33),
-        "goal": Register(42, 2, 15),
+        "goal_position": Register(42, 2, 15),
         "torque_limit": Register(48, 2),
-        "position": Register(56, 2, 15),
+        "present_position": Register(56, 2, 15),
         "current": Register(69, 2, 15),
     },
 )  # fmt: skip
@@ -165,7 +162,7 @@ SERIES = {series.model: series for series in (SCS0009, STS3215)}
 
 
 def series_of_model_bytes(raw: bytes) -> Series | None:
-    """The series whose model number stands in `raw` (2 bytes) in its own byte order.
+    """Series with the model number `raw` (2 bytes, in its own byte order); None if unknown.
 
     Examples
     --------
@@ -174,14 +171,11 @@ def series_of_model_bytes(raw: bytes) -> Series | None:
     >>> series_of_model_bytes(bytes([0x05, 0x04])).name
     'SCS0009'
     """
-    for series in SERIES.values():
-        if raw == series.word(series.model):
-            return series
-    return None
+    return next((s for s in SERIES.values() if raw == s.word(s.model)), None)
 
 
 def error_words(status: int) -> str:
-    """The error bits of a status byte in words.
+    """Error bits of a status byte in words.
 
     Examples
     --------
@@ -189,5 +183,5 @@ def error_words(status: int) -> str:
     'voltage, overload'
     """
     named = [word for bit, word in ERROR_BITS.items() if status & bit]
-    rest = status & ~int(np.bitwise_or.reduce(list(ERROR_BITS)))
+    rest = status & ~sum(ERROR_BITS)
     return ", ".join([*named, *([f"unknown bits {rest:#04x}"] if rest else [])])

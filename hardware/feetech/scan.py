@@ -1,4 +1,4 @@
-"""Who is on a Feetech line: every id is asked once, and those who answer are read out."""
+"""Scan of a Feetech line: ping every id and read the servos that answer."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.feetech.bus import AUTO_BAUDS, VOLT_SCALE, memory_of
+from pupper_sysid.hardware.feetech.bus import AUTO_BAUDS, VOLT_SCALE, memory_of, rates_in_words
 from pupper_sysid.hardware.feetech.line import FeetechLine
 from pupper_sysid.hardware.feetech.registers import HIGHEST_ID, Series, error_words
 
 
 @dataclass(frozen=True)
 class ServoReport:
-    """What one servo says of itself; None where it is of an unknown model or did not say.
+    """State and settings of one servo; None where its model is unknown or a read failed.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class ServoReport:
     count : int or None
         Present position.
     limits : tuple of int or None
-        Angle limits in its EEPROM, counts.
+        Angle limits in its EEPROM [counts].
     gains : tuple of int or None
         P, D, I.
     return_delay_us : int or None
@@ -48,33 +48,43 @@ class ServoReport:
 def scan_line(
     device: str, baud: int | None, advance: Callable[[str], None] = lambda what: None
 ) -> tuple[int, list[ServoReport]]:
-    """The baud rate at which servos answer, and what they say.
+    """Servos on a line, and their baud rate.
+
+    Parameters
+    ----------
+    device : str
+    baud : int or None
+        None: the first of `AUTO_BAUDS` at which a servo answers.
+    advance : callable
+        Called with each rate tried, in words.
+
+    Returns
+    -------
+    baud : int
+    servos : list of ServoReport
 
     Raises
     ------
     BusError
-        If the port cannot be opened or nobody answers.
+        If the port cannot be opened or no servo answers.
     """
     for rate in (baud,) if baud else AUTO_BAUDS:
         advance(f"at {rate} baud")
         line = FeetechLine(device, rate)
         try:
             line.detect_echo()
-            answering = [i for i in range(HIGHEST_ID + 1) if line.ping(i) or _again(line, i)]
+            # a first frame can be lost: the ids that robots use are tried twice
+            answering = [
+                i for i in range(HIGHEST_ID + 1) if line.ping(i) or (i <= 12 and line.ping(i))
+            ]
             if answering:
                 return rate, [_report(line, i) for i in answering]
         finally:
             line.close()
-    rates = str(baud) if baud else ", ".join(map(str, AUTO_BAUDS))
     raise BusError(
-        f"{device}: nobody answers at {rates} baud. Check that the servos have power and the data "
-        "line is connected."
+        f"{device}: no servo answers at {rates_in_words(baud)} baud. Check that the servos have "
+        "power and the data line is connected."
     )
-
-
-def _again(line: FeetechLine, servo: int) -> bool:
-    """A second question for the ids that robots use: a first frame can be lost."""
-    return servo <= 12 and line.ping(servo) is not None
 
 
 def _report(line: FeetechLine, servo: int) -> ServoReport:
@@ -96,9 +106,9 @@ def _report(line: FeetechLine, servo: int) -> ServoReport:
         series.name,
         errors,
         f"{value('firmware_major')}.{value('firmware_minor')}",
-        round(value("voltage") * VOLT_SCALE, 1),
-        float(value("temperature")),
-        value("position"),
+        round(value("present_voltage") * VOLT_SCALE, 1),
+        float(value("present_temperature")),
+        value("present_position"),
         (value("min_angle"), value("max_angle")),
         (value("p"), value("d"), value("i")),
         2 * value("return_delay"),

@@ -109,7 +109,7 @@ class FeetechEmulator:
                 self._set(servo_id, name, value)
             memory[series.lock_address] = 1
             k = bench.index_of_id[servo_id]
-            self._set(servo_id, "goal", bench.count(k, 0.0))
+            self._set(servo_id, "goal_position", bench.count(k, 0.0))
 
     def receive(
         self, data: bytes, now: float, baud: int | None = None
@@ -135,10 +135,10 @@ class FeetechEmulator:
         pieces = [(end, data)] if self.echo else []
         if baud is None or baud == self.baud:
             for frame in self._reader.feed(data):
-                pieces += self._obey(frame, byte_s)
+                pieces += self._execute(frame, byte_s)
         return sorted(pieces, key=lambda p: p[0])
 
-    def _obey(self, frame: Frame, byte_s: float) -> list[tuple[float, bytes]]:
+    def _execute(self, frame: Frame, byte_s: float) -> list[tuple[float, bytes]]:
         at, params = self._free_at, frame.data
         if frame.code == SYNC_WRITE and len(params) > 2:
             address, size = params[0], params[1]
@@ -171,12 +171,12 @@ class FeetechEmulator:
         servo.memory[address : address + len(data)] = data
         touched = range(address, address + len(data))
         k = self.bench.index_of_id[servo_id]
-        if self.series.registers["goal"].address in touched:
+        if self.series.registers["goal_position"].address in touched:
             # the goal clips at the servo's own angle limits, and switches the torque on
             low, high = self._get(servo_id, "min_angle"), self._get(servo_id, "max_angle")
             self._set(servo_id, "torque_enable", 1)
             self.bench.torque(k, at, True)
-            self.bench.command(k, at, int(np.clip(self._get(servo_id, "goal"), low, high)))
+            self.bench.command(k, at, int(np.clip(self._get(servo_id, "goal_position"), low, high)))
         if self.series.registers["torque_enable"].address in touched:
             self.bench.torque(k, at, bool(self._get(servo_id, "torque_enable")))
 
@@ -188,7 +188,7 @@ class FeetechEmulator:
         if servo is None or self._free_at < self._brown_out_until:
             return []
         begin = self._free_at + RETURN_DELAY_UNIT_S * self._get(servo_id, "return_delay")
-        kind = self._strike(servo_id, begin)
+        kind = self._inject_fault(servo_id, begin)
         if begin < self._brown_out_until:
             return []
         self._refresh(servo_id, begin)
@@ -199,7 +199,7 @@ class FeetechEmulator:
         other = Frame((servo_id + 100) % 250, 0, bytes(len(frame.data))).encode()
         if kind == "wrong-length":
             answer = with_wrong_length(frame, self._rng)
-        pieces = self.faults.spoil(kind, answer, other)
+        pieces = self.faults.apply_fault(kind, answer, other)
         arrived = []
         for delay, data in pieces:
             self._free_at = max(self._free_at, begin) + len(data) * byte_s
@@ -208,7 +208,7 @@ class FeetechEmulator:
             arrived += self._second_writer(byte_s)
         return arrived
 
-    def _strike(self, servo_id: int, at: float) -> str | None:
+    def _inject_fault(self, servo_id: int, at: float) -> str | None:
         """Draw a fault; begin those that last."""
         kind = self.faults.draw()
         servo = self.servos[servo_id]
@@ -234,8 +234,10 @@ class FeetechEmulator:
         k = self.bench.index_of_id[victim]
         count = int(np.clip(self.bench.count(k, self._free_at) + self._rng.integers(-40, 40), 0,
                             self.series.counts - 1))  # fmt: skip
-        goal = self.series.registers["goal"]
-        frame = Frame(victim, WRITE, bytes([goal.address]) + self.series.encode("goal", count))
+        goal = self.series.registers["goal_position"]
+        frame = Frame(
+            victim, WRITE, bytes([goal.address]) + self.series.encode("goal_position", count)
+        )
         self._free_at += len(frame.encode()) * byte_s
         self._store(victim, goal.address, frame.data[1:], self._free_at)
         return [(self._free_at, frame.encode())]
@@ -248,10 +250,10 @@ class FeetechEmulator:
         count = servo.frozen_count if frozen else self.bench.count(k, at)
         if self.bench.keep_log:
             self.readings.append((at, servo_id, count))
-        self._set(servo_id, "position", count)
-        self._set(servo_id, "load", self.bench.load(k))
-        self._set(servo_id, "voltage", round(10 * self.bench.supply_v))
-        self._set(servo_id, "temperature", round(AMBIENT_C))
+        self._set(servo_id, "present_position", count)
+        self._set(servo_id, "present_load", self.bench.load(k))
+        self._set(servo_id, "present_voltage", round(10 * self.bench.supply_v))
+        self._set(servo_id, "present_temperature", round(AMBIENT_C))
 
     def _set(self, servo_id: int, name: str, value: int) -> None:
         register = self.series.registers[name]

@@ -41,7 +41,7 @@ def test_scan_says_who_is_there_at_which_rate(capsys):
 def test_scan_of_a_silent_line_says_what_to_check(capsys):
     with on_a_port(still_servos(ids=[])) as port:
         code, _, err = run(capsys, "scan", "--bus", f"feetech:{port.device}@1000000")
-    assert code == 1 and "nobody answers at 1000000 baud" in err and "power" in err
+    assert code == 1 and "no servo answers at 1000000 baud" in err and "power" in err
 
 
 def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):

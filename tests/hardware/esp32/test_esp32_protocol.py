@@ -287,7 +287,7 @@ def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkey
     class Late(ScriptedProxy):
         slow = False
 
-        def spoil(self, kind, reply):
+        def apply_fault(self, kind, reply):
             return [(0.1, reply)] if self.slow else [(0.0, reply)]
 
     proxy = Late(answers)
@@ -335,12 +335,12 @@ def test_a_lock_that_another_user_left_keeps_nobody_out_if_it_can_be_read(
 
 def test_a_missing_socket_gives_a_sentence_and_keeps_no_lock(path, patient):
     for _ in range(2):
-        with pytest.raises(BusError, match="nobody answers there. On the robot, check"):
+        with pytest.raises(BusError, match="no answer. On the robot, check"):
             Esp32Bus(path)
 
 
 def test_a_map_of_raw_counts_of_another_encoder_or_of_fewer_servos_is_refused(path):
-    with pytest.raises(InputError, match="holds raw counts, and the proxy speaks calibrated ones"):
+    with pytest.raises(InputError, match="holds raw counts, and the proxy uses calibrated ones"):
         Esp32Bus(path, load_joint_map("mini_pupper_2_direct"))
     data = load_joint_map("mini_pupper_2").file.model_dump(by_alias=True)
     fine = load_joint_map("sts3215").file.model_dump(by_alias=True) | {"frame": "proxy"}
@@ -444,7 +444,7 @@ def test_servos_come_limp_out_of_a_brown_out_and_then_get_the_last_order_as_the_
     proxy.answer(setpoint([1] * 12, [500] * 12), b"", 0.5)
     bench.goals.clear()
     bench.torques.clear()
-    proxy.strike(1.0)
+    proxy.inject_fault(1.0)
     assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
     # let go, asked for once, while nobody could hear it
     assert proxy.answer(setpoint([0] * 12, [500] * 12), b"", 1.05) == b"\x02\x01"

@@ -40,7 +40,7 @@ def patience(monkeypatch):
 
 def position(line: FeetechLine, servo: int, series=STS3215) -> int | None:
     reply = line.read(servo, POSITION, 2)
-    return series.decode("position", reply.frame.data, POSITION) if reply else None
+    return series.decode("present_position", reply.frame.data, POSITION) if reply else None
 
 
 def raw(servo: int, data: bytes, code: int = 0) -> bytes:
@@ -111,7 +111,7 @@ def test_b5_3_a_late_reply_that_comes_during_the_next_read_has_another_length():
         assert line.read(1, POSITION, 8) is None
         line.patience_s = 0.5
         reply = line.read(1, POSITION, 9)
-        assert reply and STS3215.decode("position", reply.frame.data, POSITION) == 123
+        assert reply and STS3215.decode("present_position", reply.frame.data, POSITION) == 123
         line.close()
 
 
@@ -145,7 +145,9 @@ def test_b5_5_a_silent_servo_in_a_sync_read_is_missing_and_hides_nobody():
         bench_of(servos).counts |= {2: 1111, 3: 2222}
         replies = line.sync_read([1, 2, 3], POSITION, 2)
         line.close()
-    counts = {i: STS3215.decode("position", r.frame.data, POSITION) for i, r in replies.items()}
+    counts = {
+        i: STS3215.decode("present_position", r.frame.data, POSITION) for i, r in replies.items()
+    }
     assert counts == {2: 1111, 3: 2222}
 
 
@@ -390,7 +392,7 @@ def test_nobody_on_the_line_gives_a_sentence(monkeypatch):
     monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.003)
     with (
         on_a_port(still_servos(ids=[])) as server,
-        pytest.raises(BusError, match="no servo answers at 1000000 baud .asked for ids 1 to 12."),
+        pytest.raises(BusError, match="no servo answers at 1000000 baud .tried ids 1 to 12."),
     ):
         FeetechBus(server.device, 1_000_000)
 
@@ -408,7 +410,7 @@ def test_a_servo_of_an_unknown_model_is_left_alone_with_a_sentence():
     servos.servos[2].memory[3:5] = bytes([0x39, 0x05])
     with (
         on_a_port(servos) as server,
-        pytest.raises(BusError, match="servo 2 says model number 1337, which is not known"),
+        pytest.raises(BusError, match="servo 2 has the model number 1337, which is not known"),
     ):
         FeetechBus(server.device, 1_000_000)
     assert bench_of(servos).goals == []
@@ -427,7 +429,7 @@ def test_two_series_on_one_line_are_refused():
 @pytest.mark.parametrize(
     ("preset", "sentence"),
     [
-        ("mini_pupper_2", "holds counts as the robot's proxy speaks them"),
+        ("mini_pupper_2", "holds counts of the robot's proxy"),
         ("mini_pupper_2_direct", "is for servos of 1024 counts; these STS3215 have 4096"),
     ],
 )

@@ -91,7 +91,7 @@ def talking(
     servos = still_servos(series)
     bench_of(servos).counts |= {1: 2053, 2: 1000} if series is STS3215 else {3: 502}
     bench_of(servos).loads[3] = -55
-    servos.servos[3].memory[58:60] = series.encode("speed", -20)
+    servos.servos[3].memory[58:60] = series.encode("present_speed", -20)
     with on_a_port(servos) as server:
         client = SdkClient(server.device, end, monkeypatch)
         yield servos, client
@@ -138,7 +138,10 @@ def test_firmware_style_read_of_six_bytes_is_golden_and_means_position_speed_loa
     assert (result, error) == (scservo_sdk.COMM_SUCCESS, 0)
     assert servos.heard == golden("firmware read 3")
     assert servos.said == golden("firmware answer 3")
-    words = [SCS0009.decode(name, bytes(data), 56) for name in ("position", "speed", "load")]
+    words = [
+        SCS0009.decode(name, bytes(data), 56)
+        for name in ("present_position", "present_speed", "present_load")
+    ]
     assert words == [502, -20, -55]
 
 
@@ -183,7 +186,7 @@ def test_sdk_sync_write_of_position_time_speed_is_golden_and_stored(scs):
     sync_write(sdk, 42, {1: word(512) + word(0) + word(1000)})
     assert wait_until(lambda: servos.heard == golden("SCS position, time, speed"))
     memory = bytes(servos.servos[1].memory)
-    names = ("goal", "goal_time", "goal_speed")
+    names = ("goal_position", "goal_time", "goal_speed")
     assert [SCS0009.decode(name, memory) for name in names] == [512, 0, 1000]
 
 
@@ -256,7 +259,8 @@ def test_model_numbers_tell_the_series_in_its_own_byte_order():
 
 @pytest.mark.parametrize("series", [STS3215, SCS0009])
 @pytest.mark.parametrize(
-    ("name", "value", "magnitude_bit"), [("speed", -300, 0x8000), ("load", -55, 0x0400)]
+    ("name", "value", "magnitude_bit"),
+    [("present_speed", -300, 0x8000), ("present_load", -55, 0x0400)],
 )
 def test_negative_registers_are_sign_and_magnitude(series, name, value, magnitude_bit):
     encoded = series.encode(name, value)
@@ -268,7 +272,7 @@ def test_negative_registers_are_sign_and_magnitude(series, name, value, magnitud
 @pytest.mark.parametrize("value", [-1, 65_536])
 def test_a_value_that_does_not_fit_its_register_is_not_packed(value):
     with pytest.raises(OverflowError):
-        SCS0009.encode("goal", value)
+        SCS0009.encode("goal_position", value)
 
 
 def test_frames_are_found_between_garbage_and_garbage_is_counted():
@@ -342,9 +346,9 @@ def test_a_real_servo_of_the_bench_is_where_its_goal_was_after_a_second():
     servos = moving_servos(STS3215)
     bench = servos.bench
     assert isinstance(bench, ServoBench)
-    servos.receive(Frame(4, 3, bytes([42]) + STS3215.encode("goal", 2148)).encode(), 0.0)
+    servos.receive(Frame(4, 3, bytes([42]) + STS3215.encode("goal_position", 2148)).encode(), 0.0)
     [(_, answer)] = servos.receive(Frame(4, 2, bytes([56, 2])).encode(), 1.0)
-    there = STS3215.decode("position", FrameReader().feed(answer)[0].data, 56)
+    there = STS3215.decode("present_position", FrameReader().feed(answer)[0].data, 56)
     truth = bench.robot.servos[bench.index_of_id[4]].actuator
     # dry friction holds the servo at most friction / stiffness off its goal
     off = np.divide(truth.friction_loss, truth.stiffness) * bench.map.counts_per_rad()[0] + 1
