@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pupper_sysid.cli.terminal import err, warn
+from pupper_sysid.common.border import read_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
@@ -27,8 +27,8 @@ def is_policy(folder: Path) -> bool:
     """Whether a folder is a run or a policy (a servo model has a contract, too)."""
     if (folder / RUN_FILE).is_file():
         return True
-    with contextlib.suppress(OSError, ValueError):
-        found = json.loads((folder / _CONTRACT).read_text())
+    with contextlib.suppress(InputError):
+        found = read_json(folder / _CONTRACT)
         return isinstance(found, dict) and found.get("schema") == "pupper-policy"
     return False
 
@@ -143,7 +143,7 @@ def simulator(
     return task, servo_ranges(chosen, feedback)
 
 
-def tell_borrowed(servos: Iterable[ServoRanges]) -> None:
+def warn_of_fallbacks(servos: Iterable[ServoRanges]) -> None:
     """Which joints go by another's numbers, once per calibration."""
     warn(
         dict.fromkeys(

@@ -1,26 +1,22 @@
-"""Plain YAML in, plain YAML out: numbers, text, lists and mappings, and nothing that surprises.
+"""YAML without surprises: a strict subclass of `yaml.SafeLoader`, and the dumper that matches it.
 
-A file from a stranger is read event by event, so that nothing is built from what is refused:
-aliases and anchors (a few lines of which can unfold to gigabytes), tags (which can name Python
-objects), duplicate keys (of which ordinary readers silently keep the last), deep nesting and big
-files. Words mean what they say: `yes` and `no` are text, `1e-3` is a number (YAML 1.2's rules).
-
-`read` returns the data and the line each place stands on; `dump` writes what `read` reads back.
+A file from an unknown source is refused before anything is built from it if it uses aliases or
+anchors (a few lines of which can unfold to gigabytes), tags (which can name Python objects),
+duplicate keys (of which ordinary readers silently keep the last) or deep nesting. Scalars follow
+YAML 1.2: `yes` and `no` are text, `1e-3` is a number. `common.border.read_yaml` reads a file.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
+from yaml.composer import Composer
 
 from pupper_sysid.common.errors import InputError
 
-MAX_BYTES = 2_000_000
 MAX_DEPTH = 20
 
 Place = tuple[str | int, ...]
@@ -36,47 +32,90 @@ _WORDS: dict[str, bool | None] = {
     **{word: False for word in ("false", "False", "FALSE")},
 }
 
-_Parser = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-_Dumper: type[yaml.SafeDumper] = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+if TYPE_CHECKING or not hasattr(yaml, "CSafeLoader"):
+    _Loader, _Dumper = yaml.SafeLoader, yaml.SafeDumper
+else:
+    _Dumper = yaml.CSafeDumper
+
+    class _Loader(Composer, yaml.CSafeLoader):
+        """libyaml's parser; nodes are composed in Python, where `StrictLoader` can refuse them."""
+
+        def __init__(self, text: str):
+            yaml.CSafeLoader.__init__(self, text)
+            Composer.__init__(self)
 
 
-def read(path: Path) -> tuple[Any, dict[Place, int]]:
-    """Read the YAML file at `path`.
+class StrictLoader(_Loader):
+    """Loader of plain data: dict, list, str, int, float, bool and None.
 
-    Returns
-    -------
-    data : dict, list, str, int, float, bool or None
+    Parameters
+    ----------
+    text : str
+        One YAML document.
+    name : str
+        Name of the file, for messages.
+
+    Attributes
+    ----------
     lines : dict
-        The line (from 1) of every place in the file.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, too big, not text, not YAML, or uses what this module refuses.
+        The line (from 1) of every place, filled by `get_single_data`.
     """
-    text = _read_text(path)
-    lines: dict[Place, int] = {}
-    try:
-        events = yaml.parse(text, Loader=_Parser)
-        next(events)  # start of the stream
-        if isinstance(next(events), yaml.StreamEndEvent):
-            raise InputError(f"{path} is empty. Give a file with content.")
-        data = _value(events, next(events), (), lines, path)
-        next(events)  # end of the document
-        if not isinstance(next(events), yaml.StreamEndEvent):
-            raise InputError(f"{path} holds several YAML documents ('---'). Keep one per file.")
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is not valid YAML: {_one_line(error)}.") from error
-    return data, lines
 
+    def __init__(self, text: str, name: str = "the text"):
+        super().__init__(text)
+        self.name, self.lines = name, dict[Place, int]()
+        self._depth = 0
 
-def dump(data: Any) -> str:
-    """`data` as YAML text; a mapping of scalars takes one line, so that a number stays whole."""
-    return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, allow_unicode=True, width=10_000)
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """The next node, unless it is of a kind that is refused."""
+        event: Any = self.peek_event()
+        where = f"{self.name}, line {event.start_mark.line + 1}"
+        marked = isinstance(event, yaml.AliasEvent) or event.anchor is not None
+        tag = getattr(event, "tag", None)
+        if isinstance(parent, yaml.MappingNode) and index is None:
+            if marked or tag is not None or not isinstance(event, yaml.ScalarEvent):
+                raise InputError(f"{where} has a key that is not a plain word. Use words as keys.")
+        elif marked:
+            raise InputError(
+                f"{where} uses a YAML alias or anchor (& or *), which is refused because a few of "
+                "them can unfold to gigabytes. Write the value out, or quote the text."
+            )
+        if tag is not None:
+            raise InputError(f"{where} uses a YAML tag ({tag}). Write the plain value.")
+        if self._depth > MAX_DEPTH:
+            raise InputError(f"{where} is nested deeper than {MAX_DEPTH} levels. Check the file.")
+        self._depth += 1
+        node = super().compose_node(parent, index)  # pyright: ignore[reportArgumentType]
+        self._depth -= 1
+        return node
+
+    def get_single_data(self) -> Any:
+        """The document's data."""
+        node = self.get_single_node()
+        if node is None:
+            raise InputError(f"{self.name} is empty. Give a file with content.")
+        return self._value(node, ())
+
+    def _value(self, node: Any, place: Place) -> Any:
+        self.lines[place] = node.start_mark.line + 1
+        if isinstance(node, yaml.SequenceNode):
+            return [self._value(item, (*place, n)) for n, item in enumerate(node.value)]
+        if not isinstance(node, yaml.MappingNode):
+            return node.value if node.style else _plain(node.value)
+        mapping: dict[str, Any] = {}
+        for key, value in node.value:
+            if key.value in mapping:
+                raise InputError(
+                    f"{self.name}, line {key.start_mark.line + 1}, "
+                    f"{place_text((*place, key.value))} stands in the file twice. "
+                    "Remove one of the two."
+                )
+            mapping[key.value] = self._value(value, (*place, key.value))
+        return mapping
 
 
 def place_text(place: Place) -> str:
-    """`place` as people write it.
+    """`place` in words.
 
     Examples
     --------
@@ -87,70 +126,36 @@ def place_text(place: Place) -> str:
     return "".join(words).removeprefix(".")
 
 
-def _read_text(path: Path) -> str:
-    if not path.exists():
-        raise InputError(f"{path} does not exist. Check the name.")
-    if not path.is_file():
-        raise InputError(f"{path} is not a file. Give the name of a YAML file.")
+def load(text: str, name: str = "the text") -> tuple[Any, dict[Place, int]]:
+    """Data of YAML `text`, and the line (from 1) of every place in it.
+
+    Raises
+    ------
+    InputError
+        If the text is not YAML, or uses what this module refuses.
+
+    Examples
+    --------
+    >>> load("{legs: 4, names: [yes, '5']}")[0]
+    {'legs': 4, 'names': ['yes', '5']}
+    """
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    if len(content) > MAX_BYTES:
-        raise InputError(
-            f"{path} is larger than {MAX_BYTES / 1e6:g} MB, and no such file of this project is. "
-            "Check that it is the file you meant."
-        )
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path} is not a text file (byte {error.start} is not UTF-8). "
-            "Check that it is the file you meant."
-        ) from error
+        loader = StrictLoader(text, name)
+        return loader.get_single_data(), loader.lines
+    except yaml.YAMLError as error:
+        what = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
+        if what == "but found another document":
+            raise InputError(
+                f"{name} holds several YAML documents ('---'). Keep one per file."
+            ) from error
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        at = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise InputError(f"{name} is not valid YAML: {at}{what}.") from error
 
 
-def _value(
-    events: Iterator[Any], event: Any, place: Place, lines: dict[Place, int], path: Path
-) -> Any:
-    """The value that begins with `event`; takes its remaining events from `events`."""
-    line = event.start_mark.line + 1
-    lines[place] = line
-    where = f"{path}, line {line}"
-    if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
-        raise InputError(
-            f"{where} uses a YAML alias or anchor (& or *), which is refused because a few of "
-            "them can unfold to gigabytes. Write the value out, or quote the text."
-        )
-    if event.tag is not None:
-        raise InputError(f"{where} uses a YAML tag ({event.tag}). Write the plain value.")
-    if len(place) > MAX_DEPTH:
-        raise InputError(f"{where} is nested deeper than {MAX_DEPTH} levels. Check the file.")
-    if isinstance(event, yaml.SequenceStartEvent):
-        items: list[Any] = []
-        while not isinstance(event := next(events), yaml.SequenceEndEvent):
-            items.append(_value(events, event, (*place, len(items)), lines, path))
-        return items
-    if isinstance(event, yaml.MappingStartEvent):
-        mapping: dict[str, Any] = {}
-        while not isinstance(event := next(events), yaml.MappingEndEvent):
-            key = _key(event, place, mapping, path)
-            mapping[key] = _value(events, next(events), (*place, key), lines, path)
-        return mapping
-    return event.value if event.style else _plain(event.value)
-
-
-def _key(event: Any, place: Place, taken: dict[str, Any], path: Path) -> str:
-    where = f"{path}, line {event.start_mark.line + 1}"
-    if not isinstance(event, yaml.ScalarEvent) or event.anchor is not None or event.tag is not None:
-        raise InputError(f"{where} has a key that is not a plain word. Use words as keys.")
-    if event.value in taken:
-        raise InputError(
-            f"{where}, {place_text((*place, event.value))} stands in the file twice. "
-            "Remove one of the two."
-        )
-    return event.value
+def dump(data: Any) -> str:
+    """`data` as YAML text that `load` reads back; a mapping of scalars takes one line."""
+    return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, allow_unicode=True, width=10_000)
 
 
 def _plain(text: str) -> Any:
@@ -168,15 +173,8 @@ def _plain(text: str) -> Any:
     return text
 
 
-def _one_line(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    what = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
-    place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-    return f"{place}{what}"
-
-
 class _PlainDumper(_Dumper):
-    """Writes only what `read` accepts, and text only so that it reads back as text."""
+    """Writes only what `load` accepts, and text only so that it reads back as text."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

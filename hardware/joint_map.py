@@ -29,12 +29,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order, strange_joint
-from pupper_sysid.common.strict_yaml import dump, place_text, read
+from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
 
 SCHEMA = "pupper-sysid joint map"
@@ -46,7 +47,9 @@ PRESETS = ("mini_pupper_2", "mini_pupper_2_300deg", "mini_pupper_2_direct", "sts
 Frame = Literal["proxy", "raw"]
 Linkage = Literal["parallel knee", "none"]
 
-_FILE = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+_FILE = ConfigDict(
+    extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+)
 
 
 class JointEntry(BaseModel):
@@ -379,27 +382,11 @@ def joint_map_from(data: dict[str, Any], name: str, lines: dict | None = None) -
             f"{name} is no joint map: it does not say `schema: {SCHEMA}` at the top. Make one with "
             "`pupper-sysid calibrate-joints`."
         )
-    version = data.get("schema_version")
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        raise InputError(
-            f"{name} was written by a newer version of pupper-sysid (schema_version {version}; "
-            f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
-        )
-    try:
-        file = JointMapFile.model_validate(data)
-    except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
-        place = tuple(p for p in fault["loc"] if isinstance(p, str | int))
-        line = (lines or {}).get(place)
-        at = f", line {line}" if line else ""
-        message = fault["msg"]
-        what = message.removeprefix("Value error, ")  # ours, which may begin with a joint's name
-        what = message[:1].lower() + message[1:] if what == message else what
-        where = f": {place_text(place)}" if place else ""
-        raise InputError(f"{name}{at}{where}: {what}.") from error
+    refuse_other_version(name, data.get("schema_version"), SCHEMA_VERSION)
+    file = validated(JointMapFile, data, name, lines)
     return JointMap(file, tuple(in_order(file.joints)))
 
 
 def _load(path: Path) -> JointMap:
-    data, lines = read(path)
+    data, lines = read_yaml(path)
     return joint_map_from(data, str(path), lines)

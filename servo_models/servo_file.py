@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,11 +19,17 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from pupper_sysid.common.border import (
+    read_bytes,
+    read_json,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
@@ -33,10 +40,12 @@ from pupper_sysid.servo_models.joint_arrays import same_rate
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
+SCHEMA = "pupper-servo-model"
 SCHEMA_VERSION = 2
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 ARCHITECTURES = ("fir", "mlp", "lstm", "delayed-pd", "sindy")
 _LARGEST_BYTES = 50_000_000
+_AGAIN = "Copy the whole folder again, or fit the model again."
 _LONGEST_DELAY_S = 1.0
 _MAY_BE_INFINITE = ("effort_limit", "velocity_limit", "saturation_error_rad")
 
@@ -97,9 +106,7 @@ class Contract(_Strict):
         Of the weights file.
     """
 
-    schema_name: Annotated[Literal["pupper-servo-model"], Field(alias="schema")] = (
-        "pupper-servo-model"
-    )
+    schema_name: Annotated[Literal["pupper-servo-model"], Field(alias="schema")] = SCHEMA
     schema_version: Literal[1, 2] = SCHEMA_VERSION
     arch: Literal["fir", "mlp", "lstm", "delayed-pd", "sindy"]
     preset: str
@@ -214,7 +221,7 @@ def load_servo_model(
             "differ, so another joint's model is no substitute: fit one with `pupper-sysid "
             f"fit-servo --joints {missing[0]}`."
         )
-    data = _read(folder / WEIGHTS)
+    data = read_bytes(folder / WEIGHTS, _LARGEST_BYTES, _AGAIN)
     if hashlib.sha256(data).hexdigest() != contract.weights_sha256:
         raise InputError(
             f"{folder / WEIGHTS} is not the file that {CONTRACT} describes (its SHA-256 differs): "
@@ -313,51 +320,20 @@ def _check_names(arch: str, found: set[str]) -> None:
 
 def _read_contract(folder: Path) -> Contract:
     path = folder / CONTRACT
-    try:
-        found = json.loads(_read(path))
-    except FileNotFoundError:
+    if not os.path.exists(path):
         raise InputError(
             f"{folder} holds no servo model ({CONTRACT} is missing). "
             "Make one with `pupper-sysid fit-servo --out NAME`."
-        ) from None
-    except RecursionError:
-        raise InputError(f"{path} is no JSON: it is nested too deeply. Fit again.") from None
-    except ValueError as error:
-        raise InputError(f"{path} is no JSON: {error}. Copy it again, or fit again.") from error
-    if not isinstance(found, dict) or found.get("schema") != "pupper-servo-model":
-        raise InputError(f"{path} is no servo model's contract. Give a folder of `fit-servo`.")
-    version = found.get("schema_version")
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        raise InputError(
-            f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
-            f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
         )
+    found = read_json(path, _LARGEST_BYTES, _AGAIN)
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        raise InputError(f"{path} is no servo model's contract. Give a folder of `fit-servo`.")
+    refuse_other_version(path, found.get("schema_version"), SCHEMA_VERSION)
     return _validated(found, path)
 
 
 def _validated(found: dict[str, Any], path: Path) -> Contract:
-    try:
-        contract = Contract.model_validate(found)
-    except ValidationError as error:
-        # a misspelt key is also a missing one; the misspelling says more
-        faults = error.errors(include_url=False)
-        fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-        place = ".".join(str(p) for p in fault["loc"])
-        said = "unknown entry" if fault["type"] == "extra_forbidden" else fault["msg"]
-        raise InputError(f"{path}: {place}: {said}. Fit the model again.") from error
+    contract = validated(Contract, found, path, remedy="fit the model again")
     if strange := strange_joint(contract.joints):
         raise InputError(f"{path}: {strange[0]} is no joint; {strange[1]}")
     return contract
-
-
-def _read(path: Path) -> bytes:
-    try:
-        if path.exists() and not path.is_file():  # a pipe or a device never ends
-            raise InputError(f"{path} is no regular file. Fit the model again.")
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB: no servo model.")
-        return path.read_bytes()
-    except OSError as error:
-        if path.name == CONTRACT and isinstance(error, FileNotFoundError | NotADirectoryError):
-            raise FileNotFoundError(path) from None
-        raise InputError(f"{path} cannot be read: {error.strerror}. Fit the model again.") from None

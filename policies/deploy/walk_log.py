@@ -17,16 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.border import parse_json, read_text, refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
 from pupper_sysid.policies.deploy.filters import Rest
-from pupper_sysid.policies.network.file_version import refuse_other_version
-from pupper_sysid.sim.walking.env import OBSERVATION_SIZE
+from pupper_sysid.sim.walking.observation import OBSERVATION_SIZE
 
 TITLE = "# pupper-sysid walk"
 SCHEMA_VERSION = 1
+_LARGEST_BYTES = 4e9  # about a day
 
 _AXES = ("x", "y", "z")
 _COMMAND = ("forward_m_s", "left_m_s", "turn_rad_s")
@@ -124,10 +125,7 @@ def read_walk(path: Path) -> Walk:
     InputError
         If it is none, or damaged; the sentence says where.
     """
-    try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
+    text = read_text(path, _LARGEST_BYTES)
     lines = text[: text.rfind("\n") + 1].splitlines()
     if not lines or lines[0] != TITLE:
         raise InputError(f"{path} is no log of a walk; pupper-deploy writes them.")
@@ -140,10 +138,7 @@ def read_walk(path: Path) -> Walk:
         if key == "ended":
             ended = value
             continue
-        try:
-            header[key] = json.loads(value)
-        except ValueError as error:
-            raise InputError(f"{path}: its header's {key} is not JSON: {error}.") from error
+        header[key] = parse_json(value, f"{path}: its header's {key}", "Was it edited?")
     refuse_other_version(path, header.get("schema_version"), SCHEMA_VERSION)
     rows = [row for row in csv.reader(line for line in lines if not line.startswith("#"))]
     if not rows or tuple(rows[0]) != COLUMNS:

@@ -8,35 +8,43 @@ passes before it is written: no NaN, right shapes, and actions that depend on wh
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from copy import copy
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
+from pupper_sysid.common.border import (
+    read_bytes,
+    read_json,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.policies.network.file_version import refuse_other_version
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
-from pupper_sysid.sim.walking.env import OBSERVATION, VELOCITY_STEPS
+from pupper_sysid.sim.walking.observation import OBSERVATION, VELOCITY_STEPS
 
 SCHEMA, VERSION = "pupper-policy", 2
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
-_MOST_BYTES = 200_000_000
+_LARGEST_BYTES = 200_000_000
+_AGAIN = "Copy the whole folder again."
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+    )
 
 
 class ObservationPart(_Part):
@@ -167,40 +175,28 @@ def load_policy(folder: Path) -> Policy:
     for file in (path, weights):
         if not file.is_file():
             raise InputError(f"{folder} holds no policy: there is no {file.name} in it.")
-        if file.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{file} is too large to be part of a policy.")
-    _refuse_other_version(path)
-    try:
-        contract = Contract.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(p) for p in first["loc"])
-        raise InputError(f"{path}: {place or 'the file'}: {first['msg']}.") from error
+    found = read_json(path, _LARGEST_BYTES, _AGAIN)
+    if isinstance(found, dict):
+        refuse_other_version(path, found.get("schema_version"), VERSION)
+    contract = validated(Contract, found, path, remedy="copy the whole folder again")
     contract = contract.model_copy(update={"schema_version": VERSION})
     if list(contract.default_pose_rad) != list(JOINT_NAMES):
         raise InputError(f"{path}: default_pose_rad must name the joints in this project's order.")
-    if sha256(weights) != contract.weights_sha256:
+    data = read_bytes(weights, _LARGEST_BYTES, _AGAIN)
+    if hashlib.sha256(data).hexdigest() != contract.weights_sha256:
         raise InputError(f"{weights} is not the file that {path.name} describes. Copy both again.")
     network = PolicyNetwork(
         contract.kind, contract.observation_size, tuple(contract.hidden), contract.memory,
         contract.normalise,
     )  # fmt: skip
     try:
-        network.take(load_tensors(weights.read_bytes()))
+        network.take(load_tensors(data))
     except (SafetensorError, KeyError, RuntimeError) as error:
         raise InputError(
             f"{weights} does not fit {path.name}: weights of another shape."
         ) from error
     refuse_bad(network, str(folder))
     return Policy(network, contract)
-
-
-def _refuse_other_version(path: Path) -> None:
-    """A newer contract would only be said to have a wrong number in it."""
-    with suppress(OSError, ValueError, RecursionError):  # damaged: the contract's own check says so
-        found = json.loads(path.read_bytes())
-        version = found.get("schema_version") if isinstance(found, dict) else VERSION
-        refuse_other_version(path, version, VERSION, oldest=1)
 
 
 def refuse_other_observation(contract: Contract) -> None:

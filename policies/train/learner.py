@@ -24,10 +24,10 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
+from pupper_sysid.common.border import refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_bytes
 from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.network.file_version import refuse_other_version
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 

@@ -14,9 +14,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
+from pupper_sysid.common.border import read_yaml, refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256, versions, write_text
-from pupper_sysid.policies.network.file_version import refuse_other_version
 from pupper_sysid.policies.network.hyperparameters import (
     Architecture,
     Hyperparameters,
@@ -126,10 +126,7 @@ def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> R
 def _read(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise InputError(f"{path.parent} holds no run: there is no {RUN_FILE} in it.")
-    try:
-        found = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not readable YAML.") from error
+    found, _ = read_yaml(path)
     if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
     refuse_other_version(path, found.get("schema_version"), RUN_VERSION)

@@ -22,20 +22,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator
-from pydantic_core import PydanticCustomError
+from pydantic import Field, field_validator
 
+from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.joints import in_order, strange_joint
-from pupper_sysid.common.strict_yaml import dump, read
+from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.parts import (
     PARAMETER_KEYS,
     JointCalibration,
     Part,
     Whole,
 )
-from pupper_sysid.servo_models.calibration.refusals import explain
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 
@@ -114,21 +113,14 @@ class Calibration(Part):
         except ValueError:
             offset = None
         if offset != timedelta(0):
-            raise PydanticCustomError(
-                "created",
-                "'{text}' is no time in UTC; write it like 2026-01-31T12:00:00+00:00",
-                {"text": text},
-            )
+            raise ValueError(f"'{text}' is no time in UTC; write it like 2026-01-31T12:00:00+00:00")
         return text
 
     @field_validator("joints")
     @classmethod
     def _check_joints(cls, joints: dict[str, JointCalibration]) -> dict[str, JointCalibration]:
         if strange := strange_joint(joints):
-            name, hint = strange
-            raise PydanticCustomError(
-                "joint", "{name} is no joint; {hint}", {"name": name, "hint": hint.rstrip(".?")}
-            )
+            raise ValueError(f"{strange[0]} is no joint; {strange[1].rstrip('.?')}")
         return {name: joints[name] for name in in_order(joints)}
 
     @property
@@ -257,30 +249,23 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
 
 
 def _load(path: Path) -> Calibration:
-    data, lines = read(path)
+    data, lines = read_yaml(path)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(
             f"{path} is not a calibration: it does not say `schema: {SCHEMA}` at the top. "
             "Give a file that `pupper-sysid calibrate` wrote."
         )
     version = data.get("schema_version")
-    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-        raise InputError(
-            f"{path}: schema_version is {version}. Write `schema_version: {SCHEMA_VERSION}`."
-        )
-    if version > SCHEMA_VERSION:
-        raise InputError(
-            f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
-            f"this one reads {SCHEMA_VERSION}). Upgrade pupper-sysid."
-        )
-    if version == 1:
-        data, lines = _renamed(data), {tuple(map(_new_name, at)): n for at, n in lines.items()}
-        data["schema_version"] = SCHEMA_VERSION
+    refuse_other_version(path, version, SCHEMA_VERSION)
+    if version == SCHEMA_VERSION:
+        return validated(Calibration, data, path, lines)
+    data = _renamed(data) | {"schema_version": SCHEMA_VERSION}
+    lines = {tuple(map(_new_name, place)): n for place, n in lines.items()}
     try:
-        return Calibration.model_validate(data)
-    except ValidationError as error:
-        message = explain(error, Calibration, path, lines)
-        for old, new in _RENAMED.items() if version == 1 else ():
+        return validated(Calibration, data, path, lines)
+    except InputError as error:
+        message = str(error)
+        for old, new in _RENAMED.items():
             message = message.replace(new, old)  # the words of the file that is being read
         raise InputError(message) from error
 

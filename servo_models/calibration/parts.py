@@ -10,25 +10,13 @@ place of numbers, and numbers that only another unit could explain.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
 
+from pupper_sysid.common import border
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-
-UNIT_OF_SUFFIX = {
-    "nm_s_per_rad": "N·m·s/rad",
-    "nm_per_rad": "N·m/rad",
-    "nm": "N·m",
-    "kg_m2": "kg·m²",
-    "rad_s": "rad/s",
-    "rad": "rad",
-    "s": "s",
-    "percent": "%",
-}
-"""Unit of a name by its ending; longer endings first."""
 
 UNIT_OF_NAME = {
     "loss": "1",
@@ -50,9 +38,7 @@ def unit_of(name: str) -> str:
     >>> unit_of("damping_nm_s_per_rad"), unit_of("dead_time_s"), unit_of("loss")
     ('N·m·s/rad', 's', '1')
     """
-    if name in UNIT_OF_NAME:
-        return UNIT_OF_NAME[name]
-    return next((u for end, u in UNIT_OF_SUFFIX.items() if name.endswith(f"_{end}")), "")
+    return UNIT_OF_NAME.get(name) or border.unit_of(name)
 
 
 def _python_number(value: Any) -> Any:
@@ -80,6 +66,10 @@ class Part(BaseModel):
 class Quantity(Part):
     """One number, how well it is known, and whether the data say anything about it."""
 
+    EXAMPLE: ClassVar[str] = (
+        "{value: …, low: …, high: …, identified: yes | ratio only | no, why: …}"
+    )
+
     value: Number
     """The number itself, in the unit that ends the name it stands under."""
     low: Number | None = None
@@ -94,18 +84,14 @@ class Quantity(Part):
     @model_validator(mode="after")
     def _check(self) -> Quantity:
         if self.low is not None and self.high is not None and self.low > self.high:
-            raise PydanticCustomError(
-                "interval",
-                "low is {low} and high is {high}; low must not exceed high",
-                {"low": self.low, "high": self.high},
-            )
+            raise ValueError(f"low is {self.low} and high is {self.high}; low must not exceed high")
         if self.identified == "no" and not self.why:
-            raise PydanticCustomError("why", "identified is no, so `why` must give the reason")
+            raise ValueError("identified is no, so `why` must give the reason")
         return self
 
 
 @dataclass(frozen=True)
-class Band:
+class PlausibleRange:
     """The values a quantity can have at all; beyond them the unit is wrong, not the servo.
 
     Attributes
@@ -128,7 +114,7 @@ class Band:
         if quantity is not None:
             for number in (quantity.value, quantity.low, quantity.high):
                 if number is not None and (problem := self.problem(number)):
-                    raise PydanticCustomError("band", "{problem}", {"problem": problem})
+                    raise ValueError(problem)
         return quantity
 
     def problem(self, number: float) -> str:
@@ -142,13 +128,15 @@ class Band:
         return text
 
 
-_TIME = AfterValidator(Band(0, 1, "milliseconds", 1e-3))
-_AGE = AfterValidator(Band(0, 10, "milliseconds", 1e-3))
-_LAG = AfterValidator(Band(-1, 1, "milliseconds", 1e-3))
-_TORQUE = AfterValidator(Band(0, 100, "N·mm", 1e-3))
-_RATIO = AfterValidator(Band(0, 1e9))
-_SMALL_ANGLE = AfterValidator(Band(0, 0.1, "degrees", float(np.pi / 180)))
-_OFFSET = AfterValidator(Band(-2 * float(np.pi), 2 * float(np.pi), "degrees", float(np.pi / 180)))
+_TIME = AfterValidator(PlausibleRange(0, 1, "milliseconds", 1e-3))
+_AGE = AfterValidator(PlausibleRange(0, 10, "milliseconds", 1e-3))
+_LAG = AfterValidator(PlausibleRange(-1, 1, "milliseconds", 1e-3))
+_TORQUE = AfterValidator(PlausibleRange(0, 100, "N·mm", 1e-3))
+_RATIO = AfterValidator(PlausibleRange(0, 1e9))
+_SMALL_ANGLE = AfterValidator(PlausibleRange(0, 0.1, "degrees", float(np.pi / 180)))
+_OFFSET = AfterValidator(
+    PlausibleRange(-2 * float(np.pi), 2 * float(np.pi), "degrees", float(np.pi / 180))
+)
 
 
 class RatiosToArmature(Part):
@@ -192,17 +180,19 @@ class Actuator(Part):
 
     model: Literal["delayed_pd"]
     """The servo model these numbers belong to."""
-    stiffness_nm_per_rad: Annotated[Quantity, AfterValidator(Band(0, 1e5))]
+    stiffness_nm_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e5))]
     """Torque per position error [N·m/rad]."""
-    damping_nm_s_per_rad: Annotated[Quantity, AfterValidator(Band(0, 1e4))]
+    damping_nm_s_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e4))]
     """Torque per velocity [N·m·s/rad]."""
     friction_loss_nm: Annotated[Quantity, _TORQUE]
     """Dry (Coulomb) friction [N·m]."""
-    armature_kg_m2: Annotated[Quantity, AfterValidator(Band(1e-12, 10, "g·cm²", 1e-7))]
+    armature_kg_m2: Annotated[Quantity, AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))]
     """All inertia the servo feels, its own rotor's included [kg·m²]."""
     effort_limit_nm: Annotated[Quantity, _TORQUE]
     """Largest torque [N·m]."""
-    velocity_limit_rad_s: Annotated[Quantity, AfterValidator(Band(0, 1000, "degrees per second"))]
+    velocity_limit_rad_s: Annotated[
+        Quantity, AfterValidator(PlausibleRange(0, 1000, "degrees per second"))
+    ]
     """Largest rate of the set-point [rad/s]."""
     dead_time_s: Annotated[Quantity, _TIME]
     """Dead time from a command's arrival to its first effect on the torque [s]."""
@@ -236,10 +226,9 @@ class Actuator(Part):
     @model_validator(mode="after")
     def _check(self) -> Actuator:
         if self.delay_steps_min > self.delay_steps_max:
-            raise PydanticCustomError(
-                "delay_steps",
-                "delay_steps_min is {low} and delay_steps_max is {high}; swap them",
-                {"low": self.delay_steps_min, "high": self.delay_steps_max},
+            raise ValueError(
+                f"delay_steps_min is {self.delay_steps_min} and delay_steps_max is "
+                f"{self.delay_steps_max}; swap them"
             )
         return self
 
@@ -249,7 +238,7 @@ class Feedback(Part):
 
     poll_period_s: Annotated[Quantity, _TIME]
     """Time between polls of the servo [s]; 0 if every read is fresh."""
-    loss: Annotated[Quantity, AfterValidator(Band(0, 0.999, "percent", 1e-2))]
+    loss: Annotated[Quantity, AfterValidator(PlausibleRange(0, 0.999, "percent", 1e-2))]
     """Probability that a poll fails silently, a fraction of 1."""
     quantum_rad: Annotated[Quantity, _SMALL_ANGLE]
     """Size of one count [rad]; 0 if readings are continuous."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.sysid.recordings.layouts import convert
@@ -87,16 +88,9 @@ def newest_recording(folder: Path = FOLDER) -> Path:
 
 def read_bytes(path: Path) -> bytes:
     """Content of a recording file; an unreadable, empty or huge file is refused."""
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise InputError(
-                f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB; split it by joint."
-            )
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist. Check the name, or run a sweep first.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Check the name, or run a sweep first.")
+    data = border.read_bytes(path, _LARGEST_BYTES, "Split it by joint.")
     if not data.strip():
         raise InputError(f"{path} is empty: the recording never started. Record it again.")
     return data

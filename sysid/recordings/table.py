@@ -11,8 +11,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
+from pupper_sysid.common.border import parse_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
 
@@ -228,32 +229,20 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
         if not line.startswith("# ") or ": " not in line:
             continue
         key, _, value = line[2:].partition(": ")
+        name = f"{path}, line {n}: the value of '{key}'"
         try:
-            metadata[key.strip()] = json.loads(value)
-        except (ValueError, RecursionError):
+            metadata[key.strip()] = parse_json(value, name, "Mend or remove the line.")
+        except InputError:
             if lines[0].startswith(TITLE) and n < len(lines):
-                raise InputError(
-                    f"{path}, line {n}: the value of '{key}' is not JSON. Mend or remove the line."
-                ) from None
+                raise
     check_metadata(path, metadata)
     return metadata
 
 
 def check_metadata(path: Path | str, metadata: dict[str, Any]) -> None:
     """Refuse header entries of the wrong type, or of a newer version."""
-    try:
-        header = Header.model_validate(metadata)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise InputError(
-            f"{path}, header, {where}: {first['msg']}. Mend it, or leave it out."
-        ) from None
-    if header.schema_version > 1:
-        raise InputError(
-            f"{path} has schema_version {header.schema_version}, written by a newer pupper-sysid; "
-            "this one reads up to 1. Upgrade."
-        )
+    refuse_other_version(path, metadata.get("schema_version", SCHEMA_VERSION), SCHEMA_VERSION)
+    validated(Header, metadata, f"{path}, header", remedy="leave it out")
 
 
 def comments(title: str, entries: dict[str, Any]) -> str:

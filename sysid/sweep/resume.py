@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
+from pupper_sysid.common.border import validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import as_text, read_bytes
 from pupper_sysid.sysid.recordings.table import TITLE, header, parse
@@ -89,15 +90,7 @@ def header_of(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path} does not say what was planned (an older version wrote it). Record it again."
         )
-    try:
-        Request.model_validate(request)
-    except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
-        where = ".".join(map(str, ("sweep", *fault["loc"])))
-        raise InputError(
-            f"{path}, header, {where}: {fault['msg']}; what was planned there is not what this "
-            "version plans. Record it again."
-        ) from error
+    validated(Request, request, f"{path}, header's sweep", remedy="record it again")
     return metadata
 
 

@@ -79,9 +79,12 @@ def test_a_missing_file_is_refused_and_a_misspelt_preset_is_recognised(tmp_path)
         (b"&x a: 3\n", "not a plain word"),
         (b"a:\n  b: 1\n  b: 2\n", "line 3, a.b stands in the file twice"),
         (b"[" * 1_000_000, "nested deeper"),
-        (b"schema: pupper-calibration\n", "schema_version is None"),
+        (b"schema: pupper-calibration\n", "schema_version is null"),
         (b"schema: pupper-calibration\nschema_version: true\n", "schema_version is True"),
-        (b"schema: pupper-calibration\nschema_version: 0\n", "Write `schema_version: 2`"),
+        (
+            b"schema: pupper-calibration\nschema_version: 0\n",
+            "schema_version is 0; this version reads 2",
+        ),
         (b"schema: pupper-calibration\nschema_version: 3\nnew: 1\n", "newer version.*Upgrade"),
     ],
 )

@@ -195,7 +195,7 @@ def test_each_trial_knows_how_its_bus_cut_commands(tmp_path):
 )
 def test_what_numbers_are_made_of_is_checked_in_the_header_s_bus(tmp_path, bus, where):
     top = ("# pupper-sysid recording", f"# bus: {json.dumps(bus)}")
-    with pytest.raises(InputError, match=f"header, bus.{where}"):
+    with pytest.raises(InputError, match=f"header: bus.{where}"):
         load(write(tmp_path, rows(), top=top))
 
 

@@ -92,7 +92,7 @@ def test_a_recording_killed_between_the_last_row_and_the_footer_only_gets_its_fo
     [
         ("time_s,x\n1,2\n", "no recording of pupper-sysid"),
         ("# pupper-sysid recording\n# schema_version: 1\n", "does not say what was planned"),
-        ("# pupper-sysid recording\n# sweep: {\"bus\": 3}\n", "is not what this version plans"),
+        ("# pupper-sysid recording\n# sweep: {\"bus\": 3}\n", "sweep: bus is 3. Write text"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_continued_is_refused_in_a_sentence(tmp_path, capsys, text, says):

@@ -1,0 +1,401 @@
+"""The border where files come in: limited reading, versions, validation, and one form of refusal.
+
+`read_yaml`, `read_json` and `read_text` turn a file into plain data; `refuse_other_version` checks
+its schema version; `validated` turns the data into a pydantic model. Whatever is wrong becomes an
+`InputError` of a sentence or two: the file, the line, the place, what stands there, what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.strict_yaml import Place, load, place_text
+
+LARGEST_BYTES = 2_000_000
+
+UNIT_OF_SUFFIX = {
+    "counts_per_rad": "counts/rad",
+    "nm_s_per_rad": "N·m·s/rad",
+    "nm_per_rad": "N·m/rad",
+    "nm": "N·m",
+    "kg_m2": "kg·m²",
+    "rad_s": "rad/s",
+    "rad": "rad",
+    "hz": "Hz",
+    "s": "s",
+    "percent": "%",
+}
+"""Unit of a name by its ending; longer endings first."""
+
+_UNITS = (
+    "nm_s_per_rad|nm_per_rad|nm_s_per_deg|nm_per_deg|kg_m2|g_cm2|kg_cm|mnm|nmm|nm|"
+    "rad_s|deg_s|rpm|rad|deg|degrees|mrad|ms|us|s|hz|steps|percent"
+)
+_UNIT_ENDING = re.compile(rf"_({_UNITS})$", re.IGNORECASE)
+
+_WANTED = {
+    "string_type": "text (in quotes if it looks like a number)",
+    "tuple_type": "a list, one line and one dash per entry",
+    "list_type": "a list, one line and one dash per entry",
+    "dict_type": "a mapping of names",
+    "bool_type": "true or false",
+}
+_NOT_A_MAPPING = ("model_type", "model_attributes_type")
+# A misspelt key is also a missing key, and a wrong type hides what stands below it.
+_FIRST = ("extra_forbidden", *_NOT_A_MAPPING)
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+# ------------------------------------------------------------------------------------ reading
+
+
+def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> bytes:
+    """Content of a regular file of limited size.
+
+    Parameters
+    ----------
+    path : Path
+    largest_bytes : float
+        Larger files are refused without being read.
+    remedy : str
+        What to do, as a sentence; by default, to check the file's name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, no regular file, larger, or cannot be read.
+    """
+    try:
+        if not path.exists():
+            raise InputError(f"{path} does not exist. {remedy or 'Check the name.'}")
+        if not path.is_file():  # a pipe or a device never ends
+            raise InputError(f"{path} is not a file. {remedy or 'Give the name of a file.'}")
+        if path.stat().st_size > largest_bytes:
+            raise InputError(
+                f"{path} is larger than {largest_bytes / 1e6:g} MB, and no such file of this "
+                f"project is. {remedy or 'Check that it is the file you meant.'}"
+            )
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # a name with a null character is a ValueError
+        said = getattr(error, "strerror", None) or error
+        raise InputError(f"{path} cannot be read: {said}. {remedy}".rstrip()) from error
+
+
+def read_text(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> str:
+    """Text of a UTF-8 file of limited size, without a byte order mark.
+
+    Raises
+    ------
+    InputError
+        As `read_bytes`, and if the file is not text.
+    """
+    try:
+        return read_bytes(path, largest_bytes, remedy).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path} is not a text file (byte {error.start} is not UTF-8). "
+            f"{remedy or 'Check that it is the file you meant.'}"
+        ) from error
+
+
+def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
+    """Data of a YAML file, read strictly (see `common.strict_yaml`).
+
+    Returns
+    -------
+    data : dict, list, str, int, float, bool or None
+    lines : dict
+        The line (from 1) of every place in the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is not YAML, or uses what is refused.
+    """
+    return load(read_text(path), str(path))
+
+
+def read_json(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> Any:
+    """Data of a JSON file of limited size.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not JSON.
+    """
+    return parse_json(read_text(path, largest_bytes, remedy), str(path), remedy)
+
+
+def parse_json(text: str, name: str, remedy: str = "") -> Any:
+    """Data of JSON `text`; `name` says in messages what it is, `remedy` what to do.
+
+    Raises
+    ------
+    InputError
+        If it is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        what = "it is nested too deeply"
+    except ValueError as error:
+        what = str(error)
+    raise InputError(f"{name} is not JSON: {what}. {remedy}".rstrip())
+
+
+# --------------------------------------------------------------------------- schema and version
+
+
+def refuse_other_version(
+    path: Path | str, found: Any, known: int, oldest: int = 1, remedy: str = ""
+) -> None:
+    """Refuse a file of a version that this code does not read.
+
+    Parameters
+    ----------
+    path : Path or str
+    found : object
+        `schema_version` as the file gives it.
+    known, oldest : int
+        The newest and the oldest version that are read.
+    remedy : str
+        What to do about a number that is no version, as a sentence.
+
+    Raises
+    ------
+    InputError
+        With the advice to upgrade if the file is newer.
+    """
+    if type(found) is int and found > known:
+        raise InputError(
+            f"{path} was written by a newer version of pupper-sysid (schema_version {found}; "
+            f"this one reads {known}). Upgrade pupper-sysid."
+        )
+    if type(found) is not int or found < oldest:
+        raise InputError(
+            f"{path}: schema_version is {_short(found)}; this version reads {known}. "
+            f"{remedy or 'Put the file back as it was written.'}"
+        )
+
+
+# --------------------------------------------------------------------------------- validation
+
+
+def validated(
+    model: type[_Model],
+    data: Any,
+    name: Path | str,
+    lines: Mapping[Place, int] | None = None,
+    remedy: str = "",
+) -> _Model:
+    """`data` as a pydantic model.
+
+    Parameters
+    ----------
+    model : type of pydantic.BaseModel
+    data : object
+        Plain data from a file.
+    name : Path or str
+        The file, as the user named it.
+    lines : mapping, optional
+        The line of every place of the file, from `read_yaml`.
+    remedy : str
+        What to do instead of editing the file, such as "fit the model again".
+
+    Raises
+    ------
+    InputError
+        On the fault that most likely caused the others.
+
+    Examples
+    --------
+    >>> class Servo(BaseModel, extra="forbid"):
+    ...     lag_s: float
+    >>> validated(Servo, {"lag_ms": 30.0}, "servo.yaml", {("lag_ms",): 1})
+    Traceback (most recent call last):
+    ...
+    pupper_sysid.common.errors.InputError: servo.yaml, line 1: lag_ms is in another unit: \
+this file holds it in s. Convert it and name it lag_s. (1 more fault in this file.)
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise InputError(_explain(error, model, data, name, lines or {}, remedy)) from error
+
+
+def unit_of(name: str) -> str:
+    """Unit of a quantity by the ending of its name; empty if it has none.
+
+    Examples
+    --------
+    >>> unit_of("damping_nm_s_per_rad"), unit_of("dead_time_s"), unit_of("loss")
+    ('N·m·s/rad', 's', '')
+    """
+    return next((u for end, u in UNIT_OF_SUFFIX.items() if f"_{name}".endswith(f"_{end}")), "")
+
+
+def _explain(
+    error: ValidationError, top: type[BaseModel], data: Any, name: Path | str,
+    lines: Mapping[Place, int], remedy: str,
+) -> str:  # fmt: skip
+    """The sentence on the first fault, and how many more there are."""
+    faults = sorted(
+        error.errors(include_url=False),
+        key=lambda f: (
+            f["type"] == "missing",
+            _FIRST.index(f["type"]) if f["type"] in _FIRST else len(_FIRST),
+        ),
+    )
+    fault = faults[0]
+    place = _place(fault, data)
+    known = place
+    while known and known not in lines:
+        known = known[:-1]
+    at = f", line {lines[known]}" if known in lines and known else ""
+    where = f"{name}{at}: {place_text(place)}" if place else f"{name}{at}"
+    more = len({_place(f, data) for f in faults}) - 1
+    rest = f" Or {remedy}." if remedy else ""
+    rest += f" ({more} more fault{'s' if more > 1 else ''} in this file.)" if more else ""
+    message = f"{where} {_fault(fault, top, place)}{rest}"
+    # a file may hold line breaks and terminal codes in its keys; a sentence may not
+    return "".join(c if c.isprintable() else " " for c in message)
+
+
+def _place(fault: ErrorDetails, data: Any) -> Place:
+    """Where a fault stands in the data; pydantic's location also names members of unions."""
+    place: list[str | int] = []
+    steps: tuple[Any, ...] = fault["loc"]
+    for step in steps:
+        if (isinstance(data, dict) and step in data) or (
+            isinstance(data, list | tuple) and isinstance(step, int) and step < len(data)
+        ):
+            data = data[step]
+            place.append(step)
+    return (*place, fault["loc"][-1]) if fault["type"] == "missing" else tuple(place)
+
+
+def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
+    kind, given = fault["type"], fault["input"]
+    name = str(place[-1]) if place else ""
+    siblings = _fields(top, place[:-1])
+    if kind == "extra_forbidden":
+        return _unknown_key(name, siblings)
+    field = siblings.get(name)
+    meaning = _meaning(field)
+    if kind == "missing":
+        return f"is missing. Add it{meaning}."
+    if kind in _NOT_A_MAPPING:
+        return _not_a_mapping(given, field, meaning)
+    if kind == "value_error":
+        return f"is not usable: {fault['msg'].removeprefix('Value error, ')}."
+    unit = _unit_in_words(place)
+    if kind in ("float_type", "int_type", "int_from_float"):
+        whole = "a whole number" if kind.startswith("int") else "a number"
+        if isinstance(given, str) and given.strip().lower().lstrip("+-.") in ("nan", "inf"):
+            return f"is {given}. Write a finite number{unit}."
+        if isinstance(given, str):
+            return f"is the text '{_short(given)}'. Write the number only{unit}."
+        return f"is {_short(given)}. Write {whole}{unit}."
+    if kind == "finite_number":
+        return f"is {_short(given)}. Write a finite number{unit}."
+    if kind == "literal_error":
+        return f"is {_short(given)}. Write {fault.get('ctx', {}).get('expected', 'another word')}."
+    if kind in _WANTED:
+        return f"is {_short(given)}. Write {_WANTED[kind]}{meaning}."
+    message = fault["msg"].replace("Input should", "it must").replace(" should ", " must ")
+    message = message.replace(" after validation", "")
+    return f"is {_short(given)}; {message[:1].lower()}{message[1:]}{meaning}."
+
+
+def _unknown_key(name: str, fields: dict[str, FieldInfo]) -> str:
+    stem = _stem(name)
+    for known in fields:
+        # "delay_steps_min" is no other unit of "delay_s"; the stems must be the same word
+        if name not in fields and stem == _stem(known) != known and name.lower() != known:
+            had = "has no unit in its name" if stem == name.lower() else "is in another unit"
+            return f"{had}: this file holds it in {unit_of(known)}. Convert it and name it {known}."
+    near = difflib.get_close_matches(name, list(fields), n=1, cutoff=0.6)
+    if near:
+        return f"is not a key of this file. Did you mean {near[0]}?"
+    return f"is not a key of this file. Remove it, or use one of {', '.join(fields)}."
+
+
+def _stem(name: str) -> str:
+    return _UNIT_ENDING.sub("", name.lower())
+
+
+def _not_a_mapping(given: Any, field: FieldInfo | None, meaning: str) -> str:
+    """A model may show in `EXAMPLE` how to write it; its validators may know a `problem`."""
+    example = getattr(_part(field.annotation), "EXAMPLE", "") if field else ""
+    if not field or not example:
+        return f"is {_short(given)} where a mapping of keys is expected. Fill it in{meaning}."
+    if isinstance(given, bool) or not isinstance(given, int | float) or not math.isfinite(given):
+        return f"is {_short(given)}. Write {example}{meaning}."
+    checks = (getattr(getattr(entry, "func", None), "problem", None) for entry in field.metadata)
+    problem = next((said for check in checks if check and (said := check(given))), "")
+    return f"is a bare number{f' ({problem})' if problem else ''}. Write {example}{meaning}."
+
+
+def _meaning(field: FieldInfo | None) -> str:
+    text = (field.description or "").strip().rstrip(".") if field else ""
+    return f": {text[:1].lower()}{text[1:]}" if text else ""
+
+
+def _unit_in_words(place: Place) -> str:
+    """The unit of the quantity at `place`, whose last part may be value, low or high."""
+    names = [part for part in place if isinstance(part, str)]
+    if len(names) > 1 and names[-1] in ("value", "low", "high"):
+        names.pop()
+    unit = unit_of(names[-1]) if names else ""
+    return f", in {unit}" if unit else ""
+
+
+def _short(given: Any) -> str:
+    text = "null" if given is None else str(given)
+    return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+def _fields(top: type[BaseModel], place: Place) -> dict[str, FieldInfo]:
+    """Keys (as the file spells them) of the part that stands at `place`."""
+    annotation: Any = top
+    for step in place:
+        model = _part(annotation)
+        if model is not None:
+            field = _named(model).get(str(step))
+            if field is None:
+                return {}
+            annotation = field.annotation
+        else:
+            inner = [a for a in get_args(annotation) if a is not Ellipsis]
+            if not inner:
+                return {}
+            annotation = inner[-1]
+    model = _part(annotation)
+    return _named(model) if model is not None else {}
+
+
+def _named(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    return {field.alias or name: field for name, field in model.model_fields.items()}
+
+
+def _part(annotation: Any) -> type[BaseModel] | None:
+    """The model behind an annotation, through Annotated and `| None`; None for a container."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    if get_origin(annotation) in (Union, UnionType):
+        parts = [_part(argument) for argument in get_args(annotation)]
+        return next((part for part in parts if part is not None), None)
+    return None
