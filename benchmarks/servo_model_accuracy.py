@@ -80,17 +80,16 @@ def main() -> None:
     kept = {}
     for arch, preset in kinds:
         start = time.perf_counter()
-        fit = fit_servo([recording], recording.joints, arch, preset, SPLIT)
+        fit = fit_servo(recording, None, arch, preset, SPLIT)
         seconds = time.perf_counter() - start
         kept[arch, preset] = fit.model
-        own = fit.scored[arch]
-        one = np.mean([np.sqrt(np.mean(e.one_step**2)) for e in own.errors.values()])
-        floor = np.mean(list(fit.repeatability.values()))
+        found, floor = fit.rmse_free_run_rad, fit.mean.repeatability_rad
+        worst = max(s.rmse_free_run_rad for s in fit.joints.values())
         print(
-            f"| {arch}{', as published' if preset == 'paper' else ''} | {1e3 * one:.1f} "
-            f"| {1e3 * own.mean:.1f} | {1e3 * own.interval[0]:.1f} … {1e3 * own.interval[1]:.1f} "
-            f"| {1e3 * max(own.free_run(j) for j in recording.joints):.1f} "
-            f"| {1e3 * (own.mean - floor):.1f} | {seconds:.0f} |",
+            f"| {arch}{', as published' if preset == 'paper' else ''} "
+            f"| {1e3 * fit.mean.rmse_one_step_rad:.1f} "
+            f"| {1e3 * found.value:.1f} | {1e3 * found.low:.1f} … {1e3 * found.high:.1f} "
+            f"| {1e3 * worst:.1f} | {1e3 * (found.value - floor):.1f} | {seconds:.0f} |",
             flush=True,
         )
     print("\n| model | environments | one step of 12 joints ms | bare products ms |")

@@ -1,4 +1,4 @@
-"""`pupper-analyze claims`: every published claim beside what is found here, as two pages.
+"""The pages: every published claim beside what is found here.
 
 `claims.md` is for a repository, `claims.html` for reading: one file with its pictures inside.
 Beside them lie the pictures as PNG and SVG and the tables as CSV.
@@ -6,7 +6,7 @@ Beside them lie the pictures as PNG and SVG and the tables as CSV.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +19,9 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_text
 
 if TYPE_CHECKING:
-    from pupper_sysid.cli.programs.pupper_analyze import Analyze, Tries
+    from pupper_sysid.cli.commands.analyze.common import Tries
     from pupper_sysid.common.page import Picture, Section
+    from reproduction.__main__ import Options
     from reproduction.claims import Claim
     from reproduction.evidence import PolicyEvidence
     from reproduction.servos import ServoEvidence
@@ -36,31 +37,30 @@ _STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 
 
-def write_claims(options: Analyze, tries: Tries) -> None:
+def write_claims(options: Options, tries: Tries) -> None:
     """Gather, judge, draw and write."""
     from pupper_sysid.common.page import write_page
     from reproduction import servos as servo_claims
     from reproduction.evidence import KINDS, gather
     from reproduction.policies import judge
 
-    page, report = options.folder / PAGE, options.folder / REPORT
+    page, report = options.out / PAGE, options.out / REPORT
     figures = [f"figures/{name}{ending}" for name in PICTURES for ending in (".png", ".svg")]
     tables = [f"tables/{name}.csv" for name in TABLES]
-    for name in (PAGE, REPORT, *figures, *tables):  # before hours of work, not after them
-        refuse_overwrite(options.folder / name, options.force)
-    for name, policy, _ in tries:
+    for name in (PAGE, REPORT, *figures, *tables):  # before hours of work
+        refuse_overwrite(options.out / name, options.force)
+    for name, (policy, _) in tries.items():
         if policy.contract.kind not in KINDS:
             raise InputError(
-                f"{name} is of the kind {policy.contract.kind}, about which nothing was published, "
-                f"so no claim would count it. Leave it out; claims are about {', '.join(KINDS)}."
+                f"{name} is of the kind {policy.contract.kind}, about which nothing was published. "
+                f"Leave it out; claims are about {', '.join(KINDS)}."
             )
     recordings = terminal.load_all(options.recordings) if options.recordings else []
-    say = _say
-    robot = servo_claims.gather(recordings, options.seed, say)
+    robot = servo_claims.gather(recordings, options.seed, _show_step)
     evidence = []
-    for (name, policy, trial), path in zip(tries, options.policies, strict=True):
-        evidence.append(gather(name, policy, trial, run_folder(path), say))
-    stacks = _stacks(options, say)
+    for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True):
+        evidence.append(gather(name, policy, trial, run_folder(path), _show_step))
+    stacks = _stacks(options)
     found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
     pictures = _draw(evidence, robot)
     inputs = _inputs(options, tries)
@@ -73,7 +73,7 @@ def write_claims(options: Analyze, tries: Tries) -> None:
     if options.json:
         print_json(
             {
-                "claims": [asdict(c) for c in found], "page": str(page), "report": str(report),
+                "claims": found, "page": str(page), "report": str(report),
                 "pictures": [_file(p) for p in pictures], "inputs_sha256": inputs,
                 "versions": versions(*_MORE),
             }
@@ -86,29 +86,27 @@ def write_claims(options: Analyze, tries: Tries) -> None:
     err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.", soft_wrap=True)
 
 
-def _say(what: str) -> None:
+def _show_step(what: str) -> None:
     err.print(f"{what} …", style="dim")
 
 
-def _stacks(options: Analyze, say: Any) -> list[dict[str, Any]]:
+def _stacks(options: Options) -> list[dict[str, Any]]:
     """Closed loop against the servo model's prediction, walked by the first policy."""
     if options.servo is None:
         return []
-    from dataclasses import replace
-
-    from pupper_sysid.policies.deploy.stack_trials import Walker, compare_stacks
     from pupper_sysid.policies.deploy.stacks import STACKS
+    from reproduction.stacks import Walker, compare_stacks
 
     policy, run = policy_at(options.policies[0])
     actuator = chosen_actuator(options.policies[0], policy, run, options.actuator)
     closed = STACKS["closed-loop"]
-    # the same smoothing in both: only what the policy is shown differs
+    # the same smoothing in both: only the policy's observation differs
     predicted = replace(closed, observer="servo-model")
     # a servo model is one robot's: the one of --seed
     walkers = [Walker(options.seed, options.servo, k) for k in range(_STACK_ROUNDS)]
     return compare_stacks(
         policy, {"encoders": closed, "servo model": predicted}, walkers, _STACK_COMMANDS,
-        _STACK_SECONDS, actuator, say,
+        _STACK_SECONDS, actuator, _show_step,
     )  # fmt: skip
 
 
@@ -127,9 +125,9 @@ def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]
     """What can be shown of the evidence."""
     from pupper_sysid.common.page import Picture
     from pupper_sysid.policies.analysis import figures
+    from pupper_sysid.policies.analysis.attractor import DELAYS_MS
     from pupper_sysid.sysid.report.figures import sweep_figure
-    from pupper_sysid.sysid.report.servo_figures import compare_figure
-    from reproduction.evidence import DELAYS_MS
+    from reproduction.figures import delay_trace_figure
 
     made: list[Picture] = []
     if robot.sweep is not None:
@@ -144,8 +142,8 @@ def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]
             made.append(Picture(f"gait-{kind}", caption, figures.gait_figure(first.walk)))
     shown = _one_per_kind([e for e in evidence if e.orbits])
     if shown:
-        orbits = {f"{e.name} {k}": v["orbits"] for e in shown for k, v in e.orbits.items()}
-        late = {e.name: e.orbits["actions"]["states"] for e in shown}
+        orbits = {f"{e.name} {k}": v.orbits for e in shown for k, v in e.orbits.items()}
+        late = {e.name: e.orbits["actions"].states for e in shown}
         made += [
             Picture(
                 "orbits",
@@ -155,11 +153,10 @@ def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]
             Picture(
                 "late",
                 "As figure 6: the LF thigh's action in replay with late joints.",
-                figures.delay_trace_figure(late, DELAYS_MS, shown[0].walk.step_s),
+                delay_trace_figure(late, DELAYS_MS, shown[0].walk.step_s),
             ),
         ]
     every = _one_per_kind(evidence)
-    own_rhythm = {e.name: {"frozen": e.frozen, "push": e.push, "rate": e.rate} for e in every}
     made += [
         Picture(
             "ablation",
@@ -174,7 +171,7 @@ def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]
         Picture(
             "autonomy",
             "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
-            figures.autonomy_figure(own_rhythm),
+            figures.autonomy_figure({e.name: e.autonomy for e in every}),
         ),
         Picture("terrain", "Other ground.",
                 figures.terrain_figure({e.name: e.terrain for e in every})),
@@ -185,13 +182,13 @@ def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]
         ),
     ]  # fmt: skip
     if robot.servos is not None:
-        caption = "As the extension's figure: four ways to say where a servo will be, unseen loop."
-        made.append(Picture("servos", caption, compare_figure(robot.servos)))
+        caption = "As the extension's figure: four servo models on an unseen loop."
+        made.append(Picture("servos", caption, robot.servos.plot()))
     return made
 
 
 def _file(picture: Picture) -> str:
-    """Where a page finds its picture."""
+    """Path of a picture from the page."""
     return f"figures/{picture.name}.png"
 
 
@@ -202,7 +199,7 @@ def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
 
 def _page(
     found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
-    inputs: dict[str, str], options: Analyze,
+    inputs: dict[str, str], options: Options,
 ) -> str:  # fmt: skip
     """The report as Markdown."""
     lines = [
@@ -229,13 +226,13 @@ def _page(
 
 def _sections(
     found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
-    inputs: dict[str, str], options: Analyze,
+    inputs: dict[str, str], options: Options,
 ) -> list[Section]:  # fmt: skip
-    """The same as a page in the style of the other reports."""
+    """The report as a page in the style of the others."""
     from pupper_sysid.common.page import Column, Section, Table
 
     claims = tuple(
-        {**asdict(c), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
+        {**c.to_dict(), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
         for c in found
     )
     columns = (
@@ -282,7 +279,7 @@ _MORE = ("torch", "pandas")  # packages that shape these numbers beside the usua
 _ABOUT = (
     "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
     "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
-    "what needs the physical one is said to."
+    "claims that need the physical one say so."
 )
 
 
@@ -292,9 +289,9 @@ def _tally(found: list[Claim]) -> str:
     return f"{len(found)} claims: {tally}."
 
 
-def _command(options: Analyze) -> str:
-    """What was typed, with files by their names."""
-    parts = ["pupper-analyze claims", *(str(p) for p in options.policies)]
+def _command(options: Options) -> str:
+    """The command that makes the page, with files by their names."""
+    parts = ["python -m reproduction", *(str(p) for p in options.policies)]
     if options.recordings:
         parts += ["--recordings", *(p.name for p in options.recordings)]
     if options.servo:
@@ -305,19 +302,21 @@ def _command(options: Analyze) -> str:
     parts += ["--command", *(f"{c:g}" for c in options.command)]
     for flag in ("robots", "seconds", "seed"):
         parts += [f"--{flag}", f"{getattr(options, flag):g}"]
-    return " ".join([*parts, "--out", str(options.folder)])
+    return " ".join([*parts, "--out", str(options.out)])
 
 
 def _versions() -> str:
     return ", ".join(f"{name} {version}" for name, version in versions(*_MORE).items())
 
 
-def _inputs(options: Analyze, tries: Tries) -> dict[str, str]:
+def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     """SHA-256 of everything the page rests on, by name."""
     from pupper_sysid.servo_models.servo_file import WEIGHTS
 
-    found = {f"policy {name}": policy.contract.weights_sha256 for name, policy, _ in tries}
-    servos = {Path(trial.servos.source) for _, _, trial in tries}
+    found = {
+        f"policy {name}": policy.contract.weights_sha256 for name, (policy, _) in tries.items()
+    }
+    servos = {Path(trial.servos.source) for _, trial in tries.values()}
     if options.servo:
         servos.add(options.servo)
     files = [p / WEIGHTS if p.is_dir() else p for p in sorted(servos)]
@@ -327,7 +326,7 @@ def _inputs(options: Analyze, tries: Tries) -> dict[str, str]:
 
 def _bounds(claim: Claim) -> str:
     known = (claim.interval or {}).items()
-    return "; ".join(f"{k} {_number(v[0])} to {_number(v[1])}" for k, v in known) or "–"
+    return "; ".join(f"{k} {_number(v.low)} to {_number(v.high)}" for k, v in known) or "–"
 
 
 def _table_one(evidence: list[PolicyEvidence]) -> tuple[list[str], list[tuple[str, list[str]]]]:
@@ -341,11 +340,11 @@ def _table_one(evidence: list[PolicyEvidence]) -> tuple[list[str], list[tuple[st
         "action noise": (known, lambda e: e.trained["std"], 4),
         "updates of PPO": (known, lambda e: e.trained["updates"], 0),
         "steps/s in training": (known, lambda e: e.trained["steps_per_s"], 0),
-        "still up after 10 s, flat": (evidence, lambda e: e.terrain[0]["survival"], 2),
+        "still up after 10 s, flat": (evidence, lambda e: e.terrain[0].survival, 2),
         "still up, other ground": (
-            evidence, lambda e: float(np.mean([r["survival"] for r in e.terrain[1:]])), 2,
+            evidence, lambda e: float(np.mean([r.survival for r in e.terrain[1:]])), 2,
         ),
-        "forward error, m/s": (evidence, lambda e: e.terrain[0]["mae_vx_m_s"], 3),
+        "forward error, m/s": (evidence, lambda e: e.terrain[0].mae_vx_m_s, 3),
     }  # fmt: skip
     made = [("policies", [str(sum(e.kind == k for e in evidence)) for k in kinds])]
     for title, (where, value, digits) in rows.items():

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.doctor.examination import JointExamination, examine
 from pupper_sysid.sysid.identify.calibrate import DeadTime, dead_times
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.servo_fit import scores as servo_scores
 from pupper_sysid.sysid.servo_fit.compare import Comparison
 from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
 from reproduction.claims import Claim, Finding, NotTestable, claim, holds
@@ -18,7 +18,7 @@ from reproduction.claims import Claim, Finding, NotTestable, claim, holds
 
 @dataclass
 class ServoEvidence:
-    """What recordings of a robot say."""
+    """Measurements of a robot's recordings."""
 
     lag: dict[str, DeadTime] = field(default_factory=dict)
     """Per joint, from sweeps."""
@@ -33,7 +33,7 @@ class ServoEvidence:
 
 
 def gather(
-    recordings: Sequence[Recording], seed: int, say: Callable[[str], None] = lambda what: None
+    recordings: Sequence[Recording], seed: int, progress: Callable[[str], None] = lambda what: None
 ) -> ServoEvidence:
     """Lag and staleness from sweeps, servo models from the recording with most joints."""
     found = ServoEvidence()
@@ -46,12 +46,12 @@ def gather(
             f"{recording.name} {name}": one for name, one in examine(recording, rng).joints.items()
         }
     if sweeps:
-        say("lag of the sweeps")
+        progress("lag of the sweeps")
         found.lag = dead_times(sweeps, None, seed)
         found.sweep = max(sweeps, key=lambda r: len(r.table))
     if others:
         found.played = max(others, key=lambda r: (len(r.joints), len(r.table)))
-        say(f"servo models on {found.played.name}")
+        progress(f"servo models on {found.played.name}")
         found.servos = four_way(found.played, found.played.joints, seed)
     return found
 
@@ -77,9 +77,8 @@ def constant_lag(found: ServoEvidence) -> Finding:
         f"{naive:.0f} ms in all rows, {fresh:.0f} ms in fresh ones, {servo:.0f} ms the servo's own "
         f"({dead:.0f} ms of it dead time); {min(by_rate):.0f} to {max(by_rate):.0f} ms by frequency"
     )
-    bounds = {
-        "servo": [1e3 * min(b.lag.low for b in budgets), 1e3 * max(b.lag.high for b in budgets)]
-    }
+    low, high = min(b.lag.low for b in budgets), max(b.lag.high for b in budgets)
+    bounds = {"servo": Interval(float(servo), 1e3 * low, 1e3 * high)}
     stale = float(1 - servo / naive)
     return Finding(
         ours, bounds, holds(stale <= 0.15, True),
@@ -143,11 +142,11 @@ def servo_error(found: ServoEvidence) -> Finding:
 )  # fmt: skip
 def free_run(found: ServoEvidence) -> Finding:
     """S2."""
-    mean = {k: 1e3 * float(np.mean(_by_joint(found, k))) for k in ("LSTM", "MLP")}
-    errors = _servos(found).errors
+    spans = {k: _servos(found).models[k].rmse_free_run_rad for k in ("LSTM", "MLP")}
+    mean = {k: 1e3 * i.value for k, i in spans.items()}
     return Finding(
         f"LSTM {mean['LSTM']:.1f}, MLP {mean['MLP']:.1f} mrad",
-        {k: [1e3 * x for x in servo_scores.interval(errors[k], 0)] for k in mean},
+        {k: Interval(*(1e3 * x for x in (i.value, i.low, i.high))) for k, i in spans.items()},
         holds(mean["LSTM"] > 1.5 * mean["MLP"]),
         "Ours is driven by commands only; holds if it is 1.5 times worse.",
     )  # fmt: skip
@@ -155,36 +154,33 @@ def free_run(found: ServoEvidence) -> Finding:
 
 @claim(
     "S3", "One step ahead the LSTM servo is better", "LSTM better in one step",
-    "As S1, one step ahead of the last reading; beside it a servo that stays put.",
+    "As S1, one step ahead of the last reading; beside it persistence (the last reading).",
 )  # fmt: skip
 def one_step(found: ServoEvidence) -> Finding:
     """S3."""
     servos = _servos(found)
-    ahead = {
-        k: 1e3 * float(np.mean([servo_scores.rms(e.one_step) for e in servos.errors[k].values()]))
-        for k in ("LSTM", "MLP")
-    }
-    still = 1e3 * float(np.nanmean(list(servos.persistence.values())))
+    ahead = {k: 1e3 * servos.models[k].mean.rmse_one_step_rad for k in ("LSTM", "MLP")}
+    still = 1e3 * float(np.nanmean(list(servos.persistence_rmse_rad.values())))
     return Finding(
-        f"LSTM {ahead['LSTM']:.1f}, MLP {ahead['MLP']:.1f}, stays put {still:.1f} mrad", None,
+        f"LSTM {ahead['LSTM']:.1f}, MLP {ahead['MLP']:.1f}, persistence {still:.1f} mrad", None,
         holds(ahead["LSTM"] < 0.95 * ahead["MLP"]), "Holds if 5 % better.",
     )  # fmt: skip
 
 
 @claim(
     "S4", "390 samples per joint are enough", "390 samples in 3 loops",
-    "As S1: MLP against how well the robot repeats itself.",
+    "As S1: MLP against the robot's repeatability.",
 )  # fmt: skip
 def enough_data(found: ServoEvidence) -> Finding:
     """S4."""
     mlp = 1e3 * float(np.mean(_by_joint(found, "MLP")))
-    known = [v for v in _servos(found).repeatability.values() if np.isfinite(v)]
+    known = [v for v in _servos(found).repeatability_rad.values() if np.isfinite(v)]
     if not known:
         raise NotTestable("Give a playback that sends the same commands more than once.")
     floor = 1e3 * float(np.mean(known))
     rows = len(found.played.table) // len(found.played.joints) if found.played else 0
     return Finding(
-        f"{rows} rows per joint: MLP {mlp:.1f} mrad, the robot repeats to {floor:.1f}", None,
+        f"{rows} rows per joint: MLP {mlp:.1f} mrad, repeatability {floor:.1f}", None,
         holds(mlp <= 1.1 * floor, True), "More data: the data curve of the servo report.",
     )  # fmt: skip
 
@@ -203,7 +199,8 @@ def _servos(found: ServoEvidence) -> Comparison:
 
 def _by_joint(found: ServoEvidence, model: str) -> np.ndarray:
     """Free-run error of each joint [rad]."""
-    return np.array([servo_scores.rms(e.free_run) for e in _servos(found).errors[model].values()])
+    joints = _servos(found).models[model].joints
+    return np.array([s.rmse_free_run_rad for s in joints.values()])
 
 
 def _range(values: np.ndarray) -> str:

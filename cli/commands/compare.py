@@ -40,8 +40,7 @@ class Compare:
     def run(self) -> None:
         """Compare, print, draw."""
         from pupper_sysid.common.figure_style import refuse_picture, save
-        from pupper_sysid.sysid.report.servo_figures import compare_figure
-        from pupper_sysid.sysid.servo_fit.compare import compare, to_json
+        from pupper_sysid.sysid.servo_fit.compare import compare
 
         if not self.models:
             raise InputError(
@@ -50,32 +49,25 @@ class Compare:
         refuse_picture(self.plot, self.force)
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
-        found = compare(recordings, joints, self.models, self.readings, self.seed)
-        save(compare_figure(found), self.plot, self.force)
-        made = to_json(found, self.seed)
+        found = compare(recordings, self.models, joints, self.readings, self.seed)
+        save(found.plot(), self.plot, self.force)
         if self.json:
-            terminal.print_json(made | {"written": str(self.plot)})
+            terminal.print_json(found.to_dict() | {"written": str(self.plot)})
             return
-        names, models = list(made["models"]), list(made["models"].values())
         shown = terminal.table(
-            "RMS error in free run, mrad", "joint", *names, "stays put", "robot repeats"
+            "RMS error in free run, mrad", "joint", *found.models, "persistence", "repeatability"
         )
         for joint in joints:
-            shown.add_row(
-                joint,
-                *(terminal.ms(m["joints"][joint]["rmse_free_run_rad"]) for m in models),
-                terminal.ms(found.persistence[joint]), terminal.ms(found.repeatability[joint]),
-            )  # fmt: skip
+            errors = [m.joints[joint].rmse_free_run_rad for m in found.models.values()]
+            errors += [found.persistence_rmse_rad[joint], found.repeatability_rad[joint]]
+            shown.add_row(joint, *map(terminal.ms, errors))
         if len(joints) > 1:
-            shown.add_row(
-                "mean", *(terminal.ms(m["mean"]["rmse_free_run_rad"]) for m in models), style="bold"
-            )  # fmt: skip
+            means = (terminal.ms(m.mean.rmse_free_run_rad) for m in found.models.values())
+            shown.add_row("mean", *means, style="bold")
         terminal.out.print(shown)
-        for title, key in (
-            ("through the hold", "rmse_held_rad"), ("rows as logged", "rmse_raw_rad"),
-            ("one step", "rmse_one_step_rad"),
-        ):  # fmt: skip
-            parts = [f"{n} {terminal.ms(made['models'][n]['mean'][key])}" for n in names]
-            terminal.out.print(f"Mean, {title}: {', '.join(parts)}", soft_wrap=True)
+        for title in ("held", "raw", "one_step"):
+            means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in found.models.items()}
+            text = ", ".join(f"{name} {terminal.ms(value)}" for name, value in means.items())
+            terminal.out.print(f"Mean, {title.replace('_', ' ')}: {text}", soft_wrap=True)
         terminal.warn(found.notes)
         terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)

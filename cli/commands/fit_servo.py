@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
 import tyro
 from rich.text import Text
 
@@ -17,13 +16,24 @@ from pupper_sysid.common.files import refuse_overwrite
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
+    from pupper_sysid.sysid.servo_fit.result import ServoFit
 
 _SHOWN = {
     "free_run_mrad": ("free run mrad", 1),
     "linear_mrad": ("linear mrad", 1),
     "delayed_pd_mrad": ("delayed PD mrad", 1),
-    "persistence_mrad": ("stays put mrad", 1),
+    "persistence_mrad": ("persistence mrad", 1),
 }
+_SCORES = (
+    ("rmse_free_run_rad", "free run"),
+    ("rmse_held_rad", "held"),
+    ("rmse_raw_rad", "raw"),
+    ("rmse_one_step_rad", "one step"),
+    ("linear_rmse_rad", "linear"),
+    ("delayed_pd_rmse_rad", "delayed PD"),
+    ("persistence_rmse_rad", "persistence"),
+    ("repeatability_rad", "repeatability"),
+)
 
 
 @dataclass(frozen=True)
@@ -74,9 +84,7 @@ class FitServo:
     def run(self) -> None:
         """Fit, score, save, print."""
         from pupper_sysid.servo_models.servo_file import CONTRACT
-        from pupper_sysid.sysid.recordings.recording import Recording
-        from pupper_sysid.sysid.servo_fit.fit import ServoFit, fit_servo
-        from pupper_sysid.sysid.servo_fit.save import save_fit, to_json
+        from pupper_sysid.sysid.servo_fit.fit import fit_servo
 
         split = self._split()
         if len(self.recordings) == 1 and self.recordings[0].is_dir():
@@ -87,19 +95,18 @@ class FitServo:
         folder = self.out or _free_folder()
         refuse_overwrite(folder / CONTRACT, self.force)
         started = time.perf_counter()
-        recordings: list[Recording] = terminal.load_all(self.recordings)
+        recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.share_progress(f"fitting {self.arch}") as advance:
-            fit: ServoFit = fit_servo(
+            fit = fit_servo(
                 recordings, joints, self.arch, self.preset, split, self.readings, self.seed, advance
             )
         elapsed = time.perf_counter() - started
-        found = to_json(fit, elapsed)
-        save_fit(folder, fit, recordings, self.seed, self.force)
+        fit.save(folder, self.force)
         if self.json:
-            terminal.print_json(found | {"written": str(folder)})
+            terminal.print_json(fit.to_dict() | {"elapsed_s": elapsed, "written": str(folder)})
             return
-        self._print(found)
+        self._print(fit)
         terminal.warn(fit.notes)
         terminal.err.print(
             f"Wrote {folder}/ in {elapsed:.0f} s. Next: pupper-sysid compare --models {folder}",
@@ -137,54 +144,31 @@ class FitServo:
         if any(loops):
             if not all(loops):
                 raise InputError("--train-loops and --test-loops go together, such as 0,1 and 2.")
-            train, test = _numbers("--train-loops", loops[0]), _numbers("--test-loops", loops[1])
-            if set(train) & set(test):
-                raise InputError(
-                    f"Loop {min(set(train) & set(test))} is in --train-loops and in --test-loops; "
-                    "a model would be tested on what it has seen."
-                )
-            return Split(
-                f"trained on loops {loops[0]}, tested on {loops[1]}",
-                lambda number, elapsed, group: np.isin(number, train),
-                lambda number, elapsed, group: np.isin(number, test),
+            return Split.by_trials(
+                _numbers("--train-loops", loops[0]), _numbers("--test-loops", loops[1])
             )
         if times == (None, None):
             return EACH_GROUP_IN_TURN
         if self.train_before is None or self.test_after is None:
             raise InputError("--train-before and --test-after go together, such as 2 and 2.")
-        before, after = self.train_before, self.test_after
-        if not 0 < before <= after:
-            raise InputError(
-                f"--train-before is {before:g} and --test-after {after:g}; training must end "
-                "after 0 s and before testing begins."
-            )
-        return Split(
-            f"trained on the first {before:g} s of each trial, tested after {after:g} s",
-            lambda number, elapsed, group: elapsed < before,
-            lambda number, elapsed, group: elapsed >= after,
-        )
+        return Split.by_time(self.train_before, self.test_after)
 
-    def _print(self, found: dict) -> None:
+    def _print(self, fit: ServoFit) -> None:
         shown = terminal.table(
-            f"{self.arch}, {found['split']}; RMS error in mrad", "joint", "free run",
-            "through the hold", "rows as logged", "one step", "linear", "delayed PD",
-            "stays put", "robot repeats",
-        )  # fmt: skip
-        keys = (
-            "rmse_free_run_rad", "rmse_held_rad", "rmse_raw_rad", "rmse_one_step_rad",
-            "linear_rmse_rad", "delayed_pd_rmse_rad", "persistence_rmse_rad", "repeatability_rad",
-        )  # fmt: skip
-        for name, entry in found["joints"].items():
-            shown.add_row(name, *(terminal.ms(entry[k]) for k in keys))
-        if len(found["joints"]) > 1:
-            shown.add_row("mean", *(terminal.ms(found["mean"][k]) for k in keys), style="bold")
+            f"{fit.arch}, {fit.split}; RMS error in mrad", "joint", *(title for _, title in _SCORES)
+        )
+        for name, one in fit.joints.items():
+            shown.add_row(name, *(terminal.ms(getattr(one, key)) for key, _ in _SCORES))
+        if len(fit.joints) > 1:
+            means = (terminal.ms(getattr(fit.mean, key)) for key, _ in _SCORES)
+            shown.add_row("mean", *means, style="bold")
         terminal.out.print(shown)
         terminal.out.print(
             "\nFree run: commands only, from the start of each run. DelayedPD, the linear filter "
             "and the model were fitted to the same readings and scored on the same unseen ones.",
             soft_wrap=True,
         )
-        terminal.out.print(Text(f"\n{found['verdict']}", "bold"), soft_wrap=True)
+        terminal.out.print(Text(f"\n{fit.verdict}", "bold"), soft_wrap=True)
 
 
 def _free_folder() -> Path:

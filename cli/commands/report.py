@@ -83,7 +83,7 @@ class Report:
             from pupper_sysid.sysid.report.servo_section import servo_section
             from pupper_sysid.sysid.servo_fit.compare import compare
 
-            more.append(servo_section(compare(recordings, joints, self.servo, seed=seed)))
+            more.append(servo_section(compare(recordings, self.servo, joints, seed=seed)))
         written = write_report(
             folder, recordings, results, made, examinations, responses, self.force, more
         )

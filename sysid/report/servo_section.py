@@ -6,29 +6,12 @@ import numpy as np
 
 from pupper_sysid.common.page import Column, Picture, Section, Table
 from pupper_sysid.sysid.report.data_curve import MODELS, DataCurve, data_curve_figure, measured
-from pupper_sysid.sysid.report.servo_figures import compare_figure
-from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.compare import LINEAR, Comparison
 
 
 def servo_section(found: Comparison) -> Section:
     """Section of a comparison of servo models on the report's recordings."""
-    rows = [
-        {
-            "joint": joint,
-            "model": name,
-            "rmse_free_run_rad": scores.rms(errors[joint].free_run),
-            "rmse_held_rad": scores.rms(errors[joint].held),
-            "rmse_raw_rad": scores.rms(errors[joint].raw),
-            "rmse_one_step_rad": scores.rms(errors[joint].one_step),
-            "persistence_rmse_rad": found.persistence[joint],
-            "repeatability_rad": found.repeatability[joint],
-            "band_noise_rad": found.bands.get(name, {}).get(joint, (float("nan"),) * 2)[0],
-            "band_timing_s": found.bands.get(name, {}).get(joint, (float("nan"),) * 2)[1],
-        }
-        for joint in found.data.joints
-        for name, errors in found.errors.items()
-    ]
+    rows = tuple(found.to_frame().reset_index().to_dict("records"))
     columns = (
         Column("joint", lambda row: row["joint"], "key"),
         Column("model", lambda row: row["model"], "words"),
@@ -50,7 +33,7 @@ def servo_section(found: Comparison) -> Section:
             f"{joint}: models in free run, commands only. The shaded band is where the first "
             "model expects nine readings in ten, from its errors on data held out of its fit; it "
             "widens with speed, because a polled reading's time is uncertain.",
-            compare_figure(found, [joint]),
+            found.plot([joint]),
         )
         for joint in found.data.joints
     ]
@@ -76,7 +59,7 @@ def servo_section(found: Comparison) -> Section:
         ],
         figures=pictures,
         tables=[
-            Table("servo_models", "Error of the servo models", columns, tuple(rows)),
+            Table("servo_models", "Error of the servo models", columns, rows),
             _curve_table(curve),
         ],
         notes=found.notes,

@@ -1,98 +1,148 @@
 """Compare servo models on recordings: the same free run, the same readings, side by side.
 
-Models are folders of `fit-servo` and calibrations (their DelayedPD, with the feedback's offset). A
-linear filter fitted to the recording's other groups stands beside them, "it stays where it was",
-and how well the robot repeats itself. A model that was fitted to a recording it is compared on is
-said to be.
+Models are folders of `fit-servo` and calibrations (their DelayedPD, with the feedback's offset).
+Beside them stand a linear filter fitted to the recording's other groups, persistence, and the
+robot's repeatability. A note names models that were fitted to a recording they are compared on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.results import Result, internal
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
 from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
-from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, chosen_joints
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
+from pupper_sysid.sysid.servo_fit.result import ServoFit
+from pupper_sysid.sysid.servo_fit.scores import ModelScores
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LINEAR = "linear, fitted here"
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Models on the same readings.
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Result):
+    """Servo models on the same readings.
 
     Attributes
     ----------
+    models : dict of str to ModelScores
+    persistence_rmse_rad, repeatability_rad : dict of str to float
+        Per joint.
+    time_step_s : float
+        Time between commands.
+    notes : tuple of str
+    data : ServoData
     tracks : dict of str to Tracks
         Free run of each model.
-    errors : dict of str to (dict of str to Errors)
-        By model, then joint.
-    bands : dict of str to (dict of str to (float, float))
-        Noise [rad] and timing [s] of the models that have a predictive band.
-    persistence, repeatability : dict of str to float
-        Per joint [rad].
-    notes : tuple of str
+    bands : dict of str to (dict of str to Band)
+        By model, of those that have a predictive band, then joint.
     """
 
-    data: ServoData
-    tracks: dict[str, scores.Tracks]
-    errors: dict[str, dict[str, scores.Errors]]
-    bands: dict[str, dict[str, tuple[float, float]]]
-    persistence: dict[str, float]
-    repeatability: dict[str, float]
+    models: dict[str, ModelScores]
+    persistence_rmse_rad: dict[str, float]
+    repeatability_rad: dict[str, float]
+    time_step_s: float
     notes: tuple[str, ...]
+    data: ServoData = internal()
+    tracks: dict[str, scores.Tracks] = internal()
+    bands: dict[str, dict[str, scores.Band]] = internal()
+
+    def to_frame(self) -> pd.DataFrame:
+        """Scores, one row per joint and model."""
+        nothing = (float("nan"), float("nan"))
+        rows = []
+        for joint in self.data.joints:
+            for name, model in self.models.items():
+                noise, timing = self.bands.get(name, {}).get(joint, nothing)
+                rows.append(
+                    {"joint": joint, "model": name}
+                    | asdict(model.joints[joint])
+                    | {
+                        "persistence_rmse_rad": self.persistence_rmse_rad[joint],
+                        "repeatability_rad": self.repeatability_rad[joint],
+                        "band_noise_rad": noise, "band_timing_s": timing,
+                    }
+                )  # fmt: skip
+        return pd.DataFrame(rows).set_index(["joint", "model"])
+
+    def plot(self, joints: Sequence[str] | None = None) -> Figure:
+        """Figure of the models in free run beside commands and readings, a panel per joint.
+
+        Parameters
+        ----------
+        joints : sequence of str, optional
+            By default all.
+        """
+        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+
+        errors = {name: model.errors for name, model in self.models.items()}
+        shown = {name: track for name, track in self.tracks.items() if name != LINEAR}
+        return free_run_figure(self.data, shown, errors, self.bands, joints)
 
 
 def compare(
-    recordings: Sequence[Recording],
-    joints: Sequence[str],
-    models: Sequence[str],
-    mode: str = "auto",
+    recordings: Recordings,
+    models: Sequence[str | Path | Calibration | ServoFit],
+    joints: Joints = None,
+    readings: str = "auto",
     seed: int = 0,
 ) -> Comparison:
-    """Run every model over the recordings.
+    """Run servo models over recordings and score them on the same readings.
 
     Parameters
     ----------
-    recordings : sequence of Recording
-    joints : sequence of str
-    models : sequence of str
-        Servo model folders, calibration files or presets.
-    mode : {"auto", "fresh", "all"}
+    recordings : Recording or sequence of Recording
+        At one rate.
+    models : sequence of str, Path, Calibration or ServoFit
+        Models, or names of servo model folders, calibration files and presets.
+    joints : str or sequence of str, optional
+        By default all that were recorded.
+    readings : {"auto", "fresh", "all"}
         Which readings count, see `sysid.servo_fit.data`.
     seed : int
+        Of the bootstrap.
+
+    Returns
+    -------
+    Comparison
 
     Raises
     ------
     InputError
         If a model cannot be read, or is for another rate or other joints.
     """
-    data = merged_groups(servo_data(recordings, joints, mode, seed))
+    recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
+    data = merged_groups(servo_data(recordings, names, readings, seed))
     found: dict[str, ServoModel] = {}
     bands, notes = {}, []
     inputs = {r.sha256: r.name for r in recordings}
     for given in models:
         model, name, used, band = _open(given, data)
+        shown = given if isinstance(given, str | Path) else name
         if name in found:
-            name = f"{name} ({given})"
+            name = f"{name} ({shown if shown != name else len(found) + 1})"
         found[name] = model
         if band:
             bands[name] = band
         notes += [
-            f"{given} was fitted to {inputs[h]}: its errors here flatter it. Its contract has "
+            f"{shown} was fitted to {inputs[h]}: its errors here are too small. Its contract has "
             "those on unseen data."
             for h in used
             if h in inputs
@@ -103,43 +153,25 @@ def compare(
     }
     tracks[LINEAR], errors[LINEAR] = _linear(data, seed)
     return Comparison(
-        data, tracks, errors, bands, scores.persistence(data, everything),
-        scores.repeatability(data, everything), tuple(notes),
+        models={name: ModelScores.of(own, seed) for name, own in errors.items()},
+        persistence_rmse_rad=scores.persistence(data, everything),
+        repeatability_rad=scores.repeatability(data, everything),
+        time_step_s=data.period_s, notes=tuple(notes), data=data, tracks=tracks, bands=bands,
     )  # fmt: skip
 
 
-def to_json(found: Comparison, seed: int) -> dict[str, Any]:
-    """Object of `compare --json`."""
-    models = {}
-    for name, errors in found.errors.items():
-        joints = {
-            j: {
-                "rmse_free_run_rad": scores.rms(e.free_run),
-                "rmse_held_rad": scores.rms(e.held),
-                "rmse_raw_rad": scores.rms(e.raw),
-                "rmse_one_step_rad": scores.rms(e.one_step),
-            }
-            for j, e in errors.items()
-        }
-        keys = next(iter(joints.values()))
-        mean = {k: float(np.mean([entry[k] for entry in joints.values()])) for k in keys}
-        models[name] = {
-            "mean": mean | {"rmse_free_run_interval_rad": list(scores.interval(errors, seed))},
-            "joints": joints,
-        }
-    return {
-        "models": models,
-        "persistence_rmse_rad": found.persistence,
-        "repeatability_rad": found.repeatability,
-        "time_step_s": found.data.period_s,
-        "notes": list(found.notes),
-    }
-
-
 def _open(
-    given: str, data: ServoData
-) -> tuple[ServoModel, str, list[str], Mapping[str, tuple[float, float]]]:
+    given: str | Path | Calibration | ServoFit, data: ServoData
+) -> tuple[ServoModel, str, list[str], dict[str, scores.Band]]:
     """Model, a name for tables, hashes of what it was fitted to, and its band."""
+    if isinstance(given, ServoFit):
+        if missing := [j for j in data.joints if j not in given.joints]:
+            raise InputError(f"The {given.arch} model has no joint {', '.join(missing)}.")
+        with TemporaryDirectory() as folder:
+            given.save(folder, force=True)
+            return _open(folder, data)
+    if isinstance(given, Calibration):
+        return _calibrated(given, "DelayedPD", data)
     path = Path(given)
     if path.is_dir():
         saved: SavedModel = load_servo_model(path, data.joints, data.period_s)
@@ -148,17 +180,19 @@ def _open(
         name += " (paper)" if contract.preset == "paper" else ""
         band = {j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()}
         return saved.model, name, [r.sha256 for r in contract.recordings], band
-    if given in PRESETS or path.suffix.lower() in (".yaml", ".yml"):
-        calibration = load_calibration(given)
-        label = f"DelayedPD ({given if given in PRESETS else path.name})"
-        return (
-            calibrated(calibration, data.joints, data.period_s), label,
-            [f.sha256 for f in calibration.inputs], {},
-        )  # fmt: skip
+    if str(given) in PRESETS or path.suffix.lower() in (".yaml", ".yml"):
+        return _calibrated(load_calibration(given), f"DelayedPD ({path.name})", data)
     raise InputError(
         f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor one of the "
         f"presets {', '.join(PRESETS)}. Make one with `pupper-sysid fit-servo` or `calibrate`."
     )
+
+
+def _calibrated(
+    calibration: Calibration, name: str, data: ServoData
+) -> tuple[ServoModel, str, list[str], dict[str, scores.Band]]:
+    model = calibrated(calibration, data.joints, data.period_s)
+    return model, name, [f.sha256 for f in calibration.inputs], {}
 
 
 def calibrated(calibration: Calibration, joints: Sequence[str], period_s: float) -> AtControlRate:
@@ -179,11 +213,3 @@ def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores
         for group, model in fit.held_out.items()
     ]
     return scores.tracks(fit.model, data), scores.pooled(parts)
-
-
-def band_half_width(
-    band: tuple[float, float], track: NDArray[np.float64], period_s: float
-) -> NDArray[np.float64]:
-    """Half of the 90 % band about a free run [rad], from its speed."""
-    speed = np.gradient(track) / period_s
-    return 1.645 * np.sqrt(band[0] ** 2 + (band[1] * speed) ** 2)

@@ -29,8 +29,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     fresh_rows,
     readings,
 )
-from pupper_sysid.sysid.identify.calibrate import joint_rng, joint_trials
 from pupper_sysid.sysid.identify.output_error import TrialData, prepare, whole_counts
+from pupper_sysid.sysid.recordings.joints import joint_rng, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 MODES = ("auto", "fresh", "all")
@@ -213,7 +213,7 @@ def _joint_runs(
 ) -> tuple[list[Run], str]:
     trials = joint_trials(recordings, joint)
     if not trials:
-        raise InputError(f"{joint} was not recorded. Leave it out with --joints.")
+        raise InputError(f"{joint} was not recorded. Leave it out of `joints`.")
     lattice = find_poll_lattice(trials, joint_rng(seed, joint))
     if mode == "auto":
         held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION

@@ -1,9 +1,9 @@
-"""Fit servo models of all joints, score them on data they have not seen, beside honest baselines.
+"""Fit servo models of all joints and score them on unseen data, beside baselines.
 
-The caller says which part is for training and which for testing, or that each group (loop, tone) is
-to be left out in turn. Whatever is chosen on the way (ridge, weight decay, length of training) is
-chosen by groups held out of the training part. The linear filter and DelayedPD are always fitted to
-the same part and scored on the same readings, and so is "it stays where it was".
+`Split` defines the parts for training and for testing; by default each group (loop, tone) is left
+out in turn. Hyper-parameters (ridge, weight decay, length of training) are chosen by groups held
+out of the training part. A linear filter, DelayedPD and persistence are fitted to the same part and
+scored on the same readings.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
-from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, chosen_joints
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
@@ -30,6 +29,8 @@ from pupper_sysid.sysid.servo_fit.physics import (
     sindy_model,
 )
 from pupper_sysid.sysid.servo_fit.published import fit_published
+from pupper_sysid.sysid.servo_fit.result import FitScores, ServoFit, verdict
+from pupper_sysid.sysid.servo_fit.scores import ModelScores
 from pupper_sysid.sysid.servo_fit.windows import (
     Part,
     Samples,
@@ -58,151 +59,109 @@ class Split:
     train: Part | None = None
     test: Part | None = None
 
+    @classmethod
+    def by_trials(cls, train: Sequence[int], test: Sequence[int]) -> Split:
+        """Whole trials (loops of a playback).
+
+        Parameters
+        ----------
+        train, test : sequence of int
+            Numbers of trials.
+
+        Raises
+        ------
+        InputError
+            If a trial is in both.
+        """
+        if both := set(train) & set(test):
+            raise InputError(
+                f"Loop {min(both)} is in `train_loops` and in `test_loops`; a model would be "
+                "tested on what it has seen."
+            )
+        names = (",".join(map(str, numbers)) for numbers in (train, test))
+        return cls(
+            "trained on loops {}, tested on {}".format(*names),
+            lambda number, elapsed, group: np.isin(number, list(train)),
+            lambda number, elapsed, group: np.isin(number, list(test)),
+        )
+
+    @classmethod
+    def by_time(cls, train_before_s: float, test_after_s: float) -> Split:
+        """The beginning of each trial for training, its end for testing.
+
+        Parameters
+        ----------
+        train_before_s, test_after_s : float
+            Since the start of the trial [s].
+
+        Raises
+        ------
+        InputError
+            If training does not end after 0 s and before testing begins.
+        """
+        if not 0 < train_before_s <= test_after_s:
+            raise InputError(
+                f"`train_before_s` is {train_before_s:g} and `test_after_s` {test_after_s:g}; "
+                "training must end after 0 s and before testing begins."
+            )
+        return cls(
+            f"trained on the first {train_before_s:g} s of each trial, "
+            f"tested after {test_after_s:g} s",
+            lambda number, elapsed, group: elapsed < train_before_s,
+            lambda number, elapsed, group: elapsed >= test_after_s,
+        )
+
 
 EACH_GROUP_IN_TURN = Split("each group left out in turn")
 
 
-@dataclass(frozen=True)
-class Scored:
-    """One model on the test part.
-
-    Attributes
-    ----------
-    errors : dict of str to Errors
-    interval : (float, float)
-        90 % interval of the mean over joints of the free-run RMS [rad].
-    """
-
-    errors: dict[str, scores.Errors]
-    interval: tuple[float, float]
-
-    def free_run(self, joint: str) -> float:
-        """RMS of a joint in free run [rad]."""
-        return scores.rms(self.errors[joint].free_run)
-
-    @property
-    def mean(self) -> float:
-        """Mean over joints of the RMS in free run [rad]."""
-        return float(np.mean([self.free_run(j) for j in self.errors]))
-
-
-@dataclass(frozen=True)
-class ServoFit:
-    """A fitted model with all that is known of it.
-
-    Attributes
-    ----------
-    model : ServoModel
-        Fitted to the whole training part (to everything, where groups were left out in turn).
-    parameters : dict of str to ndarray
-        Its arrays, for a model file.
-    scored : dict of str to Scored
-        Under the name of the architecture, "linear" and "delayed-pd".
-    persistence, repeatability : dict of str to float
-        Per joint [rad].
-    band : dict of str to (float, float)
-        Noise [rad] and timing [s] of the predictive band, from readings held out of the fit.
-    coverage : float
-        Share of the test readings inside the 90 % band.
-    difference : (float, float, float)
-        Model less linear model, mean RMS [rad], and its 90 % interval.
-    interrupted : bool
-        Whether Ctrl-C ended the training; the best so far was kept.
-    """
-
-    arch: str
-    preset: str
-    data: ServoData
-    split: Split
-    model: ServoModel
-    parameters: Mapping[str, NDArray[np.floating]]
-    choices: dict[str, float]
-    scored: dict[str, Scored]
-    persistence: dict[str, float]
-    repeatability: dict[str, float]
-    band: dict[str, tuple[float, float]]
-    coverage: float
-    difference: tuple[float, float, float]
-    readings: dict[str, int]
-    notes: tuple[str, ...]
-    tracks: scores.Tracks
-    interrupted: bool
-
-    @property
-    def feedback(self) -> bool:
-        """Whether the model is shown the position it predicted last."""
-        return isinstance(self.model, Learned) and self.model.feedback
-
-    @property
-    def warm_up(self) -> int:
-        """Steps at rest that an LSTM needs after a reset; 0 for others."""
-        return self.model.warm_up if isinstance(self.model, RecurrentNetwork) else 0
-
-    @property
-    def verdict(self) -> str:
-        """Whether it was worth it, in words."""
-        name = {"delayed-pd": "DelayedPD", "sindy": "sparse equation"}.get(
-            self.arch, self.arch.upper()
-        )
-        gain, low, high = self.difference
-        linear = self.scored["linear"].mean
-        span = f"({100 * gain / linear:+.0f} %, 90 % interval {100 * low / linear:+.0f} to "
-        span += f"{100 * high / linear:+.0f} %)"
-        if self.arch == "fir":
-            return "This is the linear model itself."
-        if high < 0:
-            said = f"The {name} is better than the linear model on this data {span}."
-        elif low > 0:
-            said = f"The {name} is worse than the linear model on this data {span}."
-        else:
-            said = f"The {name} is not better than the linear model on this data {span}."
-        floor = scores.mean_known(list(self.repeatability.values()))
-        if np.isfinite(floor):
-            said += (
-                f" The robot repeats itself to {1e3 * floor:.1f} mrad; the model is "
-                f"{1e3 * (self.scored[self.arch].mean - floor):.1f} mrad above that."
-            )
-        return said
-
-
 def fit_servo(
-    recordings: Sequence[Recording],
-    joints: Sequence[str],
+    recordings: Recordings,
+    joints: Joints = None,
     arch: str = "mlp",
     preset: str = "default",
     split: Split = EACH_GROUP_IN_TURN,
-    mode: str = "auto",
+    readings: str = "auto",
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> ServoFit:
-    """Fit and score one kind of model.
+    """Fit a servo model per joint and score it on readings it has not seen.
 
     Parameters
     ----------
-    recordings : sequence of Recording
-    joints : sequence of str
+    recordings : Recording or sequence of Recording
+        At one rate.
+    joints : str or sequence of str, optional
+        By default all that were recorded.
     arch : {"fir", "mlp", "lstm", "delayed-pd", "sindy"}
     preset : {"default", "paper"}
-        `paper` trains an MLP or LSTM as published: shown its last position, one step ahead.
+        `paper` trains an MLP or LSTM as published: from its last position, one step ahead.
     split : Split
-    mode : {"auto", "fresh", "all"}
+    readings : {"auto", "fresh", "all"}
         Which readings count, see `sysid.servo_fit.data`.
     seed : int
+        Of the networks, of the physical models' starts and of the bootstrap.
     progress : callable, optional
-        Called with what is being done and the share of it that is done.
+        Called with the name of the present work and the share of it that is done.
+
+    Returns
+    -------
+    ServoFit
 
     Raises
     ------
     InputError
-        If the data cannot support a fit; the sentence says why.
+        If the data cannot support a fit.
     """
+    recordings, joints = as_sequence(recordings), chosen_joints(recordings, joints)
     if preset == "paper" and arch not in ("mlp", "lstm"):
-        raise InputError(f"--preset paper has an mlp and an lstm; there is no published {arch}.")
+        raise InputError(f"`preset='paper'` has an mlp and an lstm; there is no published {arch}.")
     if preset == "paper" and (other := [j for j in joints if j not in DEFAULT_POSE]):
         raise InputError(
-            f"--preset paper is for the joints of a Mini Pupper; {other[0]} is none. Leave it out."
+            f"`preset='paper'` is for the joints of a Mini Pupper; {other[0]} is none. "
+            "Leave it out."
         )
-    data = servo_data(recordings, joints, mode, seed)
+    data = servo_data(recordings, joints, readings, seed)
     notes: list[str] = []
     whole = split.train or everything
     data, note = grouped(data, whole)
@@ -217,7 +176,7 @@ def fit_servo(
             raise InputError(f"There is nothing to test on: {split.name}. Check loops and times.")
     say = progress or (lambda what, share: None)
     ready = samples(data, whole, past_ticks(data.period_s))
-    readings = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
+    count = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
 
     ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say)
     linear = physics = ours.folds
@@ -231,31 +190,46 @@ def fit_servo(
     if ours.interrupted:
         notes.append("Training was stopped early; the best so far was kept.")
     few = ours.weights_per_joint
-    if few and few > min(readings.values()):
+    if few and few > min(count.values()):
         notes.append(
-            f"Each joint's model has {few:,} weights and {min(readings.values()):,} readings: what "
-            "holds it together is weight decay, chosen by held-out groups."
+            f"Each joint's model has {few:,} weights and {min(count.values()):,} readings: it "
+            "rests on weight decay, chosen by held-out groups."
         )
-    scored = {
-        "linear": _score(linear, folds, data, seed),
-        "delayed-pd": _score(physics, folds, data, seed),
-    }
-    scored[arch] = _score(ours.folds, folds, data, seed)
-    held_out = ours.held_out or scored[arch].errors
-    bands = {j: scores.band(e) for j, e in held_out.items()}
-    low, high = scores.interval(scored[arch].errors, seed, scored["linear"].errors)
+    models = {"linear": linear, "delayed-pd": physics, arch: ours.folds}
+    scored = {name: _score(own, folds, data, seed) for name, own in models.items()}
+    errors = scored[arch].errors
+    bands = {j: scores.band(e) for j, e in (ours.held_out or errors).items()}
     test: Part = split.test or (lambda number, elapsed, group: group >= 0)
+    persistence = scores.persistence(data, test)
+    repeatability = scores.repeatability(data, test)
+    by_joint = {
+        j: FitScores(
+            **vars(scored[arch].joints[j]),
+            linear_rmse_rad=scored["linear"].joints[j].rmse_free_run_rad,
+            delayed_pd_rmse_rad=scored["delayed-pd"].joints[j].rmse_free_run_rad,
+            persistence_rmse_rad=persistence[j], repeatability_rad=repeatability[j],
+            band_noise_rad=bands[j][0], band_timing_s=bands[j][1],
+        )
+        for j in joints
+    }  # fmt: skip
+    mean = scores.mean(by_joint)
+    difference = scores.interval(errors, seed, scored["linear"].errors)
     return ServoFit(
-        arch, preset, data, split, ours.model, ours.parameters, ours.choices, scored,
-        scores.persistence(data, test), scores.repeatability(data, test), bands,
-        _coverage(scored[arch].errors, bands),
-        (scored[arch].mean - scored["linear"].mean, low, high), readings, tuple(notes),
-        scores.tracks(ours.model, data), ours.interrupted,
+        arch=arch, preset=preset, seed=seed, split=split.name, readings_counted=data.modes,
+        groups=data.groups, time_step_s=data.period_s,
+        choices={k: float(v) for k, v in ours.choices.items()}, joints=by_joint, mean=mean,
+        rmse_free_run_rad=scored[arch].rmse_free_run_rad,
+        linear_rmse_rad=scored["linear"].rmse_free_run_rad, difference_to_linear_rad=difference,
+        coverage_of_90_percent_band=_coverage(errors, bands), readings=count,
+        recordings=tuple({"name": r.name, "sha256": r.sha256} for r in recordings),
+        verdict=verdict(arch, scored, difference, mean.repeatability_rad), notes=tuple(notes),
+        interrupted=ours.interrupted, model=ours.model, parameters=ours.parameters,
+        scored=scored, data=data, tracks=scores.tracks(ours.model, data),
     )  # fmt: skip
 
 
 def _with_two_groups(data: ServoData, part: Part) -> ServoData:
-    """The data without groups that nobody has readings of, such as a tone cut short.
+    """The data without groups that have no readings, such as a tone cut short.
 
     Raises
     ------
@@ -271,8 +245,8 @@ def _with_two_groups(data: ServoData, part: Part) -> ServoData:
             seen = ", ".join(data.groups[g] for g in own) or "nothing"
             raise InputError(
                 f"{joint} has readings of {seen} only, others of more, so it cannot be tested on "
-                "what it has not seen. Leave it out with --joints, record it again, or split by "
-                "time with --train-before and --test-after."
+                "what it has not seen. Leave it out of `joints`, record it again, or split by time "
+                "(`train_before_s`, `test_after_s`)."
             )
     used = sorted(set().union(*present.values()))
     place = np.full(len(data.groups) + 1, -1)
@@ -286,7 +260,7 @@ def _with_two_groups(data: ServoData, part: Part) -> ServoData:
 
 @dataclass(frozen=True)
 class _Fitted:
-    """What `_fit` makes: the model, one per fold, and what is left of held-out groups."""
+    """The model, one per fold, and errors on held-out groups."""
 
     model: ServoModel
     parameters: Mapping[str, NDArray[np.floating]]
@@ -361,20 +335,18 @@ def _score(
     folds: list[tuple[Part, Part]],
     data: ServoData,
     seed: int,
-) -> Scored:
+) -> ModelScores:
     parts = [
         scores.errors(model, scores.tracks(model, data), data, test)
         for model, (_, test) in zip(models, folds, strict=True)
     ]
-    found = scores.pooled(parts)
-    return Scored(found, scores.interval(found, seed))
+    return ModelScores.of(scores.pooled(parts), seed)
 
 
-def _coverage(found: dict[str, scores.Errors], bands: dict[str, tuple[float, float]]) -> float:
+def _coverage(found: dict[str, scores.Errors], bands: dict[str, scores.Band]) -> float:
     inside, total = 0, 0
     for joint, e in found.items():
-        noise, timing = bands[joint]
-        half = 1.645 * np.sqrt(noise**2 + (timing * e.speed) ** 2)
+        half = scores.band_half_width(bands[joint], e.speed)
         inside, total = inside + int(np.sum(np.abs(e.free_run) <= half)), total + len(half)
     return inside / max(total, 1)
 

@@ -18,7 +18,6 @@ from pupper_sysid.sysid.identify.fleet import Fleet, robots_in, run_fleet
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split, fit_servo
-from pupper_sysid.sysid.servo_fit.save import save_fit
 
 QUANTITIES = {
     "free_run_mrad": "rmse_free_run_rad",
@@ -93,10 +92,7 @@ def _modes(path: Path, joints: Iterable[str], settings: ServoSettings) -> dict[s
 def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
     """Fit one robot's model."""
     recording = load(path)
-    fit = fit_servo(
-        [recording], recording.joints, settings.arch, settings.preset, settings.split,
-        settings.readings, settings.seed,
-    )  # fmt: skip
+    fit = fit_servo(recording, **vars(settings))
     if fit.interrupted:  # one robot alone keeps what it has; a fleet makes it again
         raise KeyboardInterrupt
-    save_fit(target, fit, [recording], settings.seed, force=True)
+    fit.save(target, force=True)

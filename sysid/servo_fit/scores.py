@@ -1,21 +1,23 @@
-"""How good a servo model is, in scores that cannot flatter it.
+"""Errors of servo models, the intervals that go with them, and what to compare them with.
 
-Free run: the model is shown commands only, from the start of each run, however long. Its error is
-taken at the readings that count, at their own times (`free_run`); at every row when the value it
-shows was measured, that is through the hold (`held`); and at every row as the log has it (`raw`).
-`one_step` is the error when it may start from the last reading, which says little: "nothing moves"
-scores well there. Beside them stand how well the robot repeats itself where a command was repeated,
-which no model can beat by much, and intervals from resampling stretches of time.
+A model is run freely from the start of each run. Its error is taken at the readings that count, at
+their own times (`free_run`); at every row when its value was measured (`held`); and at every row as
+logged (`raw`). `one_step` is the error when the model may start from the last reading: persistence
+scores well there, so it says little. Repeatability, where a command was repeated, is the least
+error that a model can reach. Intervals resample stretches of time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.results import internal
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
@@ -24,7 +26,6 @@ from pupper_sysid.sysid.servo_fit.windows import Part, chosen, chosen_rows
 
 _BLOCK_S = 0.5
 _DRAWS = 1000
-LEVEL = 0.90
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,63 @@ class Errors:
     held: NDArray[np.float64]
     raw: NDArray[np.float64]
 
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Root mean square errors of one model on one joint, or their means over joints [rad]."""
+
+    rmse_one_step_rad: float
+    rmse_free_run_rad: float
+    rmse_held_rad: float
+    rmse_raw_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelScores:
+    """Scores of one model.
+
+    Attributes
+    ----------
+    joints : dict of str to Scores
+    mean : Scores
+        Over joints.
+    rmse_free_run_rad : Interval
+        Of the mean.
+    errors : dict of str to Errors
+    """
+
+    joints: dict[str, Scores]
+    mean: Scores
+    rmse_free_run_rad: Interval
+    errors: dict[str, Errors] = internal()
+
+    @classmethod
+    def of(cls, found: dict[str, Errors], seed: int) -> ModelScores:
+        """Scores of errors; `seed` is that of the bootstrap."""
+        joints = {
+            joint: Scores(
+                rmse_one_step_rad=rms(e.one_step), rmse_free_run_rad=rms(e.free_run),
+                rmse_held_rad=rms(e.held), rmse_raw_rad=rms(e.raw),
+            )
+            for joint, e in found.items()
+        }  # fmt: skip
+        return cls(joints=joints, mean=mean(joints), rmse_free_run_rad=interval(found, seed),
+                   errors=found)  # fmt: skip
+
+
+_S = TypeVar("_S", bound=Scores)
+
+
+def mean(joints: Mapping[str, _S]) -> _S:
+    """Mean over joints of every score, where it is known."""
+    every = list(joints.values())
+    return type(every[0])(
+        **{f.name: mean_known([getattr(s, f.name) for s in every]) for f in fields(every[0])}
+    )
+
+
+Band = tuple[float, float]
+"""Noise [rad] and timing [s] of a predictive band."""
 
 Tracks = dict[str, list[NDArray[np.float64]]]
 """Per joint and run, positions at its ticks [rad], the start included."""
@@ -134,7 +192,7 @@ def mean_known(values: ArrayLike) -> float:
 
 
 def persistence(data: ServoData, part: Part) -> dict[str, float]:
-    """RMS [rad] of "it stays where it was last read", per joint."""
+    """RMS [rad] of the last reading as the prediction of the next, per joint."""
     found = {}
     for joint in data.joints:
         moves = [np.diff(r.position_rad, prepend=np.nan)[chosen(r, part)] for r in data.runs[joint]]
@@ -146,7 +204,7 @@ def persistence(data: ServoData, part: Part) -> dict[str, float]:
 def repeatability(data: ServoData, part: Part) -> dict[str, float]:
     """RMS difference of trials with equal commands over √2 [rad], per joint; NaN without any.
 
-    What the robot does differently each time: a model that knew the mean would score this.
+    A model that predicts the mean of the repetitions has this error.
     """
     found = {}
     for joint in data.joints:
@@ -169,11 +227,15 @@ def repeatability(data: ServoData, part: Part) -> dict[str, float]:
 
 def interval(
     found: dict[str, Errors], seed: int, other: dict[str, Errors] | None = None
-) -> tuple[float, float]:
-    """90 % interval of the mean over joints of the free-run RMS [rad], by block bootstrap.
+) -> Interval:
+    """Mean over joints of the free-run RMS [rad], with its interval by block bootstrap.
 
-    With `other`, of the difference of the two models' RMS: the same stretches are drawn for both.
+    With `other`, the difference of the two models' RMS: the same stretches are drawn for both.
     """
+
+    def value(models: dict[str, Errors]) -> float:
+        return mean_known([rms(e.free_run) for e in models.values()])
+
     blocks = sorted({b for e in found.values() for b in e.block})
     place = {b: n for n, b in enumerate(blocks)}
     draws = np.random.default_rng(seed).multinomial(
@@ -190,12 +252,12 @@ def interval(
                 means.append(np.sqrt((draws @ total) / (draws @ count)))
         return np.nanmean(means, axis=0)
 
-    sample = drawn(found) - (drawn(other) if other is not None else 0.0)
-    low, high = np.quantile(sample, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
+    if other is None:
+        return Interval.of_draws(value(found), drawn(found))
+    return Interval.of_draws(value(found) - value(other), drawn(found) - drawn(other))
 
 
-def band(found: Errors) -> tuple[float, float]:
+def band(found: Errors) -> Band:
     """Noise [rad] and timing [s] of a band: error variance = noise² + (timing · speed)².
 
     The form that readings of a polled servo have: counts, plus an uncertain time of measurement.
@@ -211,6 +273,11 @@ def band(found: Errors) -> tuple[float, float]:
 
     noise, timing = nnls(a, squares * weight)[0]
     return float(np.sqrt(noise)), float(np.sqrt(timing))
+
+
+def band_half_width(found: Band, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Half of the 90 % band about a free run [rad], at a speed [rad/s]."""
+    return 1.645 * np.sqrt(found[0] ** 2 + (found[1] * speed) ** 2)
 
 
 def _alone(data: ServoData) -> bool:

@@ -215,7 +215,7 @@ def _check(joint: str, command: NDArray, position: NDArray) -> None:
     if np.std(command) < 1e-3:
         raise InputError(
             f"{joint}: its commands hardly change (by {1e3 * np.ptp(command):.1f} mrad), so they "
-            "say nothing about how it moves. Leave it out with --joints, or record a sweep."
+            "say nothing about how it moves. Leave it out of `joints`, or record a sweep."
         )
 
 

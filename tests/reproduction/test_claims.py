@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,17 +13,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import reproduction.__main__ as program
 import reproduction.page
 from pupper_sysid.cli.commands.sweep import Sweep
 from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.files import sha256
-from pupper_sysid.policies.analysis.phase_reset import NUDGE_M_S, PUSH_M_S
-from pupper_sysid.policies.analysis.rhythm import Estimate
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.policies.analysis.attractor import DELAYS_MS, Orbits
+from pupper_sysid.policies.analysis.autonomy import (
+    NUDGE_M_S,
+    PUSH_M_S,
+    Autonomy,
+    FrozenTest,
+    PushTest,
+    RatePoint,
+    rate_exponent,
+)
+from pupper_sysid.policies.analysis.paths import DirectionWalk
+from pupper_sysid.policies.analysis.robustness import AblationPoint, DelayPoint, GroundPoint
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
 from reproduction import servos as servo_claims
 from reproduction.claims import Claim
-from reproduction.evidence import DELAYS_MS, PolicyEvidence
+from reproduction.evidence import PolicyEvidence, ScalePoint
 from reproduction.policies import judge
 from support.browser import looks_right
 from support.command_line import refused, run_program
@@ -33,54 +46,67 @@ SAMPLES = ROOT / "data/samples"
 CURVE = np.random.default_rng(0).random((50, 3))
 
 
-def known(value: float) -> Estimate:
-    return Estimate(value, value - 0.1, value + 0.1)
+def known(value: float) -> Interval:
+    return Interval(value, value - 0.1, value + 0.1)
+
+
+def changed(rows: Sequence, **how) -> list:
+    """The same rows with other values; a callable gets the row."""
+    return [replace(r, **{k: v(r) if callable(v) else v for k, v in how.items()}) for r in rows]
 
 
 def evidence(kind: str, name: str | None = None) -> PolicyEvidence:
     """A policy that walks well whatever is done to it."""
     delays = sorted({*DELAYS_MS, 160.0})
-    orbit = {
-        "states": [np.zeros((500, 12))] * 3, "orbits": [CURVE[:, :3]] * 3,
-        "explained_3": 0.9, "closure": [0.1] * 3, "area_ratio": [1.0] * 3,
-    }  # fmt: skip
-    frozen = [
-        {"test": test, "frequency_hz": 3.0, "amplitude_rad": 0.2, "share": share}
+    orbit = Orbits(
+        states=[np.zeros((500, 12))] * 3, orbits=[CURVE[:, :3]] * 3, explained=[0.9],
+        explained_3=0.9, participation_ratio=2.0, closure=[0.1] * 3, area_ratio=[1.0] * 3,
+    )  # fmt: skip
+    gait = {"frequency_hz": 3.0, "amplitude_rad": 0.2, "jitter_rad": 0.01}
+    frozen = tuple(
+        FrozenTest(test=test, share=share, **gait)
         for test, share in (
             ("nothing frozen", 1.0), ("senses frozen, its own last action", 1.0),
             ("senses and last action frozen", 0.0), ("last action frozen, senses recorded", 0.5),
         )
-    ]  # fmt: skip
-    gait = {"survival": 1.0, "frequency_hz": 3.0, "amplitude_rad": 0.2, "mae_vx_m_s": 0.02}
+    )  # fmt: skip
+    pushes = tuple(
+        PushTest(push_m_s=speed, survival=1.0, shift_early=s, shift_late=s, kept=1.0,
+                 phases=(0.1, 0.6), shifts=(s, -s))
+        for speed, s in ((NUDGE_M_S, 0.01), (PUSH_M_S, 0.2))
+    )  # fmt: skip
+    gait |= {"survival": 1.0, "mae_vx_m_s": 0.02}
+    rates = tuple(RatePoint(rate_hz=r, cycles_per_step=0.06, **gait) for r in (25.0, 50.0))
     directions = ("forward", "backward", "left", "right", "turn left", "turn right")
     return PolicyEvidence(
         name or kind, kind, {"reward": 7.0, "std": 0.01, "updates": 60.0, "steps_per_s": 1000.0},
         False, "flat", walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
         {"actions": orbit, "hidden": orbit},
         [
-            gait | {"extra_delay_ms": d, "mode": m}
+            DelayPoint(extra_delay_ms=d, mode=m, **gait)
             for d in delays for m in ("replay", "fixed", "jittered")
         ],
         [
-            gait | {"channel": "all joints", "kind": k, "level": level, "correlation": r}
+            AblationPoint(
+                channel="all joints", kind=k, level=level, sigma=0.1, correlation=r, **gait
+            )
             for k, level, r in (("noise", 0.1, 0.99), ("noise", 0.5, 0.6), ("zero", 0.0, 0.7))
         ],
-        frozen,
+        Autonomy(frozen=frozen, push=pushes, rate=rates, rate_exponent=rate_exponent(rates)),
+        [ScalePoint(scale_rad=s, **gait) for s in (0.45, 0.5, 0.6, 0.75)],
+        [GroundPoint(ground=g, **gait) for g in ("flat", "rough")],
         [
-            {"push_m_s": speed, "survival": 1.0, "shift_early": s, "shift_late": s, "kept": 1.0,
-             "phases": [0.1, 0.6], "shifts": [s, -s]}
-            for speed, s in ((NUDGE_M_S, 0.01), (PUSH_M_S, 0.2))
-        ],
-        [gait | {"rate_hz": r, "cycles_per_step": 0.06} for r in (25.0, 50.0)],
-        [gait | {"scale_rad": s} for s in (0.45, 0.5, 0.6, 0.75)],
-        [gait | {"ground": g} for g in ("flat", "rough")],
-        [
-            {"direction": d, "command": (0.1, 0, 0), "survival": 1.0, "share": known(0.9),
-             "drift": known(0.0), "arc_rad_m": known(-0.2), "wander_m": known(0.0),
-             "path": CURVE[:, :2]}
+            DirectionWalk(direction=d, command=(0.1, 0, 0), survival=1.0, share=known(0.9),
+                          drift=known(0.0), arc_rad_m=known(-0.2), wander_m=known(0.0),
+                          path=CURVE[:, :2])
             for d in directions
         ],
     )  # fmt: skip
+
+
+def with_tests(policy: PolicyEvidence, **tests) -> PolicyEvidence:
+    """The same policy with other results of some tests of autonomy."""
+    return replace(policy, autonomy=replace(policy.autonomy, **tests))
 
 
 def claims(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, Claim]:
@@ -89,6 +115,11 @@ def claims(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, Claim
 
 def verdicts(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, str]:
     return {i: c.verdict for i, c in claims(*policies, played=played, stacks=stacks).items()}
+
+
+def drifting(row: DelayPoint) -> float:
+    """A frequency that grows with the delay."""
+    return 3.0 + row.extra_delay_ms / 300
 
 
 BOTH = (evidence("mlp"), evidence("lstm"))
@@ -120,18 +151,18 @@ def test_a_gru_with_the_lstms_reward_contradicts_and_one_with_a_third_confirms()
 def test_an_oscillator_in_the_cell_would_be_one_and_a_loop_through_the_action_is_half_of_one():
     mlp, lstm = BOTH
     assert verdicts(mlp, lstm)["X1"] == "holds partly"
-    inside = [r | {"share": 0.9} for r in lstm.frozen]
-    assert verdicts(mlp, replace(lstm, frozen=inside))["X1"] == "holds"
-    driven = [r | {"share": 0.1} for r in lstm.frozen]
-    assert verdicts(mlp, replace(lstm, frozen=driven))["X1"] == "does not hold here"
+    inside = changed(lstm.autonomy.frozen, share=0.9)
+    assert verdicts(mlp, with_tests(lstm, frozen=inside))["X1"] == "holds"
+    driven = changed(lstm.autonomy.frozen, share=0.1)
+    assert verdicts(mlp, with_tests(lstm, frozen=driven))["X1"] == "does not hold here"
 
 
 def test_an_lstm_that_does_not_walk_is_no_oscillator_to_judge():
     mlp, lstm = BOTH
-    still = [r | {"share": float("nan")} for r in lstm.frozen]
-    assert verdicts(mlp, replace(lstm, frozen=still, push=[]))["X1"] == "not testable here"
-    # nobody stayed up to be pushed: what is frozen in replay decides
-    assert verdicts(mlp, replace(lstm, push=[]))["X1"] == "holds partly"
+    still = changed(lstm.autonomy.frozen, share=float("nan"))
+    assert verdicts(mlp, with_tests(lstm, frozen=still, push=()))["X1"] == "not testable here"
+    # without a push response, frozen inputs in replay decide
+    assert verdicts(mlp, with_tests(lstm, push=()))["X1"] == "holds partly"
 
 
 def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
@@ -139,27 +170,27 @@ def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
     assert verdicts(mlp, lstm)["G2"] == "holds" and verdicts(mlp, lstm)["G3"] == (
         "does not hold here"
     )
-    wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in mlp.delay]
+    wild = changed(mlp.delay, frequency_hz=drifting)
     assert verdicts(replace(mlp, delay=wild), lstm)["G3"] == "holds"
     assert verdicts(mlp, replace(lstm, delay=wild))["G2"] == "does not hold here"
 
 
 def test_two_policies_that_each_keep_a_rate_of_their_own_are_not_erratic():
-    slow, quick = ([r | {"frequency_hz": hz} for r in BOTH[0].delay] for hz in (2.5, 2.9))
+    slow, quick = (changed(BOTH[0].delay, frequency_hz=hz) for hz in (2.5, 2.9))
     four = [
         replace(p, name=f"{p.kind}-{i}", delay=delay)
         for p in BOTH for i, delay in enumerate((slow, quick))
     ]  # fmt: skip
     found = verdicts(*four)
     assert found["G2"] == "holds" and found["G3"] == "does not hold here"
-    wild = [r | {"frequency_hz": 3.0 + r["extra_delay_ms"] / 300} for r in slow]
+    wild = changed(slow, frequency_hz=drifting)
     one_wild = [replace(p, delay=wild) if p.name.endswith("-1") else p for p in four]
     assert verdicts(*one_wild)["G2"] == verdicts(*one_wild)["G3"] == "holds partly"
 
 
 def test_a_policy_without_a_rhythm_is_neither_constant_nor_erratic():
     mlp, lstm = BOTH
-    still = [r | {"frequency_hz": float("nan")} for r in mlp.delay]
+    still = changed(mlp.delay, frequency_hz=float("nan"))
     found = claims(replace(mlp, delay=still), replace(lstm, delay=still))
     for id_ in ("G2", "G3"):
         assert found[id_].verdict == "not testable here" and "no rhythm" in found[id_].how
@@ -167,7 +198,7 @@ def test_a_policy_without_a_rhythm_is_neither_constant_nor_erratic():
 
 def test_noise_that_is_never_worse_than_zeros_contradicts():
     mlp, lstm = BOTH
-    robust = [r | {"correlation": 0.95 if r["kind"] == "noise" else 0.7} for r in mlp.ablation]
+    robust = changed(mlp.ablation, correlation=lambda r: 0.95 if r.kind == "noise" else 0.7)
     found = claims(mlp, replace(lstm, ablation=robust))["B2"]
     assert found.verdict == "does not hold here" and "LSTM ∞" in found.ours
     # one of two is not left out of the mean
@@ -177,24 +208,22 @@ def test_noise_that_is_never_worse_than_zeros_contradicts():
 
 def test_policies_that_were_given_but_have_no_number_are_not_asked_for():
     mlp, lstm = BOTH
-    lost = [r | {"correlation": float("nan")} for r in lstm.ablation]
+    lost = changed(lstm.ablation, correlation=float("nan"))
     how = claims(mlp, replace(lstm, ablation=lost))["B2"].how
     assert "Of the LSTM that was given there is no number" in how and "Give a run" not in how
-    fallen = [
-        r | ({"frequency_hz": float("nan"), "survival": 0.0} if r["rate_hz"] < 50 else {})
-        for r in mlp.rate
-    ]
-    found = claims(replace(mlp, rate=fallen), replace(lstm, rate=fallen))["D1"]
+    nothing = {"frequency_hz": float("nan"), "survival": 0.0}
+    fallen = [replace(r, **nothing) if r.rate_hz < 50 else r for r in mlp.autonomy.rate]
+    found = claims(with_tests(mlp, rate=fallen), with_tests(lstm, rate=fallen))["D1"]
     assert found.verdict == "does not hold here" and "MLP 0, LSTM 0 %" in found.ours
 
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_direction_in_which_nothing_is_known_hides_nowhere(place):
     mlp, lstm = BOTH
-    rows = [dict(r) for r in lstm.compliance]
-    rows[place]["share"] = known(0.0)
+    rows = list(lstm.compliance)
+    rows[place] = replace(rows[place], share=known(0.0))
     assert verdicts(mlp, replace(lstm, compliance=rows))["C1"] == "does not hold here"
-    rows[place]["share"] = known(float("nan"))
+    rows[place] = replace(rows[place], share=known(float("nan")))
     assert "LSTM" not in claims(mlp, replace(lstm, compliance=rows))["C1"].ours
 
 
@@ -218,7 +247,7 @@ def test_how_a_policy_was_trained_is_looked_at_not_taken_for_granted(id_, traine
 def test_stacks_differ_only_if_the_interval_of_their_difference_says_so(low, high, verdict):
     keys = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
     row = {"falls": 0.0} | {k: known(0.05) for k in keys}
-    less = {f"less_{k}": Estimate((low + high) / 2, low, high) for k in keys}
+    less = {f"less_{k}": Interval((low + high) / 2, low, high) for k in keys}
     stacks = [row | {"stack": "encoders"}, row | {"stack": "servo model"} | less]
     assert verdicts(*BOTH, stacks=stacks)["D3"] == verdict
 
@@ -246,18 +275,18 @@ def test_intervals_are_over_policies_of_a_kind():
     second = replace(evidence("lstm", "lstm-1"), trained=BOTH[1].trained | {"reward": 6.0})
     claim = next(c for c in judge([*BOTH, second, evidence("gru")], {}, []) if c.id == "T1")
     assert claim.interval is not None
-    low, high = claim.interval["LSTM"]
-    assert low < 6.5 < high and "MLP" not in claim.interval
+    found = claim.interval["LSTM"]
+    assert found.low < found.value == 6.5 < found.high and "MLP" not in claim.interval
 
 
 def test_four_ways_on_the_sample_playback_score_unseen_readings_only():
     recording = load(SAMPLES / "playback.csv")
     found = four_way(recording, ["LF_thigh"], seed=0)
-    assert set(found.tracks) == {PUBLISHED, "LSTM", "MLP"} and FITTED in found.errors
+    assert set(found.tracks) == {PUBLISHED, "LSTM", "MLP"} and FITTED in found.models
     whole = sum(len(t.send_time_s) for t in recording.trials("LF_thigh"))
-    scored = {n: len(e["LF_thigh"].free_run) for n, e in found.errors.items()}
+    scored = {n: len(m.errors["LF_thigh"].free_run) for n, m in found.models.items()}
     assert len(set(scored.values())) == 1 and next(iter(scored.values())) < 0.5 * whole
-    rms = {n: np.sqrt(np.mean(e["LF_thigh"].free_run ** 2)) for n, e in found.errors.items()}
+    rms = {n: m.mean.rmse_free_run_rad for n, m in found.models.items()}
     assert rms["MLP"] < rms[PUBLISHED]
     claims = {
         c.id: c for c in servo_claims.judge(
@@ -267,7 +296,7 @@ def test_four_ways_on_the_sample_playback_score_unseen_readings_only():
     assert claims["S1"].verdict in ("holds", "does not hold here") and "mrad" in claims["S1"].ours
     assert claims["A1"].verdict == "not testable here"
     # commands that were never repeated do not say how well the robot repeats itself
-    once = replace(found, repeatability={"LF_thigh": float("nan")})
+    once = replace(found, repeatability_rad={"LF_thigh": float("nan")})
     for c in servo_claims.judge(servo_claims.ServoEvidence(servos=once, played=recording)):
         assert c.id != "S4" or c.verdict == "not testable here"
 
@@ -288,8 +317,8 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
         lambda name, policy, *rest: evidence(policy.contract.kind, name),
     )
     policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
-    arguments = ("claims", *policies, "--actuator", SAMPLES / "calibrated.yaml")
-    code, out, err = run_program(capsys, pupper_analyze, *arguments, "--json")
+    arguments = (*policies, "--actuator", SAMPLES / "calibrated.yaml")
+    code, out, err = run_program(capsys, program, *arguments, "--json")
     assert code == 0, err
     assert " ".join(err.split()).count("they take the numbers of") == 1, "said once, not by policy"
     found = json.loads(out)
@@ -322,22 +351,13 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     if shutil.which("chromium"):
         looks_right(Path(found["report"]), tmp_path, 375, dark=False)
         looks_right(Path(found["report"]), tmp_path, 1280, dark=True)
-    again = refused(capsys, pupper_analyze, *arguments)
+    again = refused(capsys, program, *arguments)
     assert "claims.md exists already" in again
-    twice = refused(
-        capsys,
-        pupper_analyze,
-        "claims",
-        policies[0],
-        policies[0],
-        *arguments[3:],
-        "--out",
-        "b",
-    )
+    twice = refused(capsys, program, policies[0], policies[0], *arguments[2:], "--out", "b")
     assert "rename" in twice
     Path("c/figures").mkdir(parents=True)
     Path("c/figures/ablation.png").touch()
-    taken = refused(capsys, pupper_analyze, *arguments, "--out", "c")
+    taken = refused(capsys, program, *arguments, "--out", "c")
     assert "ablation.png exists already" in taken
 
 
@@ -346,7 +366,12 @@ def test_a_kind_of_policy_about_which_nothing_was_published_is_refused(capsys, t
     shutil.copytree(SAMPLES / "policies/mlp", contract.parent)
     contract.write_text(contract.read_text().replace('"kind": "mlp"', '"kind": "mlp-actions"'))
     said = refused(
-        capsys, pupper_analyze, "claims", contract.parent, "--actuator",
+        capsys, program, contract.parent, "--actuator",
         SAMPLES / "calibrated.yaml", "--out", tmp_path / "out",
     )  # fmt: skip
     assert "of the kind mlp-actions" in said
+
+
+def test_the_tool_names_the_command_that_tests_the_claims(capsys):
+    answer = refused(capsys, pupper_analyze, "claims", "runs/A", "--robots", "2")
+    assert "`python -m reproduction runs/A --robots 2`" in answer

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 
+from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.scores import (
-    LEVEL,
     Errors,
     band,
     errors,
@@ -178,9 +180,9 @@ def test_the_interval_covers_the_true_rms_as_often_as_it_says():
     sd, covered = 0.01, 0
     for seed in range(200):
         noise = sd * np.random.default_rng([7, seed]).normal(size=600)
-        low, high = interval({JOINT: made(free_run=noise)}, seed)
-        assert low < rms(noise) < high
-        covered += low <= sd <= high
+        found = interval({JOINT: made(free_run=noise)}, seed)
+        assert found.low < rms(noise) == found.value < found.high
+        covered += found.low <= sd <= found.high
     # 90 % less a little for 60 stretches, give or take 3 sd of 200 draws
     assert LEVEL == 0.90
     assert 0.82 <= covered / 200 <= 0.96
@@ -188,36 +190,37 @@ def test_the_interval_covers_the_true_rms_as_often_as_it_says():
 
 def test_the_interval_is_as_wide_as_theory_says():
     noise = 0.01 * np.random.default_rng(3).normal(size=6000)
-    low, high = interval({JOINT: made(free_run=noise)}, 0)
+    found = interval({JOINT: made(free_run=noise)}, 0)
     # an RMS of n Gaussian errors has a standard deviation of sd / sqrt(2 n)
-    assert high - low == pytest.approx(2 * 1.645 * 0.01 / np.sqrt(12000), rel=0.15)
+    assert found.high - found.low == pytest.approx(2 * 1.645 * 0.01 / np.sqrt(12000), rel=0.15)
 
 
 def test_errors_that_last_make_the_interval_wider():
     rng = np.random.default_rng(4)
     white = made(free_run=rng.normal(size=600))
     lasting = made(free_run=np.repeat(rng.normal(size=60), 10))  # as long as a stretch
-    low, high = interval({JOINT: white}, 0)
-    low_lasting, high_lasting = interval({JOINT: lasting}, 0)
+    found = interval({JOINT: white}, 0)
+    wider = interval({JOINT: lasting}, 0)
     # a tenth as many independent errors
-    assert high_lasting - low_lasting == pytest.approx(np.sqrt(10) * (high - low), rel=0.35)
+    expected = np.sqrt(10) * (found.high - found.low)
+    assert wider.high - wider.low == pytest.approx(expected, rel=0.35)
 
 
 def test_the_difference_of_models_is_known_better_than_either():
     shared = np.random.default_rng(5).normal(size=600)
     ours, theirs = {JOINT: made(free_run=0.9 * shared)}, {JOINT: made(free_run=shared)}
-    low, high = interval(ours, 0, theirs)
-    assert low < -0.1 * rms(shared) < high
-    assert high < 0
+    found = interval(ours, 0, theirs)
+    assert found.value == pytest.approx(-0.1 * rms(shared))
+    assert found.low < found.value < found.high < 0
     alone = interval(theirs, 0)
-    assert high - low == pytest.approx(0.1 * (alone[1] - alone[0]), rel=1e-6)
-    np.testing.assert_allclose(interval(theirs, 0, theirs), 0, atol=1e-12)
+    assert found.high - found.low == pytest.approx(0.1 * (alone.high - alone.low), rel=1e-6)
+    np.testing.assert_allclose(astuple(interval(theirs, 0, theirs)), 0, atol=1e-12)
 
 
 def test_a_joint_without_test_readings_does_not_stop_the_interval():
     noise = made(free_run=np.random.default_rng(6).normal(size=600))
     with_empty = interval({JOINT: noise, "RF_hip": made()}, 0)
-    np.testing.assert_allclose(with_empty, interval({JOINT: noise}, 0))
+    np.testing.assert_allclose(astuple(with_empty), astuple(interval({JOINT: noise}, 0)))
 
 
 def test_the_band_finds_noise_and_timing():

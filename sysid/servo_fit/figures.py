@@ -1,8 +1,8 @@
-"""Pictures of servo models: each joint's command, readings, and what every model makes of them."""
+"""Figure of servo models in free run beside commands and readings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,7 +18,8 @@ from pupper_sysid.common.figure_style import (
     axes_column,
     styled,
 )
-from pupper_sysid.sysid.servo_fit.compare import LINEAR, Comparison, band_half_width
+from pupper_sysid.sysid.servo_fit.data import ServoData
+from pupper_sysid.sysid.servo_fit.scores import Band, Errors, Tracks, band_half_width, rms
 
 _LONGEST_S = 3.0
 _COLOURS = (BLUE, RED, GREEN, ORANGE, PINK)
@@ -26,19 +27,29 @@ _LINES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
 
 
 @styled
-def compare_figure(found: Comparison, joints: Sequence[str] | None = None) -> Figure:
-    """One panel per joint: the liveliest seconds of its recording.
+def free_run_figure(
+    data: ServoData,
+    tracks: Mapping[str, Tracks],
+    errors: Mapping[str, Mapping[str, Errors]],
+    bands: Mapping[str, Mapping[str, Band]],
+    joints: Sequence[str] | None = None,
+) -> Figure:
+    """One panel per joint: the seconds in which its command moves most.
 
     Parameters
     ----------
-    found : Comparison
+    data : ServoData
+    tracks : dict of str to Tracks
+        Free run of each model.
+    errors : dict of str to (dict of str to Errors)
+        By model, then joint.
+    bands : dict of str to (dict of str to Band)
+        By model, then joint; drawn for the first model.
     joints : sequence of str, optional
         Which; by default all.
     """
-    data = found.data
     shown = list(data.joints if joints is None else joints)
     figure, panels = axes_column(len(shown), 0.7 + 1.75 * len(shown))
-    names = [n for n in found.tracks if n != LINEAR]
     for axes, joint in zip(panels, shown, strict=True):
         index, low, high = _liveliest(data, joint)
         run = data.runs[joint][index]
@@ -50,24 +61,20 @@ def compare_figure(found: Comparison, joints: Sequence[str] | None = None) -> Fi
         inside = (run.tick >= low) & (run.tick < high - 1)
         when = np.interp(run.tick[inside], ticks, time)
         axes.plot(when, run.position_rad[inside], "o", ms=3.2, color=INK, label="reading")
-        for n, name in enumerate(names):
-            track = found.tracks[name][joint][index]
+        for n, (name, found) in enumerate(tracks.items()):
+            track = found[joint][index]
             colour = _COLOURS[n % len(_COLOURS)]
-            error = 1e3 * np.sqrt(np.mean(found.errors[name][joint].free_run ** 2))
+            error = 1e3 * rms(errors[name][joint].free_run)
             label = f"{name}, {error:.1f} mrad"
             axes.plot(
                 time, track[low:high], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label
             )
-            band = found.bands.get(name, {}).get(joint)
+            band = bands.get(name, {}).get(joint)
             if band and n == 0:
-                half = band_half_width(band, track, data.period_s)[low:high]
+                half = band_half_width(band, np.gradient(track) / data.period_s)[low:high]
+                middle = track[low:high]
                 axes.fill_between(
-                    time,
-                    track[low:high] - half,
-                    track[low:high] + half,
-                    color=colour,
-                    alpha=0.15,
-                    lw=0,
+                    time, middle - half, middle + half, color=colour, alpha=0.15, lw=0
                 )
         axes.set_title(joint)
         axes.set_ylabel("rad")
@@ -77,7 +84,7 @@ def compare_figure(found: Comparison, joints: Sequence[str] | None = None) -> Fi
     return figure
 
 
-def _liveliest(data, joint: str) -> tuple[int, int, int]:
+def _liveliest(data: ServoData, joint: str) -> tuple[int, int, int]:
     """Run and rows of the few seconds in which the command moves most."""
     rows = round(_LONGEST_S / data.period_s)
     best = (-1.0, 0, 0, 0)
