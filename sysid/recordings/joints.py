@@ -1,0 +1,123 @@
+"""Work per joint over one or several recordings: pooled trials, seeds, processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+from zlib import crc32
+
+import numpy as np
+
+from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
+from pupper_sysid.sysid.recordings.recording import Recording, Trial
+
+Recordings = Recording | Sequence[Recording]
+"""One recording, or several whose trials are pooled per joint."""
+
+Joints = str | Sequence[str] | None
+"""Names of joints; a text as `common.joints.select_joints` reads it; None for all."""
+
+Found = TypeVar("Found")
+
+
+def as_sequence(recordings: Recordings) -> Sequence[Recording]:
+    """The recordings as a sequence."""
+    return [recordings] if isinstance(recordings, Recording) else recordings
+
+
+def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
+    """The recorded joints that `joints` names, in joint order.
+
+    Raises
+    ------
+    InputError
+        If a name is not recorded.
+    """
+    recorded = in_order(joint for r in as_sequence(recordings) for joint in r.joints)
+    if joints is None:
+        return recorded
+    return select_joints(joints if isinstance(joints, str) else ",".join(joints), recorded)
+
+
+def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
+    """All trials of `joint`, renumbered."""
+    trials = [trial for recording in as_sequence(recordings) for trial in recording.trials(joint)]
+    return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
+
+
+def joint_rng(seed: int, joint: str) -> np.random.Generator:
+    """Generator of one joint: repeatable whatever other joints are computed."""
+    place = JOINT_NAMES.index(joint) if joint in JOINT_NAMES else crc32(joint.encode())
+    return np.random.default_rng([seed, place])
+
+
+def each_joint(
+    work: Callable[[str, tuple[Trial, ...]], Found],
+    recordings: Recordings,
+    joints: Joints = None,
+    workers: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Found]:
+    """`work(joint, trials)` of every joint, in joint order.
+
+    Parameters
+    ----------
+    work : callable
+        Must be picklable if there are several workers.
+    recordings : Recording or sequence of Recording
+    joints : str or sequence of str, optional
+        Which joints; by default all that were recorded.
+    workers : int
+        Processes.
+    progress : callable, optional
+        Called with a joint's name when it is done.
+
+    Raises
+    ------
+    InputError
+        If a joint is not recorded.
+    """
+    tasks = {j: joint_trials(recordings, j) for j in chosen_joints(recordings, joints)}
+    return map_joints(work, tasks, workers, progress)
+
+
+Task = TypeVar("Task")
+
+
+def map_joints(
+    work: Callable[[str, Task], Found],
+    tasks: dict[str, Task],
+    workers: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Found]:
+    """`work(joint, task)` of every joint, in the order of `tasks`; parameters as for `each_joint`.
+
+    Parameters
+    ----------
+    work : callable
+        Must be picklable if there are several workers.
+    tasks : dict of joint to what `work` takes
+    workers : int
+        Processes.
+    progress : callable, optional
+        Called with a joint's name when it is done.
+    """
+    found: dict[str, Found] = {}
+
+    def done(joint: str, result: Found) -> None:
+        found[joint] = result
+        if progress:
+            progress(joint)
+
+    if workers <= 1 or len(tasks) <= 1:
+        for joint, task in tasks.items():
+            done(joint, work(joint, task))
+    else:
+        from concurrent.futures import ProcessPoolExecutor, as_completed
+
+        with ProcessPoolExecutor(min(workers, len(tasks))) as pool:
+            futures = {pool.submit(work, joint, task): joint for joint, task in tasks.items()}
+            for future in as_completed(futures):
+                done(futures[future], future.result())
+    return {joint: found[joint] for joint in tasks}
