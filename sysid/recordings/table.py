@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import difflib
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -256,7 +257,9 @@ def comment(key: str, value: Any) -> str:
     def plain(found: Any) -> Any:
         return found.tolist() if hasattr(found, "tolist") else str(found)
 
-    return f"# {key}: {json.dumps(value, ensure_ascii=False, default=plain)}"
+    text = json.dumps(value, ensure_ascii=False, default=plain)
+    # what else ends a line for `splitlines`, and JSON leaves as it is
+    return f"# {key}: " + re.sub("[\x85\u2028\u2029]", lambda m: f"\\u{ord(m[0]):04x}", text)
 
 
 def _cells(path: Path, number: int, line: str) -> list[str]:
