@@ -46,8 +46,8 @@ def main() -> None:
             )  # fmt: skip
             print(
                 f"| {contract.kind} | {contract.actuator} | {Path(actuator).name} | "
-                f"{100 * found['fall_rate']:.0f} | {found['mae_vx_m_s']:.3f} | "
-                f"{found['mae_vy_m_s']:.3f} | {found['mae_yaw_rad_s']:.3f} |",
+                f"{100 * found.fall_rate:.0f} | {found.mae_vx_m_s:.3f} | "
+                f"{found.mae_vy_m_s:.3f} | {found.mae_yaw_rad_s:.3f} |",
                 flush=True,
             )
 

@@ -108,8 +108,8 @@ def main() -> None:
         cells = [
             _range(rewards, 2), _range(minutes, 0),
             _range([first_gait_minutes(f) for f in folders], 0),
-            _range([100 * w["fall_rate"] for w in walked], 0),
-            *(_range([w[k] for w in walked], 3) for k in ERRORS),
+            _range([100 * w.fall_rate for w in walked], 0),
+            *(_range([getattr(w, k) for w in walked], 3) for k in ERRORS),
         ]  # fmt: skip
         print(f"| {kind} | {len(folders)} | " + " | ".join(cells) + " |", flush=True)
     save(picture(runs, curves), options.out, force=True)

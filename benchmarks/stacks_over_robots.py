@@ -14,17 +14,19 @@ import argparse
 import os
 import sys
 import tempfile
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # reproduction/ is not installed
+
 import torch
 from deploy_protocols import CALIBRATION, DIRECTIONS, POLICIES, servo_model
 
-from pupper_sysid.policies.deploy.stack_trials import Walker, compare_stacks
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.policies.network.policy_file import load_policy
+from reproduction.stacks import Walker, compare_stacks
 
 ERRORS = {"mae_vx_m_s": "forward m/s", "mae_vy_m_s": "sideways m/s", "mae_yaw_rad_s": "turn rad/s"}
 CLOSED = STACKS["closed-loop"]
@@ -60,10 +62,12 @@ def main() -> None:
         )  # fmt: skip
     print(f"| shown | fell % | {' | '.join(ERRORS.values())} |\n|---|---|---|---|---|")
     for row in found:
-        cells = ["{:.4f} ({:.4f} to {:.4f})".format(*row[key]) for key in ERRORS]
+        cells = ["{:.4f} ({:.4f} to {:.4f})".format(*astuple(row[key])) for key in ERRORS]
         print(f"| {row['stack']} | {100 * row['falls']:.0f} | {' | '.join(cells)} |")
     for row in found[1:]:
-        cells = ["{:+.4f} ({:+.4f} to {:+.4f})".format(*row[f"less_{key}"]) for key in ERRORS]
+        cells = [
+            "{:+.4f} ({:+.4f} to {:+.4f})".format(*astuple(row[f"less_{key}"])) for key in ERRORS
+        ]
         print(f"| {row['stack']} less readings | – | {' | '.join(cells)} |")
     print(f"\n90 % intervals over {options.robots} robots.")
 

@@ -1,4 +1,4 @@
-"""A published claim beside what we find: one row of the claims report.
+"""A published claim beside what is found here: one row of the claims report.
 
 A claim is a function of evidence under `claim`, which returns a `Finding`, or raises `NotTestable`.
 """
@@ -10,20 +10,22 @@ from dataclasses import dataclass
 from functools import wraps
 from typing import Literal, TypeVar
 
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.results import Result
+
 Verdict = Literal["holds", "holds partly", "does not hold here", "not testable here"]
-Interval = dict[str, list[float]] | None
 Evidence = TypeVar("Evidence")
 
 
 @dataclass(frozen=True)
-class Claim:
+class Claim(Result):
     """One row of the report.
 
     Attributes
     ----------
     id : str
     claim, paper, ours : str
-    interval : dict of str to [low, high], or None
+    interval : dict of str to Interval, or None
         90 % intervals of the numbers in `ours`: over policies of a kind where there are several,
         else over robots or stretches of time.
     verdict : Verdict
@@ -35,45 +37,45 @@ class Claim:
     claim: str
     paper: str
     ours: str
-    interval: Interval
+    interval: dict[str, Interval] | None
     verdict: Verdict
     how: str
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the evidence says of a claim: `ours`, `interval` and `verdict` of `Claim`.
+    """Finding on a claim: `ours`, `interval` and `verdict` of `Claim`.
 
     Attributes
     ----------
     note : str
-        The threshold, and what to make of it; goes behind the claim's `how`.
+        The threshold, and its meaning; appended to the claim's `how`.
     """
 
     ours: str
-    interval: Interval
+    interval: dict[str, Interval] | None
     verdict: Verdict
     note: str
 
 
 class NotTestable(Exception):
-    """The evidence at hand cannot decide; the message says what could."""
+    """The evidence cannot decide the claim; the message names what could."""
 
 
 def claim(
     id: str, text: str, paper: str, how: str
 ) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Claim]]:
-    """Make a row of the report of a function that looks at evidence.
+    """Decorate a function of evidence so that it returns a row of the report.
 
     Parameters
     ----------
     id, text, paper : str
         See `Claim`.
     how : str
-        How it is measured, whatever comes of it.
+        How it is measured.
     """
 
-    def made(look: Callable[[Evidence], Finding]) -> Callable[[Evidence], Claim]:
+    def decorate(look: Callable[[Evidence], Finding]) -> Callable[[Evidence], Claim]:
         @wraps(look)
         def row(evidence: Evidence) -> Claim:
             try:
@@ -86,7 +88,7 @@ def claim(
 
         return row
 
-    return made
+    return decorate
 
 
 def holds(wholly: bool, partly: bool = False) -> Verdict:

@@ -1,9 +1,9 @@
-"""What the claims about policies rest on: every analysis of each of them."""
+"""Evidence for the claims about policies: every analysis of each of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +11,40 @@ import numpy as np
 import pandas as pd
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.policies.analysis.attractor import Orbits, orbits
+from pupper_sysid.policies.analysis.autonomy import Autonomy, autonomy
 from pupper_sysid.policies.analysis.gait import GaitReport, describe
-from pupper_sysid.policies.analysis.paths import compliance
-from pupper_sysid.policies.analysis.phase_reset import push_response, rate_response
-from pupper_sysid.policies.analysis.rhythm import Estimate, mean_of
+from pupper_sysid.policies.analysis.paths import DirectionWalk, compliance
+from pupper_sysid.policies.analysis.rhythm import mean_of
 from pupper_sysid.policies.analysis.robustness import (
-    Trial,
+    AblationPoint,
+    DelayPoint,
+    GroundPoint,
     ablation,
     delay_curve,
-    frozen,
-    orbits,
-    scales,
     terrain,
 )
 from pupper_sysid.policies.analysis.rollouts import Rollout
+from pupper_sysid.policies.analysis.trial import Outcome, Trial, outcome
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, load_run
-from reproduction.claims import Interval, NotTestable
+from reproduction.claims import NotTestable
 
 KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
-"""The architectures compared, and how they are called."""
-DELAYS_MS = (0.0, 160.0, 320.0)
-"""Of the published orbits."""
+"""Names of the architectures compared."""
+SCALES_RAD = (0.45, 0.6, 0.75)
+"""Of the published deployments."""
 _EXTRA_DELAYS_MS = (0, 80, 160, 320)
 _LAST_UPDATES = 10
 
-Rows = list[dict[str, Any]]
+
+@dataclass(frozen=True, kw_only=True)
+class ScalePoint(Outcome):
+    """A walk with another scale of what is sent than that of the training."""
+
+    scale_rad: float
 
 
 @dataclass(frozen=True)
@@ -56,15 +63,13 @@ class PolicyEvidence:
     walk: Rollout
     gait: GaitReport | None
     """None if no robot walked long enough."""
-    orbits: dict[str, dict[str, Any]]
-    delay: Rows
-    ablation: Rows
-    frozen: Rows
-    push: Rows
-    rate: Rows
-    scale: Rows
-    terrain: Rows
-    compliance: Rows
+    orbits: dict[str, Orbits]
+    delay: Sequence[DelayPoint]
+    ablation: Sequence[AblationPoint]
+    autonomy: Autonomy
+    scale: Sequence[ScalePoint]
+    terrain: Sequence[GroundPoint]
+    compliance: Sequence[DirectionWalk]
 
 
 def gather(
@@ -72,7 +77,7 @@ def gather(
     policy: Policy,
     trial: Trial,
     run_folder: Path | None,
-    say: Callable[[str], None] = lambda what: None,
+    progress: Callable[[str], None] = lambda what: None,
 ) -> PolicyEvidence:
     """Run every analysis.
 
@@ -82,14 +87,14 @@ def gather(
     policy : Policy
     trial : Trial
     run_folder : Path or None
-        Where its training's curve and settings are.
-    say : callable
-        Told what is about to be done.
+        With its training's curve and settings.
+    progress : callable
+        Called with the name of the next analysis.
     """
     rng = np.random.default_rng(trial.seed)
 
     def step(what: str, made: Callable[[], Any]) -> Any:
-        say(f"{name}: {what}")
+        progress(f"{name}: {what}")
         return made()
 
     walk = step("gait", lambda: trial.walk(policy))
@@ -101,16 +106,25 @@ def gather(
     return PolicyEvidence(
         name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s),
         task.curriculum.on if task else None, task.terrain if task else None, walk, gait,
-        step("orbits", lambda: orbits(policy, trial, DELAYS_MS)),
+        step("orbits", lambda: orbits(policy, trial)),
         step("delay", lambda: delay_curve(policy, trial, _EXTRA_DELAYS_MS)),
         step("ablation", lambda: ablation(policy, trial, ("all joints",))),
-        step("frozen inputs", lambda: frozen(policy, trial)),
-        step("pushes", lambda: push_response(policy, trial)),
-        step("control rate", lambda: rate_response(policy, trial)),
+        step("frozen inputs, pushes, control rates", lambda: autonomy(policy, trial)),
         step("action scale", lambda: scales(policy, trial)),
         step("terrain", lambda: terrain(policy, trial)),
         step("directions", lambda: compliance(policy, trial)),
     )  # fmt: skip
+
+
+def scales(policy: Policy, trial: Trial) -> list[ScalePoint]:
+    """Walks with other scales of what is sent, as deployed robots had."""
+    return [
+        ScalePoint(
+            scale_rad=scale,
+            **outcome(replace(trial, task=replace(trial.task, action_scale=scale)).walk(policy)),
+        )
+        for scale in sorted({*SCALES_RAD, trial.task.action_scale})
+    ]
 
 
 def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyEvidence], float]):
@@ -120,13 +134,13 @@ def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyE
     """
     values = np.array([value(e) for e in evidence if e.kind == kind], float)
     if np.isposinf(values).any():
-        return Estimate(float("inf"), float("nan"), float("nan"))
+        return Interval(float("inf"), float("nan"), float("nan"))
     return mean_of(values)
 
 
 def of_kinds(
     evidence: Sequence[PolicyEvidence], value: Callable[[PolicyEvidence], float], *needed: str
-) -> dict[str, Estimate]:
+) -> dict[str, Interval]:
     """`over` for each of `KINDS` of which there is a number.
 
     Raises
@@ -163,7 +177,7 @@ def of_kind(evidence: Sequence[PolicyEvidence], kind: str) -> list[PolicyEvidenc
     return mine
 
 
-def several(found: dict[str, Estimate], digits: int) -> str:
+def several(found: dict[str, Interval], digits: int) -> str:
     """The values by architecture, in words."""
     return ", ".join(
         f"{KINDS[k]} " + (f"{v.value:,.{digits}f}" if np.isfinite(v.value) else "∞")
@@ -171,10 +185,9 @@ def several(found: dict[str, Estimate], digits: int) -> str:
     )
 
 
-def bounds(found: dict[str, Estimate]) -> Interval:
-    """Their intervals, where there are any."""
-    known = {KINDS[k]: [v.low, v.high] for k, v in found.items() if np.isfinite(v.low)}
-    return known or None
+def bounds(found: dict[str, Interval]) -> dict[str, Interval] | None:
+    """Those with an interval, by the architecture's name; None if there are none."""
+    return {KINDS[k]: v for k, v in found.items() if np.isfinite(v.low)} or None
 
 
 def _trained(folder: Path | None, step_s: float) -> dict[str, float]:

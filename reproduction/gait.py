@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pupper_sysid.policies.analysis.phase_reset import NUDGE_M_S, PUSH_M_S, rate_exponent
+from pupper_sysid.policies.analysis.attractor import DELAYS_MS
+from pupper_sysid.policies.analysis.autonomy import NUDGE_M_S, PUSH_M_S
 from pupper_sysid.policies.analysis.rhythm import mean_of
 from reproduction.claims import Claim, Finding, NotTestable, claim, holds
 from reproduction.evidence import (
-    DELAYS_MS,
     PolicyEvidence,
     bounds,
     of_kind,
@@ -133,8 +133,8 @@ def autonomous(policies: Policies) -> Finding:
     """X1."""
     mine = of_kind(policies, "lstm")
     share = {
-        test: float(np.mean([r["share"] for p in mine for r in p.frozen if r["test"] == test]))
-        for test in (r["test"] for r in mine[0].frozen)
+        test: float(np.mean([r.share for p in mine for r in p.autonomy.frozen if r.test == test]))
+        for test in (r.test for r in mine[0].autonomy.frozen)
     }
     with_action = share["senses frozen, its own last action"]
     without = share["senses and last action frozen"]
@@ -142,11 +142,11 @@ def autonomous(policies: Policies) -> Finding:
         raise NotTestable("No robot of one of the LSTMs walked long enough. Give one that walks.")
 
     def pushed(speed: float, key: str) -> float:
-        rows = [r for p in mine for r in p.push if r["push_m_s"] == speed]
-        return mean_of(np.array([r[key] for r in rows], float)).value
+        rows = [r for p in mine for r in p.autonomy.push if r.push_m_s == speed]
+        return mean_of(np.array([getattr(r, key) for r in rows], float)).value
 
     size = pushed(PUSH_M_S, "shift_late")
-    exponent = float(np.mean([rate_exponent(p.rate) for p in mine]))
+    exponent = float(np.mean([p.autonomy.rate_exponent for p in mine]))
     keeps = f"{100 * pushed(PUSH_M_S, 'kept'):.0f} % of it kept"
     if not size >= _SMALLEST_SHIFT:
         keeps = "too little to say whether it is kept"
@@ -189,7 +189,7 @@ def ground(policies: Policies) -> Finding:
     """B3."""
 
     def survival(e: PolicyEvidence) -> float:
-        return 100 * float(np.mean([r["survival"] for r in e.terrain if r["ground"] != "flat"]))
+        return 100 * float(np.mean([r.survival for r in e.terrain if r.ground != "flat"]))
 
     flat = [p for p in policies if p.ground == "flat"]
     if not {"mlp", "lstm"} <= {p.kind for p in flat}:
@@ -212,8 +212,8 @@ def ground(policies: Policies) -> Finding:
 )  # fmt: skip
 def directions(policies: Policies) -> Finding:
     """C1."""
-    worst = of_kinds(policies, lambda e: float(np.min([r["share"].value for r in e.compliance])))
-    mean = of_kinds(policies, lambda e: float(np.mean([r["share"].value for r in e.compliance])))
+    worst = of_kinds(policies, lambda e: float(np.min([r.share.value for r in e.compliance])))
+    mean = of_kinds(policies, lambda e: float(np.mean([r.share.value for r in e.compliance])))
     low = min(v.value for v in worst.values())
     return Finding(
         f"mean {several(mean, 2)}; worst {several(worst, 2)}", bounds(mean),
@@ -229,7 +229,7 @@ def arc(policies: Policies) -> Finding:
     """C2."""
     found = of_kinds(
         policies,
-        lambda e: next(r["arc_rad_m"].value for r in e.compliance if r["direction"] == "forward"),
+        lambda e: next(r.arc_rad_m.value for r in e.compliance if r.direction == "forward"),
     )
     return Finding(
         f"{several(found, 2)} rad/m", bounds(found),
@@ -268,10 +268,10 @@ def scale(policies: Policies) -> Finding:
     """D2."""
     mine = of_kind(policies, "lstm")
     rows = {
-        scale: [r for p in mine for r in p.scale if r["scale_rad"] == scale]
-        for scale in sorted({r["scale_rad"] for r in mine[0].scale})
+        scale: [r for p in mine for r in p.scale if r.scale_rad == scale]
+        for scale in sorted({r.scale_rad for r in mine[0].scale})
     }
-    errors = {s: float(np.mean([r["mae_vx_m_s"] for r in found])) for s, found in rows.items()}
+    errors = {s: float(np.mean([r.mae_vx_m_s for r in found])) for s, found in rows.items()}
     ours = ", ".join(
         f"{s:g} rad: {100 * np.mean([r['survival'] for r in found]):.0f} % up, {errors[s]:.3f} m/s"
         for s, found in rows.items()
@@ -305,34 +305,33 @@ def _list(values: Sequence[float]) -> str:
 
 
 def _hidden(evidence: PolicyEvidence, key: str) -> float:
-    return evidence.orbits["hidden"][key] if evidence.orbits else float("nan")
+    return getattr(evidence.orbits["hidden"], key) if evidence.orbits else float("nan")
 
 
 def _acted(evidence: PolicyEvidence, key: str) -> list[float]:
-    return evidence.orbits["actions"][key] if evidence.orbits else [float("nan")]
+    return getattr(evidence.orbits["actions"], key) if evidence.orbits else [float("nan")]
 
 
 def _ablated(evidence: PolicyEvidence, kind: str, key: str) -> float:
-    return next(r[key] for r in evidence.ablation if r["kind"] == kind)
+    return next(getattr(r, key) for r in evidence.ablation if r.kind == kind)
 
 
 def _crossing(evidence: PolicyEvidence) -> float:
     """Share of noise from which replay correlates less than with zeros.
 
-    Infinite if it never does, NaN if nothing correlates because nobody walked.
+    Infinite if it never does, NaN if nothing correlates because no robot walked.
     """
     floor = _ablated(evidence, "zero", "correlation")
-    noise = [(r["level"], r["correlation"]) for r in evidence.ablation if r["kind"] == "noise"]
+    noise = [(r.level, r.correlation) for r in evidence.ablation if r.kind == "noise"]
     if not np.isfinite([floor, *(r for _, r in noise)]).all():
         return float("nan")
     return next((level for level, r in noise if r < floor), float("inf"))
 
 
 def _delayed(evidence: PolicyEvidence, extra_ms: float, key: str, mode: str = "fixed") -> float:
-    return next(
-        r[key] for r in evidence.delay if r["mode"] == mode and r["extra_delay_ms"] == extra_ms
-    )
+    rows = (r for r in evidence.delay if r.mode == mode and r.extra_delay_ms == extra_ms)
+    return getattr(next(rows), key)
 
 
 def _at_rate(evidence: PolicyEvidence, rate: float, key: str) -> float:
-    return next(r[key] for r in evidence.rate if abs(r["rate_hz"] - rate) < 0.5)
+    return next(getattr(r, key) for r in evidence.autonomy.rate if abs(r.rate_hz - rate) < 0.5)

@@ -1,10 +1,10 @@
 """The published claims about policies, one by one: what the paper says, what is found, a verdict.
 
-Each claim is a small function of the evidence (`reproduction.evidence`), declared with
-`reproduction.claims.claim`; `judge` asks them all. A verdict follows from thresholds that stand in
-the claim's `how`. "Not testable here" means that nothing this evidence contains could decide it,
-and says what could. Claims about training and about the gait have files of their own; here are
-those about the deployed stacks, and those that nothing here could decide.
+Each claim is a function of the evidence (`reproduction.evidence`), declared with
+`reproduction.claims.claim`; `judge` evaluates all. A verdict follows from thresholds given in the
+claim's `how`. "Not testable here" means that the evidence cannot decide it, and names what could.
+Claims about training and about the gait are in modules of their own; here are those about the
+deployed stacks, and those that need another experiment.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.policies.analysis.rhythm import (
     SHORTEST_S,
-    Estimate,
     null_r2,
     sine_fit_r2,
     sine_frequency,
 )
+from pupper_sysid.policies.analysis.tracking import ERRORS
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from reproduction import gait as gait_claims
@@ -43,7 +44,7 @@ def judge(
     played : dict of str to (ndarray, ndarray, ndarray)
         Of a playback, per joint: times [s], commands and positions [rad]; may be empty.
     stacks : sequence of dict
-        Of `policies.deploy.stack_trials.compare_stacks`, closed loop first; may be empty.
+        Of `reproduction.stacks.compare_stacks`, closed loop first; may be empty.
     """
     about_policies = (*training_claims.CLAIMS, *gait_claims.CLAIMS)
     return [
@@ -72,36 +73,36 @@ def hardware_sine(played: Played) -> Finding:
         if len(time) * step < SHORTEST_S or not good.any():
             continue
         moved = np.interp(time, time[good], position[good])[:, None]
-        told = command[:, None]
-        if min(moved.std(), told.std()) < 1e-3:
+        sent = command[:, None]
+        if min(moved.std(), sent.std()) < 1e-3:
             continue
         rate = sine_frequency(moved, step)
         noise = np.quantile(null_r2(moved, step, rng, _NULL_DRAWS), 0.95)
-        told_r2 = sine_fit_r2(told, step, sine_frequency(told, step))[0]
-        fits.append((rate, sine_fit_r2(moved, step, rate)[0], told_r2, noise))
+        command_r2 = sine_fit_r2(sent, step, sine_frequency(sent, step))[0]
+        fits.append((rate, sine_fit_r2(moved, step, rate)[0], command_r2, noise))
     if not fits:
         raise NotTestable(
             f"The trials are shorter than {SHORTEST_S:g} s, or nothing was read or moves in them."
         )
     rhythmic = np.array([fit for fit in fits if fit[1] > fit[3]])
     if not len(rhythmic):
-        _, moved_r2, told_r2, noise = np.mean(fits, axis=0)
+        _, moved_r2, command_r2, noise = np.mean(fits, axis=0)
         raise NotTestable(
             f"In no joint does a sine explain more than it explains of noise: R² {moved_r2:.2f} of "
-            f"what the servos did, {told_r2:.2f} of commands, up to {noise:.2f} of noise. Give a "
-            "recording of a steadier gait."
+            f"what the servos did, {command_r2:.2f} of commands, up to {noise:.2f} of noise. Give "
+            "a recording of a steadier gait."
         )
-    _, moved_r2, told_r2, noise = rhythmic.mean(axis=0)
+    _, moved_r2, command_r2, noise = rhythmic.mean(axis=0)
     rates = rhythmic[:, 0]
     ours = (
         f"{np.median(rates):.2f} Hz in the middle of the {len(rates)} joints of {len(fits)} that "
-        f"have a rhythm ({rates.min():.2f} to {rates.max():.2f}); R² of commands {told_r2:.2f}, of "
-        f"what the servos made of them {moved_r2:.2f}, of noise up to {noise:.2f}"
+        f"have a rhythm ({rates.min():.2f} to {rates.max():.2f}); R² of commands {command_r2:.2f}, "
+        f"of what the servos made of them {moved_r2:.2f}, of noise up to {noise:.2f}"
     )
     uniform = len(rates) == len(fits) and np.ptp(rates) < 0.1
-    nearer = moved_r2 > told_r2 + 0.02
+    nearer = moved_r2 > command_r2 + 0.02
     return Finding(
-        ours, {"joints": [float(rates.min()), float(rates.max())]},
+        ours, {"joints": Interval(*map(float, (np.median(rates), rates.min(), rates.max())))},
         holds(False, bool(nearer or uniform)), "Same servos in both; uniform if within 0.1 Hz.",
     )  # fmt: skip
 
@@ -116,17 +117,16 @@ def closed_loop(stacks: Sequence[dict[str, Any]]) -> Finding:
     other = next((s for s in stacks if "less_mae_vx_m_s" in s), None)
     if other is None:
         raise NotTestable("Give a servo model with --servo.")
-    keys = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
     ours = "; ".join(
-        f"{row['stack']} {' / '.join(f'{row[k].value:.3f}' for k in keys)}, "
+        f"{row['stack']} {' / '.join(f'{row[k].value:.3f}' for k in ERRORS)}, "
         f"falls {100 * row['falls']:.0f} %"
         for row in (stacks[0], other)
     )
-    gains: list[Estimate] = [other[f"less_{k}"] for k in keys]
-    better, worse = all(g.high < 0 for g in gains), all(g.low > 0 for g in gains)
+    gains: dict[str, Interval] = {k: other[f"less_{k}"] for k in ERRORS}
+    better = all(g.high < 0 for g in gains.values())
+    worse = all(g.low > 0 for g in gains.values())
     return Finding(
-        ours, {k: [g.low, g.high] for k, g in zip(keys, gains, strict=True)},
-        holds(better, not worse),
+        ours, gains, holds(better, not worse),
         "Intervals are of the prediction's error less the encoders'; partly if they are not all on "
         "one side of 0.",
     )  # fmt: skip
@@ -147,7 +147,7 @@ def _counts() -> list[Claim]:
             "D5", "Of 60 observations 15 are measured in the MLP stack, 6 in the LSTM stack",
             "15/60, 6/60 (15 + 36 + 3 = 54)",
             "both: 6 measured (IMU), 36 predicted, 12 of its own last action, 3 of the command, "
-            "3 of the trunk's speed that nobody measures; closed loop: 42 measured",
+            "3 of the trunk's speed that is not measured; closed loop: 42 measured",
             None, "holds partly", "Counted in `policies.deploy.controller`.",
         ),
     ]  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from pupper_sysid.policies.analysis.rhythm import Estimate
+from pupper_sysid.common.interval import Interval
 from reproduction.claims import Finding, NotTestable, claim, holds
 from reproduction.evidence import PolicyEvidence, bounds, of_kinds, several
 
@@ -78,12 +78,12 @@ CLAIMS = (reward, exploration, curriculum, throughput)
 
 def _trained(
     policies: Policies, value: Callable[[PolicyEvidence], float], *needed: str
-) -> dict[str, Estimate]:
+) -> dict[str, Interval]:
     """Per kind, of policies whose training is known."""
     return of_kinds([p for p in policies if p.trained], value, *needed)
 
 
-def _lstm_and_newer(found: dict[str, Estimate]) -> tuple[float, list[float]]:
+def _lstm_and_newer(found: dict[str, Interval]) -> tuple[float, list[float]]:
     """The LSTM's value, and those of GRU and Transformer."""
     rest = [v.value for k, v in found.items() if k in ("gru", "transformer")]
     if "lstm" not in found or not rest:

@@ -18,7 +18,7 @@ if sys.platform == "linux":
 import numpy as np
 import tyro
 
-from pupper_sysid.cli.policy_choice import policy_at, simulator, tell_borrowed
+from pupper_sysid.cli.policy_choice import policy_at, simulator, warn_of_fallbacks
 from pupper_sysid.cli.terminal import err, need_positive, out, warn
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
@@ -78,7 +78,7 @@ def _run(options: Play) -> None:
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
     task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
-    tell_borrowed([servos])
+    warn_of_fallbacks([servos])
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)

@@ -1,28 +1,36 @@
-"""The orbit of a gait: the closed curve that actions and hidden states run along, and its shape.
+"""The orbit of a gait: the closed curve of actions and hidden states, and its shape.
 
-A gait is a limit cycle: seen along its few largest directions of variance, what a policy does and
-what it has in mind go round one closed curve. `principal_components` finds these directions for
-several conditions together (no delay, more delay …), so that their orbits can be drawn on the same
-axes; `closure` says how well an orbit returns to itself after a period, `ellipse` and `collapse`
-how large and how round it is.
+A gait is a limit cycle: along their largest directions of variance, actions and hidden states of a
+policy go round one closed curve. `principal_components` finds these directions for several
+conditions together (no delay, more delay …), so that their orbits share axes; `closure` measures
+how well an orbit returns to itself after a period, `ellipse` and `collapse` its size and roundness.
+`orbits` does all of it for a policy with late joints.
 
-Variance explained alone says little: noise in three dimensions is explained by three components,
-too. Read it beside the closure.
+Variance explained means little without the closure: three components also explain all of the noise
+in three dimensions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.results import Result, internal
+from pupper_sysid.policies.analysis import perturbations
+from pupper_sysid.policies.analysis.rollouts import replay
+from pupper_sysid.policies.analysis.trial import NAN, Trial, moving_frequency, walking
+from pupper_sysid.policies.network.policy_file import Policy
 
 Array = NDArray[np.float64]
+
+DELAYS_MS = (0.0, 160.0, 320.0)
+"""Of the published orbits."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +57,7 @@ class PrincipalComponents:
 
     @property
     def participation_ratio(self) -> float:
-        """How many directions the variance is spread over, 1 to d: (Σ λ)² / Σ λ²."""
+        """Number of directions that the variance is spread over, 1 to d: (Σ λ)² / Σ λ²."""
         return float(self.variance.sum() ** 2 / (self.variance**2).sum())
 
     def orbit(self, states: NDArray[np.floating]) -> Array:
@@ -75,12 +83,12 @@ class Ellipse(NamedTuple):
 
 
 class Collapse(NamedTuple):
-    """What is left of an orbit in another condition: 1 if all, 0 if nothing."""
+    """An orbit relative to that of another condition: 1 if unchanged, 0 if nothing is left."""
 
     area: float
     """Ratio of the areas."""
     roundness: float
-    """Ratio of the ratios of minor to major axis; it does not see a change of size."""
+    """Ratio of the ratios of minor to major axis; independent of size."""
 
 
 def principal_components(
@@ -116,14 +124,14 @@ def principal_components(
     variance, axes = np.clip(variance[::-1], 0.0, None), axes.T[::-1][:count]
     if not variance[0] > 0:
         raise InputError("Nothing varies in these states: there is no orbit to look at.")
-    # an axis is as good as its opposite: settle on one, or figures would flip between machines
+    # the sign of an axis is arbitrary: fix it, or figures would flip between machines
     largest = np.abs(axes).argmax(axis=1)
     axes = axes * np.sign(axes[np.arange(count), largest])[:, None]
     return PrincipalComponents(mean, axes, variance)
 
 
 def closure(orbit: NDArray[np.floating], step_s: float, frequency_hz: float) -> float:
-    """How far an orbit is from itself one period later: 0 closed, 1 as far as unrelated points.
+    """Distance of an orbit from itself one period later: 0 closed, 1 as far as unrelated points.
 
     Root mean square distance between points one period apart, over the one between two points
     drawn at random from the orbit (√2 times its RMS radius). Between samples the orbit is
@@ -159,10 +167,10 @@ def closure(orbit: NDArray[np.floating], step_s: float, frequency_hz: float) -> 
 
 
 def ellipse(orbit: NDArray[np.floating]) -> Ellipse:
-    """The ellipse that, run through evenly, has the covariance of an orbit in the plane.
+    """The ellipse with the covariance of an orbit in the plane.
 
     A half axis a has the variance a²/2. Noise makes a band look rounder than it is; `closure`
-    tells noise from an orbit.
+    distinguishes noise from an orbit.
 
     Parameters
     ----------
@@ -176,7 +184,7 @@ def ellipse(orbit: NDArray[np.floating]) -> Ellipse:
 
 
 def collapse(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> Collapse:
-    """What is left of the orbit `reference` in the orbit of another condition, on the same axes.
+    """Size and roundness of an orbit relative to `reference`, on the same axes.
 
     Parameters
     ----------
@@ -191,3 +199,68 @@ def collapse(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> Co
     if not before.area > 0:
         raise InputError("The reference orbit encloses no area: nothing of it can be left.")
     return Collapse(now.area / before.area, now.roundness / before.roundness)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orbits(Result):
+    """Orbits of actions or hidden states of one robot, one per delay, on common axes."""
+
+    states: list[Array] = internal()
+    """Shape (steps, k) each; actions in rad."""
+    orbits: list[Array] = internal()
+    """Shape (steps, 3) each."""
+    explained: list[float]
+    """Shares of variance."""
+    explained_3: float
+    participation_ratio: float
+    closure: list[float]
+    """NaN where the orbit stands still."""
+    area_ratio: list[float]
+    """To no delay."""
+
+
+def orbits(
+    policy: Policy, trial: Trial, delays_ms: Sequence[float] = DELAYS_MS
+) -> dict[str, Orbits]:
+    """Orbits of `actions` and `hidden` states in replay with late joints.
+
+    Of the first robot that walked long enough; empty if none walked and moved.
+    """
+    plain = trial.walk(policy)
+    moving = walking(plain)
+    if not moving:
+        return {}
+    robot, now = next(iter(moving.items()))
+    acted, hidden_states = [], []
+    for delay in delays_ms:
+        change = perturbations.delayed(perturbations.JOINTS, round(delay / 1e3 / plain.step_s))
+        actions, hidden = replay(policy, perturbations.applied(change, plain.observation))
+        acted.append(plain.action_scale * actions[now, robot].astype(float))
+        hidden_states.append(hidden[now, robot].astype(float))
+    rate = moving_frequency(acted[0], plain.step_s)
+    found = {}
+    for name, conditions in (("actions", acted), ("hidden", hidden_states)):
+        axes = principal_components(conditions, 3)
+        paths = [axes.orbit(c) for c in conditions]
+        found[name] = Orbits(
+            states=conditions,
+            orbits=paths,
+            explained=axes.explained.tolist(),
+            explained_3=float(axes.explained[:3].sum()),
+            participation_ratio=float(axes.participation_ratio),
+            closure=[_or_nan(closure, path, plain.step_s, rate) for path in paths],
+            area_ratio=[_or_nan(_area, path[:, :2], paths[0][:, :2]) for path in paths],
+        )
+    return found
+
+
+def _area(path: Array, reference: Array) -> float:
+    return collapse(path, reference).area
+
+
+def _or_nan(measure: Callable[..., float], *given: Any) -> float:
+    """A measure of an orbit; NaN where nothing moves any more."""
+    try:
+        return measure(*given)
+    except InputError:
+        return NAN

@@ -1,20 +1,23 @@
-"""How well a policy walks: falls and tracking errors over whole episodes, in numbers one can check.
+"""Evaluation of a policy: falls and tracking errors over whole episodes.
 
 Every episode lasts 20 s (or until the robot falls), with its own servos, friction and payload,
-commands drawn anew every few seconds, and the measured feedback, unless told otherwise; no pushes.
-Errors are of the instantaneous velocity at each control step, start included. Beside the policy
-stands a robot that stands still: its error is the mean size of the command.
+commands drawn anew every few seconds, and the measured feedback by default; no pushes. Errors are
+of the instantaneous velocity at each control step, start included. The error of a robot that stands
+still, the mean size of the command, stands beside the policy's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.results import Result
+from pupper_sysid.policies.analysis.tracking import named, planar_velocity, tracking_errors
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.walking.config import Commands, Curriculum, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
@@ -36,19 +39,15 @@ RANDOM = Commands((-0.2, 0.2), (-0.1, 0.1), (-0.5, 0.5), standing=0.0, single=0.
 
 @dataclass(frozen=True)
 class Walk:
-    """What came of a number of episodes.
+    """Episodes of one or more robots.
 
     Attributes
     ----------
     fell : ndarray of bool, shape (episodes,)
-    error : ndarray, shape (episodes, 3)
-        Mean absolute error of forward and sideways speed [m/s] and turn rate [rad/s].
-    asked : ndarray, shape (episodes, 3)
-        Mean absolute command: the error of a robot that stands still.
+    command, velocity : ndarray, shape (steps, episodes, 3)
+        Forward and sideways speed [m/s], turn rate [rad/s].
     contact : ndarray of bool, shape (steps, episodes, 4)
-        Which feet were on the ground.
-    velocity : ndarray, shape (steps, episodes, 3)
-        Forward and sideways speed, turn rate.
+        Feet on the ground.
     alive : ndarray of bool, shape (steps, episodes)
     swing_s : float
         Mean length of a swing [s].
@@ -57,13 +56,71 @@ class Walk:
     """
 
     fell: NDArray[np.bool_]
-    error: NDArray[np.float64]
-    asked: NDArray[np.float64]
-    contact: NDArray[np.bool_]
+    command: NDArray[np.float64]
     velocity: NDArray[np.float64]
+    contact: NDArray[np.bool_]
     alive: NDArray[np.bool_]
     swing_s: float
     slip_m_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing(Result):
+    """Errors of a robot that stands still."""
+
+    mae_vx_m_s: float
+    mae_vy_m_s: float
+    mae_yaw_rad_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures(Standing):
+    """Figures of a number of episodes."""
+
+    fall_rate: float
+    duty: tuple[float, ...]
+    """Share of time that each foot stands."""
+    swing_s: float
+    """Mean length of a swing."""
+    foot_slip_m_s: float
+    """Mean speed of feet on the ground."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfCommand(Figures):
+    """Figures under one command."""
+
+    name: str
+    command: tuple[float, float, float]
+    mean_velocity: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfTerrain(Figures):
+    """Figures on one kind of ground."""
+
+    terrain: Terrain
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfDelay(Figures):
+    """Figures with a longer dead time of every servo."""
+
+    extra_delay_ms: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation(Figures):
+    """Evaluation of a policy under random commands, by command, ground and added dead time."""
+
+    episodes: int
+    standing_still: Standing
+    actuator: str
+    feedback: str
+    terrain: Terrain
+    by_command: tuple[OfCommand, ...]
+    by_terrain: tuple[OfTerrain, ...]
+    by_extra_delay: tuple[OfDelay, ...]
 
 
 def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
@@ -87,17 +144,19 @@ def walk(
     command: tuple[float, float, float] | None = None,
     threads: int = 0,
 ) -> Walk:
-    """Run episodes; `policy` None stands still.
+    """Run episodes.
 
     Parameters
     ----------
     policy : Policy or None
+        None stands still.
     task : Walking
         See `evaluation_task`.
     servos : ServoRanges
-    episodes, seed, threads : int
+    episodes, seed : int
     command : (float, float, float), optional
         Instead of random ones.
+    threads : int
     """
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, episodes, seed, threads, model)
@@ -106,56 +165,35 @@ def walk(
     observation, _ = env.observe()
     if policy:
         policy.reset(env.action)
-    steps = task.episode_steps
-    alive = np.ones(episodes, bool)
-    fell = np.zeros(episodes, bool)
-    error, asked, count = np.zeros((episodes, 3)), np.zeros((episodes, 3)), np.zeros(episodes)
-    contacts, velocities, lives = [], [], []
+    alive, fell = np.ones(episodes, bool), np.zeros(episodes, bool)
+    commands, velocities, contacts, lives = [], [], [], []
     slip = slip_count = 0.0
     swings: list[float] = []
-    for _ in range(steps):
-        told = env.command.copy()
-        action = policy.act(observation) if policy else np.zeros((episodes, 12))
-        found = env.step(action)
-        observation = found.observation
+    for _ in range(task.episode_steps):
+        commands.append(env.command.copy())
+        found = env.step(policy.act(observation) if policy else np.zeros((episodes, 12)))
+        observation, facts = found.observation, found.facts
         fell |= alive & found.done & ~found.timed_out
-        alive &= ~found.done
-        facts = found.facts
-        velocity = np.column_stack([facts.linear_velocity[:, :2], facts.angular_velocity[:, 2]])
-        error += alive[:, None] * np.abs(velocity - told)
-        asked += alive[:, None] * np.abs(told)
-        count += alive
+        alive = alive & ~found.done
         standing = facts.contact & alive[:, None]
         slip += float((facts.foot_speed_m_s * standing).sum())
         slip_count += float(standing.sum())
         ended = standing & (facts.contact_s <= task.control_step_s + 1e-9)
         swings += facts.last_air_s[ended & (facts.last_air_s > 0)].tolist()
         contacts.append(facts.contact)
-        velocities.append(velocity)
-        lives.append(alive.copy())
+        velocities.append(planar_velocity(facts))
+        lives.append(alive)
         if not alive.any():
             break
-    count = np.maximum(count, 1)[:, None]
     return Walk(
-        fell, error / count, asked / count, np.array(contacts), np.array(velocities),
-        np.array(lives), float(np.mean(swings)) if swings else float("nan"),
-        slip / max(slip_count, 1.0),
+        fell, np.array(commands), np.array(velocities), np.array(contacts), np.array(lives),
+        float(np.mean(swings)) if swings else float("nan"), slip / max(slip_count, 1.0),
     )  # fmt: skip
 
 
-def summary(found: Walk) -> dict[str, Any]:
+def summary(found: Walk) -> Figures:
     """Figures of a number of episodes."""
-    x, y, yaw = found.error.mean(axis=0)
-    duty = found.contact[found.alive].mean(axis=0)
-    return {
-        "fall_rate": float(found.fell.mean()),
-        "mae_vx_m_s": float(x),
-        "mae_vy_m_s": float(y),
-        "mae_yaw_rad_s": float(yaw),
-        "duty": [float(d) for d in duty],
-        "swing_s": found.swing_s,
-        "foot_slip_m_s": found.slip_m_s,
-    }
+    return Figures(**_figures(found))
 
 
 def evaluate(
@@ -165,31 +203,80 @@ def evaluate(
     episodes: int,
     seed: int,
     threads: int = 0,
-    progress=None,
-) -> dict[str, Any]:
-    """Object of `pupper-eval --json`, for one actuator and one ground."""
-    task = evaluation_task(task)
-    overall = walk(policy, task, servos, episodes, seed, None, threads)
-    asked = overall.asked.mean(axis=0)
+    *,
+    feedback: str = "held",
+    grounds: Sequence[Terrain] = (),
+    extra_delays_ms: Sequence[float] = (),
+    progress: Callable[[str], None] = lambda what: None,
+) -> Evaluation:
+    """Evaluate a policy.
+
+    Parameters
+    ----------
+    policy : Policy or None
+        None stands still.
+    task : Walking
+        Its ground is that of the random and of the fixed commands.
+    servos : ServoRanges
+    episodes : int
+        With random commands; a fifth of them per direction, half per ground and delay.
+    seed, threads : int
+    feedback : str
+        Name of the feedback in `servos`, for the result.
+    grounds : sequence of str
+        Kinds of ground to evaluate on.
+    extra_delays_ms : sequence of float
+        Added to every servo's dead time.
+    progress : callable
+        Called with the name of the next part.
+    """
+    plain = evaluation_task(task)
+
+    def part(name: str, share: int, task: Walking, servos: ServoRanges, command=None) -> Walk:
+        progress(name)
+        return walk(policy, task, servos, max(episodes // share, 1), seed, command, threads)
+
+    overall = walk(policy, plain, servos, episodes, seed, None, threads)
     by_command = []
     for name, command in DIRECTIONS.items():
-        if progress:
-            progress(name)
-        found = walk(policy, task, servos, max(episodes // 5, 1), seed, command, threads)
-        moved = found.velocity[found.alive].mean(axis=0)
+        found = part(name, 5, plain, servos, command)
+        moved = tuple(found.velocity[found.alive].mean(axis=0).tolist())
         by_command.append(
-            {"name": name, "command": list(command), **summary(found),
-             "mean_velocity": [float(v) for v in moved]}
-        )  # fmt: skip
+            OfCommand(name=name, command=command, mean_velocity=moved, **_figures(found))
+        )
+    return Evaluation(
+        **_figures(overall),
+        episodes=episodes,
+        standing_still=Standing(
+            **_errors(np.zeros_like(overall.velocity), overall.command, overall.alive)
+        ),
+        actuator=servos.source,
+        feedback=feedback,
+        terrain=task.terrain,
+        by_command=tuple(by_command),
+        by_terrain=tuple(
+            OfTerrain(terrain=g, **_figures(part(g, 2, replace(plain, terrain=g), servos)))
+            for g in grounds
+        ),
+        by_extra_delay=tuple(
+            OfDelay(
+                extra_delay_ms=extra,
+                **_figures(part(f"+{extra:g} ms", 2, plain, servos.later(extra / 1000))),
+            )
+            for extra in extra_delays_ms
+        ),
+    )
+
+
+def _figures(found: Walk) -> dict:
     return {
-        "episodes": episodes,
-        **summary(overall),
-        "standing_still": {
-            "mae_vx_m_s": float(asked[0]),
-            "mae_vy_m_s": float(asked[1]),
-            "mae_yaw_rad_s": float(asked[2]),
-        },
-        "actuator": servos.source,
-        "terrain": task.terrain,
-        "by_command": by_command,
+        "fall_rate": float(found.fell.mean()),
+        **_errors(found.velocity, found.command, found.alive),
+        "duty": tuple(found.contact[found.alive].mean(axis=0).tolist()),
+        "swing_s": found.swing_s,
+        "foot_slip_m_s": found.slip_m_s,
     }
+
+
+def _errors(velocity, command, alive) -> dict[str, float]:
+    return named(tracking_errors(velocity, command, alive).mean(axis=0))

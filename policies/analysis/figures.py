@@ -1,9 +1,8 @@
-"""Pictures of the analyses of policies: delay curves, ablations, orbits and gaits."""
+"""Figures of the analyses of policies: delay curves, ablations, orbits and gaits."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,53 +18,54 @@ from pupper_sysid.common.figure_style import (
     styled,
 )
 from pupper_sysid.common.joints import LEGS
+from pupper_sysid.policies.analysis.autonomy import Autonomy
 from pupper_sysid.policies.analysis.gait import SETTLE_S, intervals
+from pupper_sysid.policies.analysis.paths import DirectionWalk
+from pupper_sysid.policies.analysis.robustness import AblationPoint, DelayPoint, GroundPoint
 from pupper_sysid.policies.analysis.rollouts import Rollout
 
 _MODES = {"fixed": "-", "jittered": "--", "replay": ":"}
 _SHOWN_S = 2.0
 _THIGH = 1  # LF thigh, as the paper draws
 
-Rows = Sequence[Mapping[str, Any]]
-
 
 @styled
-def delay_figure(curves: Mapping[str, Rows]) -> Figure:
+def delay_figure(curves: Mapping[str, Sequence[DelayPoint]]) -> Figure:
     """Survival, frequency and amplitude against more delay; a colour per policy."""
     names = {"survival": "share still up", "frequency_hz": "gait [Hz]", "amplitude_rad": "rad"}
     figure, axes = axes_column(len(names), 2.2 * len(names))
     for (name, title), one in zip(names.items(), axes, strict=True):
         for k, (policy, rows) in enumerate(curves.items()):
-            colour = JOINT_COLOURS[k % len(JOINT_COLOURS)]
+            colour = _colour(k)
             for mode, line in _MODES.items():
-                chosen = [r for r in rows if r["mode"] == mode and np.isfinite(r[name])]
+                chosen = [r for r in rows if r.mode == mode and np.isfinite(getattr(r, name))]
                 if chosen:
                     one.plot(
-                        [r["extra_delay_ms"] for r in chosen], [r[name] for r in chosen], line,
-                        color=colour, marker="o", ms=3, label=f"{policy}, {mode}",
+                        [r.extra_delay_ms for r in chosen], [getattr(r, name) for r in chosen],
+                        line, color=colour, marker="o", ms=3, label=f"{policy}, {mode}",
                     )  # fmt: skip
         one.set_ylabel(title)
     axes[-1].set_xlabel("more delay [ms]")
-    if axes[1].lines:  # without a gait there is none to name
+    if axes[1].lines:
         axes[1].legend(fontsize=7)
     return figure
 
 
 @styled
-def ablation_figure(tables: Mapping[str, Rows]) -> Figure:
+def ablation_figure(tables: Mapping[str, Sequence[AblationPoint]]) -> Figure:
     """Gait correlation in replay against noise, with the level of zeros as a line."""
     figure, axes = axes_column(len(tables), 2.6 * len(tables))
     for (policy, rows), one in zip(tables.items(), axes, strict=True):
-        channels = list(dict.fromkeys(r["channel"] for r in rows))
+        channels = list(dict.fromkeys(r.channel for r in rows))
         for channel, colour in zip(channels, JOINT_COLOURS, strict=False):
-            noise = [r for r in rows if r["channel"] == channel and r["kind"] == "noise"]
-            zero = next(r for r in rows if r["channel"] == channel and r["kind"] == "zero")
+            noise = [r for r in rows if r.channel == channel and r.kind == "noise"]
+            zero = next(r for r in rows if r.channel == channel and r.kind == "zero")
             label = channel.replace("_", " ")
             one.semilogx(
-                [r["level"] for r in noise], [r["correlation"] for r in noise], color=colour,
+                [r.level for r in noise], [r.correlation for r in noise], color=colour,
                 marker="o", ms=3, label=label,
             )  # fmt: skip
-            one.axhline(zero["correlation"], color=colour, ls=":", lw=1)
+            one.axhline(zero.correlation, color=colour, ls=":", lw=1)
         one.set_title(policy)
         one.set_ylabel("correlation of actions")
     axes[-1].set_xlabel("noise, share of the channel's own deviation (dotted: zeros)")
@@ -91,7 +91,7 @@ def orbit_figure(orbits: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms
 def gait_figure(rollout: Rollout) -> Figure:
     """Stance bars of the four feet, LF thigh's angle, and its action, over two seconds.
 
-    Of the first robot that is up so long, others' thighs behind; empty if none is.
+    Of the first robot that is up that long, with the thighs of others behind; empty if none is.
     """
     start = round(SETTLE_S / rollout.step_s)
     stop = start + round(_SHOWN_S / rollout.step_s)
@@ -115,45 +115,25 @@ def gait_figure(rollout: Rollout) -> Figure:
 
 
 @styled
-def delay_trace_figure(
-    actions: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms: Sequence[float], step_s: float
-) -> Figure:
-    """The LF thigh's action over two seconds, a panel per delay, a line per policy."""
-    figure, axes = axes_column(len(delays_ms), 1.9 * len(delays_ms))
-    count = round(_SHOWN_S / step_s)
-    time = step_s * np.arange(count)
-    for i, (one, delay) in enumerate(zip(axes, delays_ms, strict=True)):
-        for k, (policy, conditions) in enumerate(actions.items()):
-            one.plot(
-                time, conditions[i][:count, _THIGH], "-" if k == 0 else "--",
-                color=JOINT_COLOURS[k % len(JOINT_COLOURS)], label=policy,
-            )  # fmt: skip
-        one.set(title=f"joints late by {delay:g} ms", ylabel="rad", xlim=(0, time[-1]))
-    axes[-1].set_xlabel("time [s]")
-    axes[0].legend(fontsize=7, loc="upper right")
-    return figure
-
-
-@styled
-def autonomy_figure(tests: Mapping[str, Mapping[str, Rows]]) -> Figure:
-    """Amplitude left with inputs frozen, phase shift by pushes, and frequency against rate."""
+def autonomy_figure(tests: Mapping[str, Autonomy]) -> Figure:
+    """Amplitude with inputs frozen, phase shift after pushes, and frequency against rate."""
     figure, (bars, shifts, rates) = axes_column(3, 8.0)
     count = len(tests)
     for k, (policy, found) in enumerate(tests.items()):
-        colour = JOINT_COLOURS[k % len(JOINT_COLOURS)]
-        rows = found["frozen"]
+        colour = _colour(k)
+        rows = found.frozen
         places = np.arange(len(rows)) + 0.8 * k / count
-        bars.barh(places, [r["share"] for r in rows], 0.8 / count, color=colour, label=policy)
-        for row, mark in zip(found["push"], ("x", "o"), strict=False):  # none if nobody walked
+        bars.barh(places, [r.share for r in rows], 0.8 / count, color=colour, label=policy)
+        for row, mark in zip(found.push, ("x", "o"), strict=False):  # none if no robot walked
             shifts.plot(
-                row["phases"], row["shifts"], mark, ms=3, color=colour, ls="",
+                row.phases, row.shifts, mark, ms=3, color=colour, ls="",
                 label=f"{policy}, {row['push_m_s']:g} m/s",
             )  # fmt: skip
         rates.plot(
-            [r["rate_hz"] for r in found["rate"]], [r["frequency_hz"] for r in found["rate"]],
+            [r.rate_hz for r in found.rate], [r.frequency_hz for r in found.rate],
             marker="o", ms=3, color=colour, label=policy,
         )  # fmt: skip
-    names = [r["test"] for r in next(iter(tests.values()))["frozen"]]
+    names = [r.test for r in next(iter(tests.values())).frozen]
     bars.set_yticks(np.arange(len(names)) + 0.4 * (count - 1) / count, names, fontsize=7)
     bars.set_xlabel("amplitude of the actions, share of that before")
     shifts.set(xlabel="phase at the push [cycles]", ylabel="shift [cycles]", ylim=(-0.52, 0.52))
@@ -165,16 +145,22 @@ def autonomy_figure(tests: Mapping[str, Mapping[str, Rows]]) -> Figure:
 
 
 @styled
-def terrain_figure(tables: Mapping[str, Rows]) -> Figure:
+def terrain_figure(tables: Mapping[str, Sequence[GroundPoint]]) -> Figure:
     """Survival and forward error on every kind of ground, a group of bars per ground."""
     names = {"survival": "share still up", "mae_vx_m_s": "forward error [m/s]"}
     figure, axes = axes_column(len(names), 2.4 * len(names))
     for one, (key, title) in zip(axes, names.items(), strict=True):
         for k, (policy, rows) in enumerate(tables.items()):
             places = np.arange(len(rows)) + 0.8 * k / len(tables)
-            colour = JOINT_COLOURS[k % len(JOINT_COLOURS)]
-            one.bar(places, [r[key] for r in rows], 0.8 / len(tables), color=colour, label=policy)
-        grounds = [r["ground"] for r in next(iter(tables.values()))]
+            colour = _colour(k)
+            one.bar(
+                places,
+                [getattr(r, key) for r in rows],
+                0.8 / len(tables),
+                color=colour,
+                label=policy,
+            )
+        grounds = [r.ground for r in next(iter(tables.values()))]
         one.set_xticks(np.arange(len(grounds)) + 0.4 * (len(tables) - 1) / len(tables), grounds)
         one.set_ylabel(title)
     axes[-1].legend(fontsize=7, loc="lower right")
@@ -182,17 +168,21 @@ def terrain_figure(tables: Mapping[str, Rows]) -> Figure:
 
 
 @styled
-def compliance_figure(tables: Mapping[str, Rows]) -> Figure:
-    """Paths of one robot told to go in six directions, a panel per policy, as seen from above."""
+def compliance_figure(tables: Mapping[str, Sequence[DirectionWalk]]) -> Figure:
+    """Paths of one robot in six directions seen from above, a panel per policy."""
     figure, axes = axes_column(len(tables), 3.4 * len(tables))
     for one, (policy, rows) in zip(axes, tables.items(), strict=True):
         for row, colour in zip(rows, JOINT_COLOURS, strict=False):
-            path = np.asarray(row["path"])
+            path = np.asarray(row.path)
             if len(path):
                 # forward is up, left is left
-                one.plot(-path[:, 1], path[:, 0], color=colour, lw=1.2, label=row["direction"])
+                one.plot(-path[:, 1], path[:, 0], color=colour, lw=1.2, label=row.direction)
         one.set_aspect("equal")
         one.set(title=policy, xlabel="to the right [m]", ylabel="forward [m]")
     if axes[0].lines:
         axes[0].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
+
+
+def _colour(k: int) -> str:
+    return JOINT_COLOURS[k % len(JOINT_COLOURS)]

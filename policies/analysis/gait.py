@@ -1,13 +1,13 @@
-"""What a gait is like, in numbers: frequency, regularity, phases and duty of feet, jitter, size.
+"""Measures of a gait: frequency, regularity, phases and duty factors of feet, jitter, amplitude.
 
-`describe` takes a rollout and gives a `GaitReport`; the measures themselves are functions of
-arrays, time along the first axis, for logs of other origin. Signals are joint angles or targets
+`describe` makes a `GaitReport` of a rollout; the measures themselves are functions of arrays, time
+along the first axis, for logs of other origin. Signals are joint angles or targets
 [rad], contacts are booleans per foot in the order LF, RF, LB, RB.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.rhythm import (
     SHORTEST_S,
     STILL,
+    UNKNOWN,
     Array,
-    Estimate,
     Signal,
     frequency,
     mean_of,
@@ -39,76 +41,61 @@ _NULL_QUANTILE = 0.95
 
 
 class Correlation(NamedTuple):
-    """How alike two recordings of a gait are, mean over joints of Pearson's r."""
+    """Similarity of two recordings of a gait: mean over joints of Pearson's r."""
 
     r: float
     """At no lag."""
     best: float
-    """At the lag that suits them best, the same for all joints."""
+    """Largest over lags, the same lag for all joints."""
     lag_steps: int
     """That lag; positive if the second is later."""
 
 
-@dataclass(frozen=True)
-class GaitReport:
-    """A gait, as means over robots with intervals of those means.
+@dataclass(frozen=True, kw_only=True)
+class GaitReport(Result):
+    """A gait, as means over robots with 90 % intervals of those means.
 
     Intervals come from the spread between robots (each with its own servos, friction and payload)
     by Student's t, and hold for this one policy: another training may walk otherwise. With one
-    robot there are none, but for that of the frequency, which is then its own.
-
-    Attributes
-    ----------
-    robots, left_out : int
-        Robots that walked long enough, and those that fell before.
-    frequency_hz : Estimate
-        Of the actions; see `frequency`.
-    rhythmic : float
-        Share of robots whose actions a sine explains better than it explains noise (5 % of noise
-        would pass).
-    action_r2, joint_r2 : Estimate
-        R² of the best common sine, mean over joints, of actions and true joint angles.
-    null_r2 : float
-        What 95 % of noise like the actions stays below in `action_r2`.
-    action_r2_by_joint, joint_r2_by_joint : tuple of 12 Estimate
-    phase : tuple of 4 Estimate
-        Of feet, from their contacts; see `phases`.
-    duty : tuple of 4 Estimate
-        Share of time that each foot stands.
-    diagonal : Estimate
-        See `diagonal_coordination`.
-    jitter_rad : Estimate
-        Of actions; see `jitter` [rad per step²].
-    fast_share : Estimate
-        Of actions; see `fast_share`.
-    half_range_rad, deviation_rad : tuple of 12 Estimate
-        Of actions, by joint; see `amplitude` [rad].
-    joint_half_range_rad, joint_deviation_rad : tuple of 12 Estimate
-        Of true joint angles.
+    robot there are none but that of the frequency, which is then its own.
     """
 
     robots: int
+    """Robots that walked long enough."""
     left_out: int
-    frequency_hz: Estimate
+    """Robots that fell before."""
+    frequency_hz: Interval
+    """Of the actions; see `frequency`."""
     rhythmic: float
-    action_r2: Estimate
-    joint_r2: Estimate
+    """Share of robots whose actions a sine explains better than noise (5 % of noise would pass)."""
+    action_r2: Interval
+    """R² of the best common sine of the actions, mean over joints."""
+    joint_r2: Interval
+    """R² of the best common sine of the true joint angles, mean over joints."""
     null_r2: float
-    action_r2_by_joint: tuple[Estimate, ...]
-    joint_r2_by_joint: tuple[Estimate, ...]
-    phase: tuple[Estimate, ...]
-    duty: tuple[Estimate, ...]
-    diagonal: Estimate
-    jitter_rad: Estimate
-    fast_share: Estimate
-    half_range_rad: tuple[Estimate, ...]
-    deviation_rad: tuple[Estimate, ...]
-    joint_half_range_rad: tuple[Estimate, ...]
-    joint_deviation_rad: tuple[Estimate, ...]
+    """95 % quantile of `action_r2` in noise like the actions."""
+    action_r2_by_joint: tuple[Interval, ...]
+    joint_r2_by_joint: tuple[Interval, ...]
+    phase: tuple[Interval, ...]
+    """Of the four feet, from their contacts; see `phases`."""
+    duty: tuple[Interval, ...]
+    """Share of time that each foot stands."""
+    diagonal: Interval
+    """See `diagonal_coordination`."""
+    jitter_rad: Interval
+    """Of actions; see `jitter` [rad per step²]."""
+    fast_share: Interval
+    """Of actions; see `fast_share`."""
+    half_range_rad: tuple[Interval, ...]
+    """Of actions, by joint; see `amplitude` [rad]."""
+    deviation_rad: tuple[Interval, ...]
+    joint_half_range_rad: tuple[Interval, ...]
+    """Of true joint angles."""
+    joint_deviation_rad: tuple[Interval, ...]
 
 
 def steady(rollout: Rollout) -> dict[int, slice]:
-    """Which steps of which robots belong to a gait: from `SETTLE_S` to the end or before a fall.
+    """Steps of each robot that belong to a gait: from `SETTLE_S` to the end or before a fall.
 
     Robots that fell too soon are left out.
     """
@@ -122,13 +109,13 @@ def steady(rollout: Rollout) -> dict[int, slice]:
 def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
     """Describe the gait in a rollout, from two seconds after its start.
 
-    A robot that fell counts up to half a second before its fall, if that leaves enough.
+    A robot that fell counts up to half a second before its fall, if enough is left.
 
     Parameters
     ----------
     rollout : Rollout
     rng : numpy.random.Generator
-        Draws the noise of `null_r2`.
+        For the noise of `null_r2`.
 
     Raises
     ------
@@ -143,40 +130,47 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
             f"{rollout.alive.sum(axis=0).max() * step_s:.1f} s. Collect a longer rollout, or "
             "describe no gait here."
         )
-    found = []
-    for i, now in walked.items():
-        found.append(
-            _describe_one(
-                rollout.action_rad[now, i], rollout.joint_position[now, i],
-                rollout.contact[now, i], step_s, rng,
-            )
-        )  # fmt: skip
+    found = [
+        _describe_one(
+            rollout.action_rad[now, i], rollout.joint_position[now, i], rollout.contact[now, i],
+            step_s, rng,
+        )
+        for i, now in walked.items()
+    ]  # fmt: skip
     each = {name: np.array([f[name] for f in found]) for name in found[0]}
     rate, low, high = each["frequency"].T
-    alone = Estimate(float(rate[0]), float(low[0]), float(high[0]))
-    whole_rate = mean_of(rate) if len(walked) > 1 else alone
+    alone = Interval(float(rate[0]), float(low[0]), float(high[0]))
     return GaitReport(
-        len(walked), rollout.alive.shape[1] - len(walked),
-        whole_rate,
-        float((each["action_r2"].mean(axis=1) > each["null_r2"]).mean()),
-        mean_of(each["action_r2"].mean(axis=1)), mean_of(each["joint_r2"].mean(axis=1)),
-        float(each["null_r2"].mean()), _means(each["action_r2"]), _means(each["joint_r2"]),
-        tuple(_mean_phase(p) for p in each["phase"].T), _means(each["duty"]),
-        mean_of(each["diagonal"]), mean_of(each["jitter"]), mean_of(each["fast_share"]),
-        *(_means(each[f"{which}_{name}"]) for which in ("action", "joint")
-          for name in ("half_range", "deviation")),
-    )  # fmt: skip
+        robots=len(walked),
+        left_out=rollout.alive.shape[1] - len(walked),
+        frequency_hz=mean_of(rate) if len(walked) > 1 else alone,
+        rhythmic=float((each["action_r2"].mean(axis=1) > each["null_r2"]).mean()),
+        action_r2=mean_of(each["action_r2"].mean(axis=1)),
+        joint_r2=mean_of(each["joint_r2"].mean(axis=1)),
+        null_r2=float(each["null_r2"].mean()),
+        action_r2_by_joint=_means(each["action_r2"]),
+        joint_r2_by_joint=_means(each["joint_r2"]),
+        phase=tuple(_mean_phase(p) for p in each["phase"].T),
+        duty=_means(each["duty"]),
+        diagonal=mean_of(each["diagonal"]),
+        jitter_rad=mean_of(each["jitter"]),
+        fast_share=mean_of(each["fast_share"]),
+        half_range_rad=_means(each["action_half_range"]),
+        deviation_rad=_means(each["action_deviation"]),
+        joint_half_range_rad=_means(each["joint_half_range"]),
+        joint_deviation_rad=_means(each["joint_deviation"]),
+    )
 
 
 # --------------------------------------------------------------------------------- feet
 
 
 def phases(signal: Signal, step_s: float, frequency_hz: float) -> Array:
-    """By which share of a cycle each channel is behind the first.
+    """Phase of each channel behind the first, in cycles.
 
     From the analytic signal in a band about the gait frequency (each channel times exp(-2πj f t),
     averaged over two strides under a Hann window): the angle of its mean product with the first
-    channel's. A rhythm that wanders takes all channels along, and leaves their phases alone.
+    channel's. A wandering rhythm moves all channels alike and leaves these phases as they are.
 
     Parameters
     ----------
@@ -201,16 +195,15 @@ def phases(signal: Signal, step_s: float, frequency_hz: float) -> Array:
 
 
 def duty(contact: NDArray[np.bool_]) -> Array:
-    """Share of time for which feet stand, (steps, …) to (…)."""
+    """Share of time that feet stand, (steps, …) to (…)."""
     return np.mean(contact, axis=0)
 
 
 def diagonal_coordination(contact: NDArray[np.bool_]) -> float:
-    """How much diagonal feet stand and swing together: φ, mean over the two pairs.
+    """Coordination of diagonal feet: φ, mean over the two pairs.
 
-    φ is Pearson's r of two booleans: 1 in a trot, 0 if they know nothing of each other however
-    long they stand, below 0 if they take turns (pace, bound). Feet that always stand together are
-    together, too, in a pronk: look at `phases`.
+    φ is Pearson's r of two booleans: 1 in a trot, 0 if independent, below 0 if they take turns
+    (pace, bound). A pronk has 1, too: see `phases`.
 
     Parameters
     ----------
@@ -227,9 +220,10 @@ def diagonal_coordination(contact: NDArray[np.bool_]) -> float:
 
 
 def intervals(down: NDArray[np.bool_], step_s: float) -> Array:
-    """When a foot was down, for bars: start and length of each stance [s], shape (k, 2).
+    """Start and length of each stance of a foot [s], shape (k, 2).
 
-    Those that the recording cuts are as long as they are seen. Swings are `intervals(~down, …)`.
+    Stances cut by the ends of the recording have their recorded length. Swings are
+    `intervals(~down, …)`.
 
     Parameters
     ----------
@@ -260,10 +254,9 @@ def jitter(signal: Signal) -> float:
 
 
 def fast_share(signal: Signal, step_s: float, frequency_hz: float) -> float:
-    """Share of the power that is faster than the gait and its second harmonic.
+    """Share of the power above the gait's second harmonic.
 
-    The border is at 2.5 times the gait frequency, midway between harmonics: at twice, half of the
-    second one would fall on either side.
+    The border is at 2.5 times the gait frequency, midway between harmonics.
 
     Parameters
     ----------
@@ -302,18 +295,18 @@ def amplitude(signal: Signal) -> tuple[Array, Array]:
 
 
 def correlation(actions_a: Signal, actions_b: Signal, most_lag: int) -> Correlation:
-    """How alike two recordings of a gait are: mean over joints (and robots) of Pearson's r.
+    """Similarity of two recordings of a gait: mean over joints (and robots) of Pearson's r.
 
-    A joint that stands still in the second only counts as r = 0: it keeps nothing of the gait. One
-    that stands still in the first is left out: there is nothing to keep.
+    A joint that stands still in the second only counts as r = 0; one that stands still in the first
+    is left out.
 
     Parameters
     ----------
     actions_a, actions_b : ndarray, shape (steps, 12) or (steps, n, 12)
         The gait to compare with, and the other.
     most_lag : int
-        Look for the best lag up to so many steps to either side; well under half a period, or the
-        next stride will do as well.
+        Largest lag tried, in steps to either side; well under half a period, or the next stride
+        fits as well.
 
     Raises
     ------
@@ -350,9 +343,9 @@ def _describe_one(
 ) -> dict[str, object]:  # fmt: skip
     """All measures of one robot, by name."""
     moves = bool((action.std(axis=0) > STILL).any())
-    rate = frequency(action, step_s) if moves else Estimate(*[float("nan")] * 3)
+    rate = frequency(action, step_s) if moves else UNKNOWN
     found: dict[str, object] = {
-        "frequency": rate,
+        "frequency": astuple(rate),
         "null_r2": float("nan"),
         "duty": duty(contact),
         "diagonal": diagonal_coordination(contact),
@@ -375,17 +368,17 @@ def _wrapped(cycles: NDArray[np.floating]) -> Array:
     return np.asarray((cycles + 0.25) % 1.0 - 0.25, float)
 
 
-def _means(values: Array) -> tuple[Estimate, ...]:
-    """The same for each column."""
+def _means(values: Array) -> tuple[Interval, ...]:
+    """`mean_of` each column."""
     return tuple(mean_of(column) for column in values.T)
 
 
-def _mean_phase(cycles: Array) -> Estimate:
-    """Mean over robots of shares of a cycle, which has no ends."""
+def _mean_phase(cycles: Array) -> Interval:
+    """Circular mean over robots of shares of a cycle."""
     known = cycles[np.isfinite(cycles)]
     if not len(known):
-        return Estimate(*[float("nan")] * 3)
+        return UNKNOWN
     centre = float(np.angle(np.exp(2j * np.pi * known).mean()) / (2 * np.pi))
     away = mean_of((known - centre + 0.5) % 1.0 - 0.5)
     start = float(_wrapped(np.array(centre)))
-    return Estimate(*(start + x for x in away))
+    return Interval(*(start + x for x in astuple(away)))

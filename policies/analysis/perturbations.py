@@ -1,7 +1,7 @@
-"""What can be done to an observation before a policy sees it: delay, noise, zeros, staleness.
+"""Perturbations of observations: delay, noise, zeros, staleness.
 
 Each function makes a `Change` for `policies.analysis.rollouts.collect`, or alters a recorded
-sequence for `replay`. Parts of the observation are named as in `sim.walking.env.OBSERVATION`.
+sequence for `replay`. Parts are named as in `sim.walking.observation.OBSERVATION`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.policies.analysis.rollouts import Change
-from pupper_sysid.sim.walking.env import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 
 Observations = NDArray[np.float32]
 
@@ -19,7 +19,7 @@ JOINTS = slice(PARTS["joint_position_relative"].start, PARTS["joint_effort"].sto
 
 
 def delayed(part: slice, steps: int) -> Change:
-    """Show a part as it was so many control steps ago."""
+    """Delay a part by a number of control steps."""
     past: list[Observations] = []
 
     def change(step: int, observation: Observations) -> Observations:
@@ -33,9 +33,9 @@ def delayed(part: slice, steps: int) -> Change:
 
 
 def jittered(part: slice, mean_steps: int, rng: np.random.Generator) -> Change:
-    """Show a part with a delay that wanders between 0 and twice its mean, never back in time.
+    """Delay a part by a lag that wanders between 0 and twice its mean, never back in time.
 
-    A lag grows by at most one step per step, or an older value would follow a newer one.
+    The lag grows by at most one step per step, or an older value would follow a newer one.
     """
     past: list[Observations] = []
     lag = np.zeros(0, int)
@@ -55,7 +55,7 @@ def jittered(part: slice, mean_steps: int, rng: np.random.Generator) -> Change:
 
 
 def noisy(part: slice, sigma: NDArray[np.floating], rng: np.random.Generator) -> Change:
-    """Add white noise of a standard deviation per number of the part, in its own unit."""
+    """Add white noise with a standard deviation per number of the part, in its own unit."""
     size = np.asarray(sigma, np.float32)
 
     def change(step: int, observation: Observations) -> Observations:
@@ -67,7 +67,7 @@ def noisy(part: slice, sigma: NDArray[np.floating], rng: np.random.Generator) ->
 
 
 def zeroed(part: slice) -> Change:
-    """Show zeros."""
+    """Set a part to zero."""
 
     def change(step: int, observation: Observations) -> Observations:
         observation[:, part] = 0.0
@@ -77,7 +77,7 @@ def zeroed(part: slice) -> Change:
 
 
 def held(part: slice, steps: int) -> Change:
-    """Refresh a part only every so many control steps: staleness, as slow polls make it."""
+    """Refresh a part only every `steps` control steps: staleness, as slow polls cause it."""
     kept: list[Observations] = []
 
     def change(step: int, observation: Observations) -> Observations:
@@ -90,7 +90,7 @@ def held(part: slice, steps: int) -> Change:
 
 
 def applied(change: Change, observations: Observations) -> Observations:
-    """A recorded sequence, shape (steps, n, 60), as a policy would have seen it."""
+    """A recorded sequence of observations, shape (steps, n, 60), with the change applied."""
     return np.stack([change(i, seen.copy()) for i, seen in enumerate(observations)]).astype(
         np.float32
     )

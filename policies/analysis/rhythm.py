@@ -1,14 +1,13 @@
-"""How fast a rhythm is, and how much of a signal a sine explains.
+"""Frequency of a rhythm, and the share of a signal that a sine explains.
 
-Two traps of published analyses are avoided. A frequency is not read off a spectrum of one second,
-whose bins are 1 Hz apart, but estimated from at least five seconds, with an interval. And a sine's
-R² is never given without that of noise: the best of many sines explains a good part of anything
-slow (`null_r2`).
+A frequency is estimated from at least five seconds, with an interval, not read off a spectrum of
+one second, whose bins are 1 Hz apart. A sine's R² stands beside that of noise (`null_r2`): the best
+of many sines explains a good part of any slow signal.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,14 @@ from scipy.signal import lfilter
 from scipy.stats import t as student_t
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.tones import fit_sine, least_squares, sine_design
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.floating] | NDArray[np.bool_]
 
-LEVEL = 0.9
-"""Of all intervals."""
 SHORTEST_S = 5.0
-"""Signals shorter than this have no frequency worth the name."""
+"""Shortest signal whose frequency is estimated [s]."""
 
 _SLOWEST_HZ = 0.5  # what is slower is drift: a leg of 0.1 m swings freely at 1.6 Hz
 STILL = 1e-9
@@ -34,30 +33,23 @@ _FEWEST_PHASES = 6
 _WALKS = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 29)])
 
 
-class Estimate(NamedTuple):
-    """A number with its 90 % interval, in the same unit; NaN where there is none."""
-
-    value: float
-    low: float
-    high: float
+UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
+"""Of a quantity without a value."""
 
 
-def frequency(signal: Signal, step_s: float) -> Estimate:
+def frequency(signal: Signal, step_s: float) -> Interval:
     """Common gait frequency of several channels: the mean rate of their common phase [Hz].
 
-    The best common sine (`sine_frequency`) is where the search begins. Then every stride gives one
-    phase, by least squares of a sine, a cosine and an offset over all channels (weighted by how
-    well the sine fits them; the second harmonic, fitted to the whole, is taken off), and the slope
-    of these phases is the frequency. It is fitted as a straight line with two kinds of error: white
-    ones, which noise upon the signal makes, however it is coloured, since one stride averages over
-    it; and a random walk, since a gait keeps no clock. Their ratio is found by restricted maximum
-    likelihood, the line by generalised least squares, its 90 % interval by Student's t.
+    The search begins at the best common sine (`sine_frequency`). Every stride then gives one phase,
+    by least squares of a sine, a cosine and an offset over all channels, weighted by how well the
+    sine fits them and without the second harmonic of the whole signal; the slope of these phases is
+    the frequency. The line has two kinds of error: white ones, from noise on the signal, and a
+    random walk, since a gait keeps no clock. Their ratio follows from restricted maximum
+    likelihood, the line from generalised least squares, its 90 % interval from Student's t.
 
-    An interval from residuals of the sine alone, even one corrected for their colour, holds for
-    noise upon a steady rhythm (error falling as T^-1.5), but covers only 20-40 % where the rhythm
-    itself wanders (error falling as T^-0.5). This one covers 91-98 % in the first case (most in
-    very red noise, where errors of neighbouring strides cancel), and 70-88 % in the second, where a
-    few seconds hardly show how much it wanders.
+    Residuals of the sine alone give intervals that cover 20-40 % where the rhythm itself wanders.
+    This interval covers 91-98 % for noise on a steady rhythm and 70-88 % for one that wanders,
+    which a few seconds hardly show.
 
     Parameters
     ----------
@@ -73,30 +65,28 @@ def frequency(signal: Signal, step_s: float) -> Estimate:
     y = standardised(signal)
     steps, time = len(y), times(len(y), step_s)
     angle = 2 * np.pi * best * time
-    first = np.stack([np.ones(steps), np.cos(angle), np.sin(angle)], axis=1)
-    second = np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
-    whole = np.linalg.lstsq(np.hstack([first, second]), y, rcond=None)[0]
-    y = y - second @ whole[3:]
+    design = sine_design(angle, 2 * angle)
+    whole = least_squares(design, y)
+    y = y - design[:, 3:] @ whole[3:]
     phasor = whole[1] - 1j * whole[2]
     strides = max(_FEWEST_PHASES, int(steps * step_s * best))
     parts = np.array_split(np.arange(steps), strides)
     ahead = np.zeros(strides, complex)
     for k, part in enumerate(parts):
         # with its own offset, or slow noise would leak into the phases
-        _, cosine, sine = np.linalg.lstsq(first[part], y[part], rcond=None)[0]
-        ahead[k] = ((cosine - 1j * sine) * phasor.conj()).sum()
+        ahead[k] = (fit_sine(angle[part], y[part]).phasor * phasor.conj()).sum()
     middle = np.array([time[part].mean() for part in parts])
     slope, error = _slope(np.unwrap(np.angle(ahead)), middle)
     rate, half = best + slope / (2 * np.pi), t_quantile(strides - 2) * error / (2 * np.pi)
-    return Estimate(rate, rate - half, rate + half)
+    return Interval(rate, rate - half, rate + half)
 
 
 def sine_frequency(signal: Signal, step_s: float) -> float:
     """Frequency of the sine that explains most of several channels, each with its own phase [Hz].
 
-    It maximises the mean R² over channels, between 0.5 Hz and a quarter of the sampling rate: the
-    highest point of a periodogram padded to eighths of a bin, refined continuously. It tells a
-    gait from its harmonics by their size only.
+    Maximises the mean R² over channels, between 0.5 Hz and a quarter of the sampling rate: the
+    highest point of a periodogram padded to eighths of a bin, refined continuously. A gait and its
+    harmonics differ by their size only.
 
     Parameters
     ----------
@@ -140,15 +130,14 @@ def sine_fit_r2(signal: Signal, step_s: float, frequency_hz: float) -> Array:
         0 for a channel that does not move.
     """
     y = standardised(signal)
-    angle = 2 * np.pi * frequency_hz * times(len(y), step_s)
-    design = np.stack([np.ones(len(y)), np.cos(angle), np.sin(angle)], axis=1)
-    left = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    design = sine_design(2 * np.pi * frequency_hz * times(len(y), step_s))
+    left = y - design @ least_squares(design, y)
     moves = np.any(y, axis=0)
     return np.where(moves, 1.0 - (left**2).mean(axis=0), 0.0)
 
 
 def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int = 200) -> Array:
-    """R² that the best common sine has in noise like a signal, but without a rhythm.
+    """R² of the best common sine in noise like a signal, but without a rhythm.
 
     The noise is AR(1) with each channel's own autocorrelation at one step, its innovations
     correlated between channels as the channels are.
@@ -163,7 +152,7 @@ def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int 
     Returns
     -------
     ndarray, shape (draws, channels)
-        Each draw at the frequency that suits it best.
+        Each draw at its own best frequency.
     """
     y = standardised(signal)
     steps, channels = y.shape
@@ -173,7 +162,7 @@ def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int 
     found = np.zeros((draws, channels))
     for row in found:
         pushes = rng.standard_normal((steps, channels)) @ mix
-        # it begins as wide as it goes on, or its first steps would look like a slow oscillation
+        # stationary from the first step, or that would look like a slow oscillation
         pushes[0] /= np.sqrt(1.0 - memory**2)
         noise = np.stack(
             [lfilter([1.0], [1.0, -m], x) for m, x in zip(memory, pushes.T, strict=True)], axis=1
@@ -190,25 +179,25 @@ def standardised(signal: Signal) -> Array:
 
 
 def times(steps: int, step_s: float) -> Array:
-    """Times about the middle [s], where offset, phase and frequency hardly disturb each other."""
+    """Times about the middle [s], where offset, phase and frequency hardly correlate."""
     return step_s * (np.arange(steps, dtype=float) - (steps - 1) / 2)
 
 
 def t_quantile(freedom: int) -> float:
-    """How many standard errors an interval reaches to either side."""
+    """Half width of a 90 % interval in standard errors."""
     return float(student_t.ppf((1 + LEVEL) / 2, freedom))
 
 
-def mean_of(values: Array) -> Estimate:
-    """Mean over robots (or seeds), without those that have no value."""
+def mean_of(values: Array) -> Interval:
+    """Mean of the finite values, with its 90 % interval by Student's t."""
     values = values[np.isfinite(values)]
     if not len(values):
-        return Estimate(*[float("nan")] * 3)
+        return UNKNOWN
     mean = float(values.mean())
     half = float("nan")
     if len(values) > 1:
         half = t_quantile(len(values) - 1) * float(values.std(ddof=1) / np.sqrt(len(values)))
-    return Estimate(mean, mean - half, mean + half)
+    return Interval(mean, mean - half, mean + half)
 
 
 def _peak(y: Array, step_s: float) -> float:

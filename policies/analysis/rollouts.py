@@ -1,13 +1,12 @@
-"""Rollouts: what a policy saw, did and had in mind while it walked, step by step.
+"""Rollouts: observations, actions and hidden states of a policy while it walks, step by step.
 
-`collect` lets a policy walk in the simulator under one command and keeps everything that the
-analyses of gait and internal dynamics look at; it may alter what the policy sees on the way
-(ablated, delayed or frozen observations). `replay` shows a policy recorded observations again, open
-loop: it acts, but nothing follows from it. Neither touches the state of the policy it is given, so
-probing a policy in the middle of a walk does not change the walk.
+`collect` runs a policy in the simulator under one command and records everything that the analyses
+of gait and internal dynamics need; observations may be altered on the way (ablated, delayed,
+frozen). `replay` feeds recorded observations to a policy in open loop. Neither changes the state of
+the given policy, so a policy can be probed in the middle of a walk.
 
-The hidden state is what the published analyses look at: the cell of an LSTM, the state of a GRU,
-the latent of a Transformer, the last hidden layer of an MLP.
+The hidden state is that of the published analyses: the cell of an LSTM, the state of a GRU, the
+latent of a Transformer, the last hidden layer of an MLP.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from torch.utils.hooks import RemovableHandle
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.analysis.evaluation import evaluation_task
+from pupper_sysid.policies.analysis.tracking import planar_velocity
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
 from pupper_sysid.sim.walking.config import Walking
@@ -33,21 +33,21 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
 
 Array = NDArray[np.float64]
 Change = Callable[[int, NDArray[np.float32]], NDArray[np.floating]]
-"""`change(step, observation)` gives the observation, shape (n, 60), that the policy sees instead;
-it may alter and return the one it got."""
+"""`change(step, observation)` returns the observation, shape (n, 60), for the policy; it may alter
+the one it was given."""
 
 Disturb = Callable[[int, PupperEnv], None]
-"""`disturb(step, environment)` does something to the robots before they act, such as a push."""
+"""`disturb(step, environment)` acts on the robots before their action, such as a push."""
 
 _LAST_ACTION = slice(-ACTIONS, None)  # of an observation
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """What happened in n robots under one command.
+    """A walk of n robots under one command.
 
     Observation, action and hidden state belong to the start of a control step, all else to its
-    end. Rows of a robot that is no longer `alive` belong to nothing: it was picked up.
+    end. Rows of a robot that is no longer `alive` are meaningless: it was reset.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Rollout:
     action_scale : float
         Radians per unit of action.
     observation : ndarray of float32, shape (steps, n, 60)
-        As the policy saw it, changes included.
+        As given to the policy, changes included.
     action : ndarray of float32, shape (steps, n, 12)
         Raw outputs of the policy.
     hidden : ndarray of float32, shape (steps, n, k)
@@ -105,10 +105,9 @@ def collect(
     change: Change | None = None,
     disturb: Disturb | None = None,
 ) -> Rollout:
-    """Let a policy walk from a gentle start, without pushes but those of `disturb`.
+    """Walk from a gentle start, without pushes but those of `disturb`.
 
-    Rollouts of one seed differ only by what follows from these, policy or command: servos,
-    ground, start and noise are the same until a robot falls.
+    Rollouts of one seed have the same servos, ground, start and noise until a robot falls.
 
     Parameters
     ----------
@@ -121,12 +120,12 @@ def collect(
         Forward and sideways speed [m/s], turn rate [rad/s].
     robots : int
     seconds : float
-        How long; it ends sooner when no robot is up any more.
+        Duration; a rollout ends sooner when no robot is up any more.
     seed, threads : int
-    change : callable, optional
-        What to do to observations before the policy sees them.
-    disturb : callable, optional
-        What to do to the robots before they act.
+    change : Change, optional
+        Alters observations.
+    disturb : Disturb, optional
+        Acts on the robots.
 
     Raises
     ------
@@ -137,7 +136,7 @@ def collect(
     steps = round(seconds / step_s)
     if steps < 1:
         raise InputError(f"A rollout of {seconds} s is shorter than one step of {step_s} s.")
-    # a step longer than asked, so that nobody's time is up within it
+    # a step longer, so that no episode times out within it
     task = evaluation_task(task, (steps + 1) * step_s)
     env = PupperEnv(task, servos, robots, seed, threads, servo_model_of(servos.source, step_s))
     env.set_command(np.array(command))
@@ -158,10 +157,8 @@ def collect(
             acted.append(action)
             joints.append(facts.position_relative + env.default)
             contact.append(facts.contact)
-            velocity.append(
-                np.column_stack([facts.linear_velocity[:, :2], facts.angular_velocity[:, 2]])
-            )
-            position.append(_place(env.robots.qpos))
+            velocity.append(planar_velocity(facts))
+            position.append(np.column_stack([env.robots.qpos[:, :2], heading(env.robots.qpos)]))
             lives.append(alive)
             if not alive.any():
                 break
@@ -176,10 +173,10 @@ def collect(
 def replay(
     policy: Policy, observations: NDArray[np.floating]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a policy does when it is shown recorded observations, whatever it did before.
+    """Actions and hidden states of a policy on recorded observations, in open loop.
 
-    It starts anew, as at the start of an episode; a policy that sees its past actions takes the
-    one in the first observation for all of them, and then remembers its own.
+    Starts as at the start of an episode; a policy that sees its past actions begins with the one in
+    the first observation for all of them, and continues with its own.
 
     Parameters
     ----------
@@ -201,7 +198,7 @@ def replay(
 
 @contextmanager
 def _observed(policy: Policy) -> Iterator[tuple[Policy, list[NDArray[np.float32]]]]:
-    """A policy with the same network and a state of its own, and its hidden states as it acts."""
+    """A copy of a policy with its own state, and the hidden states as it acts."""
     hidden: list[NDArray[np.float32]] = []
 
     def keep(state: torch.Tensor) -> None:
@@ -229,8 +226,7 @@ def _listen(network: PolicyNetwork, keep: Callable[[torch.Tensor], None]) -> Rem
     return reader.register_forward_pre_hook(lambda _, given: keep(given[0]))
 
 
-def _place(qpos: Array) -> Array:
-    """Trunk's x, y and heading, shape (n, 3)."""
+def heading(qpos: Array) -> Array:
+    """Heading of each trunk [rad], shape (n,)."""
     w, x, y, z = qpos[:, 3:7].T
-    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.column_stack([qpos[:, :2], heading])
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

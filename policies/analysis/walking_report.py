@@ -1,4 +1,4 @@
-"""How a policy was trained and how it walks, as a page (`common.page`): `pupper-eval --report`."""
+"""A page (`common.page`) about the training and the walk of a policy."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, RED, WIDTH_IN, axes_column, styled
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.page import Column, Picture, Section, Table
+from pupper_sysid.policies.analysis.evaluation import Evaluation, Figures, Standing
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, plain
@@ -31,7 +32,7 @@ _CURVES = {
 
 
 def walking_sections(
-    policy: Policy, run: Run | None, folder: Path, found: Mapping[str, Any]
+    policy: Policy, run: Run | None, folder: Path, found: Evaluation
 ) -> list[Section]:
     """The page's sections.
 
@@ -42,8 +43,7 @@ def walking_sections(
         How it was trained, if its folder says so.
     folder : Path
         Of the run or policy; its curves are shown if they are there.
-    found : dict
-        What `pupper-eval --json` prints.
+    found : Evaluation
 
     Raises
     ------
@@ -51,10 +51,9 @@ def walking_sections(
         If the folder's curves cannot be read.
     """
     rows = [_row("random commands", found)]
-    rows += [_row(r["name"], r) for r in found["by_command"]]
-    rows += [_row(f"ground: {r['terrain']}", r) for r in found["by_terrain"]]
-    rows += [_row(f"servos {r['extra_delay_ms']:g} ms later", r) for r in found["by_extra_delay"]]
-    still = found["standing_still"]
+    rows += [_row(r.name, r) for r in found.by_command]
+    rows += [_row(f"ground: {r.terrain}", r) for r in found.by_terrain]
+    rows += [_row(f"dead time +{r.extra_delay_ms:g} ms", r) for r in found.by_extra_delay]
     columns = (
         Column("", lambda row: row["walk"], "key"),
         Column("fell, %", lambda row: f"{100 * row['fall_rate']:.0f}"),
@@ -67,6 +66,11 @@ def walking_sections(
         Column("slip, m/s", lambda row: f"{row['foot_slip_m_s']:.3f}"),
     )
     worst = max(rows[1:], key=lambda r: (r["fall_rate"], r["mae_vx_m_s"] + r["mae_vy_m_s"]))
+    errors = (
+        f"{getattr(found, key):.3f} {unit} {name} (a robot that stands: "
+        f"{getattr(found.standing_still, key):.3f})"
+        for key, (name, unit) in ERRORS.items()
+    )
     sections = [
         Section(
             "found",
@@ -74,16 +78,12 @@ def walking_sections(
             findings=[
                 (
                     "Falls",
-                    f"{100 * found['fall_rate']:.0f} % of {found['episodes']} episodes of 20 s "
+                    f"{100 * found.fall_rate:.0f} % of {found.episodes} episodes of 20 s "
                     "with random commands.",
                 ),
                 (
                     "Tracking",
-                    "; ".join(
-                        f"{found[key]:.3f} {unit} {name} (a robot that stands: {still[key]:.3f})"
-                        for key, (name, unit) in ERRORS.items()
-                    )
-                    + ". Mean absolute errors of every instant.",
+                    "; ".join(errors) + ". Mean absolute errors of every instant.",
                 ),
                 (
                     "Hardest of these walks",
@@ -93,9 +93,9 @@ def walking_sections(
                 ),
             ],
             notes=[
-                f"Walked with the servos of {Path(str(found['actuator'])).name}, feedback "
-                f"{found['feedback']}, in simulation. Another robot's servos are another task: "
-                "evaluate with its calibration (--actuator) before it is let walk.",
+                f"Walked with the servos of {Path(str(found.actuator)).name}, feedback "
+                f"{found.feedback}, in simulation. Evaluate with the calibration of another robot "
+                "before the policy walks on it.",
             ],
         ),
         Section(
@@ -106,7 +106,7 @@ def walking_sections(
                     "errors",
                     "Mean absolute errors by direction, ground and delay; dotted: a robot that "
                     "stands, under random commands. Red: some robots fell.",
-                    _errors_figure(rows, still),
+                    _errors_figure(rows, found.standing_still),
                 )
             ],
             tables=[Table("walks", "Errors, and what the feet do", columns, tuple(rows))],
@@ -134,9 +134,10 @@ def walking_sections(
     return sections
 
 
-def _row(name: str, found: Mapping[str, Any]) -> dict[str, Any]:
+def _row(name: str, found: Figures) -> dict[str, Any]:
     keys = ("fall_rate", *ERRORS, "swing_s", "foot_slip_m_s")
-    return {"walk": name, **{k: found[k] for k in keys}, "duty": float(np.mean(found["duty"]))}
+    duty = float(np.mean(found.duty))
+    return {"walk": name, **{k: getattr(found, k) for k in keys}, "duty": duty}
 
 
 def _curves(path: Path) -> dict[str, np.ndarray] | None:
@@ -164,14 +165,14 @@ def _training_figure(curves: Mapping[str, np.ndarray]) -> Figure:
 
 
 @styled
-def _errors_figure(rows: Sequence[Mapping[str, Any]], still: Mapping[str, float]) -> Figure:
+def _errors_figure(rows: Sequence[Mapping[str, Any]], still: Standing) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.28 * len(rows)), layout="constrained")
     axes = figure.subplots(1, len(ERRORS), sharey=True)
     place = -np.arange(len(rows))
     for (key, (name, unit)), one in zip(ERRORS.items(), axes, strict=True):
         colours = [RED if r["fall_rate"] > 0 else GREEN for r in rows]
         one.barh(place, [r[key] for r in rows], color=colours, height=0.7)
-        one.axvline(still[key], color=FAINT, ls=":")
+        one.axvline(getattr(still, key), color=FAINT, ls=":")
         one.set_title(f"{name}, {unit}", fontsize=9)
         one.tick_params(axis="x", labelsize=7.5)
     axes[0].set_yticks(place, [r["walk"] for r in rows], fontsize=7.5)

@@ -30,7 +30,7 @@ from pupper_sysid.policies.deploy.commands import Commands
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
 from pupper_sysid.policies.deploy.filters import Rest, at_rest
 from pupper_sysid.policies.deploy.walk_log import WalkLog, start_header
-from pupper_sysid.sim.walking.env import FALLEN_TILT, OBSERVATION_PARTS
+from pupper_sysid.sim.walking.observation import FALLEN_TILT, OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 STAND_S = 3.0

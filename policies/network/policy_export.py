@@ -1,23 +1,20 @@
-"""From a trained network to files: a policy folder, ONNX, TorchScript, each checked.
+"""Policy folders of trained networks, and their export to ONNX and TorchScript.
 
-Exported files take the observation and the state and give the action and the next state, under
-rsl_rl's names (`obs`, `h_in`, `c_in` → `actions`, `h_out`, `c_out`); a Transformer's state is its
-context. The contract travels as metadata. A file whose actions differ from the policy's by more
-than 1e-5 over a few steps is not written.
+Exported files map observation and state to action and next state, under rsl_rl's names (`obs`,
+`h_in`, `c_in` → `actions`, `h_out`, `c_out`); a Transformer's state is its context. The contract is
+in the metadata.
 """
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from pupper_sysid.common.errors import InputError, PupperError
-from pupper_sysid.common.files import refuse_overwrite, sha256, write_bytes
+from pupper_sysid.common.files import sha256
 from pupper_sysid.policies.network.policy_file import (
     ObservationPart,
     Policy,
@@ -25,11 +22,11 @@ from pupper_sysid.policies.network.policy_file import (
     save_policy,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
-from pupper_sysid.policies.train.run_file import Run
-from pupper_sysid.sim.walking.env import OBSERVATION, OBSERVATION_SIZE, VELOCITY_STEPS
+from pupper_sysid.policies.train.run_file import Run as TrainingRun
+from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE, VELOCITY_STEPS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sysid.export.network import Run, export_module
 
-CLOSE = 1e-5
 ENDINGS = {"onnx": ".onnx", "torchscript": ".pt"}
 _STEPS = 6
 _UNITS = {
@@ -42,7 +39,7 @@ _UNITS = {
 def write_policy(
     folder: Path,
     weights: dict[str, torch.Tensor],
-    run: Run,
+    run: TrainingRun,
     servos: ServoRanges,
     action_history: int,
     training: dict[str, Any],
@@ -86,8 +83,10 @@ def write_policy(
     save_policy(folder, network, about, force)
 
 
-def export_policy(policy: Policy, to: str, path: Path, force: bool = False) -> float:
-    """Write a policy as one file that others can run; the largest difference found.
+def export_policy(
+    policy: Policy, to: Literal["onnx", "torchscript"], path: Path, force: bool = False
+) -> float:
+    """Write a policy as one file for other runtimes, checked against the policy.
 
     Parameters
     ----------
@@ -96,30 +95,31 @@ def export_policy(policy: Policy, to: str, path: Path, force: bool = False) -> f
     path : Path
     force : bool
 
+    Returns
+    -------
+    float
+        Largest difference of actions.
+
     Raises
     ------
     InputError
         If the file exists, or the `onnx` package is not installed.
     PupperError
-        If the file's actions differ from the policy's.
+        If the file's actions differ from the policy's by more than 1e-5.
     """
-    refuse_overwrite(path, force)
-    network = policy.network
-    inputs = (torch.zeros(1, network.observation_size), *network.initial_state(1))
-    if to == "torchscript":
-        data, run = _torchscript(network, inputs)
-    else:
-        data, run = _onnx(policy, inputs)
-    worst = _largest_difference(network, run)
-    if not worst <= CLOSE:
-        raise PupperError(
-            f"The {to} file differs from the policy by {worst:.1e}; it was not written."
-        )
-    write_bytes(path, data, force)
-    return worst
+    network, names = policy.network, policy.network.state_names
+    contract = policy.contract.model_dump(mode="json", by_alias=True)
+    return export_module(
+        network,
+        (torch.zeros(1, network.observation_size), *network.initial_state(1)),
+        (["obs", *(f"{n}_in" for n in names)], ["actions", *(f"{n}_out" for n in names)]),
+        path, to, difference=lambda run: _largest_difference(network, run),
+        metadata={"contract": json.dumps(contract)}, force=force,
+    )  # fmt: skip
 
 
-def _largest_difference(network: PolicyNetwork, run) -> float:
+def _largest_difference(network: PolicyNetwork, run: Run) -> float:
+    """Largest difference of actions over a few steps, each with its own state."""
     generator = torch.Generator().manual_seed(0)
     state = network.initial_state(1)
     theirs: tuple[torch.Tensor, ...] = state
@@ -132,47 +132,3 @@ def _largest_difference(network: PolicyNetwork, run) -> float:
         worst = max(worst, float((action - other).abs().max()))
         state, theirs = tuple(now), tuple(next_)
     return worst
-
-
-def _torchscript(network: PolicyNetwork, inputs: tuple[torch.Tensor, ...]):
-    with torch.inference_mode():
-        traced = torch.jit.trace(network, inputs)
-    buffer = io.BytesIO()
-    torch.jit.save(traced, buffer)
-    loaded = torch.jit.load(io.BytesIO(buffer.getvalue()))
-
-    def run(*given: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        with torch.inference_mode():
-            return loaded(*given)
-
-    return buffer.getvalue(), run
-
-
-def _onnx(policy: Policy, inputs: tuple[torch.Tensor, ...]):
-    try:
-        import onnx
-        from onnx.reference import ReferenceEvaluator
-    except ImportError as error:
-        raise InputError(
-            "Writing ONNX needs the package onnx: pip install 'pupper-sysid[onnx]'."
-        ) from error
-    network = policy.network
-    names = network.state_names
-    ins = ["obs", *(f"{n}_in" for n in names)]
-    outs = ["actions", *(f"{n}_out" for n in names)]
-    buffer = io.BytesIO()
-    export: Any = torch.onnx.export  # its types know no buffer, its code does
-    export(
-        network, inputs, buffer, input_names=ins, output_names=outs, opset_version=18, dynamo=False
-    )
-    model = onnx.load_from_string(buffer.getvalue())
-    entry = model.metadata_props.add()
-    entry.key = "contract"
-    entry.value = json.dumps(policy.contract.model_dump(mode="json", by_alias=True))
-    evaluator = ReferenceEvaluator(model)
-
-    def run(*given: torch.Tensor) -> list[torch.Tensor]:
-        found = evaluator.run(None, {n: g.numpy() for n, g in zip(ins, given, strict=True)})
-        return [torch.from_numpy(np.asarray(f)) for f in found]
-
-    return model.SerializeToString(), run

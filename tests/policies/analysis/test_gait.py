@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 
 import numpy as np
 import pytest
@@ -284,7 +284,8 @@ def test_a_report_is_the_mean_over_robots_with_the_spread_between_them():
     assert (found.robots, found.left_out, found.rhythmic) == (3, 0, 1.0)
     # Student's t with 2 degrees of freedom: 2.920; deviation 0.05, three robots
     half = 2.920 * 0.05 / np.sqrt(3)
-    np.testing.assert_allclose(found.frequency_hz, [3.25, 3.25 - half, 3.25 + half], atol=0.005)
+    expected = [3.25, 3.25 - half, 3.25 + half]
+    np.testing.assert_allclose(astuple(found.frequency_hz), expected, atol=0.005)
     np.testing.assert_allclose([p.value for p in found.phase], BEHIND, atol=0.02)
     np.testing.assert_allclose([d.value for d in found.duty], TROT.duty, atol=0.01)
     assert found.diagonal.value == pytest.approx(1.0)

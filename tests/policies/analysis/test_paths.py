@@ -8,16 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.analysis.evaluation import DIRECTIONS
-from pupper_sysid.policies.analysis.paths import _measured, compliance
-from pupper_sysid.policies.analysis.phase_reset import (
+from pupper_sysid.policies.analysis.autonomy import (
+    RatePoint,
     _pusher,
     _shift,
     push_response,
     rate_exponent,
     rate_response,
 )
-from pupper_sysid.policies.analysis.robustness import scales, terrain
+from pupper_sysid.policies.analysis.evaluation import DIRECTIONS
+from pupper_sysid.policies.analysis.paths import _measured, compliance
+from pupper_sysid.policies.analysis.robustness import terrain
+from reproduction.evidence import scales
 from support.walks import STEP, walked
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -91,22 +93,22 @@ def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):
 
 
 def test_a_push_shifts_the_phase_more_than_a_nudge(walker, monkeypatch):
-    monkeypatch.setattr("pupper_sysid.policies.analysis.phase_reset._PUSHES", 1)
+    monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy._PUSHES", 1)
     nudge, push = push_response(*walker)
-    assert push["survival"] == 1.0 and nudge["shift_late"] < push["shift_late"]
-    assert len(push["shifts"]) == len(push["phases"]) == 2
+    assert push.survival == 1.0 and nudge.shift_late < push.shift_late
+    assert len(push.shifts) == len(push.phases) == 2
 
 
 def test_it_is_asked_at_other_rates_with_other_scales_and_on_other_ground(walker, monkeypatch):
     policy, trial = walker
-    monkeypatch.setattr("pupper_sysid.policies.analysis.phase_reset.RATES_HZ", (50.0, 71.43))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy.RATES_HZ", (50.0, 71.43))
     usual, faster = rate_response(policy, trial)
-    assert usual["survival"] == 1 and usual["frequency_hz"] == pytest.approx(3.25, abs=0.15)
-    assert faster["rate_hz"] == pytest.approx(71.43, abs=0.01)
-    assert usual["cycles_per_step"] == pytest.approx(usual["frequency_hz"] / 50)
+    assert usual.survival == 1 and usual.frequency_hz == pytest.approx(3.25, abs=0.15)
+    assert faster.rate_hz == pytest.approx(71.43, abs=0.01)
+    assert usual.cycles_per_step == pytest.approx(usual.frequency_hz / 50)
     short = replace(trial, seconds=1.5)
-    assert [r["scale_rad"] for r in scales(policy, short)] == [0.45, 0.5, 0.6, 0.75]
-    rows = {r["ground"]: r["survival"] for r in terrain(policy, short)}
+    assert [r.scale_rad for r in scales(policy, short)] == [0.45, 0.5, 0.6, 0.75]
+    rows = {r.ground: r.survival for r in terrain(policy, short)}
     assert set(rows) >= {"flat", "rough", "slopes", "troughs", "steps"} and rows["flat"] == 1.0
 
 
@@ -115,18 +117,18 @@ def test_it_goes_where_it_is_told(walker, monkeypatch):
     some = {k: DIRECTIONS[k] for k in ("forward", "turn left", "stand")}
     monkeypatch.setattr("pupper_sysid.policies.analysis.paths.DIRECTIONS", some)
     forward, turn = compliance(policy, trial)
-    assert forward["direction"] == "forward" and forward["share"].value > 0.7
-    assert turn["share"].value > 0.3 and np.isnan(turn["drift"].value)
+    assert forward.direction == "forward" and forward.share.value > 0.7
+    assert turn.share.value > 0.3 and np.isnan(turn.drift.value)
 
 
 def test_a_rate_exponent_tells_steps_from_seconds():
-    def rows(power):
+    def rows(power, survival=1.0):
         return [
-            {"rate_hz": r, "frequency_hz": 3 * (r / 50) ** power, "survival": 1.0}
+            RatePoint(rate_hz=r, cycles_per_step=0.06, frequency_hz=3 * (r / 50) ** power,
+                      survival=survival)
             for r in (25.0, 50.0, 100.0)
-        ]
+        ]  # fmt: skip
 
     assert rate_exponent(rows(1.0)) == pytest.approx(1.0)
     assert rate_exponent(rows(0.0)) == pytest.approx(0.0, abs=1e-12)
-    fallen = [r | {"survival": 0.0} for r in rows(1.0)]
-    assert np.isnan(rate_exponent(fallen))
+    assert np.isnan(rate_exponent(rows(1.0, survival=0.0)))

@@ -9,19 +9,14 @@ import numpy as np
 import pytest
 
 from pupper_sysid.policies.analysis import figures, perturbations
+from pupper_sysid.policies.analysis.attractor import orbits
+from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response
 from pupper_sysid.policies.analysis.perturbations import JOINTS
-from pupper_sysid.policies.analysis.phase_reset import push_response
-from pupper_sysid.policies.analysis.robustness import (
-    Trial,
-    _rate,
-    ablation,
-    delay_curve,
-    frozen,
-    orbits,
-)
+from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
 from pupper_sysid.policies.analysis.rollouts import Rollout
+from pupper_sysid.policies.analysis.trial import Trial, moving_frequency
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.env import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -76,31 +71,29 @@ def test_zeros_are_zeros():
 
 def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker):
     rows = delay_curve(*walker, extra_ms=(0, 80))
-    assert [(r["extra_delay_ms"], r["mode"]) for r in rows] == [
+    assert [(r.extra_delay_ms, r.mode) for r in rows] == [
         (ms, mode) for ms in (0, 80) for mode in ("replay", "fixed", "jittered")
     ]
-    plain = {r["mode"]: r for r in rows if r["extra_delay_ms"] == 0}
+    plain = {r.mode: r for r in rows if r.extra_delay_ms == 0}
     # shown what it saw, a policy does what it did
-    assert plain["replay"]["frequency_hz"] == pytest.approx(
-        plain["fixed"]["frequency_hz"], rel=0.02
-    )
-    assert plain["fixed"]["survival"] == plain["jittered"]["survival"] == 1.0
-    assert plain["fixed"]["frequency_hz"] == pytest.approx(3.25, abs=0.15)
+    assert plain["replay"].frequency_hz == pytest.approx(plain["fixed"].frequency_hz, rel=0.02)
+    assert plain["fixed"].survival == plain["jittered"].survival == 1.0
+    assert plain["fixed"].frequency_hz == pytest.approx(3.25, abs=0.15)
 
 
 def test_an_ablation_hurts_more_the_more_is_taken(walker):
     policy, trial = walker
     rows = [r for r in ablation(policy, trial, channels=("last_action",))]
-    noise = [r["correlation"] for r in rows if r["kind"] == "noise"]
+    noise = [r.correlation for r in rows if r.kind == "noise"]
     assert noise[0] > 0.9 and noise[-1] < noise[0] - 0.2
-    assert {r["kind"] for r in rows} == {"noise", "zero", "hold"}
+    assert {r.kind for r in rows} == {"noise", "zero", "hold"}
 
 
 def test_joints_that_stand_apart_but_do_not_move_have_no_frequency():
     still = np.tile(np.linspace(-1.0, 1.0, 12), (400, 1))
-    assert np.isnan(_rate(still, 0.02))
+    assert np.isnan(moving_frequency(still, 0.02))
     swing = still + 0.1 * np.sin(2 * np.pi * 3.0 * 0.02 * np.arange(400))[:, None]
-    assert _rate(swing, 0.02) == pytest.approx(3.0, abs=0.01)
+    assert moving_frequency(swing, 0.02) == pytest.approx(3.0, abs=0.01)
 
 
 # ------------------------------------------------------------------ policies that do not walk
@@ -138,9 +131,10 @@ def test_replay_is_of_the_robots_that_walked_and_only_while_they_did(walker):
     alone = recorded(replace_robots(plain, [1]))
     for measure in (
         lambda t: frozen(policy, t), lambda t: delay_curve(policy, t, (80,))[:1],
-        lambda t: orbits(policy, t, (0.0, 160.0))["actions"]["closure"],
+        lambda t: orbits(policy, t, (0.0, 160.0))["actions"].closure,
     ):  # fmt: skip
         for one, other in zip(measure(half), measure(alone), strict=True):
+            one, other = (x if isinstance(x, float) else vars(x) for x in (one, other))
             assert one == pytest.approx(other, nan_ok=True, abs=1e-4)
 
 
@@ -157,16 +151,16 @@ def replace_robots(rollout: Rollout, robots: list[int]) -> Rollout:
 def test_where_all_fell_there_are_no_numbers_and_no_crash(walker, after_s):
     policy, trial = walker
     gone = recorded(fallen(trial.walk(policy), [0, 1], after_s))
-    assert all(np.isnan(r["share"]) for r in frozen(policy, gone))
-    assert all(np.isnan(r["frequency_hz"]) for r in delay_curve(policy, gone, (0, 80)))
-    assert orbits(policy, gone, (0.0, 160.0)) == {} and push_response(policy, gone) == []
+    assert all(np.isnan(r.share) for r in frozen(policy, gone))
+    assert all(np.isnan(r.frequency_hz) for r in delay_curve(policy, gone, (0, 80)))
+    assert orbits(policy, gone, (0.0, 160.0)) == {} and push_response(policy, gone) == ()
     rows = ablation(policy, gone, ("last_action",))
-    assert all(np.isnan(r["correlation"]) for r in rows)
+    assert all(np.isnan(r.correlation) for r in rows)
     figures.ablation_figure({"fell": rows})
     figures.gait_figure(gone.walk(policy))
     figures.autonomy_figure(
-        {"fell": {"frozen": frozen(policy, gone), "push": [],
-                  "rate": [{"rate_hz": 50.0, "frequency_hz": float("nan")}]}}
+        {"fell": Autonomy(frozen=frozen(policy, gone), push=(), rate_exponent=float("nan"),
+                          rate=(RatePoint(rate_hz=50.0, cycles_per_step=float("nan")),))}
     )  # fmt: skip
 
 
@@ -174,13 +168,14 @@ def test_a_policy_that_stands_has_no_orbit_and_no_phase(walker):
     policy, trial = walker
     plain = trial.walk(policy)
     standing = recorded(replace(plain, action=np.zeros_like(plain.action)))
-    assert orbits(policy, standing, (0.0, 160.0)) == {} and push_response(policy, standing) == []
-    assert all(np.isnan(r["share"]) for r in frozen(policy, standing))
-    assert all(np.isnan(r["correlation"]) for r in ablation(policy, standing, ("last_action",)))
+    assert orbits(policy, standing, (0.0, 160.0)) == {} and push_response(policy, standing) == ()
+    assert all(np.isnan(r.share) for r in frozen(policy, standing))
+    assert all(np.isnan(r.correlation) for r in ablation(policy, standing, ("last_action",)))
 
 
 def test_an_eighth_policy_is_drawn_as_well():
-    row = {"mode": "fixed", "extra_delay_ms": 0, "survival": 1.0, "frequency_hz": 3.0,
-           "amplitude_rad": 0.1}  # fmt: skip
+    row = DelayPoint(
+        mode="fixed", extra_delay_ms=0, survival=1.0, frequency_hz=3.0, amplitude_rad=0.1
+    )
     figure = figures.delay_figure({f"policy {k}": [row] for k in range(9)})
     assert [len(axes.lines) for axes in figure.axes] == [9, 9, 9]

@@ -14,7 +14,7 @@ from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import Policy, load_policy
 from pupper_sysid.policies.network.transformer import WIDTH
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.env import OBSERVATION
+from pupper_sysid.sim.walking.observation import OBSERVATION
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 

@@ -29,7 +29,7 @@ from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.bus import WalkingBus
-from pupper_sysid.sim.walking.env import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import CALIBRATION, networks, tiny_run
 

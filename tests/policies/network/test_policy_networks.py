@@ -272,16 +272,16 @@ def acts_alike(policy, run) -> bool:
 
 def test_a_file_that_acts_otherwise_is_not_written(policy, tmp_path, monkeypatch):
     from pupper_sysid.common.errors import PupperError
-    from pupper_sysid.policies.network import policy_export
+    from pupper_sysid.sysid.export import network
 
-    real = policy_export._torchscript
+    real = network._torchscript
 
-    def off_by_a_little(network, inputs):
-        data, run = real(network, inputs)
-        return data, lambda *given: [run(*given)[0] + 2e-5, *run(*given)[1:]]
+    def off_by_a_little(*given):
+        data, run = real(*given)
+        return data, lambda *inputs: [run(*inputs)[0] + 2e-5, *run(*inputs)[1:]]
 
-    monkeypatch.setattr(policy_export, "_torchscript", off_by_a_little)
-    with pytest.raises(PupperError, match="differs from the policy"):
+    monkeypatch.setattr(network, "_torchscript", off_by_a_little)
+    with pytest.raises(PupperError, match="differs from the model"):
         export_policy(policy, "torchscript", tmp_path / "policy.pt")
     assert not (tmp_path / "policy.pt").exists()
 

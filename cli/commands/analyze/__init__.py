@@ -1,0 +1,1 @@
+"""Subcommands of `pupper-analyze`."""

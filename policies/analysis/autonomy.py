@@ -1,0 +1,260 @@
+"""Autonomy of a rhythm: frozen inputs, pushes, and other control rates.
+
+A rhythm made inside the network goes on when its inputs are frozen. An oscillator with its own time
+takes a push as a jump in phase, which it keeps; a rhythm driven from outside returns to its former
+phase. A rhythm counted in the network's own steps speeds up with the control rate; one set by the
+body does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.results import Result
+from pupper_sysid.policies.analysis.gait import SETTLE_S
+from pupper_sysid.policies.analysis.rhythm import mean_of, sine_frequency
+from pupper_sysid.policies.analysis.rollouts import Disturb, Rollout, heading
+from pupper_sysid.policies.analysis.trial import (
+    NAN,
+    STILL_RAD,
+    Outcome,
+    Trial,
+    gait_of_actions,
+    outcome,
+    still,
+)
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+
+Array = NDArray[np.float64]
+
+PUSH_M_S = 0.2
+"""Sideways speed that a push gives the trunk: the largest of the training."""
+NUDGE_M_S = 0.01
+"""A push for comparison, too small to matter."""
+RATES_HZ = (25.0, 31.25, 50.0, 71.43, 100.0)
+_PUSH_S = 4.0
+_PUSHES = 4  # spread over one period
+_EARLY_S, _LATE_S = (1.0, 3.0), (3.0, 5.0)  # after the push
+_LAST_ACTION = OBSERVATION_PARTS["last_action"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrozenTest(Result):
+    """Actions in replay with part of the observation frozen; NaN if no robot walked."""
+
+    test: str
+    share: float
+    """Of the amplitude with nothing frozen."""
+    frequency_hz: float
+    amplitude_rad: float
+    jitter_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushTest(Result):
+    """Phase shifts that a push leaves."""
+
+    push_m_s: float
+    survival: float
+    shift_early: float
+    """Mean size of the phase shift 1–3 s after the push [cycles]."""
+    shift_late: float
+    """Mean size of the phase shift 3–5 s after the push [cycles]."""
+    kept: float
+    """Slope of the late shifts on the early ones: 1 is kept, 0 returns."""
+    phases: tuple[float, ...]
+    """At each push [cycles]."""
+    shifts: tuple[float, ...]
+    """Late shift after each push [cycles]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatePoint(Outcome):
+    """A walk at another control rate."""
+
+    rate_hz: float
+    cycles_per_step: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Autonomy(Result):
+    """All tests of one policy."""
+
+    frozen: tuple[FrozenTest, ...]
+    push: tuple[PushTest, ...]
+    """Empty if no robot walks to the end."""
+    rate: tuple[RatePoint, ...]
+    rate_exponent: float
+    """See `rate_exponent`."""
+
+
+def autonomy(policy: Policy, trial: Trial) -> Autonomy:
+    """Run all tests of a policy."""
+    rate = rate_response(policy, trial)
+    return Autonomy(
+        frozen=frozen(policy, trial), push=push_response(policy, trial), rate=rate,
+        rate_exponent=rate_exponent(rate),
+    )  # fmt: skip
+
+
+def frozen(policy: Policy, trial: Trial) -> tuple[FrozenTest, ...]:
+    """Rhythm without inputs, in replay, from two seconds on.
+
+    A rhythm that goes on with all inputs frozen is made inside the network; one that needs its own
+    last action is made by the loop through the action; one that stops needs the joints.
+    """
+    plain = trial.walk(policy)
+    start = round(SETTLE_S / plain.step_s)
+    own = _LAST_ACTION
+    before = gait_of_actions(plain, plain.action)["amplitude_rad"]
+    tests = {
+        "nothing frozen": (None, False),
+        "senses frozen, its own last action": (slice(0, own.start), True),
+        "senses and last action frozen": (slice(0, own.stop), False),
+        "last action frozen, senses recorded": (own, False),
+    }
+    found = []
+    for name, (part, feeds_back) in tests.items():
+        gait = gait_of_actions(plain, _driven(policy, plain, part, feeds_back, start))
+        share = gait["amplitude_rad"] / before if before > STILL_RAD else NAN
+        found.append(FrozenTest(test=name, share=share, **gait))
+    return tuple(found)
+
+
+def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
+    """Phase shifts after sideways pushes, for a nudge and for a push.
+
+    Each robot walks twice, with and without the push; pushes come at times spread over a period.
+    The shift is between the sines of the two walks' actions. Empty if no robot walks to the end.
+    """
+    trial = replace(trial, seconds=_PUSH_S + _LATE_S[1] + 1.0)
+    plain = trial.walk(policy)
+    step_s = plain.step_s
+    begin = round(_PUSH_S / step_s)
+    settled = plain.action_rad[round(SETTLE_S / step_s) :]
+    robots = [i for i in np.flatnonzero(plain.alive[-1]).tolist() if not still(settled[:, i])]
+    if not robots:
+        return ()
+    rates = {i: sine_frequency(settled[:, i], step_s) for i in robots}
+    period = 1 / float(np.median(list(rates.values())))
+    found = []
+    for speed in (NUDGE_M_S, PUSH_M_S):
+        shifts, phases, survived = [], [], []
+        for k in range(_PUSHES):
+            at = begin + round(k * period / _PUSHES / step_s)
+            pushed = trial.walk(policy, None, _pusher(at, speed))
+            survived.append(pushed.alive[-1][robots].mean())
+            both = [i for i in robots if pushed.alive[-1, i]]
+            shifts += [
+                [_shift(plain, pushed, at, w, i, rates[i]) for w in (_EARLY_S, _LATE_S)]
+                for i in both
+            ]
+            phases += [_phase(plain, at, i, rates[i]) for i in both]
+        early, late = np.array(shifts).reshape(-1, 2).T
+        found.append(
+            PushTest(
+                push_m_s=speed,
+                survival=float(np.mean(survived)),
+                shift_early=mean_of(np.abs(early)).value,
+                shift_late=mean_of(np.abs(late)).value,
+                kept=float(early @ late / (early @ early)) if early.any() else NAN,
+                phases=tuple(phases),
+                shifts=tuple(late.tolist()),
+            )
+        )
+    return tuple(found)
+
+
+def rate_response(policy: Policy, trial: Trial) -> tuple[RatePoint, ...]:
+    """Walks at control rates below and above that of the training."""
+    physics_s = trial.task.physics_step_s
+    found = []
+    for rate in RATES_HZ:
+        step_s = round(1 / rate / physics_s) * physics_s
+        task = replace(trial.task, control_step_s=step_s)
+        walked = outcome(replace(trial, task=task).walk(policy))
+        cycles = walked["frequency_hz"] * step_s
+        found.append(RatePoint(rate_hz=1 / step_s, cycles_per_step=cycles, **walked))
+    return tuple(found)
+
+
+def rate_exponent(rows: Sequence[RatePoint]) -> float:
+    """Exponent of the gait's frequency over the control rate: 1 counted in steps, 0 in seconds."""
+    known = [r for r in rows if np.isfinite(r.frequency_hz) and r.survival > 0.5]
+    if len(known) < 2:
+        return NAN
+    rates, gaits = np.log([r.rate_hz for r in known]), np.log([r.frequency_hz for r in known])
+    return float(np.polyfit(rates, gaits, 1)[0])
+
+
+def _driven(
+    policy: Policy, plain: Rollout, part: slice | None, own_action: bool, start: int
+) -> Array:
+    """Actions of a policy on a recording with a part of the observation frozen from `start` on.
+
+    With `own_action` its last action is its own, else that of the recording (or frozen part).
+    """
+    player = copy(policy)
+    seen = plain.observation
+    player.reset(seen[0, :, _LAST_ACTION])
+    last, actions = seen[0, :, _LAST_ACTION], []
+    for step, observation in enumerate(seen):
+        shown = observation.copy()
+        if part is not None and step >= start:
+            shown[:, part] = seen[start, :, part]
+        if own_action:
+            shown[:, _LAST_ACTION] = last
+        last = player.act(shown)
+        actions.append(last)
+    return np.stack(actions)
+
+
+def _pusher(at: int, speed: float) -> Disturb:
+    """One push of each trunk to the left."""
+
+    def disturb(step: int, env: PupperEnv) -> None:
+        if step != at:
+            return
+        robots = env.robots
+        velocity = robots.qvel[:, :2].copy()
+        angle = heading(robots.qpos)
+        velocity += speed * np.column_stack([-np.sin(angle), np.cos(angle)])
+        robots.push(np.arange(env.environments), velocity)
+
+    return disturb
+
+
+def _shift(
+    plain: Rollout,
+    pushed: Rollout,
+    at: int,
+    window_s: tuple[float, float],
+    robot: int,
+    rate: float,
+) -> float:
+    """Phase of the pushed walk ahead of the plain one [cycles], -0.5 to 0.5."""
+    begin, end = (at + round(s / plain.step_s) for s in window_s)
+    end = min(end, len(plain.action))  # the last pushes of a slow gait come late
+    carrier = _carrier(rate, begin, end, plain.step_s)
+    before, after = (r.action_rad[begin:end, robot] for r in (plain, pushed))
+    one, other = (carrier @ (x - x.mean(axis=0)) for x in (before, after))
+    return float(np.angle(np.vdot(one, other)) / (2 * np.pi))
+
+
+def _phase(plain: Rollout, at: int, robot: int, rate: float) -> float:
+    """Phase of the LF thigh's action at the push [cycles], 0 to 1."""
+    begin = at - round(SETTLE_S / plain.step_s)
+    thigh = plain.action_rad[begin:at, robot, 1]
+    turned = np.angle(_carrier(rate, begin, at, plain.step_s) @ (thigh - thigh.mean()))
+    return float((turned / (2 * np.pi) + rate * at * plain.step_s) % 1.0)
+
+
+def _carrier(rate: float, begin: int, end: int, step_s: float) -> NDArray[np.complex128]:
+    return np.exp(-2j * np.pi * rate * step_s * np.arange(begin, end))

@@ -1,0 +1,128 @@
+"""A trial of a policy: task, servos, command and robots, and what a walk in it comes to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.results import Result
+from pupper_sysid.policies.analysis.gait import amplitude, jitter, steady
+from pupper_sysid.policies.analysis.rhythm import frequency, mean_of
+from pupper_sysid.policies.analysis.rollouts import Change, Disturb, Rollout, collect
+from pupper_sysid.policies.analysis.tracking import pooled_errors
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+Array = NDArray[np.float64]
+NAN = float("nan")
+STILL_RAD = 1e-3
+"""Smaller deviations move no servo by a count [rad]."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Task, servos, command, number of robots and duration in which a policy is tried."""
+
+    task: Walking
+    servos: ServoRanges
+    command: tuple[float, float, float] = (0.15, 0.0, 0.0)
+    robots: int = 16
+    seconds: float = 10.0
+    seed: int = 0
+    threads: int = 0
+    _plain: list[tuple[Policy, Rollout]] = field(
+        init=False, repr=False, compare=False, default_factory=list
+    )
+
+    def walk(
+        self, policy: Policy, change: Change | None = None, disturb: Disturb | None = None
+    ) -> Rollout:
+        """One rollout, perhaps with altered observations or disturbed robots.
+
+        A rollout with neither is kept per policy: most analyses begin with it.
+        """
+        plain = change is None and disturb is None
+        known = next((r for p, r in self._plain if p is policy), None)
+        if plain and known:
+            return known
+        found = collect(
+            policy, self.task, self.servos, self.command, self.robots, self.seconds,
+            self.seed, self.threads, change, disturb,
+        )  # fmt: skip
+        if plain:
+            self._plain.append((policy, found))
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Result):
+    """Survival, tracking errors and gait of a walk; NaN where there is none."""
+
+    survival: float = NAN
+    """Share of robots that are up at the end."""
+    mae_vx_m_s: float = NAN
+    mae_vy_m_s: float = NAN
+    mae_yaw_rad_s: float = NAN
+    frequency_hz: float = NAN
+    """Of the actions, mean over robots that walked long enough."""
+    amplitude_rad: float = NAN
+    jitter_rad: float = NAN
+
+
+def outcome(rollout: Rollout) -> dict[str, float]:
+    """Values of an `Outcome` by field; those of the gait are NaN if no robot walked long enough."""
+    alive = rollout.alive
+    gaits = [
+        (
+            frequency(action, rollout.step_s).value,
+            float(amplitude(action)[0].mean()),
+            jitter(action),
+        )
+        for i, now in steady(rollout).items()
+        if not still(action := rollout.action_rad[now, i])
+    ]
+    means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [NAN] * 3
+    return {
+        "survival": float(alive[-1].mean()),
+        **pooled_errors(rollout.velocity, np.array(rollout.command), alive),
+        **dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True)),
+    }
+
+
+def gait_of_actions(plain: Rollout, actions: NDArray[np.floating]) -> dict[str, float]:
+    """Frequency, amplitude and jitter of replayed actions, once settled.
+
+    Means over the robots whose recording is of a walk, up to their fall; NaN if there is none (for
+    the frequency: none that moves in the replay).
+    """
+    radians = plain.action_scale * actions.astype(float)
+    walked = [radians[now, i] for i, now in steady(plain).items()]
+    return {
+        "frequency_hz": mean([moving_frequency(x, plain.step_s) for x in walked]),
+        "amplitude_rad": mean([float(amplitude(x)[0].mean()) for x in walked]),
+        "jitter_rad": mean([jitter(x) for x in walked]),
+    }
+
+
+def walking(rollout: Rollout) -> dict[int, slice]:
+    """The steady steps of each robot that walked long enough and moved."""
+    return {i: n for i, n in steady(rollout).items() if not still(rollout.action_rad[n, i])}
+
+
+def still(signal: Array) -> bool:
+    """Whether no joint moves, at whatever angle it stands."""
+    return bool(signal.std(axis=0).max() < STILL_RAD)
+
+
+def moving_frequency(signal: Array, step_s: float) -> float:
+    """Frequency of a signal [Hz]; NaN if it stands still."""
+    return NAN if still(signal) else frequency(signal, step_s).value
+
+
+def mean(values: Sequence[float]) -> float:
+    """Mean of the finite values, NaN if there are none."""
+    return mean_of(np.array(values, float)).value

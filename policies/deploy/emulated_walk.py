@@ -1,0 +1,104 @@
+"""Walks of an emulated robot, in virtual time, through guard, bus and log as on a robot.
+
+Every robot has servos of its own, drawn as `sim.emulator.robot` draws them, and its true motion is
+known: `WalkScore` compares it with the commands.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.hardware.bus import ServoBus
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.analysis.tracking import ERRORS, named, tracking_errors
+from pupper_sysid.policies.deploy.assembly import assemble
+from pupper_sysid.policies.deploy.commands import constant
+from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, deploy
+from pupper_sysid.policies.deploy.stacks import Stack
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.robot import WalkingRobot
+
+
+class WalkScore:
+    """Tracking errors of an emulated robot; a watcher of `policies.deploy.deployment.deploy`.
+
+    Parameters
+    ----------
+    bus : ServoBus
+        For its clock.
+    robot : WalkingRobot
+    """
+
+    def __init__(self, bus: ServoBus, robot: WalkingRobot):
+        self._bus, self._robot = bus, robot
+        self._moved: list[np.ndarray] = []
+        self._commands: list[np.ndarray] = []
+
+    def __call__(self, tick: Tick) -> None:
+        """Record the robot's true motion at a tick."""
+        trunk = self._robot.trunk(self._bus.now())
+        self._moved.append(np.array([*trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s]))
+        self._commands.append(tick.senses.command)
+
+    def summary(self) -> dict[str, Any]:
+        """Mean absolute errors and `mean_motion`; None before the first tick."""
+        if not self._moved:
+            return dict.fromkeys((*ERRORS, "mean_motion"))
+        moved, commands = (np.array(x)[:, None] for x in (self._moved, self._commands))
+        errors = tracking_errors(moved, commands, np.ones((len(moved), 1), bool))[0]
+        return {**named(errors), "mean_motion": (moved[:, 0].sum(axis=0) / len(moved)).tolist()}
+
+
+def walk_once(
+    policy: Policy,
+    stack: Stack,
+    command: tuple[float, float, float],
+    seconds: float,
+    seed: int,
+    actuator: str,
+    servo: Path | None = None,
+    log: Path | None = None,
+    rows: Rows | None = None,
+    noise: int = 0,
+) -> tuple[Outcome, WalkScore]:
+    """One walk of one emulated robot.
+
+    Parameters
+    ----------
+    policy : Policy
+    stack : Stack
+    command : (float, float, float)
+        Forward and sideways speed [m/s], turn rate [rad/s].
+    seconds : float
+    seed : int
+        Of the robot.
+    actuator : str
+        Calibration of a simulated PD; see `policies.deploy.assembly.assemble`.
+    servo : Path, optional
+        Servo model's folder.
+    log : Path, optional
+        Where to keep the log; discarded by default.
+    rows : Rows, optional
+        Takes the servos' rows, as of a recording.
+    noise : int
+        Seed of what is not the robot: lost polls, noise, timing.
+    """
+    truth = draw_robot(np.random.default_rng(seed))
+    joint_map = load_joint_map("mini_pupper_2")
+    inner = WalkingBus(truth, np.random.default_rng([seed, noise]))
+    with closing(GuardedBus(inner)) as bus, tempfile.TemporaryDirectory() as folder:
+        parts = assemble(policy, stack, joint_map, actuator, servo)
+        score = WalkScore(bus, inner.robot)
+        outcome = deploy(
+            bus, inner, parts.controller, constant(command), seconds,
+            log or Path(folder) / "walk.csv", parts.header, rows, [score],
+        )  # fmt: skip
+    return outcome, score
