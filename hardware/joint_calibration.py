@@ -1,14 +1,12 @@
-"""From what servos say while a person moves a limp robot, to a joint map of that robot.
+"""Joint map of a robot from readings of its servos while it is moved by hand.
 
     travel = Travel(joints=12, counts=1024)          # one `add` per reading
     new = calibrated(start, Measured(offsets, limits), "2026-11-21")
 
-Three things are measured, all in counts. The *offset* of a servo's horn is where the middle pose
-lies, less the centre of the encoder. The *limits* are the ends of a joint's travel, drawn in by a
-margin. The *scale* (counts per radian) is checked by moving one joint through a known angle; it is
-the one number on which published sources disagree, so limits stay in counts whatever it is.
-
-Nothing here talks to a bus or to a person: `cli.commands.calibrate_joints` does both.
+Three things are measured, all in counts: the *offset* of a servo's horn (count of the middle pose
+less the centre of the encoder), the *limits* (ends of a joint's travel, less a margin) and the
+*scale* (counts per radian), which is checked by moving one joint through a known angle. Published
+sources disagree on the scale, so limits stay in counts whatever it is.
 """
 
 from __future__ import annotations
@@ -24,13 +22,13 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.joint_map import JointMap, JointMapFile, joint_map_from
 
 MARGIN = 0.02
-"""Share of the travel by which limits stay away from each end."""
+"""Distance of the limits from each end, as a fraction of the travel."""
 SMALLEST_TRAVEL = 40 / 1024
-"""Share of the encoder's range; whoever moved a joint less has not moved it through its range."""
+"""Least travel that counts as the whole range, as a fraction of the encoder's range."""
 SCALE_AGREES = 0.03
-"""A scale measured by hand is not known better: 2 degrees of 90 are 2.2 %."""
+"""Relative accuracy of a scale measured by hand: 2 degrees of 90 are 2.2 %."""
 STILL = 8 / 1024
-"""Share of the encoder's range by which a held joint may stray while it is measured."""
+"""Largest motion of a held joint while it is measured, as a fraction of the encoder's range."""
 
 _FAR_OFFSET_DEG = 30.0
 _WHOLE_RANGE_DEG = (150.0, 400.0)  # no servo of this kind has less or more
@@ -84,7 +82,7 @@ class Travel:
         self.wrapped = np.zeros(joints, bool)
 
     def add(self, count: NDArray[np.int64]) -> None:
-        """Take in one reading, shape (joints,); -1 where there is none."""
+        """Add one reading, shape (joints,); -1 where there is none."""
         here = count >= 0
         sure = here & (self.now >= 0)
         lower, higher = np.maximum(count, self.now), np.minimum(count, self.now)
@@ -99,12 +97,12 @@ class Travel:
         self.now = np.where(here, count, self.now)
 
     def forget(self, joint: int) -> None:
-        """Start anew with one joint."""
+        """Reset one joint."""
         self.low[joint] = self.high[joint] = self._before[joint] = -1
         self.wrapped[joint] = False
 
     def refusals(self, names: tuple[str, ...]) -> dict[str, str]:
-        """Why the travel of a joint is no measurement of its limits, by joint."""
+        """Reasons by joint why its travel does not show its limits."""
         least = SMALLEST_TRAVEL * self.counts
         why: dict[str, str] = {}
         for k, name in enumerate(names):
@@ -123,7 +121,7 @@ class Travel:
         return why
 
     def cut_off(self, names: tuple[str, ...]) -> list[str]:
-        """Joints whose travel ran into an end of the encoder, so that its own end was not seen."""
+        """Joints whose travel reached an end of the encoder before their own end."""
         at_end = (self.low == 0) | (self.high >= self.counts - 1)
         return [name for name, cut in zip(names, at_end, strict=True) if cut]
 
@@ -154,7 +152,7 @@ def middle_pose_in_words(file: JointMapFile, joints: tuple[str, ...]) -> str:
 
 
 def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean count of held joints, and how far they strayed meanwhile.
+    """Mean count of held joints, and their motion meanwhile.
 
     Parameters
     ----------
@@ -164,7 +162,7 @@ def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArr
     Returns
     -------
     mean, strayed : ndarray, shape (joints,)
-        NaN where a joint was never read. `strayed` is from the lowest to the highest reading.
+        NaN where there is no reading. `strayed` is the highest less the lowest reading.
     """
     known = np.where(readings < 0, np.nan, readings.astype(float))
     mean, strayed = np.full((2, readings.shape[1]), np.nan)
@@ -175,52 +173,34 @@ def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArr
 
 
 def offset_counts(mean_count: float, counts: int) -> int:
-    """What a horn is off by: the count of the middle pose less the encoder's centre.
-
-    Examples
-    --------
-    >>> offset_counts(530.4, 1024)
-    18
-    """
+    """Offset of a horn: count of the middle pose less the encoder's centre."""
     return round(mean_count - counts / 2)
 
 
 def limits_within(low: int, high: int) -> tuple[int, int]:
-    """Limits that stay `MARGIN` of the travel away from both of its ends.
-
-    Examples
-    --------
-    >>> limits_within(200, 800)  # 2 % of 600 counts are 12
-    (212, 788)
-    """
+    """Limits that keep `MARGIN` of the travel to both of its ends."""
     margin = MARGIN * (high - low)
     return int(np.ceil(low + margin)), int(np.floor(high - margin))
 
 
 def counts_per_rad(from_count: float, to_count: float, angle_deg: float) -> float:
-    """Scale of a servo that was turned through a known angle, in either direction.
-
-    Examples
-    --------
-    >>> round(counts_per_rad(512, 512 - 275, 90), 2)  # 275 counts for pi/2 are 550/pi
-    175.07
-    """
+    """Scale of a servo that was turned through a known angle, in either direction."""
     return float(abs(to_count - from_count) / np.radians(angle_deg))
 
 
 def scales_agree(measured: float, stated: float) -> bool:
-    """Whether a scale measured by hand gives no reason to doubt the stated one."""
+    """Whether a scale measured by hand agrees with the stated one."""
     return abs(measured / stated - 1) <= SCALE_AGREES
 
 
 def is_plausible_scale(measured: float, counts: int) -> bool:
-    """Whether the encoder's whole range would be an angle that such servos have."""
+    """Whether the encoder's whole range would be an angle that hobby servos have."""
     low, high = _WHOLE_RANGE_DEG
     return low <= np.degrees(counts / measured) <= high if measured > 0 else False
 
 
 def known_scale_near(measured: float, counts: int) -> str | None:
-    """The published scale that a measured one agrees with best, in words; None if none does."""
+    """The published scale nearest to a measured one, in words; None if none agrees."""
     near = {
         name: abs(measured / scale - 1)
         for name, scale in _KNOWN_SCALES[counts].items()
@@ -231,21 +211,21 @@ def known_scale_near(measured: float, counts: int) -> str | None:
 
 @dataclass(frozen=True)
 class Measured:
-    """What a calibration found.
+    """Result of a calibration by hand.
 
     Attributes
     ----------
     offset_counts : mapping of joint to int
-        Of all joints that were calibrated.
+        For all calibrated joints.
     limits_counts : mapping of joint to (int, int)
-        Of those that were moved through their range; the others keep the starting map's, which
-        move along with the offset.
+        For those moved through their range; the others keep the starting map's, shifted by the
+        offset.
     scale_joint : str or None
-        The joint on which the scale was checked; None if it was not.
+        Joint on which the scale was measured.
     counts_per_rad : float or None
-        What was measured there.
+        Scale measured there.
     use_scale : bool
-        Whether all joints take the measured scale; else each keeps that of the starting map.
+        Use the measured scale for all joints; else each keeps that of the starting map.
     """
 
     offset_counts: Mapping[str, int]
@@ -256,12 +236,12 @@ class Measured:
 
 
 def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
-    """The starting map with what was measured; `limits_rad`, signs and ids stay.
+    """The starting map with the measured values; `limits_rad`, signs and ids stay.
 
     Raises
     ------
     InputError
-        If a joint would have no room left, or the map would not be valid.
+        If the limits of a joint leave the encoder, or the map would not be valid.
     """
     data = start.model_dump(by_alias=True)
     data["name"] = f"{start.name.partition(', calibrated ')[0]}, calibrated {date}"
@@ -286,7 +266,7 @@ def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
 
 
 def doubts(new: JointMap, joints: Mapping[str, int]) -> list[str]:
-    """What a person should look at again before trusting the offsets and limits of `joints`."""
+    """Warnings about the offsets and limits of `joints`, as sentences."""
     sentences, far = [], []
     file = new.file
     for joint in new.joint_names:
@@ -313,7 +293,7 @@ def doubts(new: JointMap, joints: Mapping[str, int]) -> list[str]:
 
 
 def _place(entry: dict, joint: str, start: JointMapFile, measured: Measured) -> list[str]:
-    """Set offset and limits of one entry; what to say of them."""
+    """Set offset and limits of one entry; their origin in words."""
     shift = measured.offset_counts[joint] - entry["offset_counts"]
     entry["offset_counts"] = measured.offset_counts[joint]
     if joint in measured.limits_counts:

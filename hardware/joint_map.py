@@ -1,21 +1,20 @@
-"""Joint map: which servo moves which joint, and what its counts mean, as one YAML file.
+"""Joint map: the servo of each joint and the meaning of its counts, as one YAML file.
 
     joint_map = load_joint_map("mini_pupper_2")      # a preset, or Path("joints.yaml")
     counts = joint_map.to_counts(angles)              # joints of the simulator -> servo counts
     angles = joint_map.to_angles(counts)              # and back, by the same transform
 
 A servo's angle is `neutral_rad + sign * (count - centre - offset) / counts_per_rad`. On the Mini
-Pupper a push rod makes the third servo of a leg set the *absolute* angle of the calf, thigh + calf:
-`linkage: parallel knee` says so, and both directions go through `_servo_from_joint`.
+Pupper a push rod makes the third servo of a leg set the *absolute* angle of the calf, thigh + calf
+(`linkage: parallel knee`).
 
-Two things are called angles here. In *joint* coordinates a calf is bent relative to its thigh, as
-in the simulator; a controller commands those. In *servo* coordinates (`joint_map.per_servo()`)
-each joint is one servo's angle, told as if the thigh stood at its neutral; a sweep commands those,
-so that one servo moves at a time and its readings are its own.
+In *joint* coordinates the calf's angle is relative to its thigh, as in the simulator and in a
+controller. In *servo* coordinates (`joint_map.per_servo()`) each joint is one servo's angle,
+expressed as if the thigh stood at its neutral; a sweep uses these, so that one servo moves at a
+time.
 
-Counts have a frame: a servo on a direct bus speaks raw counts, the robot's proxy speaks counts
-that its firmware has shifted by a stored calibration. A map of one frame is refused by a bus of
-the other.
+Counts have a frame: a direct bus uses raw counts, the robot's proxy counts that its firmware has
+shifted by a stored calibration. A map of one frame is refused by a bus of the other.
 """
 
 from __future__ import annotations
@@ -40,8 +39,8 @@ from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
 
 SCHEMA = "pupper-sysid joint map"
 SCHEMA_VERSION = 1
-REST_ROOM_RAD = 0.4
-"""What a sweep's start leaves to both sides, where the limits allow it."""
+REST_MARGIN_RAD = 0.4
+"""Margin of the rest pose to both limits, where they allow it."""
 PRESETS = ("mini_pupper_2", "mini_pupper_2_300deg", "mini_pupper_2_direct", "sts3215")
 
 Frame = Literal["proxy", "raw"]
@@ -58,20 +57,20 @@ class JointEntry(BaseModel):
     model_config = _FILE
 
     id: int = Field(ge=0, le=253)
-    """Of the servo on its bus."""
+    """Servo id on its bus."""
     sign: Literal[1, -1]
     """Direction of the counts as the servo's angle grows."""
     neutral_rad: float = Field(ge=-7, le=7)
     """The servo's angle at its centre count plus offset: absolute for a calf on a push rod."""
     counts_per_rad: float = Field(gt=1, lt=100_000)
     offset_counts: int = Field(ge=-4096, le=4096)
-    """What this servo's horn is off by."""
+    """Offset of the servo's horn."""
     limits_counts: tuple[int, int]
-    """Lowest and highest count the servo may be sent to."""
+    """Lowest and highest count that may be commanded."""
     limits_rad: tuple[float, float]
     """Lowest and highest angle of the simulator's joint."""
     source: str
-    """Who says so: a preset's source, or the calibration that measured it."""
+    """Origin of these values: a preset's source, or the calibration that measured them."""
 
     @model_validator(mode="before")
     @classmethod
@@ -118,7 +117,7 @@ class JointMapFile(BaseModel):
             low, high = entry.limits_counts
             if low < 0 or high > self.counts - 1:
                 raise ValueError(f"{joint}: limits_counts {[low, high]} leave 0..{self.counts - 1}")
-            # a push rod's servo counts thigh + calf: any one thigh may have room for it
+            # a push rod's servo counts thigh + calf: it depends on the thigh
             if self.linkage != "none" and joint.endswith("_calf"):
                 continue
             first, last = sorted(
@@ -182,18 +181,18 @@ class JointMap:
         return replace(self, coordinates="servo")
 
     def rest_pose(self) -> NDArray[np.float64]:
-        """Where a joint stands before it is swept, shape (joints,) [rad].
+        """Pose in which a sweep starts, shape (joints,) [rad].
 
-        The Mini Pupper's standing pose; of another robot the servos' neutral, or as near to it as
-        leaves `REST_ROOM_RAD` to both limits. A joint that has a Mini Pupper's name, and limits in
-        which that pose has not half of this room, is another robot's.
+        The Mini Pupper's standing pose; for another robot the servos' neutral, moved until its
+        margin to both limits is `REST_MARGIN_RAD`. A joint with a Mini Pupper's name belongs to
+        another robot if the standing pose has less than half of this margin.
         """
         limits = self.per_servo().position_limits()
-        room = np.minimum(REST_ROOM_RAD, (limits.high_rad - limits.low_rad) / 2)
-        pose = np.clip(self.zero_rad(), limits.low_rad + room, limits.high_rad - room)
+        margin = np.minimum(REST_MARGIN_RAD, (limits.high_rad - limits.low_rad) / 2)
+        pose = np.clip(self.zero_rad(), limits.low_rad + margin, limits.high_rad - margin)
         standing = np.array([DEFAULT_POSE.get(n, np.nan) for n in self.joint_names])
         free = np.minimum(standing - limits.low_rad, limits.high_rad - standing)
-        return np.where(free >= REST_ROOM_RAD / 2, standing, pose)
+        return np.where(free >= REST_MARGIN_RAD / 2, standing, pose)
 
     def counts_per_rad(self) -> NDArray[np.float64]:
         """Counts per radian, shape (joints,)."""
@@ -218,7 +217,7 @@ class JointMap:
         return self._servo_from_joint(servo, -1)
 
     def clip_counts(self, counts: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Whole counts within the servos' limits: the last word before anything is packed."""
+        """Counts rounded to integers within the servos' limits: the last step before sending."""
         low, high = self._ends.T
         return np.clip(np.rint(counts), low, high).astype(np.int64)
 
@@ -226,11 +225,11 @@ class JointMap:
         """Bounds of both the servos' counts and the joints' angles, in this map's coordinates."""
         turned = (self._ends - self._zero_count[:, None]) / self._scale[:, None]
         servo = np.sort(self._neutral[:, None] + turned, axis=1)
-        joint = np.array([self._entry(j).limits_rad for j in self.joint_names])
+        joint = self._column("limits_rad")
         calf, thigh = self._legs
         both = np.stack([np.maximum(servo, joint)[:, 0], np.minimum(servo, joint)[:, 1]], axis=1)
         if self.coordinates == "servo" and self.file.linkage != "none":
-            # a calf without its thigh: the thigh is taken to rest at its neutral
+            # a calf without its thigh: the thigh is assumed to be at its neutral
             alone = [i for i in self._calves.tolist() if i not in calf]
             own = servo[alone] - self._thigh_neutral(alone)[:, None]
             both[alone, 0] = np.maximum(own, joint[alone])[:, 0]
@@ -248,7 +247,7 @@ class JointMap:
         return PositionLimits(both[:, 0], both[:, 1], coupling)
 
     def metadata(self) -> dict[str, Any]:
-        """What a recording should say of it."""
+        """Entries for the header of a recording."""
         zero = self.zero_rad()
         names = self.joint_names
         return {
@@ -278,27 +277,29 @@ class JointMap:
     def _entry(self, joint: str) -> JointEntry:
         return self.file.joints[joint]
 
-    # cached: a file does not change, and a control loop asks in every tick
+    def _column(self, field: str) -> NDArray[np.float64]:
+        """One field of all joints, shape (joints, ...)."""
+        return np.array([getattr(self._entry(j), field) for j in self.joint_names], float)
+
+    # cached: a file does not change, and a control loop needs them in every tick
 
     @cached_property
     def _neutral(self) -> NDArray[np.float64]:
-        return np.array([self._entry(j).neutral_rad for j in self.joint_names])
+        return self._column("neutral_rad")
 
     @cached_property
     def _scale(self) -> NDArray[np.float64]:
         """Counts per radian, with the sign."""
-        entries = [self._entry(j) for j in self.joint_names]
-        return np.array([e.sign * e.counts_per_rad for e in entries])
+        return self._column("sign") * self._column("counts_per_rad")
 
     @cached_property
     def _zero_count(self) -> NDArray[np.float64]:
-        offsets = np.array([float(self._entry(j).offset_counts) for j in self.joint_names])
-        return self.file.counts / 2 + offsets
+        return self.file.counts / 2 + self._column("offset_counts")
 
     @cached_property
     def _ends(self) -> NDArray[np.float64]:
         """Lowest and highest count, shape (joints, 2)."""
-        return np.array([self._entry(j).limits_counts for j in self.joint_names], float)
+        return self._column("limits_counts")
 
     @cached_property
     def _calves(self) -> NDArray[np.intp]:
