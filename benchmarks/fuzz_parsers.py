@@ -392,11 +392,11 @@ class _WatchedEmulator(FeetechEmulator):
 
     obeyed: list[tuple[Frame, list[tuple[float, bytes]], list[tuple[str, int, int, int, int]]]]
 
-    def _obey(self, frame: Frame, byte_s: float) -> list[tuple[float, bytes]]:
+    def _execute(self, frame: Frame, byte_s: float) -> list[tuple[float, bytes]]:
         assert isinstance(self.bench, _WatchedServos)
         self.bench.moves.clear()
         low = {i: self._limits(i) for i in self.servos} if frame.code in (3, 0x83) else {}
-        pieces = super()._obey(frame, byte_s)
+        pieces = super()._execute(frame, byte_s)
         high = {i: self._limits(i) for i in low}
         goals = [
             (what, i, value, min(low[i][0], high[i][0]), max(low[i][1], high[i][1]))

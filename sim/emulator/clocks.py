@@ -1,7 +1,7 @@
-"""The two clocks a bus of emulated servos can live by: virtual time, or the host's own.
+"""Clocks of emulated buses: virtual time, or the host's own.
 
-Both start at 0 and count seconds to the microsecond. In virtual time sleeping costs nothing and
-ends a little late, as on a real host; in real time it really sleeps.
+Both start at 0 and count seconds to the microsecond. In virtual time a sleep costs nothing and ends
+a little late, as on a real host; in real time it really sleeps.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Clock(Protocol):
 
 
 class VirtualClock:
-    """Time that passes only when someone sleeps or talks to the bus.
+    """Time that passes only in sleeps and exchanges with the bus.
 
     Parameters
     ----------

@@ -2,9 +2,9 @@
 
 `ProxyEmulator` is the shared block, the firmware's loop behind it and the servos, without a socket;
 `sim.emulator.esp32_socket` serves it. It has the real one's quirks: no owner and no watchdog, an
-acknowledgement that says nothing about the servos, zeros until the first feedback, feedback polled
+acknowledgement that does not depend on the servos, zeros until the first feedback, feedback polled
 one servo after the other with silent losses, an unknown request answered with the previous answer,
-the last request carried out once more when a client leaves, and a torque byte that stores a
+the last request executed once more when a client leaves, and a torque byte that stores a
 calibration.
 """
 
@@ -23,9 +23,9 @@ from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 
 TICK_S = 0.002
-"""The firmware's servo task writes goals this often."""
+"""Period of the firmware's servo task [s], which writes goal positions."""
 STAND_UP_S = 4.0
-"""After a start or a stored calibration the firmware stands up and ignores setpoints."""
+"""Time to stand up after a start or a stored calibration, in which commands are ignored [s]."""
 LOW_VOLTAGE_V = 4.0
 
 _SET = struct.Struct("<BB12B12H")
@@ -40,7 +40,7 @@ class ProxyEmulator:
     bench : ServoBench
         With a joint map of the proxy's counts, ids 1 to 12.
     rng : numpy.random.Generator
-        Lost polls, and what a quirk answers.
+        Lost polls, and the answers to unknown requests.
     faults : BusFaults, optional
 
     Raises
@@ -73,7 +73,7 @@ class ProxyEmulator:
         self._calibration = np.zeros(servos, int)
         self._time = 0.0
         self.unplug_for_s = 0.0
-        """Set by a fault: the proxy shall die and come back after so long."""
+        """Set by a fault: the server shall close and come back after this time [s]."""
         self.history: list[tuple[float, tuple[int, ...]]] = []
         """The block's positions by id, from each time on."""
 
@@ -82,7 +82,7 @@ class ProxyEmulator:
         opcode = request[1] if len(request) > 1 and request[0] == len(request) else 0
         if opcode == datagrams.SET_POSITION and len(request) == _SET.size:
             values = _SET.unpack(request)[2:]
-            self._obey(values[:12], values[12:], now)
+            self._execute(values[:12], values[12:], now)
             return datagrams.ACKNOWLEDGED
         if request == datagrams.request(datagrams.GET_IMU):
             return self._imu(now)
@@ -97,12 +97,12 @@ class ProxyEmulator:
         return previous or self.rng.bytes(2)
 
     def resend(self, now: float) -> None:
-        """What the proxy does all the time, asked or not: orders reach deaf servos later."""
+        """Repeat the last command once deaf servos hear again, as the proxy does all the time."""
         if self._undone and self._block and now >= self._deaf_until:
-            self._obey(*self._block, now)
+            self._execute(*self._block, now)
 
-    def strike(self, now: float) -> str | None:
-        """Draw a fault for the next answer; begin those that last."""
+    def inject_fault(self, now: float) -> str | None:
+        """Draw a fault for the next answer; start it if it lasts. Returns its kind."""
         kind = self.faults.draw()
         servo = int(self.rng.integers(datagrams.SERVOS))
         # any status bit makes the firmware drop the answer: the servo's feedback freezes
@@ -122,23 +122,23 @@ class ProxyEmulator:
         elif kind == "second-writer":
             self._refresh(now)
             goal = np.clip(self._counts + self.rng.integers(-8, 9, 12), 1, datagrams.HIGHEST_COUNT)
-            self._obey((1,) * 12, tuple(int(c) for c in goal), now)
+            self._execute((1,) * 12, tuple(int(c) for c in goal), now)
         return kind
 
-    def spoil(self, kind: str | None, reply: bytes) -> list[tuple[float, bytes]]:
-        """What is sent instead of `reply`, each with its delay."""
+    def apply_fault(self, kind: str | None, reply: bytes) -> list[tuple[float, bytes]]:
+        """What is sent instead of `reply`: pieces, each with its delay [s]."""
         if kind == "wrong-length":
             return [(0.0, reply + b"\0" if self.rng.random() < 0.5 else reply[:-1] or b"\0")]
         other = struct.pack("<BB2f", 10, datagrams.GET_POWER, self.bench.supply_v, 0.4)
-        return self.faults.spoil(kind, reply, other)
+        return self.faults.apply(kind, reply, other)
 
     def _imu(self, now: float) -> bytes:
         sample = self.bench.imu(now)
         raw = np.zeros(6) if sample is None else to_chip(sample)
         return struct.pack("<BB6f", 26, datagrams.GET_IMU, *raw)
 
-    def _obey(self, torque: tuple[int, ...], counts: tuple[int, ...], now: float) -> None:
-        """A setpoint reaches the servos with the firmware's next tick."""
+    def _execute(self, torque: tuple[int, ...], counts: tuple[int, ...], now: float) -> None:
+        """A command reaches the servos with the firmware's next tick."""
         if torque[0] == datagrams.SAVE_CALIBRATION:
             # the present goals become the new centre; then the firmware stands up anew
             shifted = self._calibration + _CENTRE - np.array(counts)
@@ -177,7 +177,7 @@ class ProxyEmulator:
 
 
 class ImuProxy(ProxyEmulator):
-    """A proxy that answers for the IMU alone: the robot's servos hang on another line."""
+    """A proxy that answers for the IMU alone; the robot's servos are on another line."""
 
     def answer(self, request: bytes, previous: bytes, now: float) -> bytes:
         """The reply to one datagram at `now`; all but GET_IMU are unknown."""

@@ -48,7 +48,7 @@ class ProxySocket:
         """Answer until `stop`."""
         while not self._stop.is_set():
             if self.emulator.unplug_for_s > 0:
-                self._die_and_return()
+                self._unplug()
             self._deliver()
             self.emulator.resend(self.now())
             wait = min((d[0] for d in self._due), default=self.now() + _IDLE_S) - self.now()
@@ -79,16 +79,16 @@ class ProxySocket:
             request = b""
         now = self.now()
         if not request:
-            # the real proxy's child carries out the last request once more before it ends
+            # the real proxy's child executes the last request once more before it ends
             if client in self._last:
                 self.emulator.answer(self._last[client], self._previous[client], now)
             self._drop(client)
             return
         self._last[client] = request
-        kind = self.emulator.strike(now)
+        kind = self.emulator.inject_fault(now)
         reply = self.emulator.answer(request, self._previous[client], now)
         self._previous[client] = reply
-        for delay, piece in self.emulator.spoil(kind, reply):
+        for delay, piece in self.emulator.apply_fault(kind, reply):
             if delay > 0:
                 self._due.append((now + delay, client, piece))
             else:
@@ -110,7 +110,7 @@ class ProxySocket:
         self._due = [d for d in self._due if d[1] is not client]
         client.close()
 
-    def _die_and_return(self) -> None:
+    def _unplug(self) -> None:
         self.close()
         time.sleep(self.emulator.unplug_for_s)
         self.emulator.unplug_for_s = 0.0
@@ -123,12 +123,12 @@ class ProxySocket:
         self._server.listen(_BACKLOG)
 
     def _free(self, path: Path) -> None:
-        """Make way if a server has died here; refuse if one lives."""
+        """Remove the socket of a server that has ended; refuse if one is running."""
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             return
         if not path.is_socket():
-            raise InputError(f"{path} exists and is no socket. Choose another --socket.")
+            raise InputError(f"{path} exists and is no socket. Choose another path for the socket.")
         probe = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with probe:
             try:
@@ -136,4 +136,6 @@ class ProxySocket:
             except OSError:
                 path.unlink()
                 return
-        raise InputError(f"{path}: a proxy is already running there. Choose another --socket.")
+        raise InputError(
+            f"{path}: a proxy is already running there. Choose another path for the socket."
+        )

@@ -1,11 +1,11 @@
-"""Faults on request: what goes wrong on real buses, at chosen rates, repeatably.
+"""Faults of real buses, injected at chosen rates, repeatably.
 
     faults = BusFaults.parse("lost=0.02,late=0.01", rng)
 
-Some faults happen to single answers (lost, late, truncated, corrupted, duplicated, foreign, wrong
-length), some to servos for a while (error bits, frozen; in a brown-out all are limp and deaf, and
-hold nothing afterwards until they are told to), some to the line itself (unplugged, a second
-writer). `counts` and `ended` keep account.
+Faults of single answers: lost, late, truncated, corrupted, duplicated, foreign, wrong length. Of
+servos, for a while: error bits, frozen; in a brown-out all are limp and deaf, and stay limp until a
+command switches them on. Of the line: unplugged, a second writer. `counts` and `ended` keep
+account.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LATE_S = (0.004, 0.06)
 
 @dataclass
 class BusFaults:
-    """Draws faults.
+    """Faults drawn at given rates.
 
     Attributes
     ----------
@@ -36,11 +36,11 @@ class BusFaults:
         Probability per answer, for each of `KINDS`.
     rng : numpy.random.Generator
     lasts_s : float
-        How long those last that are no single answer.
+        How long faults of servos and lines last.
     counts : dict of str to int
         How many were injected.
     ended : list of (str, float)
-        Kind and end of those that last, on the emulator's clock.
+        Kind and end of faults that last, on the emulator's clock.
     """
 
     rates: dict[str, float]
@@ -54,7 +54,7 @@ class BusFaults:
             if kind not in KINDS:
                 raise InputError(f"fault '{kind}' is not known; known are {', '.join(KINDS)}.")
             if not 0 <= rate <= 1:
-                raise InputError(f"fault {kind}: {rate} is no probability; choose 0 to 1.")
+                raise InputError(f"fault {kind}: {rate} is not a probability; choose 0 to 1.")
         if sum(self.rates.values()) > 1:
             raise InputError("faults: the probabilities add up to more than 1.")
         self._kinds = [k for k, r in self.rates.items() if r > 0]
@@ -76,7 +76,7 @@ class BusFaults:
                 rates[kind] = float(rate)
             except ValueError:
                 raise InputError(
-                    f"--faults: '{part}' is not kind=probability, such as lost=0.02."
+                    f"`faults`: '{part}' is not kind=probability, such as lost=0.02."
                 ) from None
         return cls(rates, rng)
 
@@ -90,39 +90,37 @@ class BusFaults:
         self.counts[self._kinds[k]] = self.counts.get(self._kinds[k], 0) + 1
         return self._kinds[k]
 
-    def spoil(self, kind: str | None, answer: bytes, other: bytes) -> list[tuple[float, bytes]]:
+    def apply(self, kind: str | None, answer: bytes, other: bytes) -> list[tuple[float, bytes]]:
         """What arrives instead of `answer`: pieces, each with its delay [s].
 
-        `other` is an answer that belongs to somebody else.
+        `other` is the answer to another request.
         """
-        rng = self.rng
-        if kind == "lost":
-            return []
-        if kind == "late":
-            return [(float(rng.uniform(*_LATE_S)), answer)]
-        if kind == "truncated":
-            return [(0.0, answer[: int(rng.integers(1, len(answer)))])]
-        if kind == "corrupted":
-            return [(0.0, corrupted(answer, rng))]
-        if kind == "duplicated":
-            return [(0.0, answer), (0.0, answer)]
-        if kind == "foreign":
-            return [(0.0, other)]
-        return [(0.0, answer)]
+        match kind:
+            case "lost":
+                return []
+            case "late":
+                return [(float(self.rng.uniform(*_LATE_S)), answer)]
+            case "truncated":
+                return [(0.0, answer[: int(self.rng.integers(1, len(answer)))])]
+            case "corrupted":
+                return [(0.0, corrupted(answer, self.rng))]
+            case "duplicated":
+                return [(0.0, answer), (0.0, answer)]
+        return [(0.0, other if kind == "foreign" else answer)]
 
 
 def corrupted(answer: bytes, rng: np.random.Generator) -> bytes:
     """One burst of noise on a line: some bits of one byte, or of two neighbours, flipped."""
-    spoiled = bytearray(answer)
-    at = int(rng.integers(len(spoiled)))
-    spoiled[at] ^= int(rng.integers(1, 256))
-    if rng.random() < 0.3 and at + 1 < len(spoiled):
-        spoiled[at + 1] ^= int(rng.integers(1, 256))
-    return bytes(spoiled)
+    damaged = bytearray(answer)
+    at = int(rng.integers(len(damaged)))
+    damaged[at] ^= int(rng.integers(1, 256))
+    if rng.random() < 0.3 and at + 1 < len(damaged):
+        damaged[at + 1] ^= int(rng.integers(1, 256))
+    return bytes(damaged)
 
 
 def with_wrong_length(frame: Frame, rng: np.random.Generator) -> bytes:
-    """A frame that is right in itself and has a parameter too few or too many."""
+    """A valid frame with a parameter too few or too many."""
     data = frame.data
     data = data[:-1] if len(data) and rng.random() < 0.5 else data + bytes([int(rng.integers(256))])
     return Frame(frame.id, frame.code, data).encode()

@@ -1,11 +1,11 @@
-"""Feetech servos that speak the real protocol: bytes in, bytes out, each with its time.
+"""Emulated Feetech servos: bytes of the real protocol in, bytes out, each with its time.
 
 `FeetechEmulator` is the line and its servos without a port: `receive` takes what the host sent
 and returns what comes back and when its last byte has arrived, at the line's baud rate and after
 each servo's return delay. `sim.emulator.feetech_pty` puts it behind a pseudo-terminal.
 
-Every servo has its memory table; goals and torque act on `ServoBench` when the last byte of their
-frame has arrived, and a position is measured when its answer begins.
+Every servo has its memory table; commands and torque act on `ServoBench` when the last byte of
+their frame has arrived, and a position is measured when its answer begins.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _SETTINGS = {
 
 @dataclass
 class _Servo:
-    """Memory and troubles of one servo."""
+    """Memory and faults of one servo."""
 
     memory: bytearray
     frozen_until: float = -np.inf
@@ -69,12 +69,12 @@ class FeetechEmulator:
         Of all of them.
     rng : numpy.random.Generator
     ids : sequence of int, optional
-        Those that are there; default all of the map.
+        Servos on the line; default all of the map.
     baud : int
-        At which the servos listen.
+        Rate at which the servos listen.
     faults : BusFaults, optional
     echo : bool
-        Whether the adapter sends the host's own bytes back.
+        Whether the adapter returns the host's own bytes.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class FeetechEmulator:
         self._free_at = 0.0
         self._brown_out_until = -np.inf
         self.unplug_for_s = 0.0
-        """Set by a fault: the port shall vanish for so long."""
+        """Set by a fault: the port shall vanish for this time [s]."""
         self.readings: list[tuple[float, int, int]] = []
-        """Every position that was honestly measured for an answer: time, id, count."""
+        """Every position measured for an answer: time, id, count."""
         self.servos: dict[int, _Servo] = {}
         for servo_id in ids if ids is not None else bench.map.ids:
             memory = bytearray(MEMORY_BYTES)
@@ -122,7 +122,7 @@ class FeetechEmulator:
         now : float
             Seconds; must not go backwards.
         baud : int, optional
-            At which the host sends; at another rate than theirs the servos hear only noise.
+            Rate at which the host sends; at another than theirs the servos receive only noise.
 
         Returns
         -------
@@ -195,11 +195,11 @@ class FeetechEmulator:
         error = servo.error if begin < servo.faulty_until else 0
         frame = Frame(servo_id, error, bytes(servo.memory[address : address + size]))
         answer = frame.encode()
-        # an id that others may have too, and a register nobody asked for
+        # the answer of another servo to another request
         other = Frame((servo_id + 100) % 250, 0, bytes(len(frame.data))).encode()
         if kind == "wrong-length":
             answer = with_wrong_length(frame, self._rng)
-        pieces = self.faults.apply_fault(kind, answer, other)
+        pieces = self.faults.apply(kind, answer, other)
         arrived = []
         for delay, data in pieces:
             self._free_at = max(self._free_at, begin) + len(data) * byte_s
@@ -209,7 +209,7 @@ class FeetechEmulator:
         return arrived
 
     def _inject_fault(self, servo_id: int, at: float) -> str | None:
-        """Draw a fault; begin those that last."""
+        """Draw a fault; start it if it lasts. Returns its kind."""
         kind = self.faults.draw()
         servo = self.servos[servo_id]
         if kind == "frozen":
@@ -229,7 +229,7 @@ class FeetechEmulator:
         return kind
 
     def _second_writer(self, byte_s: float) -> list[tuple[float, bytes]]:
-        """Another host's request on the wire, which ours can hear."""
+        """Another host's request on the wire, which the first host receives, too."""
         victim = int(self._rng.choice(list(self.servos)))
         k = self.bench.index_of_id[victim]
         count = int(np.clip(self.bench.count(k, self._free_at) + self._rng.integers(-40, 40), 0,
@@ -243,7 +243,7 @@ class FeetechEmulator:
         return [(self._free_at, frame.encode())]
 
     def _refresh(self, servo_id: int, at: float) -> None:
-        """Measure: what stands in the memory from 56 on is of this moment."""
+        """Measure: the memory from 56 on holds values of this moment."""
         k = self.bench.index_of_id[servo_id]
         servo = self.servos[servo_id]
         frozen = at < servo.frozen_until

@@ -1,8 +1,8 @@
-"""Emulated Feetech servos behind a pseudo-terminal: a serial device that any program can open.
+"""Emulated Feetech servos behind a pseudo-terminal: a serial device for any program.
 
-A pseudo-terminal has no baud rate of its own, so the server keeps the bytes back for as long as a
-real line would. It keeps one end open itself, or a client that closes would end it; an unplugged
-adapter is a terminal that goes away and comes back behind the same link.
+A pseudo-terminal has no baud rate of its own, so the server holds bytes back for as long as a real
+line would. It keeps one end open itself, or a client that closes would end it; an unplugged adapter
+is a terminal that goes away and comes back behind the same link.
 """
 
 from __future__ import annotations
@@ -104,10 +104,10 @@ class FeetechPty:
         self.emulator.faults.ended.append(("unplugged", self.now()))
 
     def _baud(self) -> int | None:
-        """Rate that the host has set; None if the terminal does not say.
+        """Rate that the host has set; None if the terminal has none.
 
-        A terminal cannot tell rates without a name from each other: such a one is the servos' if
-        theirs has no name either, and else 0, at which nobody listens.
+        A terminal does not distinguish rates without a name: such a one counts as the servos' if
+        theirs has no name either, and else as 0, at which no servo listens.
         """
         with contextlib.suppress(termios.error):
             named = _SPEEDS.get(termios.tcgetattr(self._host)[4])

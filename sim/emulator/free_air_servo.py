@@ -1,9 +1,8 @@
-"""One servo turning in free air, stepped by MuJoCo only as far, and as often, as someone asks.
+"""One servo in free air, stepped by MuJoCo only as far, and as often, as its position is needed.
 
 Commands come at any instant, not only on physics steps: the actuator gets the mean of the held
-command over the step before, and its delay is shortened by that one step, so that a command's
-timing is kept although MuJoCo reads one value per step. A position can be asked for at any
-instant. A servo that has come to rest is not stepped until it is told to move.
+command over the step before (`sim.robot.servo_mjcf.for_commands_between_steps`). A position can be
+asked for at any instant. A servo at rest is not stepped until a command moves it.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from collections import deque
 import numpy as np
 
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import (
     for_commands_between_steps,
     free_air_xml,
@@ -23,7 +23,7 @@ from pupper_sysid.sim.robot.servo_mjcf import (
 PHYSICS_STEP_S = 0.001
 """Half the step of fitting, so that the truth is not made by the model that is fitted."""
 
-_STILL_RAD_S = 1e-4  # MuJoCo's dry friction creeps at up to 3e-5 rad/s, which nobody can see
+_STILL_RAD_S = 1e-4  # MuJoCo's dry friction creeps at up to 3e-5 rad/s: invisible
 _STILL_RAD_S2 = 1e-4
 _STEPS_BETWEEN_LOOKS = 50
 
@@ -36,14 +36,14 @@ class FreeAirServo:
     parameters : DelayedPDParameters
         Scalars; `dead_time_s` at least two physics steps.
     position_rad : float
-        Where it rests at the start, commanded there for ever.
+        Where it rests at the start, commanded there for long.
     time_step_s : float
         Physics step [s].
 
     Raises
     ------
     InputError
-        If the delay is shorter than two physics steps.
+        If the dead time is shorter than two physics steps.
     """
 
     def __init__(
@@ -52,9 +52,6 @@ class FreeAirServo:
         position_rad: float,
         time_step_s: float = PHYSICS_STEP_S,
     ):
-        from pupper_sysid.sim.robot.engine import mujoco
-
-        self._mj_step = mujoco.mj_step
         native = for_commands_between_steps(parameters, time_step_s, "servo")
         self._model = mujoco.MjModel.from_xml_string(free_air_xml([native], time_step_s))
         self._data = mujoco.MjData(self._model)
@@ -67,11 +64,10 @@ class FreeAirServo:
         self._changed = -self._settled_after - 1
         self._goal = float(position_rad)
         self._queue: deque[tuple[float, float]] = deque()
-        self._limp = False
-        self._asleep = False
+        self._limp = self._asleep = False
 
     def command(self, time_s: float, position_rad: float) -> None:
-        """Set the goal from `time_s` on; times must not go backwards."""
+        """Set the command from `time_s` on; times must not go backwards."""
         latest = self._queue[-1][1] if self._queue else self._goal
         if not self._limp and position_rad != latest:
             self._queue.append((time_s, float(position_rad)))
@@ -89,7 +85,7 @@ class FreeAirServo:
 
     @property
     def load(self) -> float:
-        """Share of the effort limit at work, signed, at the time last asked for."""
+        """Signed share of the effort limit in use at the time last asked for."""
         if self._limp or self._asleep:
             return 0.0
         return float(self._data.actuator_force[0]) / self._effort
@@ -110,18 +106,18 @@ class FreeAirServo:
     def _advance(self, last: int) -> None:
         """Take physics steps until the state is that of the start of step `last`."""
         while self._step < last:
-            # step k sees what was commanded during step k - 1
+            # step k sees the commands of step k - 1
             event = int(self._queue[0][0] / self._dt) + 1 if self._queue else last
             if event > self._step:
                 steps = min(event, last) - self._step
                 if not self._resting():
                     steps = min(steps, _STEPS_BETWEEN_LOOKS)
                     self._data.ctrl[0] = self._goal
-                    self._mj_step(self._model, self._data, nstep=steps)
+                    mujoco.mj_step(self._model, self._data, nstep=steps)
                 self._step += steps
             else:
                 self._data.ctrl[0] = self._mean_of_last_step()
-                self._mj_step(self._model, self._data)
+                mujoco.mj_step(self._model, self._data)
                 self._changed = self._step
                 self._step += 1
 

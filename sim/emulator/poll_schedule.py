@@ -1,8 +1,8 @@
-"""When the bus really asks each servo for its position, and which questions fail.
+"""Poll instants of an emulated bus, and which polls fail (`servo_models.held_feedback`).
 
-The servo task of the robot's firmware asks one servo at a time, round and round: servo `i` of `n`
-is polled a share `i / n` of a round after the first. The length of a round wanders slowly, each
-poll has its own small jitter, and each fails with the same probability, silently.
+The servo task of the robot's firmware polls one servo after the other: servo `i` of `n` a share
+`i / n` of a round after the first. The length of a round wanders slowly, each poll has its own
+small jitter, and each fails with the same probability, silently.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class PollSchedule:
             self._round += due
 
     def _draw(self) -> None:
-        """Append a chunk of rounds, and forget those that every servo has left behind."""
+        """Append a chunk of rounds, and drop those that lie behind every servo."""
         memory = np.exp(-self._period / _DRIFT_MEMORY_S)
         kicks = self._drift * np.sqrt(1 - memory**2) * self._rng.standard_normal(_CHUNK)
         starts = np.empty(_CHUNK)

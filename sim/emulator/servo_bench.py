@@ -1,10 +1,9 @@
-"""Emulated servos as a protocol server sees them: goals and positions in counts, in real time.
+"""Emulated servos as registers and datagrams show them: commands and positions in counts.
 
-Behind the emulators of both buses stand the same servos as behind `EmulatedBus`, with the same
-truth, in free air or in a robot that walks (`sim.emulator.servo_plant`). Here they have what a
-register or a datagram can ask of them: counts of an encoder, share of duty, temperature, a supply
-that can sag, an encoder that can freeze, and a hand that moves a limp joint (`by_hand`), so that a
-calibration of the joints can be tried without a robot.
+The emulators of both protocols use the same servos as `EmulatedBus`, with the same truth, in free
+air or in a robot that walks (`sim.emulator.servo_plant`). A bench adds the encoder's counts, the
+duty, the supply, and a hand that moves limp joints (`by_hand`), so that a calibration of the joints
+can be tried without a robot.
 """
 
 from __future__ import annotations
@@ -33,11 +32,16 @@ class ServoBench:
     rng : numpy.random.Generator
         Reading noise.
     by_hand : bool
-        Whether someone swings the joints while they are limp.
+        Whether limp joints swing as if moved by hand.
     keep_log : bool
-        Whether goals and readings are remembered: for proofs, not for a robot that runs for days.
+        Whether commands and readings are remembered: for tests, not for runs of days.
     plant : ServoPlant, optional
         What moves; by default the robot's servos in free air.
+
+    Attributes
+    ----------
+    commands : list of (float, int, int)
+        Every command: time [s], servo index, count.
     """
 
     def __init__(
@@ -52,7 +56,6 @@ class ServoBench:
         self.robot, self.map = robot, joint_map.select(robot.joint_names).per_servo()
         self._rng, self._by_hand = rng, by_hand
         self.plant = plant or FreeAirServos(robot)
-        """What moves."""
         self._offset = np.array([s.feedback.offset_rad for s in robot.servos])
         self._noise = robot.spec.reading_noise_rad
         self._limp_since = np.full(len(robot.servos), np.inf)
@@ -62,10 +65,9 @@ class ServoBench:
         self.index_of_id = {i: k for k, i in enumerate(self.map.ids)}
         self.supply_v, self.keep_log = SUPPLY_V, keep_log
         self.commands: list[tuple[float, int, int]] = []
-        """Every change of a goal: time, index, count."""
 
     def command(self, index: int, time_s: float, count: int) -> None:
-        """Goal of one servo from `time_s` on, which must not go backwards."""
+        """Command one servo from `time_s` on, which must not go backwards."""
         self.plant.command(index, time_s, (count - self._zero[index]) / self._scale[index])
         if self.keep_log:
             self.commands.append((time_s, index, count))
@@ -83,7 +85,7 @@ class ServoBench:
         return not np.isfinite(self._limp_since[index])
 
     def angle(self, index: int, time_s: float) -> float:
-        """Where the servo truly is [rad], servo coordinates."""
+        """True angle of a servo [rad], servo coordinates."""
         angle = self.plant.angle(index, time_s)
         if self._by_hand and np.isfinite(self._limp_since[index]):
             phase = 2 * np.pi * (time_s - self._limp_since[index]) / _HAND_PERIOD_S
@@ -91,7 +93,7 @@ class ServoBench:
         return angle
 
     def count(self, index: int, time_s: float) -> int:
-        """What the encoder says."""
+        """Count of the encoder: angle with offset and noise, rounded."""
         noise = self._noise * self._rng.standard_normal()
         angle = self.angle(index, time_s) + self._offset[index] + noise
         count = round(float(self._zero[index] + self._scale[index] * angle))
@@ -103,9 +105,9 @@ class ServoBench:
         return round(1000 * direction * self.plant.load(index))
 
     def imu(self, time_s: float) -> ImuSample | None:
-        """What the robot's IMU says."""
+        """Latest sample of the robot's IMU."""
         return self.plant.imu(time_s)
 
     def truth(self, **transport: Any) -> dict[str, Any]:
-        """What an identification should find, with how the protocol delays commands."""
+        """True parameters, and how the protocol delays commands (`transport`)."""
         return self.robot.truth() | {"transport": transport}

@@ -1,8 +1,8 @@
 """What moves behind the emulators: twelve servos in free air, or one robot that walks.
 
-`EmulatedBus` and `ServoBench` say what a host would read of a plant; a `ServoPlant` says what is
-true. Servos are counted in the order of `JOINT_NAMES`, and their angles are in servo coordinates
-(`hardware.joint_map`): a calf's is told as if its thigh stood at its neutral.
+A `ServoPlant` gives the truth; `EmulatedBus` and `ServoBench` make of it what a host reads. Servos
+are counted in the order of `JOINT_NAMES`, their angles are in servo coordinates
+(`hardware.joint_map`): a calf's servo angle is that with its thigh at neutral.
 """
 
 from __future__ import annotations
@@ -12,19 +12,18 @@ from typing import Protocol
 import numpy as np
 
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
-from pupper_sysid.sim.emulator.free_air_servo import FreeAirServo
 from pupper_sysid.sim.emulator.robot import EmulatedRobot
 
 
 class ServoPlant(Protocol):
     """Twelve servos and an IMU. Time starts at 0, in the default pose with the torque on.
 
-    It passes only as far as someone asks. What is asked for may lie a little before what was
-    asked last, for servos are not polled at the same time; commands come in order.
+    Time passes only as far as a call asks. A call may ask for an instant a little before the last
+    one, since servos are not polled at the same time; commands come in order.
     """
 
     def command(self, index: int, time_s: float, angle_rad: float) -> None:
-        """Goal of one servo from `time_s` on; a limp one ignores it."""
+        """Command one servo from `time_s` on; a limp one ignores it."""
         ...
 
     def torque(self, index: int, time_s: float, on: bool) -> None:
@@ -36,25 +35,27 @@ class ServoPlant(Protocol):
         ...
 
     def load(self, index: int) -> float:
-        """Share of a servo's effort limit at work, signed, when its angle was last asked for."""
+        """Signed share of a servo's effort limit in use at the time of the last `angle` call."""
         ...
 
     def imu(self, time_s: float) -> ImuSample | None:
-        """What the IMU says; None if it says nothing."""
+        """Latest sample of the IMU; None if it gives none."""
         ...
 
 
 class FreeAirServos:
-    """The servos of a robot on a stand, level and at rest, with its legs in free air."""
+    """A `ServoPlant` on a stand: level and at rest, legs in free air."""
 
     def __init__(self, robot: EmulatedRobot):
+        from pupper_sysid.sim.emulator.free_air_servo import FreeAirServo  # imports MuJoCo
+
         pose = robot.joint_map.rest_pose().tolist()
         self._servos = [
             FreeAirServo(s.actuator, x) for s, x in zip(robot.servos, pose, strict=True)
         ]
 
     def command(self, index: int, time_s: float, angle_rad: float) -> None:
-        """Goal of one servo from `time_s` on; a limp one ignores it."""
+        """Command one servo from `time_s` on; a limp one ignores it."""
         self._servos[index].command(time_s, angle_rad)
 
     def torque(self, index: int, time_s: float, on: bool) -> None:
@@ -66,9 +67,9 @@ class FreeAirServos:
         return self._servos[index].position_at(time_s)
 
     def load(self, index: int) -> float:
-        """Share of a servo's effort limit at work, signed, when its angle was last asked for."""
+        """Signed share of a servo's effort limit in use at the time of the last `angle` call."""
         return self._servos[index].load
 
     def imu(self, time_s: float) -> ImuSample:
-        """Nothing but gravity."""
+        """Gravity alone."""
         return ImuSample(time_s, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2]), False)

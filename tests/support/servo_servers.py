@@ -103,10 +103,10 @@ class ScriptedProxy(ProxyEmulator):
     def resend(self, now: float) -> None:
         """See `ProxyEmulator`."""
 
-    def strike(self, now: float) -> str | None:
+    def inject_fault(self, now: float) -> str | None:
         return None
 
-    def spoil(self, kind: str | None, reply: bytes) -> list[tuple[float, bytes]]:
+    def apply_fault(self, kind: str | None, reply: bytes) -> list[tuple[float, bytes]]:
         return [(0.0, reply)] if reply else []
 
 
