@@ -93,8 +93,8 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
         [
             *lines,
             "",
-            f"`{program} COMMAND --help` lists the options of a command. Every command takes",
-            "--debug (show an error's traceback). --install-completion completes in the shell.",
+            f"`{program} COMMAND --help` lists a command's options. All commands take",
+            "--debug (an error's traceback). --install-completion sets up the shell.",
         ]
     )
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.sysid.doctor import examination as doctor
-from pupper_sysid.sysid.identify import calibrate as calibration
-from pupper_sysid.sysid.lag import frequency_response
-from pupper_sysid.sysid.lag.lag_budget import LagBudget
-from pupper_sysid.sysid.report.json_objects import delay_json
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.lag.lag_budget import LagBudget
 
 
 @dataclass(frozen=True)
@@ -33,6 +32,8 @@ class Doctor:
     def run(self) -> None:
         """Examine and print."""
         import numpy as np
+
+        from pupper_sysid.sysid.doctor import examination as doctor
 
         (recording,) = terminal.load_all([self.recording] if self.recording else [])
         found = doctor.examine(recording, np.random.default_rng(self.seed))
@@ -75,6 +76,9 @@ class Delay:
 
     def run(self) -> None:
         """Measure and print."""
+        from pupper_sysid.sysid.identify import calibrate as calibration
+        from pupper_sysid.sysid.report.json_objects import delay_json
+
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.progress("measuring", len(joints)) as advance:
@@ -146,6 +150,9 @@ class Bode:
 
     def run(self) -> None:
         """Measure and print."""
+        from pupper_sysid.sysid.identify import calibrate as calibration
+        from pupper_sysid.sysid.lag import frequency_response
+
         if self.plot:
             from pupper_sysid.common.figure_style import refuse_picture
 

@@ -1,0 +1,71 @@
+"""A program answers at once: what costs time is imported by the command that needs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from pupper_sysid.cli.dispatch import overview, words
+from pupper_sysid.cli.programs import pupper_sysid
+from support.command_line import refused, run
+
+PROGRAMS = ("train", "play", "eval", "deploy", "analyze")
+SLOW = ("torch", "rsl_rl", "matplotlib", "pandas", "scipy", "control", "mujoco", "numba", "sklearn")
+
+
+def imported(code: str) -> set[str]:
+    """Slow libraries that a fresh interpreter has imported after `code`."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys\n{code}\nprint('AFTER', *sys.modules)"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return set(SLOW) & set(done.stdout.rpartition("AFTER ")[2].split())
+
+
+def test_help_and_version_of_every_command_import_no_slow_library():
+    programs = {f"pupper_{name}": [[]] for name in PROGRAMS}
+    programs["pupper_sysid"] = [[], *(name.split() for name in words(pupper_sysid.COMMANDS))]
+    assert (
+        imported(f"""
+from contextlib import suppress
+from importlib import import_module
+for module, commands in {programs!r}.items():
+    main = import_module("pupper_sysid.cli.programs." + module).main
+    for words in commands:
+        for option in ("--help", "--version"):
+            with suppress(SystemExit):
+                main([*words, option])
+""")
+        == set()
+    )
+
+
+def test_the_package_itself_imports_nothing_slow():
+    assert imported("import pupper_sysid") == set()
+
+
+def test_the_overview_fits_a_screen_of_24_times_80():
+    lines = overview("pupper-sysid", pupper_sysid.DESCRIPTION, pupper_sysid.COMMANDS).splitlines()
+    assert len(lines) < 24 and max(map(len, lines)) <= 80
+    groups = dict.fromkeys(c.group for c in pupper_sysid.COMMANDS.values())
+    assert list(groups) == ["robot", "recording", "model", "use"]
+    assert all(any(f" {word} " in line for line in lines) for word in pupper_sysid.COMMANDS)
+
+
+@pytest.mark.parametrize(("arguments"), [(), ("-h",), ("--help",)])
+def test_the_overview_is_what_help_prints(capsys, arguments):
+    code, out, _ = run(capsys, *arguments)
+    assert code == 0 and "calibrate-joints" in out
+
+
+def test_a_misspelt_command_is_answered_with_the_nearest(capsys):
+    assert "Did you mean `pupper-sysid calibrate`" in refused(capsys, pupper_sysid, "calibarte")
+    assert "Did you mean" not in refused(capsys, pupper_sysid, "xyz")
+
+
+def test_help_of_emulate_names_both_robots_and_not_python(capsys):
+    code, out, _ = run(capsys, "emulate", "--help")
+    assert code == 0 and "esp32" in out and "feetech" in out and "Union" not in out

@@ -1,0 +1,58 @@
+"""From the bus to calibration, report and export, nothing needs torch or rsl_rl."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parents[1]
+
+COMMANDS = '''
+import sys
+
+BANNED = ("torch", "rsl_rl")
+
+
+class NotInstalled:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in BANNED:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+sys.meta_path.insert(0, NotInstalled())
+
+from pupper_sysid.cli.programs.pupper_sysid import main
+from support.servo_servers import on_a_port, still_servos
+
+with on_a_port(still_servos(ids=[4, 7])) as port:
+    main(["scan", "--bus", f"feetech:{port.device}@1000000", "--json"])
+for line in """
+monitor --bus emulated --once
+sweep --freqs 2,3 --joints LF_hip --duration 2 --out s.csv --truth
+doctor s.csv
+delay s.csv
+bode s.csv --plot bode.png
+calibrate s.csv --out c.yaml
+report s.csv --calibration c.yaml --out page
+export s.csv
+export c.yaml
+export c.yaml --to mjcf
+export c.yaml --to isaaclab
+""".strip().splitlines():
+    main(line.split())
+    print("DONE", line)
+
+assert not set(BANNED) & set(sys.modules)
+'''
+
+
+def test_no_command_on_the_way_to_a_calibration_imports_torch(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", COMMANDS],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(TESTS)}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("DONE") == 11
+    assert (tmp_path / "page/report.html").is_file() and (tmp_path / "bode.png").is_file()
