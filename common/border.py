@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.strict_yaml import Place, load, place_text
+from pupper_sysid.common.strict_yaml import Place, load, place_text, printable
 
 LARGEST_BYTES = 2_000_000
 
@@ -269,9 +269,7 @@ def _explain(
     more = len({_place(f, data) for f in faults}) - 1
     rest = f" Or {remedy}." if remedy else ""
     rest += f" ({more} more fault{'s' if more > 1 else ''} in this file.)" if more else ""
-    message = f"{where} {_fault(fault, top, place)}{rest}"
-    # a file may hold line breaks and terminal codes in its keys; a sentence may not
-    return "".join(c if c.isprintable() else " " for c in message)
+    return printable(f"{where} {_fault(fault, top, place)}{rest}")
 
 
 def _place(fault: ErrorDetails, data: Any) -> Place:

@@ -81,7 +81,7 @@ class StrictLoader(_Loader):
                 "them can unfold to gigabytes. Write the value out, or quote the text."
             )
         if tag is not None:
-            raise InputError(f"{where} uses a YAML tag ({tag}). Write the plain value.")
+            raise InputError(f"{where} uses a YAML tag ({printable(tag)}). Write the plain value.")
         if self._depth > MAX_DEPTH:
             raise InputError(f"{where} is nested deeper than {MAX_DEPTH} levels. Check the file.")
         self._depth += 1
@@ -123,7 +123,12 @@ def place_text(place: Place) -> str:
     'joints.LF_hip.selection.candidate_models[2]'
     """
     words = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in place]
-    return "".join(words).removeprefix(".")
+    return printable("".join(words).removeprefix("."))
+
+
+def printable(text: str) -> str:
+    """`text` without line breaks and terminal codes, which a file may hold and a sentence not."""
+    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def load(text: str, name: str = "the text") -> tuple[Any, dict[Place, int]]:
@@ -162,7 +167,7 @@ def _plain(text: str) -> Any:
     """What unquoted `text` means by YAML 1.2's core rules."""
     if text in _WORDS:
         return _WORDS[text]
-    if len(text) < 20 and _INTEGER.fullmatch(text):
+    if len(text) <= 20 and _INTEGER.fullmatch(text):
         return int(text)
     if _FLOAT.fullmatch(text):
         return float(text)

@@ -1,0 +1,191 @@
+"""Files at the border: limited, of a known version, valid, or refused in a sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Annotated, Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pupper_sysid.common.border import (
+    parse_json,
+    read_bytes,
+    read_json,
+    read_text,
+    read_yaml,
+    refuse_other_version,
+    unit_of,
+    validated,
+)
+from pupper_sysid.common.errors import InputError
+
+
+def refusal(function, *given, **options) -> str:
+    with pytest.raises(InputError) as caught:
+        function(*given, **options)
+    return str(caught.value)
+
+
+# ------------------------------------------------------------------------------------ reading
+
+
+def test_what_is_no_readable_file_is_refused_by_its_name(tmp_path):
+    assert (
+        refusal(read_bytes, tmp_path / "a") == f"{tmp_path / 'a'} does not exist. Check the name."
+    )
+    assert "is not a file" in refusal(read_bytes, tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    assert "is not a file" in refusal(read_bytes, tmp_path / "pipe")
+    for name in ("n" * 300, "a\0b"):
+        said = refusal(read_bytes, tmp_path / name, remedy="Copy it again.")
+        assert said.endswith("Copy it again.")
+    (tmp_path / "latin").write_bytes("Hüfte".encode("latin-1"))
+    assert "is not a text file (byte 1 is not UTF-8)" in refusal(read_text, tmp_path / "latin")
+
+
+def test_a_file_is_read_up_to_its_limit_and_not_beyond(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"x" * 1000)
+    assert read_bytes(path, 1000) == b"x" * 1000
+    assert "is larger than 0.000999 MB" in refusal(read_bytes, path, 999)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
+    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfa: 1")
+    assert read_yaml(tmp_path / "a")[0] == {"a": 1}
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 200_000, "9" * 5000, "nothing"])
+def test_what_is_not_json_is_refused(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    said = refusal(read_json, tmp_path / "a.json", remedy="Fit it again.")
+    assert "a.json is not JSON: " in said and said.endswith("Fit it again.")
+
+
+@settings(max_examples=200)
+@given(st.text())
+def test_any_text_is_json_or_refused(text):
+    try:
+        expected = json.loads(text)
+    except (ValueError, RecursionError):
+        assert "x is not JSON" in refusal(parse_json, text, "x")
+    else:
+        assert repr(parse_json(text, "x")) == repr(expected)
+
+
+@settings(max_examples=100)
+@given(content=st.binary(max_size=60))
+def test_any_bytes_are_yaml_or_refused(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_bytes(content)
+    try:
+        read_yaml(path)
+    except InputError as error:
+        assert str(path) in str(error)
+
+
+# ----------------------------------------------------------------------------------- versions
+
+
+def test_only_the_versions_that_are_known_pass():
+    for found in (1, 2, 3):
+        refuse_other_version("a", found, 3)
+    assert "newer version of pupper-sysid (schema_version 4; this one reads 3). Upgrade" in refusal(
+        refuse_other_version, "a", 4, 3
+    )
+    for found in (0, -1, None, True, 1.0, "2", [3], "9" * 99):
+        assert "schema_version is" in refusal(refuse_other_version, "a", found, 3)
+    assert "is 2; this version reads 3" in refusal(refuse_other_version, "a", 2, 3, oldest=3)
+
+
+# --------------------------------------------------------------------------------- validation
+
+
+class Leg(BaseModel):
+    model_config = ConfigDict(
+        extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    length_m: Annotated[float, Field(gt=0)]
+    lag_s: float | dict[str, float] | None = None
+    """Lag of its servos."""
+    side: Literal["left", "right"]
+    joints: list[str] = []
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.length_m > 10:
+            raise ValueError("a leg of this length is a tower")
+        return self
+
+
+class Robot(BaseModel):
+    legs: dict[str, Leg]
+
+
+GOOD = {"length_m": 0.1, "side": "left"}
+
+
+def fault(leg, **options) -> str:
+    said = refusal(validated, Robot, {"legs": {"LF": leg}}, "robot.yaml", **options)
+    return said.removeprefix("robot.yaml: legs.LF")
+
+
+@pytest.mark.parametrize(
+    ("leg", "says"),
+    [
+        ({"side": "left"}, ".length_m is missing. Add it."),
+        (GOOD | {"length_m": -1.0}, ".length_m is -1.0; it must be greater than 0."),
+        (GOOD | {"length_m": "0.1"}, ".length_m is the text '0.1'. Write the number only."),
+        (GOOD | {"length_m": 50.0}, " is not usable: a leg of this length is a tower."),
+        (GOOD | {"side": "top"}, ".side is top. Write 'left' or 'right'."),
+        (GOOD | {"sid": "left"}, ".sid is not a key of this file. Did you mean side?"),
+        (GOOD | {"lag_ms": 30}, ".lag_ms is in another unit: this file holds it in s. Convert it "
+         "and name it lag_s."),
+        (GOOD | {"lag": 30}, ".lag has no unit in its name: this file holds it in s. Convert it "
+         "and name it lag_s."),
+        (GOOD | {"lag_s": "30"}, ".lag_s is the text '30'. Write the number only, in s."),
+        (GOOD | {"lag_s": {"hip": None}}, ".lag_s is {'hip': None}. Write a number, in s. (1 more "
+         "fault in this file.)"),
+        (GOOD | {"joints": "hip"}, ".joints is hip. Write a list, one line and one dash per "
+         "entry."),
+        (GOOD | {"joints": ["hip", 5]}, ".joints[1] is 5. Write text (in quotes if it looks like a "
+         "number)."),
+        (5, " is 5 where a mapping of keys is expected. Fill it in."),
+    ],
+)  # fmt: skip
+def test_a_fault_is_named_with_its_place_and_what_to_do(leg, says):
+    assert fault(leg) == says
+
+
+def test_the_first_fault_is_the_one_that_explains_others_and_the_rest_are_counted():
+    assert fault({"lenght_m": 0.1, "side": "up"}) == (
+        ".lenght_m is not a key of this file. Did you mean length_m? (2 more faults in this file.)"
+    )
+
+
+def test_a_remedy_for_files_of_programs_comes_last():
+    assert fault({"side": "left"}, remedy="fit it again").endswith("Add it. Or fit it again.")
+
+
+def test_the_line_is_that_of_the_place_or_of_what_holds_it(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text("legs:\n  LF:\n    side: left\n    length_m: x\n  RF: {side: right}\n")
+    data, lines = read_yaml(path)
+    assert f"{path}, line 4: legs.LF.length_m is" in refusal(validated, Robot, data, path, lines)
+    del data["legs"]["LF"]
+    assert f"{path}, line 5: legs.RF.length_m is" in refusal(validated, Robot, data, path, lines)
+
+
+def test_a_sentence_is_one_printable_line_whatever_the_file_says():
+    said = refusal(validated, Robot, {"legs": {"a\n\x1b[31mb": 1}}, "robot.yaml")
+    assert said.isprintable()
+
+
+def test_units_are_the_ends_of_names():
+    names = ["counts_per_rad", "stiffness_nm_per_rad", "dead_time_s", "rate_rad_s", "steps", "s"]
+    assert [unit_of(n) for n in names] == ["counts/rad", "N·m/rad", "s", "rad/s", "", "s"]
