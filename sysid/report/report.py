@@ -1,99 +1,213 @@
-"""Report: everything found about a robot's servos, as one page that opens anywhere.
+"""Report: all findings about a robot's servos as one page that opens anywhere.
 
-`write_report` makes a folder with `report.html`, the same figures as PNG and SVG, and the same
-tables as CSV (`common.page`). Each section is built by one function below, from results that were
-computed elsewhere.
+`write_report` examines and calibrates recordings and makes a folder with `report.html`, its figures
+as PNG and SVG, and its tables as CSV (`common.page`). `sections` builds the page from findings that
+were computed elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pupper_sysid.common.files import versions
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite, versions
 from pupper_sysid.common.page import Column, Picture, Section, Table, WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
+from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, calibrate
+from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.identify.search import PREFERRED
+from pupper_sysid.sysid.recordings.joints import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    joint_rng,
+    joint_trials,
+)
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures, tables
 from pupper_sysid.sysid.report.advice import advice
-from pupper_sysid.sysid.report.figure_data import Track, hold_runs, lag_parts, tracks
+from pupper_sysid.sysid.report.figure_data import hold_runs, lag_parts, tracks
+from pupper_sysid.sysid.report.servo_section import servo_section
 from pupper_sysid.sysid.report.tables import MODEL_NAMES
 
-if TYPE_CHECKING:  # both bring libraries that a page does not need
+if TYPE_CHECKING:  # they bring libraries that a page does not need
     from pupper_sysid.sysid.doctor.examination import Examination
     from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+    from pupper_sysid.sysid.servo_fit.compare import Comparison
+    from pupper_sysid.sysid.servo_fit.result import ServoFit
+
+PAGE = "report.html"
 
 
-def write_report(
-    folder: Path,
-    recordings: Sequence[Recording],
-    results: Mapping[str, JointCalibrationResult],
-    calibration: Calibration,
-    examinations: Sequence[tuple[str, Examination]],
-    responses: Mapping[str, FrequencyResponse],
-    force: bool = False,
-    more: Sequence[Section] = (),
-) -> WrittenPage:
-    """Write the report's page, figures and tables into `folder`.
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """Results that a report shows.
 
-    Parameters
+    Attributes
     ----------
-    folder : Path
-        Made if it is missing; gets `report.html`, `figures/*.png`, `figures/*.svg` and
-        `tables/*.csv`.
     recordings : sequence of Recording
-        What was computed from.
+        From which all was computed.
     results : dict of joint to JointCalibrationResult
     calibration : Calibration
         Has at least the joints of `results`; the parameter table shows its numbers.
     examinations : sequence of (str, Examination)
-        Name of each recording and what the doctor found in it.
+        Name of each recording and its examination.
     responses : dict of joint to FrequencyResponse
-        Joints without tones are left out.
+        Of joints with tones.
+    comparison : Comparison, optional
+        Of servo models.
+    """
+
+    recordings: Sequence[Recording]
+    results: Mapping[str, JointCalibrationResult]
+    calibration: Calibration
+    examinations: Sequence[tuple[str, Examination]] = ()
+    responses: Mapping[str, FrequencyResponse] = field(default_factory=dict)
+    comparison: Comparison | None = None
+
+    def write(self, folder: Path, force: bool = False) -> WrittenPage:
+        """Write the page, its figures and its tables; errors as for `write_page`."""
+        more = len(self.recordings) - 1
+        title = f"Servo report: {self.recordings[0].name}" + (f" and {more} more" if more else "")
+        made = self.calibration
+        subtitle = f"{made.robot} · {', '.join(self.results)} · {made.created}"
+        return write_page(folder / PAGE, title, subtitle, sections(self), force)
+
+
+def write_report(
+    recordings: Recordings,
+    folder: Path | str,
+    *,
+    joints: Joints = None,
+    calibration: Calibration | None = None,
+    models: Sequence[str | Path | Calibration | ServoFit] = (),
+    seed: int = 0,
+    workers: int = 1,
+    force: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> WrittenPage:
+    """Examine and calibrate recordings, and write all findings as a page.
+
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+        Pooled per joint.
+    folder : Path or str
+        Made if missing; gets `report.html`, `figures/*.png`, `figures/*.svg` and `tables/*.csv`.
+    joints : str or sequence of str, optional
+        By default all that were recorded.
+    calibration : Calibration, optional
+        Made from these recordings: its numbers are shown and its seed is used. By default the
+        recordings are calibrated.
+    models : sequence of str, Path, Calibration or ServoFit
+        Servo models to compare on the recordings, as in `sysid.servo_fit.compare`.
+    seed : int
+        Of the bootstrap and of the models' global starts.
+    workers : int
+        Processes that calibrate.
     force : bool
         Replace files that exist.
-    more : sequence of Section
-        Placed before what to record next.
+    progress : callable, optional
+        Called with the name of the present work and the share of it that is done.
+
+    Returns
+    -------
+    WrittenPage
+        Names of the files.
 
     Raises
     ------
     InputError
-        If one of the files exists and `force` is not given (nothing has been written then), or if
-        one cannot be written.
+        If one of the files exists and `force` is not given (nothing has been written then), if one
+        cannot be written, or if the calibration was made from other recordings.
     """
-    page = sections(recordings, results, calibration, examinations, responses)
-    page[-2:-2] = more
-    return write_page(
-        folder / "report.html", _title(recordings), _subtitle(results, calibration), page, force
-    )
+    refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
+    found = find(
+        recordings, joints=joints, calibration=calibration, models=models, seed=seed,
+        workers=workers, progress=progress,
+    )  # fmt: skip
+    return found.write(Path(folder), force)
 
 
-def sections(
-    recordings: Sequence[Recording],
-    results: Mapping[str, JointCalibrationResult],
-    calibration: Calibration,
-    examinations: Sequence[tuple[str, Examination]],
-    responses: Mapping[str, FrequencyResponse],
-) -> list[Section]:
-    """All sections of the page, in order; parameters as for `write_report`."""
-    runs = {joint: tracks(result) for joint, result in results.items()}
-    made = [
-        _summary(results),
-        _lag(results),
-        _doctor(examinations, results),
-        _overlays(results, runs),
-        _holds(examinations, results),
-        _bode(results, responses),
-        _models(results),
-        _parameters(results, calibration),
-        _residuals(results, runs),
-        Section(
-            "next", "What to record next", findings=[("", s) for s in advice(results, examinations)]
-        ),
-        _provenance(recordings, calibration),
+def find(
+    recordings: Recordings,
+    *,
+    joints: Joints = None,
+    calibration: Calibration | None = None,
+    models: Sequence[str | Path | Calibration | ServoFit] = (),
+    seed: int = 0,
+    workers: int = 1,
+    progress: Callable[[str, float], None] | None = None,
+) -> Findings:
+    """The findings of a report; parameters and errors as for `write_report`."""
+    from pupper_sysid.sysid.doctor.examination import examine
+    from pupper_sysid.sysid.lag.frequency_response import frequency_response
+
+    recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
+    if calibration is not None:
+        _refuse_foreign(calibration, recordings, names)
+        seed = seed if calibration.seed is None else calibration.seed
+    steps, done = 2 * len(names) + len(recordings), 0
+
+    def advance(what: str) -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(what, done / steps)
+
+    results = calibrate(recordings, names, seed, preset_parameters(), workers, advance)
+    examinations, responses = [], {}
+    for recording in recordings:
+        examinations.append((recording.name, examine(recording, seed)))
+        advance(recording.name)
+    for joint, result in results.items():
+        if result.budget.by_frequency:
+            trials, rng = joint_trials(recordings, joint), joint_rng(seed, joint)
+            responses[joint] = frequency_response(joint, trials, rng, result.budget.lattice)
+        advance(joint)
+    comparison = None
+    if models:
+        from pupper_sysid.sysid.servo_fit.compare import compare  # brings torch
+
+        comparison = compare(recordings, models, names, seed=seed)
+    return Findings(
+        recordings=recordings, results=results, examinations=examinations, responses=responses,
+        calibration=calibration or to_calibration(results, recordings, seed),
+        comparison=comparison,
+    )  # fmt: skip
+
+
+def _refuse_foreign(
+    calibration: Calibration, recordings: Sequence[Recording], joints: Sequence[str]
+) -> None:
+    """Refuse a calibration of other recordings or without one of the joints."""
+    if {i.sha256 for i in calibration.inputs} != {r.sha256 for r in recordings}:
+        made_from = ", ".join(i.name for i in calibration.inputs) or "no recording"
+        raise InputError(
+            f"The calibration was made from {made_from}, which is not, byte for byte, "
+            f"{', '.join(r.name for r in recordings)}. Give its own recordings, or leave "
+            "`calibration` out."
+        )
+    for joint in joints:
+        calibration.joint(joint)
+
+
+def sections(found: Findings) -> list[Section]:
+    """All sections of the page, in order."""
+    results = found.results
+    made = [_summary(results), _lag(results), _doctor(found)]
+    overlays, residuals = _free_runs(results)
+    made += [overlays, _holds(found), _bode(found), _models(results), _parameters(found), residuals]
+    if found.comparison:
+        made.append(servo_section(found.comparison))
+    next_steps = advice(results, found.examinations)
+    made += [
+        Section("next", "What to record next", findings=[("", text) for text in next_steps]),
+        _provenance(found),
     ]
     return [s for s in made if s.text or s.findings or s.figures or s.tables]
 
@@ -108,111 +222,97 @@ def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
         findings=[(joint, lag_parts(r).sentence()) for joint, r in results.items()],
         notes=[
             "Naive lag: from a command's row to the position's row, as a cross-correlation of the "
-            "log would measure it. Only the servo's own part belongs into a simulated actuator; "
-            "stale feedback belongs into the observation.",
+            "log measures it. Only the servo's own part belongs to a simulated actuator; stale "
+            "feedback belongs to the observation.",
         ],
     )
 
 
 def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
-    notes = [w for r in results.values() for w in r.budget.warnings]
     picture = Picture(
         "lag_budget",
-        "Lag budget: what passes between the moment a command is sent and the row in which its "
-        "motion is read. The black line is the naive lag, which is the sum.",
+        "Lag budget: the time from sending a command to the row in which its motion is read. The "
+        "black line is the naive lag, which is the sum.",
         figures.lag_budget_figure(results),
     )
     return Section(
-        "lag",
-        "Lag budget",
-        figures=[picture],
+        "lag", "Lag budget", figures=[picture],
         tables=[tables.lag_table(results), tables.estimator_table(results)],
-        notes=notes,
-    )
+        notes=[w for r in results.values() for w in r.budget.warnings],
+    )  # fmt: skip
 
 
-def _doctor(
-    examinations: Sequence[tuple[str, Examination]], results: Mapping[str, JointCalibrationResult]
-) -> Section:
-    findings = [
-        (f"{recording}, {joint}", _sentences([f"{found.verdict}.", *found.reasons]))
-        for recording, examination in examinations
-        for joint, found in examination.joints.items()
-        if joint in results
-    ]
-    return Section(
-        "doctor",
-        "Are the recordings usable?",
-        findings=findings,
-        tables=[tables.doctor_table(examinations, list(results))],
-    )
+def _doctor(found: Findings) -> Section:
+    texts = []
+    for recording, examination in found.examinations:
+        for name, joint in examination.joints.items():
+            if name in found.results:
+                sentences = (t[:1].upper() + t[1:] for t in (f"{joint.verdict}.", *joint.reasons))
+                texts.append((f"{recording}, {name}", " ".join(sentences)))
+    table = tables.doctor_table(found.examinations, list(found.results))
+    return Section("doctor", "Are the recordings usable?", findings=texts, tables=[table])
 
 
-def _sentences(texts: Sequence[str]) -> str:
-    return " ".join(text[:1].upper() + text[1:] for text in texts)
-
-
-def _overlays(
-    results: Mapping[str, JointCalibrationResult], runs: Mapping[str, list[Track]]
-) -> Section:
-    pictures = [
-        Picture(
-            f"overlay_{joint}",
-            f"{joint}: the grey steps are the readings as the log has them; the dots are the same "
-            "readings at the time they were measured, and the model is judged by those.",
-            figures.overlay_figure(result, runs[joint]),
-        )
-        for joint, result in results.items()
-    ]
-    return Section(
-        "overlays",
-        "Command, model, readings",
-        text=["DelayedPD runs freely from rest: it is shown commands only, never a reading."],
-        figures=pictures,
-    )
-
-
-def _holds(
-    examinations: Sequence[tuple[str, Examination]], results: Mapping[str, JointCalibrationResult]
-) -> Section:
-    found = {}
+def _free_runs(results: Mapping[str, JointCalibrationResult]) -> tuple[Section, Section]:
+    """Overlays and residuals of DelayedPD."""
+    overlays, residuals = [], []
     for joint, result in results.items():
-        examined = [e.joints[joint] for _, e in examinations if joint in e.joints]
-        if examined:
-            found[joint] = hold_runs(examined, result.budget.lattice)
-    if not found:
-        return Section("holds", "How long readings are held")
-    picture = Picture(
-        "holds",
-        "For how many rows in a row each reading stayed the same while its joint moved. A sensor "
-        "that is read afresh each time would have all its runs at 1.",
-        figures.hold_histogram_figure(found),
-    )
-    return Section("holds", "How long readings are held", figures=[picture])
-
-
-def _bode(
-    results: Mapping[str, JointCalibrationResult], responses: Mapping[str, FrequencyResponse]
-) -> Section:
-    pictures = []
-    if responses:
-        pictures.append(
+        runs = tracks(result)
+        overlays.append(
             Picture(
-                "bode",
-                "Frequency response from the held command to the motion, from fresh readings, with "
-                "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too "
-                "low.",
-                figures.bode_figure(responses),
+                f"overlay_{joint}",
+                f"{joint}: the grey steps are the readings as logged; the dots are the fresh "
+                "readings at the time they were measured. The model is scored on those.",
+                figures.overlay_figure(result, runs),
             )
         )
-    findings = [
-        (joint, f"−3 dB bandwidth {response.bandwidth_text()}.")
-        for joint, response in responses.items()
-    ]
-    made = [tables.frequency_table(results), tables.transfer_table(responses)]
+        residuals.append(
+            Picture(
+                f"residuals_{joint}",
+                f"{joint}: above, the error of rows at their own time is proportional to speed: "
+                "that is the feedback age; fresh rows have no such error. Below, the residuals of "
+                "fresh rows.",
+                figures.residual_figure(result, runs),
+            )
+        )
+    text = "DelayedPD runs freely from rest: its input is commands only, never a reading."
+    return (
+        Section("overlays", "Command, model, readings", text=[text], figures=overlays),
+        Section("residuals", "Residuals of the model", figures=residuals),
+    )
+
+
+def _holds(found: Findings) -> Section:
+    held = {}
+    for joint, result in found.results.items():
+        examined = [e.joints[joint] for _, e in found.examinations if joint in e.joints]
+        if examined:
+            held[joint] = hold_runs(examined, result.budget.lattice)
+    pictures = []
+    if held:
+        text = (
+            "For how many rows each reading stayed the same while its joint moved. A sensor that "
+            "is read afresh each time has all its runs at 1."
+        )
+        pictures.append(Picture("holds", text, figures.hold_histogram_figure(held)))
+    return Section("holds", "How long readings are held", figures=pictures)
+
+
+def _bode(found: Findings) -> Section:
+    pictures = []
+    if found.responses:
+        text = (
+            "Frequency response from the held command to the motion, from fresh readings, with "
+            "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too low."
+        )
+        pictures.append(Picture("bode", text, figures.bode_figure(found.responses)))
+    made = [tables.frequency_table(found.results), tables.transfer_table(found.responses)]
     return Section(
-        "bode", "Frequency response", findings=findings, figures=pictures,
-        tables=[t for t in made if t.rows],
+        "bode", "Frequency response", figures=pictures, tables=[t for t in made if t.rows],
+        findings=[
+            (joint, f"−3 dB bandwidth {response.bandwidth_text()}.")
+            for joint, response in found.responses.items()
+        ],
     )  # fmt: skip
 
 
@@ -246,8 +346,8 @@ def _best_by_naive_score(result: JointCalibrationResult) -> str:
     return min(scores, key=lambda name: scores[name])
 
 
-def _parameters(results: Mapping[str, JointCalibrationResult], calibration: Calibration) -> Section:
-    scale = calibration.joint(next(iter(results))).actuator.scale
+def _parameters(found: Findings) -> Section:
+    scale = found.calibration.joint(next(iter(found.results))).actuator.scale
     return Section(
         "parameters",
         "Parameters",
@@ -256,27 +356,13 @@ def _parameters(results: Mapping[str, JointCalibrationResult], calibration: Cali
             f"({scale.source}). “Ratio only” means that the recording gives this number divided by "
             "the armature, and the anchor gives the rest.",
         ],
-        tables=[tables.parameter_table(calibration, list(results))],
-        notes=[w for r in results.values() for w in r.warnings if w not in r.budget.warnings],
+        tables=[tables.parameter_table(found.calibration, list(found.results))],
+        notes=[w for r in found.results.values() for w in r.warnings if w not in r.budget.warnings],
     )
 
 
-def _residuals(
-    results: Mapping[str, JointCalibrationResult], runs: Mapping[str, list[Track]]
-) -> Section:
-    pictures = [
-        Picture(
-            f"residuals_{joint}",
-            f"{joint}: above, rows taken at their own time are wrong in proportion to speed, which "
-            "is the age of the reading; fresh rows are not. Below, what the model leaves of them.",
-            figures.residual_figure(result, runs[joint]),
-        )
-        for joint, result in results.items()
-    ]
-    return Section("residuals", "What the model leaves unexplained", figures=pictures)
-
-
-def _provenance(recordings: Sequence[Recording], calibration: Calibration) -> Section:
+def _provenance(found: Findings) -> Section:
+    recordings, calibration = found.recordings, found.calibration
     rows = tuple(
         {
             "recording": r.path.name if r.path else r.name,
@@ -304,12 +390,3 @@ def _provenance(recordings: Sequence[Recording], calibration: Calibration) -> Se
         tables=[Table("recordings", "Recordings", columns, rows)],
         notes=[*(w for r in recordings for w in r.warnings), *calibration.notes],
     )
-
-
-def _title(recordings: Sequence[Recording]) -> str:
-    first, more = recordings[0].name, len(recordings) - 1
-    return f"Servo report: {first}" + (f" and {more} more" if more else "")
-
-
-def _subtitle(results: Mapping[str, JointCalibrationResult], calibration: Calibration) -> str:
-    return f"{calibration.robot} · {', '.join(results)} · {calibration.created}"

@@ -39,7 +39,7 @@ from pupper_sysid.sysid.report.figure_data import (
     tracks,
     window,
 )
-from pupper_sysid.sysid.report.report import write_report
+from pupper_sysid.sysid.report.report import Findings
 from support.browser import looks_right, needs_chromium
 
 HOSTILE = '<script>alert("x")</script>&lt;'
@@ -128,15 +128,11 @@ def examined(name: str) -> Examination:
 def write(folder, name: str = "sweep", force: bool = False):
     recordings, results = [recording_of(name)], {"LF_thigh": result_of()}
     calibration = to_calibration(results, recordings, 3)
-    return write_report(
-        folder,
-        recordings,
-        results,
-        calibration,
-        [(name, examined(name))],
-        {"LF_thigh": response_of()},
-        force,
-    )
+    found = Findings(
+        recordings=recordings, results=results, calibration=calibration,
+        examinations=[(name, examined(name))], responses={"LF_thigh": response_of()},
+    )  # fmt: skip
+    return found.write(folder, force)
 
 
 class Page(HTMLParser):
@@ -422,9 +418,9 @@ def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path)
     unknown = replace(LATTICE, kind="unresolved", period_s=np.nan, loss=np.nan)
     budget = replace(result_of().budget, lattice=unknown)
     results, recordings = {"LF_thigh": result_of(budget=budget)}, [recording_of()]
-    made = write_report(
-        tmp_path, recordings, results, to_calibration(results, recordings, 0), [], {}
-    )
+    calibration = to_calibration(results, recordings, 0)
+    found = Findings(recordings=recordings, results=results, calibration=calibration)
+    made = found.write(tmp_path)
     (row,) = rows_of(made, "lag_budget")
     assert row["poll_period_ms"] == row["loss"] == ""
     assert not re.search(r">\s*-?(nan|inf|None)\s*<", made.path.read_text(encoding="utf-8"))
