@@ -1,4 +1,4 @@
-"""Driving a robot by keys, with a live table of what it is told and how it is."""
+"""Driving a robot by keys, with a live table of commands and readings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.policies.deploy.deployment import Tick
 
 STEP = np.array([0.05, 0.04, 0.1])
-"""What one key press adds [m/s, m/s, rad/s]."""
+"""Increment of one key press [m/s, m/s, rad/s]."""
 LARGEST = np.array([0.2, 0.1, 0.5])
 KEYS = {
     "w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "e": (2, -1),
@@ -31,7 +31,7 @@ _SHOWN_EVERY_S = 0.2
 
 
 class Driver:
-    """Commands from the keyboard; also watches the ticks to show them.
+    """Commands from the keyboard, and a live table of the ticks.
 
     Use it as a context; it is a `policies.deploy.commands.Commands`.
     """
@@ -46,11 +46,11 @@ class Driver:
         self._seen_s = 0.0
 
     def __call__(self, elapsed_s: float) -> np.ndarray | None:
-        """What to do now; None once x was pressed."""
+        """Command at this moment, shape (3,); None once x was pressed."""
         while select.select([sys.stdin], [], [], 0)[0]:
             typed = os.read(sys.stdin.fileno(), 64).decode(errors="ignore").lower()
             if not typed:
-                self._ended = True  # the terminal is gone: nobody drives
+                self._ended = True  # the terminal is gone
                 break
             for key in typed:
                 self._press(key)
@@ -63,9 +63,9 @@ class Driver:
             self._command[:] = 0.0
         elif key in KEYS:
             axis, sign = KEYS[key]
-            told = self._command[axis] + sign * STEP[axis]
-            # steps back to standing end there, not a rounding error beside it
-            self._command[axis] = np.clip(np.round(told, 6), -LARGEST[axis], LARGEST[axis])
+            changed = self._command[axis] + sign * STEP[axis]
+            # rounded: steps back to standing end at 0
+            self._command[axis] = np.clip(np.round(changed, 6), -LARGEST[axis], LARGEST[axis])
 
     def watch(self, tick: Tick) -> None:
         """Show a tick, a few times a second."""
@@ -80,7 +80,7 @@ class Driver:
 
     @contextmanager
     def driving(self) -> Iterator[Driver]:
-        """Keys come one by one, unseen, for as long as the block.
+        """Read keys one by one, without echo, during the block.
 
         Raises
         ------
@@ -104,10 +104,10 @@ def _table(tick: Tick, age_s: np.ndarray) -> Table:
     shown = terminal.table(
         f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
         f"{turn:+.2f} rad/s\n{_HELP}",
-        "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "room rad",
+        "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "margin rad",
     )  # fmt: skip
     for i, joint in enumerate(JOINT_NAMES):
-        room = tick.decision.room[i]
+        room = tick.decision.margin[i]
         shown.add_row(
             joint, terminal.number(tick.sent[i], 3),
             terminal.number(float(tick.reading.position_rad[i]), 3), terminal.ms(age_s[i], 0),

@@ -273,7 +273,7 @@ def scale(policies: Policies) -> Finding:
     }
     errors = {s: float(np.mean([r.mae_vx_m_s for r in found])) for s, found in rows.items()}
     ours = ", ".join(
-        f"{s:g} rad: {100 * np.mean([r['survival'] for r in found]):.0f} % up, {errors[s]:.3f} m/s"
+        f"{s:g} rad: {100 * np.mean([r.survival for r in found]):.0f} % up, {errors[s]:.3f} m/s"
         for s, found in rows.items()
     )
     best = min(errors, key=lambda s: errors[s] if np.isfinite(errors[s]) else np.inf)

@@ -63,6 +63,16 @@ class Walk:
     swing_s: float
     slip_m_s: float
 
+    @property
+    def error(self) -> NDArray[np.float64]:
+        """Mean absolute errors, shape (episodes, 3)."""
+        return tracking_errors(self.velocity, self.command, self.alive)
+
+    @property
+    def commanded(self) -> NDArray[np.float64]:
+        """Mean absolute command: the error of a robot that stands still, shape (episodes, 3)."""
+        return tracking_errors(np.zeros_like(self.velocity), self.command, self.alive)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Standing(Result):
@@ -247,9 +257,7 @@ def evaluate(
     return Evaluation(
         **_figures(overall),
         episodes=episodes,
-        standing_still=Standing(
-            **_errors(np.zeros_like(overall.velocity), overall.command, overall.alive)
-        ),
+        standing_still=Standing(**named(overall.commanded.mean(axis=0))),
         actuator=servos.source,
         feedback=feedback,
         terrain=task.terrain,
@@ -271,12 +279,8 @@ def evaluate(
 def _figures(found: Walk) -> dict:
     return {
         "fall_rate": float(found.fell.mean()),
-        **_errors(found.velocity, found.command, found.alive),
+        **named(found.error.mean(axis=0)),
         "duty": tuple(found.contact[found.alive].mean(axis=0).tolist()),
         "swing_s": found.swing_s,
         "foot_slip_m_s": found.slip_m_s,
     }
-
-
-def _errors(velocity, command, alive) -> dict[str, float]:
-    return named(tracking_errors(velocity, command, alive).mean(axis=0))

@@ -127,7 +127,7 @@ def autonomy_figure(tests: Mapping[str, Autonomy]) -> Figure:
         for row, mark in zip(found.push, ("x", "o"), strict=False):  # none if no robot walked
             shifts.plot(
                 row.phases, row.shifts, mark, ms=3, color=colour, ls="",
-                label=f"{policy}, {row['push_m_s']:g} m/s",
+                label=f"{policy}, {row.push_m_s:g} m/s",
             )  # fmt: skip
         rates.plot(
             [r.rate_hz for r in found.rate], [r.frequency_hz for r in found.rate],

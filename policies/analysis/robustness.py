@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,13 +128,15 @@ def ablation(
             steps = max(round(ms / 1e3 / plain.step_s), 1)
             cases.append(("hold", ms, NAN, partial(perturbations.held, part, steps)))
         for kind, level, size, change in cases:
-            row = partial(AblationPoint, channel=name, kind=kind, level=level, sigma=size)
+            row: dict[str, Any] = {"channel": name, "kind": kind, "level": level, "sigma": size}
             if kind == "noise" and not walked:
-                found.append(row(correlation=NAN))
+                found.append(AblationPoint(**row, correlation=NAN))
                 continue
             closed_loop = outcome(trial.walk(policy, change()))
             actions, _ = replay(policy, perturbations.applied(change(), plain.observation))
-            found.append(row(correlation=_agreement(plain, actions), **closed_loop))
+            found.append(
+                AblationPoint(**row, correlation=_agreement(plain, actions), **closed_loop)
+            )
     return found
 
 

@@ -1,4 +1,4 @@
-"""A controller from its parts: policy, stack, observer, and the check that they belong together."""
+"""Assembly of a controller from policy, stack and observer, with a check that they match."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 
 @dataclass(frozen=True)
 class Assembly:
-    """A controller, and what was found while it was put together.
+    """A controller, with the comparison of its observer and the header of its log.
 
     Attributes
     ----------
     controller : Controller
     match : Match
-        What the observer will say of this robot against the actuator the policy was trained with.
+        The observer on this robot compared with the actuator the policy was trained with.
     header : dict
-        What a log must say so that the same can be put together again.
+        Everything that `reassemble` needs.
     """
 
     controller: Controller
@@ -47,7 +47,7 @@ def assemble(
     servo: Path | None,
     trained: str | None = None,
 ) -> Assembly:
-    """Put a controller together.
+    """Make a controller.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def assemble(
     joint_map : JointMap
         Of the bus, in joint coordinates.
     actuator : str
-        Calibration or preset of the robot at hand, which a simulated PD moves like.
+        Calibration or preset of the robot, for a simulated PD.
     servo : Path or None
         A learned servo model's folder.
     trained : str, optional
@@ -75,7 +75,7 @@ def assemble(
     model = None
     if stack.observer == "servo-model" and servo is not None:
         if not servo.is_dir():
-            raise InputError(f"--servo {servo}: there is no such folder.")
+            raise InputError(f"`servo` is {servo}: there is no such folder.")
         model = servo_model_of(servo, period)
     observer = make_observer(
         stack.observer, period, contract.velocity_steps, parameters,
@@ -119,7 +119,7 @@ def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:
         raise InputError(f"{log}: its header is damaged: {error}.") from error
     if changed:
         file = header[changed[0].removesuffix("_sha256")]
-        raise InputError(f"{log} was made with another file at {file}. Put that back.")
+        raise InputError(f"{log} was made with another file at {file}. Restore that file.")
     return found.controller
 
 

@@ -1,4 +1,4 @@
-"""What a robot is told to do over time: always the same, or a script."""
+"""Velocity commands over time: constant, or from a script."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 
 Commands = Callable[[float], NDArray[np.float64] | None]
-"""Forward and sideways speed [m/s] and turn rate [rad/s], so many seconds after the first tick;
-None to stop."""
+"""Forward and sideways speed [m/s] and turn rate [rad/s] by time since the first tick [s]; None to
+stop."""
 
 COLUMNS = ("seconds", "forward_m_s", "left_m_s", "turn_rad_s")
 _LARGEST = 2.0
 
 
 def constant(command: tuple[float, float, float]) -> Commands:
-    """The same command for ever.
+    """A constant command.
 
     Raises
     ------
     InputError
-        If it is no motion this robot could be asked for.
+        If it is out of range.
     """
-    told = np.array(command, float)
-    if not np.isfinite(told).all() or np.abs(told).max() > _LARGEST:
+    value = np.array(command, float)
+    if not np.isfinite(value).all() or np.abs(value).max() > _LARGEST:
         raise InputError(
-            f"--command {' '.join(map(str, command))}: each must be within ±{_LARGEST:g} "
+            f"`command` is {' '.join(map(str, command))}; each must be within ±{_LARGEST:g} "
             "(m/s, m/s, rad/s)."
         )
-    return lambda elapsed_s: told
+    return lambda elapsed_s: value
 
 
 def script(path: Path) -> Commands:
-    """Commands of a CSV file with `COLUMNS`, one row after the other; then stop.
+    """Commands of a CSV file with `COLUMNS`, one row after another, then a stop.
 
     Raises
     ------
@@ -61,8 +61,8 @@ def script(path: Path) -> Commands:
         )
     ends = np.cumsum(rows[:, 0])
 
-    def told(elapsed_s: float) -> NDArray[np.float64] | None:
+    def command(elapsed_s: float) -> NDArray[np.float64] | None:
         row = int(np.searchsorted(ends, elapsed_s, side="right"))
         return rows[row, 1:] if row < len(rows) else None
 
-    return told
+    return command

@@ -1,12 +1,12 @@
-"""The controller: from what a robot senses in one tick to where its joints are sent.
+"""The controller: from a robot's sensors in one tick to its joint targets.
 
-It is a pure function of its inputs and of its own state: it reads no clock and talks to no bus, so
-that a log of its inputs gives the same actions again, bit for bit (`policies.deploy.walk_log`).
+A pure function of its inputs and its own state, without clock or bus: a log of its inputs gives the
+same actions again, bit for bit (`policies.deploy.walk_log`).
 
     controller = Controller(policy, stack, observer)
     controller.reset(position, rest)          # standing, at rest
     for senses in ...:
-        decision = controller.step(senses)    # decision.target is what to send
+        decision = controller.step(senses)    # decision.target goes to the servos
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PUBLISHED_SPEED_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Senses:
-    """What came in at a tick.
+    """Inputs of a tick.
 
     Attributes
     ----------
@@ -57,23 +57,23 @@ class Senses:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the controller made of it.
+    """Outputs of a tick.
 
     Attributes
     ----------
     observation : ndarray of float32, shape (60,)
     action : ndarray of float32, shape (12,)
-        Of the policy, as it is.
+        Raw output of the policy.
     target : ndarray, shape (12,)
         Joint angles to send [rad], within the limits.
-    room : ndarray, shape (12,)
-        How far each target is from its nearest limit [rad].
+    margin : ndarray, shape (12,)
+        Distance of each target from its nearest limit [rad].
     """
 
     observation: NDArray[np.float32]
     action: NDArray[np.float32]
     target: Array
-    room: Array
+    margin: Array
 
 
 class Controller:
@@ -86,14 +86,14 @@ class Controller:
     observer : Observer
         In servo coordinates, at the loop's period.
     joint_map : JointMap
-        Of the bus, in joint coordinates: limits, and how the knees are linked.
+        Of the bus, in joint coordinates: limits, and the linkage of the knees.
     stall_torque_nm : float
         Torque at a reported load of 1 [N·m].
 
     Raises
     ------
     InputError
-        If the policy expects another observation than this gives.
+        If the policy expects another observation.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Controller:
             else None
         )
         self._attitude = ComplementaryFilter()
-        self._told = self.default.copy()
+        self._target = self.default.copy()
         self._action = np.zeros(len(JOINT_NAMES), np.float32)
         self._last_s: float | None = None
         self._rate = np.zeros(3)
@@ -133,13 +133,13 @@ class Controller:
         Parameters
         ----------
         position : ndarray, shape (12,)
-            Where the joints are [rad], and have been told to be.
+            Position and target of the joints [rad].
         rest : Rest
             Bias of the gyroscope and direction of gravity, measured at rest.
         """
         self.observer.reset(self.to_servo(position))
         self._attitude.reset(rest)
-        self._told = np.asarray(position, float).copy()
+        self._target = np.asarray(position, float).copy()
         self._action = np.zeros(len(JOINT_NAMES), np.float32)
         self.policy.reset(self._action[None])
         if self._smooth:
@@ -157,11 +157,11 @@ class Controller:
         """
         since = self.period_s if self._last_s is None else senses.elapsed_s - self._last_s
         self._last_s = senses.elapsed_s
-        heard = np.isfinite(senses.rate).all() and np.isfinite(senses.acceleration).all()
-        if heard:
+        answered = np.isfinite(senses.rate).all() and np.isfinite(senses.acceleration).all()
+        if answered:
             self._rate = senses.rate
-        # without an answer the trunk is taken to turn on; no force is no direction
-        force = senses.acceleration if heard else np.zeros(3)
+        # without an IMU sample the trunk is assumed to turn on; zero force has no direction
+        force = senses.acceleration if answered else np.zeros(3)
         attitude = self._attitude.step(self._rate, force, since)
         joints = self._estimate(senses)
         observation = np.concatenate(
@@ -185,19 +185,19 @@ class Controller:
         fade = self.stack.fade_in_s
         grown = min(senses.elapsed_s / fade, 1.0) if fade > 0 else 1.0
         target = self._limits.clip(self.default + grown * self._scale * sent)
-        self._told = target
+        self._target = target
         return Decision(observation, action, target, self._limits.margin(target))
 
     def _estimate(self, senses: Senses) -> JointEstimate:
-        """Where the joints are, as the policy is told, in joint coordinates."""
-        found = self.observer.step(self.to_servo(self._told), self.to_servo(senses.position))
+        """The joints as the policy observes them, in joint coordinates."""
+        found = self.observer.step(self.to_servo(self._target), self.to_servo(senses.position))
         position = _apply(self._to_joint, found.position)
         velocity = found.velocity @ self._to_joint[0]
         measured = self.stack.observer == "readings"
         return JointEstimate(position, velocity, senses.load if measured else found.effort)
 
     def _speed(self, command: Array) -> Array:
-        """The trunk's speed, which nobody measures: zeros, or the paper's guess from commands."""
+        """The trunk's speed, not measured: zeros, or the paper's estimate from commands."""
         if self.policy.contract.base_velocity == "zero":
             return np.zeros(3)
         return np.array([*(_PUBLISHED_SPEED_SHARE * command[:2]), 0.0])
@@ -208,13 +208,13 @@ class Controller:
 
 
 def _affine(source: JointMap, target: JointMap) -> tuple[Array, Array]:
-    """Matrix and constant that turn angles of one map into those of another of the same counts."""
+    """Matrix and constant of the conversion between two maps of the same counts."""
     constant = target.to_angles(source.to_counts(np.zeros(len(JOINT_NAMES))))
     return target.to_angles(source.to_counts(np.eye(len(JOINT_NAMES)))) - constant, constant
 
 
 def _apply(affine: tuple[Array, Array], angles: Array) -> Array:
-    """Each row of the matrix is what one source angle moves; a missing angle stays its own."""
+    """Convert angles; a missing one makes only those missing that depend on it."""
     matrix, constant = affine
     missing = np.isnan(angles)
     if not missing.any():

@@ -1,9 +1,9 @@
-"""What a real robot's signals pass through on their way to and from a policy.
+"""Filters between a robot's signals and a policy.
 
-`LowPass` smooths the joint targets before they reach the servos. `ComplementaryFilter` makes the
-trunk's rate and the direction of gravity, which a policy sees, from an IMU: the gyro turns the
-gravity it knows, and the accelerometer pulls it, slowly, to where the mean force points. `at_rest`
-makes the filter's start from some samples of a robot that stands still.
+`LowPass` smooths the joint targets before they reach the servos. `ComplementaryFilter` estimates
+the trunk's rate and the direction of gravity from an IMU: the gyro turns the last estimate of
+gravity, and the accelerometer slowly corrects it towards the mean force. `at_rest` determines the
+filter's start from samples of a robot that stands still.
 
 The body's frame is the simulator's: x forward, y left, z up. Rates are radians per second, right
 handed. Accelerations are what an ideal accelerometer measures, the specific force: +9.81 m/s² on z
@@ -24,8 +24,8 @@ from pupper_sysid.common.errors import InputError
 
 Array = NDArray[np.float64]
 
-_SHORTEST_S = 1e-3  # what a clock that has not moved counts as
-_NO_FORCE_M_S2 = 0.1  # free fall, or a failed read of zeros: no direction in it
+_SHORTEST_S = 1e-3  # least time between samples
+_NO_FORCE_M_S2 = 0.1  # below: free fall, or a failed read of zeros
 _FULL_SCALE = 0.999  # the highest positive code is one short of the range's end
 
 _FEWEST_SAMPLES = 20
@@ -43,7 +43,7 @@ class LowPass:
     Parameters
     ----------
     cutoff_hz : float
-        Where the gain is 1/√2 [Hz]; below half of `rate_hz`.
+        At which the gain is 1/√2 [Hz]; below half of `rate_hz`.
     rate_hz : float
         Samples per second.
     channels : int
@@ -68,15 +68,15 @@ class LowPass:
     def __init__(self, cutoff_hz: float, rate_hz: float, channels: int):
         if not 0 < cutoff_hz < rate_hz / 2:
             raise InputError(
-                f"A low-pass filter at {rate_hz:g} samples per second was asked to cut off at "
-                f"{cutoff_hz:g} Hz; it must be below half the rate, {rate_hz / 2:g} Hz."
+                f"The cut-off of the low-pass filter is {cutoff_hz:g} Hz at {rate_hz:g} samples "
+                f"per second; it must be below half the rate, {rate_hz / 2:g} Hz."
             )
         self._sos = np.asarray(signal.butter(2, cutoff_hz, fs=rate_hz, output="sos"))
         self._shape = (channels,)
         self.reset(np.zeros(channels))
 
     def reset(self, value: ArrayLike) -> None:
-        """Be as if `value`, shape (channels,), had been the input for ever."""
+        """Set the steady state of the constant input `value`, shape (channels,)."""
         value = _finite(value, self._shape, "A low-pass filter's value")
         self._state = signal.sosfilt_zi(self._sos)[0][:, None] * value
 
@@ -93,7 +93,7 @@ class LowPass:
 
 @dataclass(frozen=True)
 class Attitude:
-    """What an IMU says of the trunk.
+    """The trunk's motion from an IMU.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Attitude:
     gravity : ndarray, shape (3,)
         Unit vector, the direction of gravity in the trunk's frame: (0, 0, -1) when level.
     clipped : bool
-        Whether the accelerometer was at its limit, and so was not believed.
+        Whether the accelerometer was at its limit, and so was ignored.
     """
 
     rate_rad_s: Array
@@ -112,14 +112,14 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Rest:
-    """Where a `ComplementaryFilter` starts.
+    """Start of a `ComplementaryFilter`.
 
     Attributes
     ----------
     gravity : ndarray, shape (3,)
         Unit vector in the trunk's frame.
     bias_rad_s : ndarray, shape (3,)
-        What the gyro reports of a robot that does not turn.
+        Gyro reading of a robot that does not turn.
     """
 
     gravity: Array
@@ -127,28 +127,25 @@ class Rest:
 
 
 class ComplementaryFilter:
-    """Rate and gravity from gyro and accelerometer. See the module's text for frames and signs.
+    """Rate and gravity from gyro and accelerometer; frames and signs as in the module's docstring.
 
-    Gravity is fixed in the world, so in a frame that turns with rate ω it obeys
-
-        dg/dt = -ω × g,
-
-    which is integrated exactly over each sample. Then it moves towards the accelerometer's
-    -a / |a| by `weight`. Gravity is believed over many samples (time constant: period / weight, 2 s
-    at 25 Hz), so that the accelerations of single steps hardly tilt it.
+    Gravity is fixed in the world; in a frame that turns with rate ω, dg/dt = -ω × g, which is
+    integrated exactly over each sample. Then it moves towards the accelerometer's -a / |a| by
+    `weight`, with a time constant of period / weight (2 s at 25 Hz), so that the accelerations of
+    single steps hardly tilt it.
 
     Parameters
     ----------
     weight : float
         Share of the accelerometer in each sample, 0 ≤ weight < 0.5.
     limit_m_s2 : float
-        Full scale of the accelerometer's axes [m/s²]. Small robots' feet strike hard enough to
-        exceed ±2 g; a sample with an axis there has lost its direction.
+        Full scale of the accelerometer's axes [m/s²]. Footfalls of small robots exceed ±2 g; a
+        clipped sample has lost its direction.
 
     Attributes
     ----------
     clipped_samples : int
-        How many samples had an axis at the limit since `reset`.
+        Number of samples with an axis at the limit since `reset`.
 
     Raises
     ------
@@ -157,20 +154,20 @@ class ComplementaryFilter:
     """
 
     def __init__(self, weight: float = 0.02, limit_m_s2: float = 2 * STANDARD_GRAVITY):
-        if not 0 <= weight < 0.5:  # from there on an upside-down robot could cancel gravity out
+        if not 0 <= weight < 0.5:  # above, gravity of an upside-down robot could cancel out
             raise InputError(
                 f"A complementary filter's weight is {weight:g}; it must be in [0, 0.5)."
             )
         if not limit_m_s2 > STANDARD_GRAVITY:
             raise InputError(
-                f"A complementary filter was told that its accelerometer ends at {limit_m_s2:g} "
-                "m/s²; below 1 g it could never see gravity."
+                f"`limit_m_s2` of a complementary filter is {limit_m_s2:g}; below 1 g the "
+                "accelerometer could not measure gravity."
             )
         self.weight, self.limit_m_s2 = weight, limit_m_s2
         self.reset(Rest(gravity=np.array([0.0, 0.0, -1.0]), bias_rad_s=np.zeros(3)))
 
     def reset(self, rest: Rest) -> None:
-        """Start from rest, as `at_rest` found it.
+        """Start from rest; see `at_rest`.
 
         Raises
         ------
@@ -191,7 +188,7 @@ class ComplementaryFilter:
         Parameters
         ----------
         gyro_rad_s : array_like, shape (3,)
-            As the gyro reports it; the bias is subtracted here.
+            With the gyro's bias.
         acceleration_m_s2 : array_like, shape (3,)
             Specific force.
         dt_s : float
@@ -228,7 +225,7 @@ def at_rest(gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike) -> Rest:
     ------
     InputError
         If there are too few, the robot moved, it stands tilted by more than 30°, or the
-        accelerometer does not measure 1 g; the sentence says which, and what to do.
+        accelerometer does not measure 1 g.
     """
     rates = np.asarray(gyro_rad_s, float)
     forces = np.asarray(acceleration_m_s2, float)
@@ -267,7 +264,7 @@ def at_rest(gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike) -> Rest:
 
 
 def _turned(vector: Array, rotation: Array) -> Array:
-    """`vector` turned about the axis of `rotation`, by its length [rad] (Rodrigues' formula)."""
+    """`vector` turned by the rotation vector `rotation` [rad] (Rodrigues' formula)."""
     angle = math.hypot(*rotation.tolist())
     if angle == 0:
         return vector
@@ -283,12 +280,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _finite(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
-    """`value` as an array of its own, of this shape and without NaN, which a filter never forgets.
-
-    Raises
-    ------
-    InputError
-    """
+    """A copy of `value`, refused if of another shape or not finite: NaN would stay in a filter."""
     array = np.array(value, float)
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}; it must be {shape}.")

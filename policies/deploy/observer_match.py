@@ -1,10 +1,9 @@
-"""Does an observer move like the actuator a policy was trained with? Asked before it is deployed.
+"""Comparison of an observer with the actuator a policy was trained with, before deployment.
 
-A policy has learned how far and how late its joints follow its targets. `compare` drives the
-observer and the trained actuator with the same sines, at every frequency up to that of a gait, and
-says where they differ most. The paper's observer, for one, swings three times as far as it is told
-at 3 Hz, where the actuator that its policies were trained with does not resonate at all
-(facts/paper.md, sections 5.2 and 7).
+A policy has learned how far and how late its joints follow its targets. `compare` drives observer
+and trained actuator with the same sines, at frequencies up to that of a gait, and finds where they
+differ most. The paper's observer, for example, has a gain of three at 3 Hz, where the actuator of
+its training has no resonance.
 """
 
 from __future__ import annotations
@@ -16,20 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, KINDS
+from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.policies.deploy.observers import Observer, SyntheticPD
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 
 FREQUENCIES_HZ = np.arange(2, 25) / 4
-"""Where the two are compared: up to the band of a gait [Hz]."""
+"""Frequencies of the comparison, up to the band of a gait [Hz]."""
 
 AMPLITUDE_RAD = 0.15
-"""How far a walking policy swings its targets, about: friction and limits depend on it [rad]."""
+"""Typical amplitude of a walking policy's targets; friction and limits depend on it [rad]."""
 
 MOST_GAIN_ERROR = 0.25
-"""How much farther or less far an observer may swing, as a share of the actuator's swing."""
+"""Largest accepted deviation of the gain ratio from 1."""
 
 MOST_PHASE_DEG = 20.0
-"""At 6 Hz 9 ms, about what a calibration leaves open in a dead time."""
+"""Largest accepted phase difference: 9 ms at 6 Hz, about the uncertainty of a dead time."""
 
 _SETTLE_S = 3.0
 _WINDOW_S = 4.0
@@ -39,27 +39,27 @@ _STILL = 1e-9  # a gain below it has no phase
 def response(
     observer: Observer, frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float
 ) -> NDArray[np.complex128]:
-    """Frequency response of an observer to its targets, with no reading ever given to it.
+    """Frequency response of an observer to its targets, without readings.
 
-    Sines about the default pose, all frequencies side by side on a leading axis. After a settling
-    time, each response is fitted by least squares over a whole number of cycles. A target is held
-    for its control period and the estimate is of the period's end, so half a period of hold is part
-    of the lag, as it is on the robot.
+    Sines about the default pose, all frequencies on a leading axis. After a settling time, each
+    response is fitted by least squares over a whole number of cycles. A target is held for its
+    control period and the estimate is of the period's end, so the lag includes half a period of
+    zero-order hold, as on the robot.
 
     Parameters
     ----------
     observer : Observer
-        Left in some state: reset it before use.
+        Its state changes: reset it before use.
     frequencies_hz : array_like, shape (frequencies,)
         Below half the control rate.
     amplitude_rad : float
     period_s : float
-        Control period of the controller that the observer is meant for [s].
+        Control period [s].
 
     Returns
     -------
     ndarray of complex, shape (frequencies, 12)
-        Its size is how far a joint swings over how far it was told, its angle the phase.
+        Swing of a joint over that of its target; the angle is the phase.
 
     Raises
     ------
@@ -88,7 +88,7 @@ class Match:
 
     @property
     def gain_ratio(self) -> NDArray[np.float64]:
-        """How much farther the observer swings than the actuator, shape (frequencies, 12)."""
+        """Gain of the observer over that of the actuator, shape (frequencies, 12)."""
         return np.abs(self.observer) / np.abs(self.actuator)
 
     @property
@@ -113,21 +113,21 @@ class Match:
 
     @property
     def fits(self) -> bool:
-        """Whether a policy would hardly notice: see `MOST_GAIN_ERROR` and `MOST_PHASE_DEG`."""
+        """Whether both are within `MOST_GAIN_ERROR` and `MOST_PHASE_DEG`."""
         return self._gain_fits() and abs(self.worst_phase_difference_deg) <= MOST_PHASE_DEG
 
     def sentence(self) -> str:
-        """What to know before deploying: the worst place and both numbers there."""
+        """The worst frequency and both values there, as a sentence for the user."""
         if not self._gain_fits():
             i, j = self._worst_gain()
-            told, trained = abs(self.observer[i, j]), abs(self.actuator[i, j])
+            estimated, trained = abs(self.observer[i, j]), abs(self.actuator[i, j])
             meaning = (
                 "the policy would follow the observer's resonance instead of its legs"
-                if told > trained
+                if estimated > trained
                 else "the policy would not see how far its legs move"
             )
             return (
-                f"The observer swings {told:#.2g} times as far as commanded at "
+                f"The observer swings {estimated:#.2g} times as far as commanded at "
                 f"{self.frequencies_hz[i]:.1f} Hz where the trained actuator swings "
                 f"{trained:#.2g} times ({self._joints(i, j)}): {meaning}. {_ADVICE}"
             )
@@ -177,7 +177,7 @@ class Match:
         return _largest(np.abs(self.phase_difference_deg))
 
     def _joints(self, i: int, j: int) -> str:
-        """Joint `j`, or all joints if the others answer alike at frequency `i`."""
+        """Joint `j`, or all joints if their responses at frequency `i` are alike."""
         alike = all(np.allclose(h[i], h[i, j], atol=0.01) for h in (self.observer, self.actuator))
         return "all joints" if alike else JOINT_NAMES[j]
 
@@ -199,14 +199,13 @@ def compare(
     Parameters
     ----------
     observer : Observer
-        Left in some state: reset it before use. One that needs readings is given those of
-        `robot`.
+        Its state changes: reset it before use. Its readings are those of `robot`.
     actuator : DelayedPDParameters
         Scalars or arrays of 12: the middle of what training drew from.
     period_s : float
         Control period of the controller [s].
     robot : DelayedPDParameters, optional
-        Of the robot at hand; by default it is one of the training's.
+        Of the robot; by default that of the training.
 
     Raises
     ------
@@ -228,8 +227,10 @@ def compare(
     if robot is not None:
         readings = _drive(SyntheticPD(robot, period_s), targets, nothing, period_s)
     seen = _drive(observer, targets, readings, period_s)
-    told, trained = (_phasors(x, FREQUENCIES_HZ, period_s) / AMPLITUDE_RAD for x in (seen, moved))
-    return Match(FREQUENCIES_HZ.copy(), told, trained)
+    estimated, trained = (
+        _phasors(x, FREQUENCIES_HZ, period_s) / AMPLITUDE_RAD for x in (seen, moved)
+    )
+    return Match(FREQUENCIES_HZ.copy(), estimated, trained)
 
 
 def _sines(frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float) -> NDArray[np.float64]:
@@ -239,9 +240,8 @@ def _sines(frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float) -> 
         raise InputError("A frequency response needs a list of frequencies.")
     if not (np.all(frequencies > 0) and np.all(frequencies * period_s < 0.5)):
         raise InputError(
-            f"A frequency response was asked for at {frequencies.min():g} … "
-            f"{frequencies.max():g} Hz; a controller with a period of {period_s:g} s can only "
-            f"command between 0 and {0.5 / period_s:g} Hz."
+            f"The frequencies are {frequencies.min():g} … {frequencies.max():g} Hz; a controller "
+            f"with a period of {period_s:g} s can only command between 0 and {0.5 / period_s:g} Hz."
         )
     if not amplitude_rad > 0:
         raise InputError(f"The amplitude is {amplitude_rad:g} rad; it must be positive.")
@@ -278,10 +278,7 @@ def _phasors(
     for i, f in enumerate(np.asarray(frequencies_hz, float)):
         cycles = np.floor(window * f + 1e-9)
         last = slice(steps - round(cycles / f / period_s), None)
-        angle = 2 * np.pi * f * time[last]
-        design = np.column_stack([np.sin(angle), np.cos(angle), np.ones_like(angle)])
-        in_phase, quadrature, _ = np.linalg.pinv(design) @ positions[last, i]
-        found.append(in_phase + 1j * quadrature)
+        found.append(1j * fit_sine(2 * np.pi * f * time[last], positions[last, i]).phasor)
     return np.array(found)
 
 

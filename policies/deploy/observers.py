@@ -1,19 +1,16 @@
-"""Observers: what a policy is told about its joints where their encoders cannot be trusted.
+"""Observers: the joint positions, velocities and efforts in a deployed policy's observation.
 
-In the simulator a policy sees its joints as the measured bus would report them. On a robot the
-same is needed, or a substitute: a model of the servos that runs along with them and sees only what
-they are told (`SyntheticPD`, `ServoModelObserver`), the readings themselves (`HeldEncoder`), or
-nothing (`Zero`).
+In training a policy observes its joints as the measured bus would report them. On a robot it
+observes the readings themselves (`HeldEncoder`), a model of the servos driven by the same commands
+(`SyntheticPD`, `ServoModelObserver`), or joints at rest (`Zero`).
 
-An observer is asked once per control period, when it ends: `target` is what the servos were told
-for that period, `reading` what the bus reports at its end, and the estimate is of that instant. So
-a controller reads the bus, steps its observer with the target of the period that is over, and then
-lets the policy act.
+An observer steps at the end of each control period: `target` is the command of that period,
+`reading` the bus's report at its end, and the estimate is of that instant. A controller reads the
+bus, steps its observer with the target of the period that ended, and then the policy acts.
 
 Arrays are (..., 12) in the order of `common.joints.JOINT_NAMES`, with any leading axes
 (environments). Angles are radians in servo coordinates: one number per servo, as its `DelayedPD` or
-servo model was fitted (`hardware.joint_map.JointMap.per_servo`: a calf behind a push rod is told as
-if its thigh stood at the neutral). The caller converts from joint coordinates and back.
+servo model was fitted (see `hardware.joint_map.JointMap.per_servo`); the caller converts.
 """
 
 from __future__ import annotations
@@ -40,7 +37,7 @@ _PAPER_DELAY_STEPS = {0.02: 9, 0.04: 5}  # by control period: 180 and 200 ms
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """What an observer believes of the joints at the end of a control period.
+    """An observer's estimate of the joints at the end of a control period.
 
     Attributes
     ----------
@@ -49,7 +46,7 @@ class JointEstimate:
     velocity : ndarray, shape (..., 12)
         [rad/s]
     effort : ndarray, shape (..., 12)
-        Torque [N·m]; 0 where it is not known.
+        Torque [N·m]; 0 where unknown.
     """
 
     position: Array
@@ -58,15 +55,13 @@ class JointEstimate:
 
 
 class Observer(Protocol):
-    """Stands in for the encoders in what a policy sees. See the module's text."""
+    """Source of a policy's joint observation; see the module's docstring."""
 
     name: str
     period_s: float
 
     def reset(self, position: ArrayLike) -> None:
-        """Rest at `position` [rad], shape (..., 12), which sets the leading axes.
-
-        It has been the target, and the reading, for ever.
+        """Rest at `position` [rad], shape (..., 12), its target and reading so far.
 
         Raises
         ------
@@ -76,27 +71,27 @@ class Observer(Protocol):
         ...
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
-        """Let one control period pass, and say where the joints are at its end.
+        """Estimate the joints at the end of one more control period.
 
         Parameters
         ----------
         target : array_like, shape (..., 12)
-            What the servos were told for this period [rad].
+            Command of this period [rad].
         reading : array_like, shape (..., 12)
-            What the bus reports at its end [rad]; NaN where it reports nothing.
+            Reading at its end [rad]; NaN where there is none.
 
         Raises
         ------
         InputError
-            If what it uses of the two has another shape than at `reset`, or a target is not finite.
+            If one that is used has another shape than at `reset`, or a target is not finite.
         """
         ...
 
 
 class SyntheticPD:
-    """A simulated PD servo per joint: `DelayedPD`, held at joint limits, free-running on targets.
+    """A `DelayedPD` per joint, stopped at joint limits, in free run on targets.
 
-    Given the parameters the policy was trained with, this is the trained actuator in free air.
+    With the parameters of the training, it is the trained actuator in free air.
 
     Parameters
     ----------
@@ -155,9 +150,8 @@ class SyntheticPD:
         """The observer of the Mini Pupper 2 paper's deployment, to compare with.
 
         Stiffness 70, damping 1.2, inertia 0.20, friction 0.03, delay 9 control steps at 50 Hz and 5
-        at 25 Hz (facts/paper.md, 5.1 and 5.2). It resonates: near 3 Hz it swings three times as far
-        as it is told. As in the authors' final controller its torque has no limit, and the effort
-        it reports is 0.
+        at 25 Hz. It resonates: near 3 Hz its gain is three. As in the authors' final controller its
+        torque has no limit, and the effort it reports is 0.
 
         Raises
         ------
@@ -192,11 +186,11 @@ class SyntheticPD:
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; `reading` is not used."""
-        return self._servo.advance(_told(target, self._servo.batch), self._substeps)
+        return self._servo.advance(_checked_target(target, self._servo.batch), self._substeps)
 
 
 class _StoppedServo(DelayedPD):
-    """`DelayedPD` whose joint stops at its limits, and that says all of its state."""
+    """`DelayedPD` whose joint stops at its limits, with its whole state."""
 
     def __init__(
         self, parameters: DelayedPDParameters, time_step_s: float, low: Array, high: Array
@@ -205,7 +199,7 @@ class _StoppedServo(DelayedPD):
         self._low, self._high = low, high
 
     def longest_time_step_s(self) -> float:
-        """Beyond it the spring, integrated explicitly, feeds the oscillation [s].
+        """Longest time step for which the explicitly integrated spring is stable [s].
 
         With k and d, stiffness and damping over inertia, the characteristic polynomial
         (1 + h d) z² - (2 + h d - h² k) z + 1 leaves the unit circle at z = -1, where
@@ -235,18 +229,18 @@ class _StoppedServo(DelayedPD):
         own = self._values
         torque = own["stiffness"] * (setpoint - position) - own["damping"] * velocity
         limit = np.broadcast_to(own["effort_limit"], self.batch)
-        # nothing was said of a torque without a limit: its scale is anyone's guess
+        # the scale of a torque without a limit is unknown
         effort = np.where(np.isfinite(limit), np.clip(torque, -limit, limit), 0.0)
         return JointEstimate(position.copy(), velocity.copy(), effort)
 
 
 class ServoModelObserver:
-    """A learned servo model that free-runs on targets; it never looks at a reading.
+    """A learned servo model in free run on targets.
 
     Parameters
     ----------
     model : JointArrays
-        Of all twelve joints, in order, one step per control period. The observer owns its state.
+        Of all twelve joints, in order, one step per control period; the observer owns its state.
     period_s : float
         Control period [s].
 
@@ -263,7 +257,7 @@ class ServoModelObserver:
         if model.joints != JOINT_NAMES:
             raise InputError(
                 f"The servo model is of {', '.join(model.joints)}; an observer needs all twelve "
-                "joints, in order. Fit it with --joints all."
+                "joints, in order: fit one for all joints."
             )
         if not same_rate(model.time_step_s, period_s):
             raise InputError(
@@ -280,16 +274,16 @@ class ServoModelObserver:
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; `reading` is not used. Effort is not known."""
-        position = self._model.step(_told(target, self._position.shape)).astype(float)
+        position = self._model.step(_checked_target(target, self._position.shape)).astype(float)
         velocity = (position - self._position) / self.period_s
         self._position = position
         return JointEstimate(position.copy(), velocity, np.zeros_like(position))
 
 
 class HeldEncoder:
-    """The readings themselves, as `sim.walking.env` shows them to the policy in training.
+    """The readings themselves, as the policy observes them in training.
 
-    A missing reading leaves the last one in place. Velocity is the difference of the readings
+    A missing reading is replaced by the last one. Velocity is the difference of readings
     `velocity_steps` control periods apart: cheap buses poll too rarely for less.
 
     Parameters
@@ -330,7 +324,7 @@ class HeldEncoder:
 
 
 class Zero:
-    """Joints that rest for ever: what a policy does when it is told nothing of its legs.
+    """Joints that always rest: a walk without joint feedback.
 
     Parameters
     ----------
@@ -366,7 +360,7 @@ def _positive(period_s: float) -> float:
 
 
 def _resting(position: ArrayLike) -> Array:
-    """An observer's first position, checked, as an array of its own."""
+    """A copy of an observer's first position, checked."""
     position = np.array(position, float)
     if position.shape[-1:] != (_JOINTS,):
         raise InputError(
@@ -378,8 +372,8 @@ def _resting(position: ArrayLike) -> Array:
     return position
 
 
-def _told(target: ArrayLike, batch: tuple[int, ...]) -> Array:
-    """A target, checked: one NaN would stay in a model's state for ever."""
+def _checked_target(target: ArrayLike, batch: tuple[int, ...]) -> Array:
+    """A checked target: one NaN would stay in a model's state."""
     target = _spread(target, batch, "A target")
     if not np.isfinite(target).all():
         raise InputError("A target is not finite: the policy or a filter before it failed.")
@@ -404,7 +398,7 @@ def make_observer(
     limits_rad: tuple[ArrayLike, ArrayLike],
     servo_model: JointArrays | None,
 ) -> Observer:
-    """The observer that a stack names.
+    """The observer of a stack.
 
     Parameters
     ----------
@@ -417,14 +411,14 @@ def make_observer(
     actuator : DelayedPDParameters
         Each (12,), for `synthetic-pd`.
     limits_rad : tuple of ndarray, shape (12,)
-        Of the servos' angles, where a simulated one stops.
+        Limits of the servos' angles, for a simulated servo.
     servo_model : JointArrays or None
         For `servo-model`.
 
     Raises
     ------
     InputError
-        If a servo model is asked for and none is given, or it does not fit.
+        If a servo model is needed and none is given, or it does not fit.
     """
     if kind == "readings":
         return HeldEncoder(period_s, velocity_steps)
@@ -436,7 +430,7 @@ def make_observer(
         return Zero(period_s)
     if servo_model is None:
         raise InputError(
-            "This stack shows the policy a servo model's prediction: name one with --servo FOLDER "
+            "This stack uses a servo model's prediction: give one with `servo` "
             "(`pupper-sysid fit-servo` makes one)."
         )
     return ServoModelObserver(servo_model, period_s)

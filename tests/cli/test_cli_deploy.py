@@ -140,7 +140,7 @@ def test_the_shipped_policies_are_tried_from_any_folder(capsys, here):
         ((POLICY, "--actuator", CALIBRATION, "--command", "9", "0", "0"), "--command"),
         ((POLICY, "--actuator", CALIBRATION, "--lowpass-hz", "40"), "half the rate"),
         ((POLICY, "--actuator", CALIBRATION, "--keyboard"), "terminal"),
-        ((POLICY, "--replay", "nowhere.csv"), "cannot be read"),
+        ((POLICY, "--replay", "nowhere.csv"), "does not exist"),
         ((POLICY, "--seconds", "-1"), "--seconds"),
         ((POLICY, "--seed", "-1"), "--seed is -1"),
     ],

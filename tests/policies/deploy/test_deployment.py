@@ -293,7 +293,7 @@ def test_the_policy_is_shown_a_servo_model_in_place_of_readings(policy):
 
 
 def test_a_stack_that_lacks_its_servo_model_is_refused(policy):
-    with pytest.raises(InputError, match="--servo"):
+    with pytest.raises(InputError, match="`servo`"):
         assemble(policy, STACKS["lstm-servo"], JOINTS, CALIBRATION, None)
     with pytest.raises(InputError, match="no such folder"):
         assemble(policy, STACKS["lstm-servo"], JOINTS, CALIBRATION, Path("nowhere"))

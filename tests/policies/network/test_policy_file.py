@@ -290,18 +290,18 @@ def test_a_robot_that_stands_still_is_wrong_by_what_it_was_asked_and_what_it_mov
     found = walk(None, task, servo_ranges("ideal"), 6, 3, threads=1)
     assert not found.fell.any() and found.alive[:-1].all()
     moved = np.abs(found.velocity[:-1]).mean(axis=0)
-    assert (np.abs(found.error - found.asked) <= moved + 1e-9).all()
+    assert (np.abs(found.error - found.commanded) <= moved + 1e-9).all()
     # ideal servos stand still after a drop of 2 mm: what is left is the command
-    np.testing.assert_allclose(found.error.mean(axis=0), found.asked.mean(axis=0), rtol=0.05)
+    np.testing.assert_allclose(found.error.mean(axis=0), found.commanded.mean(axis=0), rtol=0.05)
     ends = np.array([RANDOM.forward_m_s[1], RANDOM.sideways_m_s[1], RANDOM.yaw_rad_s[1]])
-    assert (found.asked <= ends).all() and (found.asked > 0).all()
+    assert (found.commanded <= ends).all() and (found.commanded > 0).all()
 
 
 def test_the_error_is_that_of_the_command_given():
     task = evaluation_task(Walking(), 0.4)
     command = (0.15, -0.05, 0.4)
     found = walk(None, task, servo_ranges(CALIBRATION), 3, 3, command, threads=1)
-    np.testing.assert_allclose(found.asked, [np.abs(command)] * 3)
+    np.testing.assert_allclose(found.commanded, [np.abs(command)] * 3)
     expected = np.abs(found.velocity[:-1] - command).mean(axis=0)
     np.testing.assert_allclose(found.error, expected)
 
@@ -310,7 +310,7 @@ def test_the_share_of_falls_counts_each_robot_that_fell_once_and_no_time_out():
     task = evaluation_task(Walking(), 2.0)
     found = walk(Scripted(), task, servo_ranges(CALIBRATION), 6, 3, (0.0, 0.0, 0.0), threads=1)
     assert found.fell.tolist() == [False, True] * 3
-    assert summary(found)["fall_rate"] == 0.5
+    assert summary(found).fall_rate == 0.5
     lived = found.alive.sum(axis=0)
     assert (lived[1::2] < task.episode_steps - 1).all()
     assert (lived[::2] == task.episode_steps - 1).all()
@@ -319,15 +319,15 @@ def test_the_share_of_falls_counts_each_robot_that_fell_once_and_no_time_out():
 def test_an_evaluation_covers_all_commands_and_says_where():
     stages = []
     found = evaluate(
-        None, Walking(episode_s=0.1), servo_ranges(CALIBRATION), 5, 0, 1, stages.append
+        None, Walking(episode_s=0.1), servo_ranges(CALIBRATION), 5, 0, 1, progress=stages.append
     )
-    assert [row["name"] for row in found["by_command"]] == list(DIRECTIONS) == stages
-    assert [tuple(row["command"]) for row in found["by_command"]] == list(DIRECTIONS.values())
+    assert [row.name for row in found.by_command] == list(DIRECTIONS) == stages
+    assert [row.command for row in found.by_command] == list(DIRECTIONS.values())
     commands = np.array(list(DIRECTIONS.values()))
     for axis in range(3):
         assert (commands[:, axis] > 0).any() and (commands[:, axis] < 0).any()
     assert not commands[list(DIRECTIONS).index("stand")].any()
-    assert found["episodes"] == 5 and found["actuator"] == CALIBRATION
+    assert found.episodes == 5 and found.actuator == CALIBRATION
 
 
 def test_an_evaluation_has_no_pushes_no_curriculum_and_gentle_starts():
