@@ -16,11 +16,8 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import tyro
 
-from pupper_sysid.cli.flags import remember
-from pupper_sysid.cli.user_errors import end_politely, need_seed, user_errors
+from pupper_sysid.cli.user_errors import CONFIG, end_politely, parse, user_errors
 from pupper_sysid.common.errors import InputError
-
-CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
 class Command(NamedTuple):
@@ -69,13 +66,9 @@ def run_command(
             tyro.cli(functools.reduce(operator.or_, every), prog=program, args=left, config=CONFIG)
         chosen = _chosen(first, program, commands)
         kind = chosen.load()
-        command = tyro.cli(
-            kind, prog=f"{program} {first}", args=rest, config=CONFIG,
-            # a union has no docstring of its own, and Python's would be shown
-            description=None if isinstance(kind, type) else chosen.summary,
-        )  # fmt: skip
-        remember(command)
-        need_seed(command)
+        # a union has no docstring of its own, and Python's would be shown
+        described = None if isinstance(kind, type) else chosen.summary
+        command = parse(kind, rest, f"{program} {first}", described)
         end_politely()
         command.run()
 

@@ -1,15 +1,16 @@
-"""What all commands share: where words go, how a table looks, what a number looks like.
+"""Output of all commands: streams, tables, numbers, JSON, progress bars.
 
-Results go to stdout, everything else (progress, warnings, what to run next) to stderr, so that
-`--json` leaves one object on stdout and nothing else.
+Results go to stdout, everything else (progress, warnings, what to run next) to stderr: with
+`--json`, stdout is one JSON object.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ err = Console(stderr=True, highlight=False, markup=False)
 
 
 def load_all(paths: Sequence[Path]) -> list[Recording]:
-    """The recordings at `paths`, or the newest in `recordings/`; their warnings are shown."""
+    """Read `paths`, or the newest recording in `recordings/`, and show the warnings."""
     from pupper_sysid.sysid.recordings.files import load, newest_recording
 
     chosen = list(paths)
@@ -46,34 +47,31 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
 
 
 def pick_joints(recordings: Sequence[Recording], text: str) -> list[str]:
-    """Joints that were recorded and that `text` names."""
-    recorded: list[str] = []
-    for recording in recordings:
-        recorded += [j for j in recording.joints if j not in recorded]
-    return select_joints(text, recorded)
+    """Recorded joints that `text` names."""
+    return select_joints(text, list(dict.fromkeys(j for r in recordings for j in r.joints)))
 
 
 def print_json(value: Any) -> None:
-    """One JSON object on stdout; non-finite numbers become null."""
+    """Print one JSON object on stdout; non-finite numbers become null."""
     from pupper_sysid.common.results import plain
 
     print(json.dumps(plain(value), indent=2, ensure_ascii=False))
 
 
-def warn(sentences) -> None:
-    """Sentences the user should read, on stderr."""
+def warn(sentences: Iterable[str]) -> None:
+    """Print warnings on stderr, one per line."""
     for sentence in sentences:
         err.print(Text.assemble(("warning: ", "yellow"), spell(sentence)))
 
 
 def table(title: str, *columns: str) -> Table:
-    """An empty table in the house style; the first column is left-aligned text."""
+    """Empty table; the first column is left-aligned text, the others numbers."""
     made = Table(
         title=title, title_justify="left", title_style="bold", box=None, pad_edge=False,
-        min_width=min(len(title), out.width),  # or a long title is broken to a small table's width
+        min_width=min(len(title), out.width),  # a title is broken at the table's width
     )  # fmt: skip
     for k, column in enumerate(columns):
-        # folded, where it is too wide: a number that ends in … is none
+        # folded where it is too wide: a number cut off at … is another number
         made.add_column(
             column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold"
         )
@@ -86,7 +84,7 @@ def ms(seconds: float | None, digits: int = 1) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number, or a dash where there is none."""
+    """A number, or a dash if it is missing or not finite."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
@@ -103,9 +101,9 @@ def print_fleet(
     what: str,
     columns: Mapping[str, tuple[str, int]],
 ) -> None:
-    """A fleet's joints, servos unlike the others, recordings that failed, where it all is.
+    """Print a fleet's joints, outliers and failed recordings, and the files written.
 
-    `what` is made of each robot; `columns` has, by column of the fleet's table, title and digits.
+    `what` names the result per robot; `columns` gives title and digits by column of the table.
     """
     from pupper_sysid.sysid.identify.fleet import TABLE
 
@@ -121,7 +119,7 @@ def print_fleet(
     out.print(shown)
     for _, row in known.query("unlike != ''").iterrows():
         out.print(
-            f"{row['robot']} {row['joint']} is unlike its sisters: "
+            f"{row['robot']} {row['joint']} is an outlier: "
             f"{', '.join(str(row['unlike']).split(';'))}.",
             soft_wrap=True,
         )
@@ -135,7 +133,7 @@ def print_fleet(
 
 
 def cell(value: Any, digits: int) -> str:
-    """What a table shows of a value: numbers rounded, those of lists and dicts, too."""
+    """Text of a value for a table: numbers rounded, also within lists and dicts."""
     if isinstance(value, dict):
         return ", ".join(f"{k} {cell(v, digits)}" for k, v in value.items())
     if isinstance(value, list | tuple):
@@ -143,52 +141,40 @@ def cell(value: Any, digits: int) -> str:
     return number(value, digits) if isinstance(value, float) else str(value)
 
 
-@contextmanager
-def progress(label: str, total: int) -> Iterator[Any]:
-    """A progress bar on stderr if that is a terminal; yields `advance(what)`."""
-    with Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"),
-        TimeElapsedColumn(), console=err, disable=not err.is_terminal, transient=True,
-    ) as bar:  # fmt: skip
-        task = bar.add_task(label, total=total)
-
-        def advance(what: str = "") -> None:
-            bar.update(task, advance=1, description=f"{label} {what}".strip())
-
-        yield advance
-
-
-@contextmanager
-def share_progress(label: str) -> Iterator[Any]:
-    """A progress bar over shares of stages; yields `advance(what, share)`."""
-    with Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(), console=err, disable=not err.is_terminal, transient=True,
-    ) as bar:  # fmt: skip
-        task = bar.add_task(label, total=1.0)
-
-        def advance(what: str, share: float) -> None:
-            bar.update(task, completed=share, description=f"{label}: {what}")
-
-        yield advance
-
-
 def need_positive(name: str, value: float) -> None:
-    """Refuse an option that must be positive."""
+    """Refuse an option that is not a positive number."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}; it must be a positive number.")
 
 
 @contextmanager
+def progress(label: str, total: int) -> Iterator[Any]:
+    """Show a bar over steps; yields `advance(what)`."""
+    with _bar(label, total, "{task.completed}/{task.total}") as update:
+        yield lambda what="": update(advance=1, description=f"{label} {what}".strip())
+
+
+@contextmanager
+def share_progress(label: str) -> Iterator[Any]:
+    """Show a bar over shares of stages; yields `advance(what, share)`."""
+    with _bar(label, 1.0, "{task.percentage:3.0f} %") as update:
+        yield lambda what, share: update(completed=share, description=f"{label}: {what}")
+
+
+@contextmanager
 def seconds_progress(label: str, total_s: float) -> Iterator[Any]:
-    """A progress bar over seconds; yields `advance(done_s, total_s, what)`."""
+    """Show a bar over seconds; yields `advance(done_s, total_s, what)`."""
+    with _bar(label, total_s, "{task.completed:.0f} s") as update:
+        yield lambda done_s, total_s, what: update(
+            completed=done_s, total=total_s, description=f"{label} {what}"
+        )
+
+
+@contextmanager
+def _bar(label: str, total: float, count: str) -> Iterator[Any]:
+    """A progress bar on stderr if that is a terminal; yields its `update`."""
     with Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} s"),
-        TimeElapsedColumn(), console=err, disable=not err.is_terminal, transient=True,
+        TextColumn("{task.description}"), BarColumn(), TextColumn(count), TimeElapsedColumn(),
+        console=err, disable=not err.is_terminal, transient=True,
     ) as bar:  # fmt: skip
-        task = bar.add_task(label, total=total_s)
-
-        def advance(done_s: float, total: float, what: str) -> None:
-            bar.update(task, completed=done_s, total=total, description=f"{label} {what}")
-
-        yield advance
+        yield partial(bar.update, bar.add_task(label, total=total))

@@ -1,7 +1,7 @@
-"""How every command ends: 0, or 2 for what the user gave, or 1, and never with a traceback.
+"""Exit codes and errors of every program: 0, 2 for bad input, 1 for anything else.
 
-`--debug` shows the traceback after all. Every program also answers `--version`, and
-`--install-completion`, which teaches the shell its words.
+An error is one sentence; `--debug` shows the traceback. The options that every program has are
+here: `--debug`, `--version` and `--install-completion`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 from rich.text import Text
@@ -27,6 +27,7 @@ _COMPLETIONS = {
     "bash": ".local/share/bash-completion/completions/{}",
     "zsh": ".zfunc/_{}",
 }
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 Options = TypeVar("Options")
 
@@ -38,27 +39,34 @@ def run_program(
     description: str,
     arguments: Sequence[str] | None,
 ) -> None:
-    """Parse a program's arguments into `options` and do its `work`; ends the process on errors."""
+    """Parse a program's arguments into `options` and run `work`; ends the process on errors."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, program) as rest:
-        parsed = tyro.cli(
-            options, args=rest, description=description, prog=program,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )  # fmt: skip
-        remember(parsed)
-        need_seed(parsed)
-        work(parsed)
+        work(parse(options, rest, program, description))
 
 
-def need_seed(options: object) -> None:
-    """Refuse a negative `--seed`, which no generator takes."""
-    seed = getattr(options, "seed", 0)
+def parse(
+    options: Any,
+    arguments: Sequence[str],
+    program: str,
+    description: str | None = None,
+    **keywords: Any,
+) -> Any:
+    """Parse `arguments` into the dataclass `options` (or a union of some), within `user_errors`.
+
+    `keywords` are further ones of `tyro.cli`.
+    """
+    given = {"config": CONFIG, "description": description} | keywords
+    parsed = tyro.cli(options, args=arguments, prog=program, **given)
+    remember(parsed)
+    seed = getattr(parsed, "seed", 0)
     if seed < 0:
         raise InputError(f"--seed is {seed}; it must be a whole number from 0 on.")
+    return parsed
 
 
 def end_politely() -> None:
-    """End on SIGTERM and a closed terminal as on Ctrl-C: the robot is parked first."""
+    """Treat SIGTERM and a closed terminal as Ctrl-C, so that the robot is parked first."""
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt
@@ -71,29 +79,29 @@ def end_politely() -> None:
 
 @contextmanager
 def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
-    """Yields the arguments without `--debug`; what goes wrong inside becomes a sentence."""
+    """Yield the arguments without `--debug`; an exception inside becomes a sentence."""
     debug = "--debug" in arguments
     try:
         if "--version" in arguments:
-            _tell_version(program)
+            _print_version(program)
         if "--install-completion" in arguments:
             arguments = _completion(program)
         yield [a for a in arguments if a != "--debug"]
     except PupperError as error:
         if debug:
             raise
-        _tell(spell(str(error)))
+        _print_error(spell(str(error)))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         err.print("Stopped.")
         sys.exit(1)
-    except BrokenPipeError:  # `| head` closed its end: not our user's mistake
+    except BrokenPipeError:  # `| head` closed its end: no error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except Exception as error:
         if debug:
             raise
-        _tell(
+        _print_error(
             f"{type(error).__name__}: {error}. This is a defect of {program}; run again with "
             "--debug and report what it prints."
         )
@@ -102,19 +110,19 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         forget()
 
 
-def _tell(error: str) -> None:
+def _print_error(error: str) -> None:
     err.print(Text.assemble(("error: ", "red"), error), soft_wrap=True)
 
 
-def _tell_version(program: str) -> None:
-    """Name, version, and what shapes its numbers; ends the process."""
+def _print_version(program: str) -> None:
+    """Print the versions of the program and of the libraries behind its numbers; end."""
     own, *rest = versions().items()
     out.print(f"{program} {own[1]} ({', '.join(f'{k} {v}' for k, v in rest)})")
     sys.exit(0)
 
 
 def _completion(program: str) -> list[str]:
-    """Arguments with which tyro writes the completion of the user's shell where it looks for it."""
+    """Arguments with which tyro writes the completion file of the user's shell."""
     shell = Path(os.environ.get("SHELL", "")).name
     if shell not in _COMPLETIONS:
         raise InputError(

@@ -21,9 +21,8 @@ import tyro
 import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pupper_sysid.cli.flags import remember
 from pupper_sysid.cli.terminal import err, out, print_json
-from pupper_sysid.cli.user_errors import user_errors
+from pupper_sysid.cli.user_errors import parse, user_errors
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.train.run_file import Run, plain, preset
@@ -62,17 +61,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, "pupper-train") as rest:
-        options = _parse(rest)
-        remember(options)
-        _run(options, rest)
+        _run(_parse(rest), rest)
 
 
 def _parse(given: list[str]) -> Options:
     """Options; --preset and --policy decide what the other flags start from."""
     start = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind))
-    return tyro.cli(
-        Options, args=given, default=Options(start), description=DESCRIPTION, prog="pupper-train",
-        config=(tyro.conf.FlagCreatePairsOff,),
+    return parse(
+        Options, given, "pupper-train", DESCRIPTION,
+        default=Options(start), config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
 
 
