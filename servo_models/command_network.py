@@ -1,17 +1,17 @@
-"""CommandNetwork: where a servo will be, from the last commands it was given.
+"""CommandNetwork: servo position from the last commands, by a linear filter and a neural network.
 
 One model per joint, all joints computed at once. With `x` the last commands, newest first, each
-less its mean and over its spread in training,
+normalised by its mean and spread in training,
 
     position = centre + spread * (fir · x + fir_bias + bound * tanh(network(x) / bound))
 
-The first part is a linear filter (finite impulse response, FIR): the honest baseline, and all there
-is of a model without a network. The second, a feed-forward network with ReLU, corrects it by no
-more than `bound`: far from what it was trained on the model falls back to the linear one instead of
-inventing. No reading is needed, so a stale or dead encoder cannot mislead it.
+The first part is a linear filter (finite impulse response, FIR), the baseline; a model may have no
+other. The second, a feed-forward network with ReLU, corrects it by no more than `bound`, so that the
+model falls back to the linear one far from its training data. No reading is needed: stale feedback
+has no influence.
 
-A network may also be shown the position it predicted last (`feedback`), as the published servo
-models were; then errors can build up over time, and `bound` is infinite.
+With `feedback` the network's last input is the position it predicted last, as in the published
+servo models; then errors can build up over time, and `bound` is infinite.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.joint_arrays import JointArrays
 
 _FEW = 16
-"""Environments up to which all joints go through one call, because calls cost more than work."""
+"""Environments up to which all joints are computed in one call, since calls cost the most."""
 
 Parameters = Mapping[str, NDArray[np.floating]]
 

@@ -1,7 +1,7 @@
-"""AtControlRate: a model that steps at the rate of physics, asked once per command.
+"""AtControlRate: a model with physics steps, stepped once per command.
 
 `DelayedPD` and `SparseEquation` step every 2 ms or so; learned models step once per command of a
-controller, every 20 or 40 ms. Behind this wrapper they all answer the same question.
+controller, every 20 or 40 ms. This wrapper gives both the same interface.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class AtControlRate:
     count : int
         Steps of the model per command.
     offset_rad : array_like
-        Added to its positions: what its readings showed beside them.
+        Added to its positions [rad]: bias of the readings.
     """
 
     def __init__(self, model: ServoModel, count: int, offset_rad: ArrayLike = 0.0):

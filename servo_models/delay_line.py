@@ -1,16 +1,91 @@
-"""A delay line: commands reach the servo later than they were given, by any fraction of a step.
+"""Dead time of servo models: a line of commands, late by any fraction of a time step.
 
-Every servo model here meets its commands late. `DelayLine` holds what has been commanded but has
-not arrived yet, so that a model can be run piece by piece; `fractional_shift` is its arithmetic,
-which fitting calls on whole trials. Between time steps the command is interpolated linearly, as
-MuJoCo's `<pid delay nsample interp="linear">` does: for a command that changes on time steps this
-is the mean of the held command over the step, a continuous function of the delay.
+`DelayedServo` is the base of the models that integrate an equation of motion; `DelayLine` holds the
+commands that have been given and have not arrived yet; `fractional_shift` is its arithmetic, which
+fitting calls on whole trials. Between time steps the command is interpolated linearly, as MuJoCo's
+`<pid delay nsample interp="linear">` does: for a command that changes on time steps this is the
+mean of the held command over the step, a continuous function of the delay.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from pupper_sysid.common.errors import InputError
+
+
+class DelayedServo(ABC):
+    """A `ServoModel` that integrates an equation of motion under delayed commands.
+
+    Parameters
+    ----------
+    values : iterable of ndarray
+        All its numbers; their broadcast shape is the batch until `reset` widens it.
+    dead_time_s : ndarray
+        From a command's arrival to its first effect [s].
+    time_step_s : float
+        Time step [s]; commands and positions are at this step.
+
+    Raises
+    ------
+    InputError
+        If the time step is not positive.
+    """
+
+    def __init__(
+        self, values: Iterable[NDArray], dead_time_s: NDArray[np.float64], time_step_s: float
+    ):
+        refuse_time_step(type(self).__name__, time_step_s)
+        self.time_step_s = float(time_step_s)
+        self._own = np.broadcast_shapes(*(v.shape for v in values))
+        self._delay_line = DelayLine(dead_time_s, self.time_step_s)
+        self.reset(np.zeros(self._own))
+
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], which has been the command for as long as the dead time.
+
+        The batch becomes the shape to which `position` and the parameters broadcast.
+        """
+        position = np.asarray(position, float)
+        self.batch = np.broadcast_shapes(position.shape, self._own)
+        position = np.broadcast_to(position, self.batch)
+        self._rest(position)
+        self._delay_line.reset(position)
+
+    def step(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Advance one time step under `command` [rad]; returns the position after it."""
+        return self.rollout(np.broadcast_to(np.asarray(command, float), self.batch)[None])[0]
+
+    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
+        """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
+        commands = np.asarray(commands, float)
+        if commands.ndim == 1:  # one series for the whole batch
+            commands = commands.reshape(-1, *[1] * len(self.batch))
+        commands = np.broadcast_to(commands, (len(commands), *self.batch))
+        return self._integrate(self._delay_line.shift(commands))
+
+    @abstractmethod
+    def _rest(self, position: NDArray[np.float64]) -> None:
+        """Set the state to rest at `position`, of shape `batch`."""
+
+    @abstractmethod
+    def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions after each delayed command; advances the state."""
+
+
+def refuse_time_step(model: str, time_step_s: float) -> None:
+    """Refuse a time step [s] that is not a positive number.
+
+    Raises
+    ------
+    InputError
+    """
+    if not (np.isfinite(time_step_s) and time_step_s > 0):
+        raise InputError(f"{model}: time_step_s is {time_step_s}; it must be positive.")
 
 
 class DelayLine:

@@ -1,7 +1,7 @@
 """DelayedPD: a late, force-limited, speed-limited PD servo with dry friction, as MuJoCo steps it.
 
-One servo holds one joint whose inertia is `armature`. The goal reaches it `dead_time_s` late, its
-set-point moves at `velocity_limit` at most, and the torque
+One servo holds one joint whose inertia is `armature`. A command takes effect after `dead_time_s`;
+its set-point moves at `velocity_limit` at most, and the torque
 
     tau = clip(stiffness * (setpoint - position) - damping * velocity, ±effort_limit)
 
@@ -10,10 +10,10 @@ native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with 
 `frictionloss`, integrated with `implicitfast`; `tests/servo_models/test_delayed_pd.py` holds the
 two together:
 
-* delay: the command of the past, linearly interpolated between time steps. For a command that
+* dead time: the command of the past, linearly interpolated between time steps. For a command that
   changes on time steps this is the mean of the held command over the step, so the trajectory is a
-  continuous function of the delay;
-* speed limit: `slewmax`, a limit on the set-point's rate (a servo's goal speed);
+  continuous function of the dead time;
+* speed limit: `slewmax`, a limit on the set-point's rate (a servo's Goal_Speed);
 * friction: a constraint that removes the whole velocity in one time step if `friction_loss`
   allows it (`sim.robot.servo_mjcf`). MuJoCo's default friction is far softer than
   a servo's gears: it would still creep at 1 rad/s;
@@ -31,16 +31,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import DelayLine
+from pupper_sysid.servo_models.delay_line import DelayedServo
 
 TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""
 
 FRICTION_IMPEDANCE = 0.9999
+_TORQUES = ("stiffness", "damping", "friction_loss", "effort_limit")
 
 
 def whole_steps(low_s: float, high_s: float, time_step_s: float) -> tuple[int, int]:
-    """An interval of a delay [s] in whole time steps, rounded outward.
+    """An interval of a dead time [s] in whole time steps, rounded outward.
 
     Examples
     --------
@@ -74,32 +75,23 @@ class DelayedPDParameters:
     velocity_limit: ArrayLike
     dead_time_s: ArrayLike
 
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """The numbers as arrays, by name."""
+        return {f.name: np.asarray(getattr(self, f.name), float) for f in fields(self)}
+
     def per_inertia(self) -> DelayedPDParameters:
         """The same motion with an armature of 1: the ratios that free-air data identify."""
-        j = np.asarray(self.armature, float)
-        return replace(
-            self,
-            stiffness=np.asarray(self.stiffness) / j,
-            damping=np.asarray(self.damping) / j,
-            friction_loss=np.asarray(self.friction_loss) / j,
-            effort_limit=np.asarray(self.effort_limit) / j,
-            armature=np.ones_like(j),
-        )
+        values = self.arrays()
+        ratios = {name: values[name] / values["armature"] for name in _TORQUES}
+        return replace(self, **ratios, armature=np.ones_like(values["armature"]))
 
     def scaled(self, armature: ArrayLike) -> DelayedPDParameters:
         """The same motion with another armature."""
-        one, j = self.per_inertia(), np.asarray(armature, float)
-        return replace(
-            one,
-            stiffness=one.stiffness * j,
-            damping=one.damping * j,
-            friction_loss=one.friction_loss * j,
-            effort_limit=one.effort_limit * j,
-            armature=j,
-        )
+        ratios, armature = self.per_inertia().arrays(), np.asarray(armature, float)
+        return replace(self, **{n: ratios[n] * armature for n in _TORQUES}, armature=armature)
 
 
-class DelayedPD:
+class DelayedPD(DelayedServo):
     """The servo model that is fitted, and that training simulates. See the module's text.
 
     Parameters
@@ -112,54 +104,23 @@ class DelayedPD:
     Raises
     ------
     InputError
-        If a parameter is not finite, negative, or the armature or time step is zero.
+        If a parameter is not a number or is negative, or the armature or time step is zero.
     """
 
     def __init__(self, parameters: DelayedPDParameters, time_step_s: float = TIME_STEP_S):
-        if not (np.isfinite(time_step_s) and time_step_s > 0):
-            raise InputError(f"DelayedPD: time_step_s is {time_step_s}; it must be positive.")
-        values = {
-            f.name: np.asarray(getattr(parameters, f.name), float) for f in fields(parameters)
-        }
-        for name, value in values.items():
+        self.parameters, self._values = parameters, parameters.arrays()
+        for name, value in self._values.items():
             lowest = np.min(value)
-            # an infinite limit is a way to say "none"; everything else must be a number
+            # an infinite limit is no limit
             if np.isnan(value).any() or lowest < 0 or (name == "armature" and lowest == 0):
                 raise InputError(f"DelayedPD: {name} is {lowest}; it must be a positive number.")
-        self.parameters = parameters
-        self.time_step_s = float(time_step_s)
-        self._values = values
-        self._own = np.broadcast_shapes(*(v.shape for v in values.values()))
-        self._delay_line = DelayLine(values["dead_time_s"], self.time_step_s)
-        self.reset(np.zeros(self._own))
+        super().__init__(self._values.values(), self._values["dead_time_s"], time_step_s)
 
-    def reset(self, position: ArrayLike) -> None:
-        """Rest at `position` [rad], which has been the command for as long as the delay.
+    def _rest(self, position: NDArray[np.float64]) -> None:
+        self._state = (position.copy(), np.zeros(self.batch), position.copy())
 
-        The batch becomes the shape to which `position` and the parameters broadcast.
-        """
-        position = np.asarray(position, float)
-        self.batch = np.broadcast_shapes(position.shape, self._own)
-        position = np.broadcast_to(position, self.batch)
-        self._position = position.copy()
-        self._velocity = np.zeros(self.batch)
-        self._setpoint = position.copy()
-        self._delay_line.reset(position)
-
-    def step(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Advance one time step under `command` [rad]; returns the position after it."""
-        command = np.broadcast_to(np.asarray(command, float), self.batch)
-        return self.rollout(command[None])[0]
-
-    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
-        """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
-        commands = np.asarray(commands, float)
-        commands = np.broadcast_to(commands, (len(commands), *self.batch))
-        state = (self._position, self._velocity, self._setpoint)
-        positions, state = integrate(
-            self._delay_line.shift(commands), state, self._values, self.time_step_s
-        )
-        self._position, self._velocity, self._setpoint = state
+    def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
+        positions, self._state = integrate(delayed, self._state, self._values, self.time_step_s)
         return positions
 
 
@@ -171,15 +132,15 @@ def integrate(
     out: NDArray[np.float64] | None = None,
     implicit: bool = True,
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:
-    """Step the servo through commands that have already been delayed: the inner loop of fitting.
+    """Step the servo through commands that have already been delayed; the inner loop of fitting.
 
     Parameters
     ----------
     delayed : ndarray, shape (steps, *batch)
-        Goal positions as the servo receives them [rad].
+        Commands as they take effect [rad].
     state : (position, velocity, setpoint), each of shape batch
     values : dict
-        Fields of `DelayedPDParameters` but the delay, each broadcastable to batch.
+        Fields of `DelayedPDParameters` but the dead time, each broadcastable to batch.
     time_step_s : float
     out : ndarray, optional
         Where the positions go; may be `delayed` itself.
@@ -196,10 +157,7 @@ def integrate(
     def flat(value):  # one contiguous axis: the fastest shape for the small steps below
         return np.ascontiguousarray(np.broadcast_to(value, batch), dtype=float).reshape(-1)
 
-    kp, kd, friction, effort = (
-        flat(values[name] / values["armature"])
-        for name in ("stiffness", "damping", "friction_loss", "effort_limit")
-    )
+    kp, kd, friction, effort = (flat(values[name] / values["armature"]) for name in _TORQUES)
     positions = np.empty(delayed.shape) if out is None else out
     flat_positions = positions.reshape(len(delayed), -1)  # a view: splitting or merging one axis
     delayed = delayed.reshape(len(delayed), -1)

@@ -1,9 +1,9 @@
-"""HeldFeedback: why a reading of a cheap servo bus is old, coarse and off, and does not say so.
+"""HeldFeedback: readings of a polled servo bus are stale, quantised and biased.
 
 The bus polls each servo once per `poll_period_s`. A poll fails with probability `loss` and then
-leaves the previous value in place. The host reads whatever is there. So a reading is the position
-at the last successful poll, plus `offset_rad`, rounded to `quantum_rad`; its age is between zero
-and many periods, on average `mean_age_s = poll_period_s * (1/2 + loss / (1 - loss))`.
+leaves the previous value in place, which the host reads. So a reading is the position at the last
+successful poll, plus `offset_rad`, rounded to `quantum_rad`; its age is between zero and many
+periods, on average `mean_age_s = poll_period_s * (1/2 + loss / (1 - loss))`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class HeldFeedback:
     Attributes
     ----------
     poll_period_s : float
-        Time between polls [s]; 0 if every read is a fresh one.
+        Time between polls [s]; 0 if every reading is fresh.
     loss : float
         Probability that a poll fails silently, 0 <= loss < 1.
     quantum_rad : float
-        Size of one count [rad]; 0 if readings are continuous.
+        Quantisation step [rad]; 0 if readings are continuous.
     offset_rad : float
         Reading minus position, constant [rad].
     """

@@ -1,4 +1,4 @@
-"""What every servo model can do: say where a servo will be, given what it was told."""
+"""Interface of servo models: predict servo position from commanded position."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class ServoModel(Protocol):
-    """A servo, or many: positions out, commands in, one fixed time step.
+    """One servo or a batch of servos with a fixed time step: commands in, positions out.
 
     All arrays share one trailing shape, the model's batch (joints, environments, trials,
     parameter candidates, or any combination that broadcasts). Angles are radians.
@@ -18,7 +18,7 @@ class ServoModel(Protocol):
     time_step_s: float
 
     def reset(self, position: ArrayLike) -> None:
-        """Rest at `position`, with that position as the only command ever given."""
+        """Rest at `position`, which has been the command for ever."""
         ...
 
     def step(self, command: ArrayLike) -> NDArray[np.floating]:

@@ -1,4 +1,4 @@
-"""What the learned servo models share: joints on the first axis inside, on the last one outside.
+"""Base of the learned servo models: parameters per joint, normalisation, layout of arrays.
 
 Inside, arrays are (joints, environments, …), so that one matrix product per joint serves all
 environments; outside they are (*environments, joints), as everywhere in this project.
@@ -14,20 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delay_line import refuse_time_step
 
 _SAME_RATE = 0.02
 
 
 def same_rate(one_s: float, other_s: float) -> bool:
-    """Whether a model may step every `other_s` that was fitted to commands every `one_s`.
-
-    A recorded rate is never quite the one that was asked for.
-    """
+    """Whether two time steps agree within 2 %: a recorded rate is never quite the nominal one."""
     return abs(one_s / other_s - 1) <= _SAME_RATE
 
 
 class JointArrays(ABC):
-    """Parameters per joint, normalisation, and the way in and out of the inner layout.
+    """A learned `ServoModel`; see the module's text.
 
     Parameters
     ----------
@@ -48,8 +46,7 @@ class JointArrays(ABC):
         time_step_s: float,
         parameters: Mapping[str, NDArray[np.floating]],
     ):
-        if not (np.isfinite(time_step_s) and time_step_s > 0):
-            raise InputError(f"A servo model's time step is {time_step_s}; it must be positive.")
+        refuse_time_step("A servo model", time_step_s)
         self.joints = tuple(joints)
         self.time_step_s = float(time_step_s)
         self.parameters = {k: np.ascontiguousarray(v, np.float32) for k, v in parameters.items()}
@@ -83,7 +80,7 @@ class JointArrays(ABC):
     @property
     @abstractmethod
     def memory(self) -> dict[str, NDArray[np.float32]]:
-        """What is remembered from step to step, writable, environments on axis 2 (1 of `last`)."""
+        """State between steps, writable; environments are on axis 2 (axis 1 of `last`)."""
 
     def reset_some(self, rows: NDArray[np.intp], position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (len(rows), joints), in environments `rows` only."""
@@ -99,7 +96,7 @@ class JointArrays(ABC):
     def one_step(
         self, commands: NDArray[np.floating], position: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """Positions after each command when the last position is measured instead of predicted.
+        """Positions after each command, each from the measured position before it (one-step).
 
         Parameters
         ----------

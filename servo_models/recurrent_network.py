@@ -1,13 +1,13 @@
-"""RecurrentNetwork: where a servo will be, from a memory of all it was told (LSTM).
+"""RecurrentNetwork: servo position from all past commands, by a linear filter and an LSTM.
 
-As `CommandNetwork`, but what corrects the linear filter is a long short-term memory network
-(Hochreiter and Schmidhuber 1997, with forget gates), several of them, whose outputs are averaged:
+As `CommandNetwork`, but the linear filter is corrected by the mean output of several long
+short-term memory networks (Hochreiter and Schmidhuber 1997, with forget gates):
 
     i, f, o = sigmoid(…), g = tanh(…) of  input · weight_input + hidden · weight_hidden + bias
     cell = f * cell + i * g,   hidden = o * tanh(cell)
     position = centre + spread * (fir · x + fir_bias + mean(bound * tanh(hidden · out / bound)))
 
-Its memory starts empty and is filled by `warm_up` steps at the position it rests at.
+Its memory starts empty and is filled by `warm_up` steps at the position of rest.
 """
 
 from __future__ import annotations

@@ -1,23 +1,24 @@
 """SparseEquation: a servo as one short, readable equation of motion.
 
     q̈ = stiffness · e + saturated_stiffness · sat(e, e₀)
-        − damping · q̇ − drag · q̇|q̇| − friction · sign(q̇),      e = u(t − delay) − q
+        − damping · q̇ − drag · q̇|q̇| − friction · sign(q̇),      e = u(t − dead time) − q
 
 `u` is the command, `q` the position, sat(e, e₀) is e clipped to ±e₀. A term whose coefficient is
-zero is absent. All is per unit of inertia, because free-air positions say no more. Each term is a
-part of a servo: `stiffness` is its proportional controller; `saturated_stiffness` the same with a
-limit on the motor's voltage, reached at an error of e₀; `damping` back-EMF and derivative action,
-`drag` what grows with the square of speed; `friction` is dry and stops the servo altogether where
-the drive is weaker than it.
+zero is absent. All coefficients are per unit of inertia, because positions in free air determine
+no more. Each term is a part of a servo: `stiffness` is its proportional controller;
+`saturated_stiffness` the same with a limit on the motor's voltage, reached at an error of e₀;
+`damping` is back-EMF and derivative action, `drag` grows with the square of speed; `friction` is
+dry (Coulomb) and holds the servo still where the drive is weaker.
 
-`integrate` is the only arithmetic: the fit, the class and the tests all run it. Damping and drag
-act on the mean of the speeds before and after a step, so that the numbers are those of the
-equation above; a fully implicit step, MuJoCo's, adds step · damping / 2 to the inertia, 8 % for a
-hobby servo, and `DelayedPD` so much to its numbers. Friction removes at most the velocity there
-is: it holds the servo still and never makes it chatter (as in time-stepping contact solvers:
-D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic
-collisions and Coulomb friction", 1996). As in `DelayedPD` a step answers the command and the error
-at its beginning, so the delay holds half a time step, 1 ms, of integration.
+The fit, the class and the tests all run `integrate`. Damping and drag act on the mean of the
+speeds before and after a step, so that the coefficients are those of the equation above; a fully
+implicit step, as in MuJoCo and `DelayedPD`, adds step · damping / 2 to the inertia, 8 % for a hobby
+servo. Friction removes at most the present velocity: it holds the servo still without chatter [1]_.
+As in `DelayedPD`, a step responds to the command and the error at its beginning, so the dead time
+contains half a time step, 1 ms, of integration.
+
+.. [1] D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with
+   inelastic collisions and Coulomb friction", 1996.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import DelayLine
+from pupper_sysid.servo_models.delay_line import DelayedServo, refuse_time_step
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 
 
@@ -58,7 +59,7 @@ COEFFICIENTS: dict[str, Coefficient] = {
 _NEVER = {"saturation_error_rad": np.inf}  # every other coefficient is 0 when absent
 
 
-class SparseEquation:
+class SparseEquation(DelayedServo):
     """A servo that moves by the equation in the module's text; a `ServoModel`.
 
     Parameters
@@ -68,16 +69,15 @@ class SparseEquation:
     dead_time_s : array_like
         From a command's arrival to its first effect [s].
     offset_rad : array_like
-        Added to every position returned [rad]: what the servo's readings show beside the angle
-        that it controls.
+        Added to every position [rad]: bias of the servo's readings.
     time_step_s : float
         Time step [s]; commands and positions are at this step.
 
     Raises
     ------
     InputError
-        If a name is unknown, a number is negative or not finite, or the time step is too long for
-        the stiffness: the integration would explode.
+        If a name is unknown, a number is negative or not finite, or the integration would be
+        unstable because the time step is too long for the stiffness.
 
     Examples
     --------
@@ -94,8 +94,7 @@ class SparseEquation:
         offset_rad: ArrayLike = 0.0,
         time_step_s: float = TIME_STEP_S,
     ):
-        if not (np.isfinite(time_step_s) and time_step_s > 0):
-            raise InputError(f"SparseEquation: time_step_s is {time_step_s}; it must be positive.")
+        refuse_time_step("SparseEquation", time_step_s)
         for name in coefficients:
             if name not in COEFFICIENTS:
                 near = difflib.get_close_matches(name, COEFFICIENTS, 1, 0.3)
@@ -113,7 +112,7 @@ class SparseEquation:
         if not np.isfinite(self.offset_rad).all():
             raise InputError(f"SparseEquation: offset_rad is {self.offset_rad}; it must be finite.")
         self.coefficients = values
-        self.time_step_s = h = float(time_step_s)
+        h = float(time_step_s)
         # the roots of y₊ − 2y + y₋ = −h² · stiffness · y leave the unit circle there
         spring = sum(values.get(n, 0.0) for n in ("stiffness_per_s2", "saturated_stiffness_per_s2"))
         if np.max(h * h * spring) >= 4.0:
@@ -121,40 +120,16 @@ class SparseEquation:
                 f"SparseEquation: steps of {1e3 * h:g} ms are too long for a stiffness of "
                 f"{np.max(spring):g} s⁻²; use {1e3 * TIME_STEP_S:g} ms."
             )
-        self._own = np.broadcast_shapes(
-            *(v.shape for v in values.values()), self.dead_time_s.shape, self.offset_rad.shape
+        numbers = (*values.values(), self.dead_time_s, self.offset_rad)
+        super().__init__(numbers, self.dead_time_s, h)
+
+    def _rest(self, position: NDArray[np.float64]) -> None:
+        self._state = (position.copy(), np.zeros(self.batch))
+
+    def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
+        positions, self._state = integrate(
+            delayed, self._state, self.coefficients, self.time_step_s
         )
-        self._delay_line = DelayLine(self.dead_time_s, h)
-        self.reset(np.zeros(self._own))
-
-    def reset(self, position: ArrayLike) -> None:
-        """Rest at `position` [rad], which has been the command for as long as the delay.
-
-        The batch becomes the shape to which `position` and the coefficients broadcast.
-        """
-        position = np.asarray(position, float)
-        self.batch = np.broadcast_shapes(position.shape, self._own)
-        self._position = np.broadcast_to(position, self.batch).copy()
-        self._velocity = np.zeros(self.batch)
-        self._delay_line.reset(np.broadcast_to(position, self.batch))
-
-    def step(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Advance one time step under `command` [rad]; returns the position after it."""
-        return self.rollout(np.broadcast_to(np.asarray(command, float), self.batch)[None])[0]
-
-    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
-        """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
-        commands = np.asarray(commands, float)
-        if commands.ndim == 1:  # one series for the whole batch
-            commands = commands.reshape(-1, *[1] * len(self.batch))
-        commands = np.broadcast_to(commands, (len(commands), *self.batch))
-        positions, state = integrate(
-            self._delay_line.shift(commands),
-            (self._position, self._velocity),
-            self.coefficients,
-            self.time_step_s,
-        )
-        self._position, self._velocity = state
         return positions + self.offset_rad
 
 
@@ -264,7 +239,7 @@ def explain(
     dead_time_s: float,
     ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[str]:
-    """One line per number: value, unit, meaning; `ranges` adds what it becomes on part of the data.
+    """One line per number: value, unit, meaning, and its range over parts of the data.
 
     Examples
     --------
@@ -272,14 +247,9 @@ def explain(
     '9 120 s⁻²: stiffness: acceleration per radian of error'
     """
     lines = []
-    rows = [(name, value, *COEFFICIENTS[name]) for name, value in coefficients.items()]
-    delay = (
-        "dead_time_s",
-        dead_time_s,
-        "s",
-        "dead time from a command's arrival to its first effect",
-    )
-    for name, value, unit, meaning in [*rows, delay]:
+    dead_time = Coefficient("s", "dead time: from a command's arrival to its first effect")
+    rows = [(name, value, COEFFICIENTS[name]) for name, value in coefficients.items()]
+    for name, value, (unit, meaning) in [*rows, ("dead_time_s", dead_time_s, dead_time)]:
         low, high = (ranges or {}).get(name, (value, value))
         around = f" ({digits(low)} … {digits(high)} with one frequency left out)"
         lines.append(f"{digits(value)} {unit}: {meaning}{around if low < high else ''}")

@@ -1,16 +1,16 @@
-"""What a simulator's time step does to a servo's lag, and the delay that makes up for it.
+"""Effect of a simulator's time step on a servo's lag, and the dead time that compensates for it.
 
-In a step MuJoCo, like most engines, turns the set-point and brakes the joint with what will be true
-at the step's end. A stepped servo therefore answers sooner than the same servo in continuous time,
-by about a step: a calibration found with steps of 2 ms and simulated with 5 ms would be 2 to 3 ms
-too quick. A simulator whose set-points have no speed limit answers sooner, too, and one that
-computes the PD before its step later. `delay_at_step` is the delay with which another `Engine`, or
-another step, gives the same lag.
+MuJoCo, like most engines, computes set-point and damping of a step with the values at the step's
+end. A stepped servo therefore responds earlier than the same servo in continuous time, by about a
+step: a calibration found with steps of 2 ms and simulated with 5 ms would be 2 to 3 ms too early. A
+simulator without a speed limit on set-points responds earlier, too, and one that computes the PD
+before its step later. `delay_at_step` is the dead time with which another `Engine`, or another
+step, gives the same lag.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,19 @@ _TONES_HZ, _AMPLITUDE_RAD = (1.0, 2.0, 4.0), 0.2  # a walk's speeds, below most 
 _LOOP_S = 0.0193  # no multiple of a step: a delay puts commands anywhere in one
 _WARM_UP_S, _LENGTH_S = 1.0, 3.0
 _FAR_RAD = 100.0  # further than a servo goes, near enough to be squared
-_RATTLE = 0.5  # random servos in steps of up to 10 ms are at most 0.4 from the usual
+_UNSTABLE = 0.5  # random servos in steps of up to 10 ms are at most 0.4 from the usual
 
 
 @dataclass(frozen=True)
 class Engine:
-    """How a simulator runs a PD servo.
+    """How a simulator integrates a PD servo.
 
     Attributes
     ----------
     slews : bool
         Whether it limits the speed of the set-point.
     implicit : bool
-        Whether it brakes with the velocity at the step's end, or computes the PD before its step.
+        Whether damping acts on the velocity at the step's end; otherwise the PD is computed before.
     """
 
     slews: bool = True
@@ -49,7 +49,7 @@ MUJOCO = Engine()
 def tones_in_steps_of(
     parameters: DelayedPDParameters, time_step_s: float, engine: Engine = MUJOCO
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How servos stepped so follow slow tones, without their delay.
+    """Lag of servos in such steps behind slow tones, without their dead time.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def tones_in_steps_of(
     lag : ndarray, shape (servos,)
         Mean over the tones [s].
     rest : ndarray, shape (servos,)
-        What of the motion is no tone, root mean square by the tone's amplitude; of the worst tone.
-        A servo that is not stable in such steps rattles between the limits of its torque.
+        Root mean square of the motion that is no tone, relative to the tone's amplitude; of the
+        worst tone. An unstable servo oscillates between the limits of its torque.
     """
     count = round(_LENGTH_S / time_step_s)
     edge = time_step_s * np.arange(count + 1)
@@ -75,19 +75,16 @@ def tones_in_steps_of(
     stairs = _AMPLITUDE_RAD * np.sin(stair[:-1, None] * turn)
     area = np.concatenate([np.zeros((1, len(turn))), np.cumsum(stairs * _LOOP_S, axis=0)])
     commands = np.stack([np.diff(np.interp(edge, stair, a)) for a in area.T], axis=1) / time_step_s
-    values = {
-        f.name: np.atleast_1d(np.asarray(getattr(parameters, f.name), float))[:, None]
-        for f in fields(parameters)
-    }
+    values = {name: np.atleast_1d(v)[:, None] for name, v in parameters.arrays().items()}
     if not engine.slews:
         values["velocity_limit"] = np.full_like(values["velocity_limit"], np.inf)
     batch = (len(values["stiffness"]), len(turn))
     still = (np.zeros(batch), np.zeros(batch), np.zeros(batch))
-    told = np.broadcast_to(commands[:, None], (count, *batch))
-    moved, _ = integrate(told, still, values, time_step_s, implicit=engine.implicit)
+    given = np.broadcast_to(commands[:, None], (count, *batch))
+    moved, _ = integrate(given, still, values, time_step_s, implicit=engine.implicit)
     late = edge[1:] > _WARM_UP_S
     lags, rests = [], []
-    with np.errstate(over="ignore", invalid="ignore"):  # one that is not stable may end anywhere
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable servo may end anywhere
         for n, w in enumerate(turn):
             at, track = w * edge[1:][late], np.clip(moved[late, :, n], -_FAR_RAD, _FAR_RAD)
             design = sine_design(at)
@@ -104,7 +101,7 @@ def delay_at_step(
     fitted_step_s: float = TIME_STEP_S,
     engine: Engine = MUJOCO,
 ) -> NDArray[np.float64]:
-    """Delay [s] with which servos in steps of `time_step_s` lag as they do in `fitted_step_s`.
+    """Dead time [s] with which servos in steps of `time_step_s` lag as in `fitted_step_s`.
 
     Parameters
     ----------
@@ -129,7 +126,7 @@ def delay_at_step(
         return delay
     fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
     there, rest = tones_in_steps_of(parameters, time_step_s, engine)
-    if not (rest - usual < _RATTLE).all():
+    if not (rest - usual < _UNSTABLE).all():
         raise InputError(
             f"a servo of this calibration is not stable in physics steps of {1e3 * time_step_s:g} "
             "ms; take shorter ones."
