@@ -1,4 +1,4 @@
-"""What the commands that talk to a bus share: the joint map to use, and opening the bus."""
+"""Joint map and guarded bus of the commands that use a bus."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ JOINTS_FILE = Path("joints.yaml")
 
 
 def chosen_map(text: str | None) -> JointMap | None:
-    """The joint map a user names (a file or a preset), else `joints.yaml` if it is here."""
+    """The joint map `text` (a file or a preset), else `joints.yaml` if it is in this folder."""
     if text is None and JOINTS_FILE.exists():
         terminal.err.print(f"Taking the joint map {JOINTS_FILE}.", soft_wrap=True)
         return load_joint_map(JOINTS_FILE)
-    if text is None:
-        return None
-    return load_joint_map(text)
+    return None if text is None else load_joint_map(text)
 
 
 def connect(bus: str, joint_map: str | None, joints: Sequence[str] | None = None) -> GuardedBus:
-    """The bus that a user names, guarded and in servo coordinates."""
+    """The bus at an address, guarded and in servo coordinates."""
     address = parse_address(bus)
     chosen = chosen_map(joint_map)
     return open_guarded(address, chosen.per_servo() if chosen else None, joints)

@@ -1,4 +1,4 @@
-"""Questions to a person, asked so that the servos can be read while nobody has answered yet."""
+"""Questions at the terminal; the servos can be read while an answer is awaited."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ from pupper_sysid.common.errors import InputError
 
 
 class Keyboard:
-    """Lines that a person types; waiting for one does not keep the servos from being read."""
+    """Lines typed at the terminal, read without blocking."""
 
     def __init__(self) -> None:
         try:
-            self._input = sys.stdin.fileno()
+            self._fd = sys.stdin.fileno()
         except (OSError, ValueError, AttributeError):
             raise _ended() from None
         self._typed = b""
 
     def ask(self, question: str) -> str:
-        """What a person answers to a question, in small letters."""
+        """Answer to a question, in lower case; waits for it."""
         terminal.err.print(Text(question, "bold"))
         self.forget()
         while (line := self.line()) is None:
-            select.select([self._input], [], [])
+            select.select([self._fd], [], [])
         return line
 
     def forget(self) -> None:
-        """An Enter that was pressed too early answers no question that was not yet asked."""
-        if os.isatty(self._input):
-            termios.tcflush(self._input, termios.TCIFLUSH)
+        """Discard what was typed before the question."""
+        if os.isatty(self._fd):
+            termios.tcflush(self._fd, termios.TCIFLUSH)
             self._typed = b""
 
     @contextmanager
     def unseen(self) -> Iterator[None]:
-        """An Enter that is echoed would push a live table down by a line."""
-        if not os.isatty(self._input):
+        """Without echo during the block: Enter would push a live table down by a line."""
+        if not os.isatty(self._fd):
             yield
             return
         self.forget()
-        before = termios.tcgetattr(self._input)
+        before = termios.tcgetattr(self._fd)
         quiet = [*before[:3], before[3] & ~termios.ECHO, *before[4:]]
-        termios.tcsetattr(self._input, termios.TCSANOW, quiet)
+        termios.tcsetattr(self._fd, termios.TCSANOW, quiet)
         try:
             yield
         finally:
-            termios.tcsetattr(self._input, termios.TCSANOW, before)
+            termios.tcsetattr(self._fd, termios.TCSANOW, before)
 
     def line(self) -> str | None:
-        """A line if there is one by now.
+        """A line if one has been typed.
 
         Raises
         ------
         InputError
             If the input has ended.
         """
-        if b"\n" not in self._typed and select.select([self._input], [], [], 0)[0]:
-            typed = os.read(self._input, 1024)
+        if b"\n" not in self._typed and select.select([self._fd], [], [], 0)[0]:
+            typed = os.read(self._fd, 1024)
             if not typed:
                 raise _ended()
             self._typed += typed

@@ -1,4 +1,4 @@
-"""`calibrate-joints`: measure the joint map of a limp robot, together with whoever moves it."""
+"""`calibrate-joints`: measure the joint map of a limp robot that is moved by hand."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Group
 from rich.live import Live
 from rich.text import Text
@@ -31,7 +32,7 @@ _TORQUE_OFF_TRIES = 5
 
 @dataclass(frozen=True)
 class CalibrateJoints:
-    """Measure where each servo's middle is, how far it may go, and what its counts mean.
+    """Measure each servo's middle, its range, and the scale of its counts.
 
     The robot goes limp and you move it by hand; nothing moves by itself, and the servos stay limp
     at the end. Example: pupper-sysid calibrate-joints --bus feetech:/dev/ttyUSB0
@@ -43,19 +44,19 @@ class CalibrateJoints:
     """Joint map to start from, a file or a preset: its ids, signs and limits_rad are kept. By
     default the preset that fits the bus."""
     joints: str = "all"
-    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; the others keep what
-    the starting map says."""
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; the others keep the
+    values of the starting map."""
     out: Path = Path("joints.yaml")
-    """File to write; the other commands take joints.yaml by themselves."""
+    """File to write; the other commands use joints.yaml by default."""
     scale_joint: str | None = None
     """Joint on which counts per radian are checked; by default the first."""
     scale_deg: float = 90.0
-    """Angle that it is moved by for that [degrees]."""
+    """Angle that it is moved through for that [degrees]."""
     force: bool = False
     """Replace the file if it exists."""
 
     def run(self) -> None:
-        """Ask, measure, write."""
+        """Guide through the steps and write the map."""
         refuse_overwrite(self.out, self.force)
         if self.out.suffix not in (".yaml", ".yml"):
             raise InputError(f"--out {self.out}: a joint map is a .yaml file.")
@@ -66,8 +67,8 @@ class CalibrateJoints:
             )
         if bus_name(self.bus) == EMULATED:
             raise InputError(
-                "--bus emulated: nobody can move that one by hand. Start `pupper-sysid emulate "
-                "feetech --by-hand` in another terminal and use the bus that it names."
+                "--bus emulated: it cannot be moved by hand. Start `pupper-sysid emulate feetech "
+                "--by-hand` in another terminal and use the bus that it names."
             )
         address = parse_address(self.bus)
         given = load_joint_map(self.joint_map) if self.joint_map else None
@@ -85,16 +86,14 @@ class CalibrateJoints:
             here = [n for n in names if n in bus.joint_names]
             silent = [n for n in names if n not in here]
             if silent:
-                terminal.warn(
-                    [f"{', '.join(silent)}: no answer; their part of the map stays as it was."]
-                )
+                terminal.warn([f"{', '.join(silent)}: no answer; their part of the map is kept."])
             if self.scale_joint in silent:
                 raise BusError(f"--scale-joint {self.scale_joint}: it does not answer.")
-            self._lead(Guide(bus, start, here, Keyboard()), self.scale_joint or here[0])
+            self._calibrate(Guide(bus, start, here, Keyboard()), self.scale_joint or here[0])
         finally:
             bus.close()
 
-    def _lead(self, guide: Guide, scale_joint: str) -> None:
+    def _calibrate(self, guide: Guide, scale_joint: str) -> None:
         guide.go_limp()
         offsets = guide.offsets()
         limits = guide.limits()
@@ -126,12 +125,12 @@ class CalibrateJoints:
 
 
 class Guide:
-    """Leads a person through the steps; every method is one of them.
+    """The steps of a calibration, one method each.
 
     Parameters
     ----------
     bus : ServoBus
-        Only read, and told to go limp.
+        Only read, and its torque switched off.
     start : JointMap
         The map to start from.
     joints : list of str
@@ -146,11 +145,11 @@ class Guide:
         self._counts = start.file.counts
 
     def go_limp(self) -> None:
-        """Torque off, once whoever holds the robot is ready."""
+        """Switch the torque off after a confirmation."""
         if self.start.frame == "proxy":
             terminal.err.print(
                 "Counts here are the proxy's: the firmware has added its own stored calibration, "
-                "and the offsets that are measured now come on top of that."
+                "and the offsets measured now are added on top of it."
             )
         self._keyboard.ask(
             "The robot will go limp. Lay it on its stand, hold what could fall, then press Enter."
@@ -159,13 +158,13 @@ class Guide:
         terminal.err.print("All servos are limp; move them by hand, gently.")
 
     def stay_limp(self) -> None:
-        """Torque off, insisted on."""
+        """Switch the torque off, in several tries."""
         for _ in range(_TORQUE_OFF_TRIES):
             if self.bus.torque(False):
                 return
         raise BusError(
-            "not every servo confirmed that it is limp, so nothing was written. Check the cable "
-            "and the power, and do not force a joint that holds."
+            "not every servo confirmed that its torque is off, so nothing was written. Check the "
+            "cable and the power, and do not force a joint that holds."
         )
 
     def offsets(self) -> dict[str, int]:
@@ -180,14 +179,10 @@ class Guide:
                 for name, by in zip(self.joints, strayed, strict=True)
                 if by > jc.STILL * self._counts
             ]
-            if not moved:
-                break
-            answer = self._choice(
+            if not moved or self._keep(
                 f"Moved while being measured, in counts: {_some(moved)}. "
-                "Enter to measure again, k to keep this",
-                {"": "again", "k": "keep"},
-            )
-            if answer == "keep":
+                "Enter to measure again, k to keep this"
+            ):
                 break
         return {
             name: jc.offset_counts(float(count), self._counts)
@@ -195,7 +190,7 @@ class Guide:
         }
 
     def limits(self) -> dict[str, tuple[int, int]]:
-        """Step 2: the whole range; limits of the joints that were moved through it."""
+        """Step 2: the whole range; limits of the joints moved through it."""
         terminal.err.print(Text("\nStep 2 of 3: the whole range.", "bold"))
         travel = jc.Travel(len(self.joints), self._counts)
         while True:
@@ -209,12 +204,10 @@ class Guide:
                 break
             for name, why in refused.items():
                 terminal.err.print(Text.assemble((name, "yellow"), f" {why}."))
-            answer = self._choice(
+            if self._keep(
                 "Enter to go on moving, k to keep the starting map's limits for "
-                f"{'it' if len(refused) == 1 else 'these'}",
-                {"": "again", "k": "keep"},
-            )
-            if answer == "keep":
+                f"{'it' if len(refused) == 1 else 'these'}"
+            ):
                 break
             for name in refused:
                 travel.forget(self.joints.index(name))
@@ -230,7 +223,7 @@ class Guide:
         }
 
     def scale(self, joint: str, angle_deg: float) -> tuple[float | None, bool]:
-        """Step 3: the scale measured, None if that was skipped, and whether to use it."""
+        """Step 3: the measured scale (None if skipped), and whether to use it."""
         stated = self.start.file.joints[joint].counts_per_rad
         terminal.err.print(
             Text.assemble(
@@ -241,11 +234,8 @@ class Guide:
         )
         which = self.joints.index(joint)
         while True:
-            answer = self._choice(
-                f"Hold {joint} at the first position and press Enter, or s to skip this step",
-                {"": "go", "s": "skip"},
-            )
-            if answer == "skip":
+            first = f"Hold {joint} at the first position and press Enter, or s to skip this step"
+            if self._choice(first, ("", "s")) == "s":
                 return None, False
             before = self._mean()[0][which]
             self._keyboard.ask(
@@ -253,19 +243,19 @@ class Guide:
             )
             after = self._mean()[0][which]
             measured = jc.counts_per_rad(before, after, angle_deg)
-            said = f"{abs(after - before):.0f} counts: {measured:.1f} counts per radian"
+            found = f"{abs(after - before):.0f} counts: {measured:.1f} counts per radian"
             if abs(after - before) < jc.SMALLEST_TRAVEL * self._counts:
-                terminal.err.print(f"{said}. That is too little motion to tell; try again.")
+                terminal.err.print(f"{found}. That is too little motion; try again.")
                 continue
             if jc.scales_agree(measured, stated):
                 terminal.err.print(
-                    f"{said}, within {100 * jc.SCALE_AGREES:.0f} % of the map's {stated:.1f}, "
+                    f"{found}, within {100 * jc.SCALE_AGREES:.0f} % of the map's {stated:.1f}, "
                     "which is kept."
                 )
                 return measured, False
             known = jc.known_scale_near(measured, self._counts)
             terminal.err.print(
-                f"{said}; the starting map says {stated:.1f} "
+                f"{found}; the starting map has {stated:.1f} "
                 f"({100 * (measured / stated - 1):+.0f} %)."
                 + (f" It agrees with {known}." if known else "")
             )
@@ -273,18 +263,17 @@ class Guide:
                 range_deg = np.degrees(self._counts / measured)
                 terminal.err.print(
                     f"The whole range would be {range_deg:.0f} degrees, which no such servo has, "
-                    "so the number is not offered. Was it the right joint, and the right angle?"
+                    "so this scale is not offered. Check the joint and the angle."
                 )
                 continue
             answer = self._choice(
-                "For all joints, use n the new number, or m the map's; r to repeat",
-                {"n": "new", "m": "map", "r": "repeat"},
+                "For all joints, use n the new scale, or m the map's; r to repeat", ("n", "m", "r")
             )
-            if answer != "repeat":
-                return measured, answer == "new"
+            if answer != "r":
+                return measured, answer == "n"
 
     def _follow(self, travel: jc.Travel) -> None:
-        """Take in readings, and show them, until Enter."""
+        """Add readings to `travel`, and show it, until Enter."""
         live = Live(console=terminal.err, auto_refresh=False) if terminal.err.is_terminal else None
         drawn_s, tick = -np.inf, self.bus.now()
         with self._keyboard.unseen(), live or nullcontext():
@@ -311,8 +300,8 @@ class Guide:
             table.add_row(name, *cells, f"{degrees:.0f}", state)
         return Group(table, Text("Enter when every joint has been at both ends.", style="bold"))
 
-    def _mean(self):
-        """Mean counts over half a second, and how far they strayed."""
+    def _mean(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean counts over half a second, and their motion meanwhile."""
         readings = []
         until = self.bus.now() + _MEAN_OVER_S
         while self.bus.now() < until:
@@ -327,13 +316,14 @@ class Guide:
             )
         return mean, strayed
 
-    def _choice(self, question: str, choices: dict[str, str]) -> str:
-        while True:
-            answer = self._keyboard.ask(question + ".")
-            if answer in choices:
-                return choices[answer]
+    def _keep(self, question: str) -> bool:
+        return self._choice(question, ("", "k")) == "k"
+
+    def _choice(self, question: str, choices: tuple[str, ...]) -> str:
+        while (answer := self._keyboard.ask(question + ".")) not in choices:
             known = ", ".join(key or "Enter" for key in choices)
             terminal.err.print(f"'{answer}' is none of {known}.")
+        return answer
 
 
 def _some(names: list[str]) -> str:

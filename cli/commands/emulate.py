@@ -1,4 +1,4 @@
-"""`emulate`: a robot without a robot, behind the real protocols."""
+"""`emulate`: an emulated robot behind the real protocols."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from pupper_sysid.sim.emulator.servo_bench import ServoBench
 
 @dataclass(frozen=True)
 class Common:
-    """What both emulators take."""
+    """Options of both emulators."""
 
     seed: int = 0
     """Seed of the robot: its servos, its lost polls, its noise."""
     faults: str = ""
-    """What goes wrong, as kind=probability per answer: lost=0.02,late=0.01,corrupted=0.01. Kinds:
+    """Faults to inject, as kind=probability per answer: lost=0.02,late=0.01,corrupted=0.01. Kinds:
     lost, late, truncated, corrupted, duplicated, foreign, wrong-length, error-bits, frozen,
     brown-out, unplugged, second-writer."""
     walking: bool = False
     """The robot stands on the ground and walks where its servos carry it; otherwise its legs hang
     in free air."""
     by_hand: bool = False
-    """Someone swings the joints while they are limp, for trying calibrate-joints."""
+    """The joints swing while they are limp, as if moved by hand, for trying calibrate-joints."""
     truth: Path | None = None
-    """Write what the robot really is to this YAML file."""
+    """Write the true parameters of the robot to this YAML file."""
     force: bool = False
     """Replace the file of --truth."""
 
@@ -87,7 +87,7 @@ class Feetech(Common):
     ids: str = "all"
     """Which of them are there: 1-12, 4,5,6, or all."""
     baud: int | None = None
-    """Rate at which they listen; default 1000000 (STS3215) or 500000 (SCS0009)."""
+    """Their baud rate; default 1000000 (STS3215) or 500000 (SCS0009)."""
     link: Path | None = None
     """A stable name for the device; survives being unplugged."""
     echo: bool = False
@@ -105,8 +105,8 @@ class Feetech(Common):
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
         baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
         if baud not in BAUD_RATES:
-            raise InputError(f"--baud {baud}: servos know {', '.join(map(str, BAUD_RATES))}.")
-        # read directly, a servo answers for the very moment: no polls in between, none lost
+            raise InputError(f"--baud {baud}: choose {', '.join(map(str, BAUD_RATES))}.")
+        # read directly, a servo answers with its present position: no polls, none lost
         spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
         robot = draw_robot(rng, spec, layout if self.joint_map else None)
         bench = _bench(self, robot, layout, rng)
@@ -152,7 +152,7 @@ def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) 
     if path is None:
         yield
         return
-    # a proxy polls its servos, although nobody can ask this one for them
+    # a proxy polls its servos, although this one does not return them
     polled = replace(bench.robot, spec=RobotSpec())
     shown = ServoBench(
         polled, load_joint_map("mini_pupper_2"), rng.spawn(1)[0], keep_log=False, plant=bench.plant

@@ -16,7 +16,7 @@ _AMPLITUDE_RAD, _SMALLEST_RAD = 0.3, 0.05
 
 @dataclass(frozen=True)
 class InitRobot:
-    """Make a joint map of another robot with hobby servos, and say how to sweep it.
+    """Make a joint map of another robot with hobby servos, and plan its sweeps.
 
     Example: pupper-sysid init-robot my_robot.xml --servo sts3215
     """
@@ -33,15 +33,15 @@ class InitRobot:
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
-        """Read the model, write the map, show what to do next."""
+        """Read the model, write the map, print the next commands."""
         from pupper_sysid.sim.robot.robot_map import joint_map_of
 
         found, left_out = joint_map_of(self.model, self.servo)
         target = self.out or Path(f"{self.model.stem}.joints.yaml")
         found.save(target, self.force)
         servos = found.per_servo()
-        room = servos.position_limits().margin(servos.rest_pose())
-        plan = _plan(found.joint_names, room)
+        margin = servos.position_limits().margin(servos.rest_pose())
+        plan = _plan(found.joint_names, margin)
         sweeps = [
             f"pupper-sysid sweep --joint-map {target} --joints {','.join(names)} --freqs 1-6 "
             f"--amplitude {amplitude:g}"
@@ -50,16 +50,16 @@ class InitRobot:
         if left_out:
             terminal.warn(
                 [
-                    f"left out, for no actuator of {self.model} drives them: {', '.join(left_out)}."
+                    f"no actuator of {self.model} drives these, left out: {', '.join(left_out)}."
                     " If they have servos, give them actuators there, or take all actuators out."
                 ]
             )
-        narrow = [n for n, r in zip(found.joint_names, room, strict=True) if r < _SMALLEST_RAD]
+        narrow = [n for n, r in zip(found.joint_names, margin, strict=True) if r < _SMALLEST_RAD]
         if narrow:
             terminal.warn(
                 [
-                    f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of room, too little for "
-                    f"a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
+                    f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of margin, too little "
+                    f"for a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
                     'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
                 ]
             )
@@ -70,18 +70,18 @@ class InitRobot:
                     "joints": list(found.joint_names),
                     "ids": list(found.ids),
                     "left_out": left_out,
-                    "room_rad": dict(zip(found.joint_names, map(float, room), strict=True)),
+                    "margin_rad": dict(zip(found.joint_names, map(float, margin), strict=True)),
                     "sweeps": sweeps,
                 }
             )
             return
-        table = terminal.table(f"{target}", "joint", "id", "centre rad", "limits rad", "room rad")
+        table = terminal.table(f"{target}", "joint", "id", "centre rad", "limits rad", "margin rad")
         for k, name in enumerate(found.joint_names):
             entry = found.file.joints[name]
             low, high = entry.limits_rad
             table.add_row(
                 name, str(entry.id), f"{entry.neutral_rad:.2f}", f"{low:.2f} … {high:.2f}",
-                f"{room[k]:.2f}",
+                f"{margin[k]:.2f}",
             )  # fmt: skip
         terminal.out.print(table)
         terminal.out.print(
@@ -99,10 +99,10 @@ class InitRobot:
         )
 
 
-def _plan(names: tuple[str, ...], room: np.ndarray) -> list[tuple[float, list[str]]]:
-    """Amplitudes that leave a fifth of each joint's room, and the joints that take them."""
+def _plan(names: tuple[str, ...], margin: np.ndarray) -> list[tuple[float, list[str]]]:
+    """Amplitudes that leave a fifth of each joint's margin, and the joints of each."""
     groups: dict[float, list[str]] = {}
-    for name, free in zip(names, room, strict=True):
+    for name, free in zip(names, margin, strict=True):
         amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
         groups.setdefault(float(amplitude), []).append(name)
     return sorted(groups.items(), reverse=True)

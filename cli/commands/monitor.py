@@ -1,4 +1,4 @@
-"""`monitor`: what every servo says of itself, live; it only reads."""
+"""`monitor`: a live table of every servo; it only reads."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 
-_ONCE_S = 0.3  # voltage and temperature come with every other answer only
-_GOALS_EVERY_S = 1.0  # one question per servo, and only another program could change them
+_ONCE_S = 0.3  # voltage and temperature are not in every reply
+_GOALS_EVERY_S = 1.0  # one request per servo, and only another program could change them
 _DRAW_EVERY_S = 0.1
 _PLAIN_EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
 class Monitor:
-    """Show what every servo says: goal, position, load, voltage, temperature, errors.
+    """Show every servo: goal position, position, load, voltage, temperature, errors.
 
-    It only reads: no goal is written and no torque is switched. Ctrl-C ends it. Angles are each
-    servo's own, as in a sweep: a calf's is told as if its thigh stood in its middle.
+    It only reads: no command is sent and no torque is switched. Ctrl-C ends it. Angles are each
+    servo's own, as in a sweep: a calf's is given as if its thigh were at its neutral.
     Example: pupper-sysid monitor --bus feetech:/dev/ttyUSB0
     """
 
@@ -52,7 +52,7 @@ class Monitor:
     """Print one JSON object and nothing else, and end."""
 
     def run(self) -> None:
-        """Read and show until told to end."""
+        """Read and show until the end."""
         terminal.need_positive("--rate", self.rate)
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
@@ -62,12 +62,12 @@ class Monitor:
             if self.once or self.json:
                 self._watch(watched, self.seconds or _ONCE_S)
                 if self.json:
-                    terminal.print_json(watched.as_data(self.bus))
+                    terminal.print_json(watched.as_data(bus_name(self.bus)))
                 else:
-                    terminal.out.print(watched.table(self.bus))
+                    terminal.out.print(watched.table(bus_name(self.bus)))
                 return
             self._show(watched)
-        except KeyboardInterrupt:  # the way out of a monitor is no mishap
+        except KeyboardInterrupt:  # the usual way to end a monitor
             terminal.err.print("Stopped.")
         finally:
             bus.close()
@@ -106,11 +106,11 @@ class Monitor:
 
 
 class Watched:
-    """A bus that is only read, and since when each of its joints has said the same.
+    """A bus that is only read, and the age of each joint's reading.
 
-    A serial servo answers for the very moment, so the age of its reading is the time since it last
-    answered. The proxy and the emulated robot hand on old readings without saying so: of those is
-    told for how long the value has not changed, which a joint at rest makes long.
+    A serial servo answers with its present position, so the age of a reading is the time since its
+    last reply. The proxy and the emulated robot return stale readings without a time stamp: for
+    those it is the time since the value last changed, which is long for a joint at rest.
     """
 
     def __init__(self, bus: ServoBus):
@@ -119,7 +119,7 @@ class Watched:
         joints = len(bus.joint_names)
         self.now_s = self._start_s = bus.now()
         self._seen_s = np.full(joints, np.nan)
-        self._seen_changing = np.zeros(joints, bool)
+        self._has_changed = np.zeros(joints, bool)
         self._position, self._goal = np.full((2, joints), np.nan)
         self._count = np.full(joints, -1)
         self._here = np.zeros(joints, bool)
@@ -132,7 +132,7 @@ class Watched:
         sample = self._sample = self.bus.read()
         here = self._here = np.isfinite(sample.position_rad)
         changed = here & (sample.position_rad != self._position) & np.isfinite(self._position)
-        self._seen_changing |= changed
+        self._has_changed |= changed
         news = here if self.answers_now else changed | (here & np.isnan(self._seen_s))
         self._seen_s = np.where(news, sample.time_s, self._seen_s)
         self._position = np.where(here, sample.position_rad, self._position)
@@ -145,7 +145,7 @@ class Watched:
         self.now_s = self.bus.now()
 
     def as_data(self, bus_name: str) -> dict[str, Any]:
-        """Everything as plain numbers."""
+        """The table as plain data."""
         return {
             "bus": bus_name,
             "joint_map": self.bus.metadata.get("joint_map"),
@@ -154,7 +154,7 @@ class Watched:
         }
 
     def rows(self) -> list[dict[str, Any]]:
-        """One dict per joint; None where the bus does not tell."""
+        """One dict per joint; None where the bus has no value."""
         sample = self._sample
         assert sample is not None
         rows = []
@@ -179,7 +179,7 @@ class Watched:
         return rows
 
     def table(self, bus_name: str) -> Group:
-        """The table and what its columns mean."""
+        """The table and the meaning of its columns."""
         table = terminal.table(
             bus_name, "joint", "goal", "rad", "count", "age" if self.answers_now else "unchanged",
             "load %", "volt", "°C", "errors",
@@ -197,28 +197,25 @@ class Watched:
                 errors if row["answers"] else Text("silent", "red"),
             )  # fmt: skip
         if self.answers_now:
-            said = "age: since the last good answer. goal: what stands in the servo."
-        elif self.bus.metadata["kind"] == "emulated":
-            said = "unchanged: since the value last changed; old readings do not say so."
+            note = "age: since the last valid reply. goal: the servo's Goal_Position."
         else:
-            said = (
-                "unchanged: since the value last changed; the proxy does not say how old a reading "
-                "is, nor goals, temperatures or errors."
-            )
-        return Group(table, Text(said, style="dim"))
+            note = "unchanged: since the value last changed; the feedback age is unknown"
+            proxy = self.bus.metadata["kind"] != "emulated"
+            note += ", as are goals, temperatures and errors." if proxy else "."
+        return Group(table, Text(note, style="dim"))
 
     def _age(self, joint: int, seconds: float | None) -> str:
         if seconds is None:
             return "–"
         if self.answers_now and seconds < 1:
             return f"{1e3 * seconds:.0f} ms"
-        # it may have stood there long before the first look
-        since_before = not self.answers_now and not self._seen_changing[joint]
+        # it may have been there long before the first reading
+        since_before = not self.answers_now and not self._has_changed[joint]
         return ("≥" if since_before else "") + f"{seconds:.1f} s"
 
 
 def _open(bus: str, joint_map: str | None) -> ServoBus:
-    """The bus to read, without guard and watchdog: nothing will move."""
+    """The bus to read, without guard and watchdog: nothing moves."""
     if bus_name(bus) == EMULATED:
         if joint_map:
             raise InputError("--joint-map: the emulated robot has its own; leave it out.")

@@ -1,4 +1,4 @@
-"""`scan`: who is on the bus, and is everyone well."""
+"""`scan`: the servos on a bus and their state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pupper_sysid.hardware.feetech.scan import ServoReport, scan_line
 
 @dataclass(frozen=True)
 class Scan:
-    """Ask who is on a bus: id, model, firmware, voltage, temperature, limits, error bits.
+    """List the servos on a bus: id, model, firmware, voltage, temperature, limits, error bits.
 
     Nothing moves and nothing is written. Example: pupper-sysid scan --bus feetech:/dev/ttyUSB0
     """
@@ -24,12 +24,12 @@ class Scan:
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
-        """Ask, and print a table."""
+        """Scan, and print a table."""
         address = parse_address(self.bus)
         if address.kind == "esp32":
             self._proxy(Path(address.where))
             return
-        with terminal.progress("asking", 0) as advance:
+        with terminal.progress("scanning", 0) as advance:
             baud, found = scan_line(address.where, address.baud, advance)
         if self.json:
             terminal.print_json({"baud": baud, "servos": [vars(s) for s in found]})
@@ -41,11 +41,12 @@ class Scan:
         for servo in found:
             table.add_row(*_cells(servo))
         terminal.out.print(table)
-        slow = [s.id for s in found if s.return_delay_us and s.return_delay_us > 100]
+        delay_us = {s.id: s.return_delay_us or 0 for s in found}
+        slow = [servo for servo, delay in delay_us.items() if delay > 100]
         if slow:
             terminal.err.print(
-                f"Servos {', '.join(map(str, slow))} wait {found[0].return_delay_us} µs before "
-                "they answer; a return delay of 0 would make reading faster."
+                f"Servos {', '.join(map(str, slow))} have a return delay (servo {slow[0]}: "
+                f"{delay_us[slow[0]]} µs); 0 would make reading faster."
             )
 
     def _proxy(self, path: Path) -> None:
@@ -54,14 +55,14 @@ class Scan:
             sample = bus.read()
         finally:
             bus.close()
-        volts = None if sample.voltage_v is None else float(sample.voltage_v[0])
+        assert sample.voltage_v is not None and sample.load is not None
+        volts = float(sample.voltage_v[0])
         rows = [
-            {"joint": name, "count": int(count), "load": None if load is None else float(load)}
+            {"joint": name, "count": int(count), "load": float(load)}
             for name, count, load in zip(
-                bus.joint_names, sample.position_count,
-                [None] * len(bus.joint_names) if sample.load is None else sample.load, strict=True,
+                bus.joint_names, sample.position_count, sample.load, strict=True
             )
-        ]  # fmt: skip
+        ]
         if self.json:
             terminal.print_json({"voltage_v": volts, "servos": rows})
             return
@@ -69,13 +70,11 @@ class Scan:
             f"the proxy at {path}, {terminal.number(volts, 1)} V", "joint", "count", "load %"
         )
         for row in rows:
-            silent = row["count"] < 0
-            load = None if row["load"] is None else 100 * row["load"]
-            table.add_row(row["joint"], "silent" if silent else str(row["count"]),
-                          terminal.number(load, 0))  # fmt: skip
+            count = "silent" if row["count"] < 0 else str(row["count"])
+            table.add_row(row["joint"], count, terminal.number(100 * row["load"], 0))
         terminal.out.print(table)
         terminal.err.print(
-            "The proxy tells neither model nor temperature; counts are the firmware's calibrated "
+            "The proxy reports neither model nor temperature; counts are the firmware's calibrated "
             "ones."
         )
 

@@ -50,7 +50,7 @@ _TORQUE_ON_TRIES, _TORQUE_OFF_TRIES = 10, 3
 _GOAL_TRIES = 3
 _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
-_CHUNK = 16
+_PIECES = (16, 15, 14, 13, 9)  # of registers 0 to 66; unequal: a late reply fits no later read
 _DOUBTS = 10  # exchanges from which the uncertainty of reading times is estimated
 
 
@@ -334,8 +334,7 @@ def rates_in_words(baud: int | None) -> str:
 def memory_of(line: FeetechLine, servo: int) -> bytes | None:
     """Registers 0 to 66 of a servo, read in pieces; None if a read failed."""
     memory = b""
-    while len(memory) <= 66:
-        size = min(_CHUNK, 67 - len(memory))
+    for size in _PIECES:
         reply = line.read(servo, len(memory), size) or line.read(servo, len(memory), size)
         if reply is None:
             return None

@@ -88,7 +88,7 @@ def test_the_servos_go_limp_only_after_enter(capsys):
     person = ScriptedPerson(("will go limp", "", lambda: seen.append(bus.limp)))
     guide(person, bus=bus)[0].go_limp()
     assert seen == [False] and bus.limp
-    assert "on top of that" in capsys.readouterr().err, "the proxy's counts are told apart"
+    assert "added on top of it" in capsys.readouterr().err, "the proxy's counts are told apart"
 
 
 def test_servos_that_do_not_confirm_that_they_are_limp_end_it():
@@ -166,7 +166,7 @@ def test_a_scale_that_differs_is_shown_beside_the_maps_and_asked_about(capsys, a
     # 307 counts for 90 degrees: 1024 would be 300.2 degrees
     assert measured == pytest.approx(1024 / np.radians(300), rel=0.002) and used is use
     err = _flat(capsys.readouterr().err)
-    assert "the starting map says 175.1 (+12 %)" in err and "the SCS0009's data sheet" in err
+    assert "the starting map has 175.1 (+12 %)" in err and "the SCS0009's data sheet" in err
 
 
 def test_a_scale_that_no_servo_has_is_not_offered_and_the_step_can_be_skipped(capsys):
@@ -280,7 +280,7 @@ def test_an_input_that_ends_is_a_sentence_and_leaves_no_file(monkeypatch, capsys
         (("--out", "taken.yaml"), "exists already"),
         (("--out", "map.csv"), "a joint map is a .yaml file"),
         (("--scale-deg", "1"), "5 to 300"),
-        (("--bus", "emulated"), "nobody can move that one by hand"),
+        (("--bus", "emulated"), "it cannot be moved by hand"),
         (("--joints", "LF", "--scale-joint", "RF_hip"), "not among the joints"),
         (("--bus", "usb"), "write emulated, esp32"),
     ],

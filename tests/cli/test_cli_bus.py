@@ -116,7 +116,7 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, says):
     [
         ("feetech:/dev/no-such-port", "There is no such device"),
         ("esp32:/tmp/no-such-folder-here/socket", "cannot be opened"),
-        ("esp32:nobody.socket", "nobody answers there"),
+        ("esp32:nobody.socket", "no answer. On the robot"),
     ],
 )
 def test_a_bus_that_is_not_there_says_what_to_check(capsys, bus, says):
@@ -130,7 +130,7 @@ def test_a_map_of_the_other_frame_is_refused(capsys):
             capsys, "sweep", *SHORT, "--bus", f"feetech:{port.device}",
             "--joint-map", "mini_pupper_2",
         )  # fmt: skip
-    assert code == 2 and "a direct bus speaks raw ones" in err and "calibrate-joints" in err
+    assert code == 2 and "a direct bus uses raw ones" in err and "calibrate-joints" in err
 
 
 @pytest.mark.parametrize("kind", ["feetech", "esp32"])

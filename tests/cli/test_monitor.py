@@ -115,7 +115,7 @@ def test_monitoring_a_line_only_pings_and_reads(capsys):
     with on_a_port(servos) as port:
         code, out, _ = run(capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", "--once")
     asked = {frame.code for frame in FrameReader().feed(servos.heard)}
-    assert code == 0 and "LF_thigh" in out and "since the last good answer" in out
+    assert code == 0 and "LF_thigh" in out and "since the last valid reply" in out
     assert asked and asked <= {PING, _READ, SYNC_READ}
     assert bench_of(servos).goals == bench_of(servos).torques == []
 
@@ -129,7 +129,7 @@ def test_monitoring_the_proxy_only_asks_and_says_what_it_cannot_tell(capsys, tmp
         datagrams.GET_POSITION, datagrams.GET_LOAD, datagrams.GET_POWER
     }  # fmt: skip
     words = " ".join(out.split())
-    assert "unchanged" in words and "does not say how old a reading is" in words
+    assert "unchanged" in words and "the feedback age is unknown, as are goals, temperatures and errors" in words
     row = next(line.split() for line in out.splitlines() if line.startswith("LF_hip"))
     assert row[1] == "–" and row[3] == "512"
 

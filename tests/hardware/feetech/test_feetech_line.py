@@ -12,7 +12,7 @@ from scservo_sdk import scservo_def
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech import scan
-from pupper_sysid.hardware.feetech.bus import FeetechBus, open_line
+from pupper_sysid.hardware.feetech.bus import FeetechBus, memory_of, open_line
 from pupper_sysid.hardware.feetech.frames import Frame
 from pupper_sysid.hardware.feetech.line import FeetechLine
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
@@ -68,18 +68,24 @@ def test_b5_1_both_series_in_one_process_are_read_right():
 
 
 @pytest.mark.wall_clock
+@pytest.mark.wall_clock
 def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
-    monkeypatch.undo()
-    assert feetech_line.REPLY_TIMEOUT_S == 0.003
-    with on_a_port(still_servos(ids=[1])) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    monkeypatch.undo()  # the product's own patience, not that of these tests
+
+    def cost_s(line: FeetechLine) -> float:
         took = []
-        for _ in range(20):
+        for _ in range(15):
             start = time.perf_counter()
             assert line.read(2, POSITION, 2) is None
             took.append(time.perf_counter() - start)
+        return float(np.median(took))
+
+    with on_a_port(still_servos(ids=[1])) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        assert cost_s(line) < 0.010
+        line.patience_s = 0.034  # what the SDK adds to every exchange: the limit would show it
+        assert cost_s(line) > 0.030
         line.close()
-    assert np.median(took) < 0.010
 
 
 def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
@@ -133,6 +139,25 @@ def test_b5_4_a_reply_of_another_length_is_no_answer(size):
     with on_a_port(Scripted(lambda request: [(0.0, raw(1, bytes([1] * size)))])) as server:
         line = FeetechLine(server.device, 1_000_000)
         assert line.read(1, POSITION, 2) is None
+        line.close()
+
+
+def test_b5_3_late_replies_do_not_shift_the_registers_that_a_recording_keeps():
+    """Every first reply comes during the second try, whose own reply comes during the next read."""
+    memory = bytes(range(67))
+    late = iter([0.12, 0.12] * 20)
+
+    def answer(request: Frame) -> list[tuple[float, bytes]]:
+        address, size = request.data
+        return [(next(late), raw(1, memory[address : address + size]))]
+
+    with on_a_port(Scripted(answer)) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        line.patience_s = 0.08
+        for _ in range(3):
+            assert memory_of(line, 1) in (None, memory)
+        line.patience_s = PATIENT_S
+        assert memory_of(line, 1) == memory
         line.close()
 
 

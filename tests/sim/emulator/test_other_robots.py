@@ -61,7 +61,7 @@ def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys)
     pose = dict(zip(arm.joint_names, arm.rest_pose(), strict=True))
     # 10° before its lower end, a gripper at zero has no room to swing
     assert pose["gripper"] == pytest.approx(np.radians(-10) + 0.4, abs=2e-3)
-    assert pose["elbow"] == 0.0 and min(found["room_rad"].values()) > 0.39
+    assert pose["elbow"] == 0.0 and min(found["margin_rad"].values()) > 0.39
 
 
 def test_what_is_guessed_is_said_with_what_corrects_it(capsys):
@@ -78,7 +78,7 @@ def test_limits_in_the_wrong_unit_are_said(capsys):
         f"<mujoco><worldbody><body>{hinge.format('lift')}</body></worldbody></mujoco>"
     )
     code, _, err = run(capsys, "init-robot", "odd_unit.xml", "--json")
-    assert code == 0 and "lift: less than 0.05 rad of room" in " ".join(err.split())
+    assert code == 0 and "lift: less than 0.05 rad of margin" in " ".join(err.split())
     assert 'angle="radian"' in err
 
 
