@@ -61,11 +61,11 @@ class Sweep:
     out: Path | None = None
     """File to write; by default recordings/<kind>_<date>_<time>.csv."""
     resume: Path | None = None
-    """Continue this unfinished recording, as it was planned; other options are not looked at."""
+    """Continue this unfinished recording with its own plan; other options are ignored."""
     truth: bool = False
-    """Also write what the emulated robot really did, beside the recording."""
+    """Also write the true parameters and positions of the emulated robot, beside the recording."""
     real_time: bool = False
-    """Let the emulated robot take as long as a real one."""
+    """Run the emulated robot in real time."""
     force: bool = False
     """Replace files that exist."""
     json: bool = False
@@ -74,7 +74,7 @@ class Sweep:
     """Seed of the emulated robot: its servos, its lost polls, its noise."""
 
     def run(self) -> None:
-        """Plan, record, and say what to run next."""
+        """Plan, record, and name the next commands."""
         from pupper_sysid.sim.emulator.bus import EmulatedBus
         from pupper_sysid.sysid.recordings.files import FOLDER
         from pupper_sysid.sysid.sweep.recorder import record
@@ -94,7 +94,7 @@ class Sweep:
         for other in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
             refuse_overwrite(Path(other), self.force)
         if self.truth and (self.resume or request["bus"] != EMULATED):
-            raise InputError("--truth: only a new recording of the emulated robot has its truth.")
+            raise InputError("--truth: only a new recording of the emulated robot has true values.")
         bus = _open(request)
         try:
             chosen = _plan(request, bus)
@@ -122,7 +122,7 @@ class Sweep:
         except (BusError, KeyboardInterrupt):
             if path.exists() and (resume or not existed or self.force):
                 terminal.err.print(
-                    f"What was recorded is in {path}; go on with\n"
+                    f"The recording up to here is in {path}; continue it with\n"
                     f"  pupper-sysid sweep --resume {path}",
                     soft_wrap=True,
                 )
@@ -131,16 +131,16 @@ class Sweep:
         written = [path]
         if self.truth and isinstance(bus, EmulatedBus):
             written += bus.write_truth(stem, self.force)
-        self._say(request, chosen, written, time.perf_counter() - started)
+        self._print(request["joints"], chosen, written, time.perf_counter() - started)
 
     def _request(self) -> dict[str, Any]:
-        """All that decides what will be done; the recording keeps it, so that it can go on."""
+        """Options that define the plan; the recording keeps them, so that it can be continued."""
         terminal.need_positive("--rate", self.rate)
         bus = bus_name(self.bus)
         if self.loops < 1:
             raise InputError(f"--loops is {self.loops}; it must be at least 1.")
         if self.real_time and bus != EMULATED:
-            raise InputError("--real-time: a real bus knows no other time; leave it out.")
+            raise InputError("--real-time: a real bus always runs in real time; leave it out.")
         return {
             "bus": bus,
             "joint_map": self.joint_map,
@@ -157,27 +157,21 @@ class Sweep:
         }
 
     def _joints_there(self) -> tuple[str, ...]:
-        """Joints to choose from: of the joint map, if one was named or lies here."""
+        """Joints to choose from: those of the joint map that is named or is in this folder."""
         here = JOINTS_FILE if bus_name(self.bus) != EMULATED and JOINTS_FILE.exists() else None
         chosen = self.joint_map or here
         return load_joint_map(chosen).joint_names if chosen else JOINT_NAMES
 
-    def _say(
-        self, request: dict[str, Any], chosen: Plan, written: list[Path], elapsed: float
-    ) -> None:
-        path, joints = written[0], request["joints"]
+    def _print(self, joints: list[str], chosen: Plan, written: list[Path], elapsed: float) -> None:
+        path = written[0]
         if self.json:
             terminal.print_json(
                 {
-                    "recording": str(path),
-                    "written": [str(p) for p in written],
-                    "joints": joints,
-                    "trials": len(chosen.trials),
-                    "recorded_s": chosen.duration_s,
-                    "elapsed_s": elapsed,
-                    "warnings": list(chosen.warnings),
+                    "recording": path, "written": written, "joints": joints,
+                    "trials": len(chosen.trials), "recorded_s": chosen.duration_s,
+                    "elapsed_s": elapsed, "warnings": chosen.warnings,
                 }
-            )
+            )  # fmt: skip
             return
         terminal.out.print(
             f"Recorded {len(chosen.trials)} trials of {len(joints)} joints, "
@@ -202,12 +196,11 @@ def _open(request: dict[str, Any]) -> ServoBus:
         rng = np.random.default_rng(request["seed"])
         real_time = bool(request["real_time"])
         own = load_joint_map(request["joint_map"]) if request["joint_map"] else None
-        whose = f"one with the servos of {own.file.name}" if own else "the emulated one"
-        terminal.err.print(
-            f"No robot: using {whose}" + (", in real time." if real_time else "."), soft_wrap=True
-        )
-        robot = draw_robot(rng, directly_read(own) if own else None, own)
-        return EmulatedBus(robot, rng, real_time=real_time)
+        robot = f"an emulated one with the servos of {own.file.name}" if own else "the emulated one"
+        how = ", in real time" if real_time else ""
+        terminal.err.print(f"No robot: using {robot}{how}.", soft_wrap=True)
+        drawn = draw_robot(rng, directly_read(own) if own else None, own)
+        return EmulatedBus(drawn, rng, real_time=real_time)
     return connect(request["bus"], request["joint_map"], request["joints"])
 
 
@@ -220,12 +213,12 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
     pose = bus.metadata["rest_pose_rad"]
-    room = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
+    margin = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
     return plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
         request["duration_s"], request["loop_period_s"], bus.metadata["speed_limit_rad_s"],
         bus.metadata.get("poll_rate_hz", POLL_RATE_HZ),
-        dict(zip(bus.joint_names, map(float, room), strict=True)), pose,
+        dict(zip(bus.joint_names, map(float, margin), strict=True)), pose,
     )  # fmt: skip
 
 
@@ -234,26 +227,20 @@ def _priority(request: dict[str, Any]) -> Iterator[str]:
     if request["bus"] == EMULATED and not request["real_time"]:
         yield "none: virtual time"
         return
-    with real_time_priority() as said:
-        terminal.err.print(f"Control loop at {said}.")
-        yield said
+    with real_time_priority() as priority:
+        terminal.err.print(f"Control loop at {priority}.")
+        yield priority
 
 
 def _guard_warnings(path: Path) -> list[str]:
-    """What a user should know of what the guard did to the commands."""
+    """Sentences on commands that the guard changed."""
     from pupper_sysid.sysid.sweep.resume import footer
 
-    did = footer(path).get("guard", {})
-    found = []
-    if did.get("clipped"):
-        found.append(
-            f"{did['clipped']} commands were outside the joints' limits and were held at them."
-        )
-    if did.get("slowed"):
-        found.append(
-            f"{did['slowed']} commands came later than asked, at the guard's speed and "
-            "acceleration limits; the recording holds what was sent."
-        )
-    if did.get("unsent"):
-        found.append(f"{did['unsent']} commands could not be sent; the servos kept the last goal.")
-    return found
+    counts = footer(path).get("guard", {})
+    sentences = {
+        "clipped": "were outside the joints' limits and were held at them.",
+        "slowed": "were delayed by the guard's speed and acceleration limits; the recording holds "
+        "the commands that were sent.",
+        "unsent": "could not be sent; the servos kept the last set-point.",
+    }
+    return [f"{counts[k]} commands {text}" for k, text in sentences.items() if counts.get(k)]

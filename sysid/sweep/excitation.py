@@ -1,13 +1,12 @@
-"""What to command: the trials of a recording, each a smooth, bounded motion from rest.
+"""Excitations: the trials of a recording, each a smooth, bounded motion from rest.
 
-`plan` makes them from a kind ("sine", "chirp", "multisine", "steps", "square"); `playback` from a
-file of recorded commands; `parse_frequencies` reads what a user writes (`1-10`, `1-10:0.5`,
-`1,2,4`). A plan knows commands only: `sysid.sweep.recorder` carries it out.
+`plan` makes them from a kind ("sine", "chirp", "multisine", "steps", "square"), and
+`sysid.sweep.playback` from a file of recorded commands; `sysid.sweep.recorder` executes them.
 
-Every trial begins with a short rest at the start pose: the onset from rest is what tells a
-servo's dead time from its dynamics. Amplitudes are reduced where a servo could not follow, and
-tones are moved off the frequencies that the loop or the poll would sample at the same few phases
-again and again; both are said in `Plan.warnings`.
+Every trial begins with a short rest at the start pose: the onset from rest separates dead time from
+dynamics. Amplitudes are reduced where the servo could not follow, and tones are moved off the
+frequencies that the loop or the poll samples at a few phases only; `Plan.warnings` names every
+change.
 """
 
 from __future__ import annotations
@@ -33,16 +32,16 @@ LEAD_IN_S = 0.2
 """Rest at the start pose, recorded at the head of every trial [s]."""
 
 SPEED_MARGIN = 0.9
-"""Share of the speed limit that an excitation may ask for."""
+"""Largest speed of an excitation, as a share of the speed limit."""
 
 LOOP_PERIOD_S = 0.019
 """Default time between commands [s]: the rate of the recordings this project starts from."""
 
 POLL_RATE_HZ = 1 / 0.02685
-"""Feedback polls of a Mini Pupper 2, as far as is known before the recording [Hz]."""
+"""Feedback polls of a Mini Pupper 2 [Hz], assumed before a recording."""
 
 _RATIOS = 12
-_LEAST_ROOM_RAD = 0.03
+_LEAST_MARGIN_RAD = 0.03
 _NUDGE_STEP_HZ = 0.01
 
 
@@ -83,9 +82,9 @@ class Plan:
     start_pose_rad : dict of str to float
         Every joint's pose before and between the trials, absolute [rad].
     description : dict
-        What a reader of the recording should know of the excitation.
+        Written into the recording's header.
     warnings : tuple of str
-        What was changed of what the user asked for.
+        Changes of the requested amplitudes and frequencies.
     """
 
     trials: tuple[TrialPlan, ...]
@@ -108,7 +107,7 @@ def plan(
     loop_period_s: float = 0.019,
     speed_limit_rad_s: float = 7.5,
     poll_rate_hz: float = POLL_RATE_HZ,
-    room_rad: Mapping[str, float] | None = None,
+    margin_rad: Mapping[str, float] | None = None,
     start_pose_rad: Mapping[str, float] | None = None,
 ) -> Plan:
     """The trials of an excitation, one joint after the other.
@@ -123,19 +122,19 @@ def plan(
     frequencies_hz : sequence of float
         Ignored by "steps".
     amplitude_rad : float
-        Largest excursion from the start pose. Steps and square waves keep it whatever the speed
-        limit: they are meant to reach it.
+        Largest excursion from the start pose. It is not reduced for steps and square waves, which
+        are meant to reach the speed limit.
     duration_s : float, optional
         Of each trial without its lead-in. Default: for tones 5 s or 5 periods, whichever is
         longer; 20 s for a chirp or multisine; one pass for steps.
     loop_period_s : float
-        Period at which commands will be sent.
+        Time between commands.
     speed_limit_rad_s : float
-        What the servo can do.
+        Of the servo.
     poll_rate_hz : float
         Feedback polls per second, 0 if there are none.
-    room_rad : mapping of joint to float, optional
-        How far each joint may swing to both sides of its start pose.
+    margin_rad : mapping of joint to float, optional
+        Largest excursion of each joint to both sides of its start pose.
     start_pose_rad : mapping of joint to float, optional
         Default: the Mini Pupper's standing pose.
 
@@ -161,17 +160,17 @@ def plan(
     if not frequencies and kind != "steps":
         raise InputError("excitation: no frequency was chosen; give at least one, such as 1-10.")
     warnings: list[str] = []
-    amplitude_rad = _within(amplitude_rad, joints, room_rad or {}, warnings)
+    amplitude_rad = _within(amplitude_rad, joints, margin_rad or {}, warnings)
     top_speed = SPEED_MARGIN * speed_limit_rad_s
     if kind in ("sine", "square"):
         shapes = []
-        for asked in frequencies:
-            time = duration_s or max(5.0, 5.0 / asked)
-            f = off_harmonics(asked, (1 / loop_period_s, poll_rate_hz), time)
-            if f != asked:
+        for wanted in frequencies:
+            time = duration_s or max(5.0, 5.0 / wanted)
+            f = off_harmonics(wanted, (1 / loop_period_s, poll_rate_hz), time)
+            if f != wanted:
                 warnings.append(
-                    f"{asked:g} Hz became {f:g} Hz: the loop ({1 / loop_period_s:.1f} Hz) or the "
-                    f"poll ({poll_rate_hz:.1f} Hz) would see the asked one at a few phases only."
+                    f"{wanted:g} Hz became {f:g} Hz: the loop ({1 / loop_period_s:.1f} Hz) or the "
+                    f"poll ({poll_rate_hz:.1f} Hz) would sample it at a few phases only."
                 )
             if kind == "sine":
                 amplitude = _bounded(amplitude_rad, 2 * np.pi * f, top_speed, f"{f:g} Hz", warnings)
@@ -230,16 +229,16 @@ def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
             step = float(step_text) if step_text else 1.0
         except ValueError:
             raise InputError(
-                f"--freqs: '{part}' is no frequency in Hz. Write 1-10, 1-10:0.5 or 1,2,4,6.5."
+                f"`frequencies`: '{part}' is not a frequency in Hz. Write 1-10, 1-10:0.5 or 1,2,4."
             ) from None
         for value in (low, high):
             _checked_frequency(value, highest_hz)
         if high < low:
-            raise InputError(f"--freqs: '{part}' runs backwards; write {high:g}-{low:g}.")
+            raise InputError(f"`frequencies`: '{part}' runs backwards; write {high:g}-{low:g}.")
         if not (np.isfinite(step) and step > 0) or (step_text and not dash):
-            raise InputError(f"--freqs: '{part}' has no usable step; write for example 1-10:0.5.")
+            raise InputError(f"`frequencies`: '{part}' has no usable step; write 1-10:0.5.")
         if (high - low) / step > 1000:
-            raise InputError(f"--freqs: '{part}' is more than 1000 frequencies; use a larger step.")
+            raise InputError(f"`frequencies`: '{part}' has more than 1000; use a larger step.")
         count = int((high - low) / step + 1e-9) + 1
         found += [round(low + i * step, 9) for i in range(count)]
     return sorted(set(found))
@@ -267,7 +266,7 @@ def off_harmonics(frequency_hz: float, rates_hz: Sequence[float], duration_s: fl
             if gcd(p, q) == 1
         )
 
-    # further than a few tenths of a hertz would be another frequency than the one asked for
+    # at most a few tenths of a hertz: further off it would be another measurement
     for k in range(round(0.5 / _NUDGE_STEP_HZ)):
         for f in (frequency_hz + k * _NUDGE_STEP_HZ, frequency_hz - k * _NUDGE_STEP_HZ):
             if f > 0 and clear(f):
@@ -288,28 +287,28 @@ def _checked_frequency(value: float, highest_hz: float) -> float:
 
 
 def _within(
-    amplitude: float, joints: Sequence[str], room: Mapping[str, float], warnings: list[str]
+    amplitude: float, joints: Sequence[str], margin: Mapping[str, float], warnings: list[str]
 ) -> float:
-    """`amplitude`, or less where a joint has no room for it; then with a warning."""
-    tight = min((j for j in joints if j in room), key=lambda j: room[j], default=None)
-    if tight is None or room[tight] >= amplitude:
+    """`amplitude`, or the smallest margin of the joints with a warning."""
+    tight = min((j for j in joints if j in margin), key=lambda j: margin[j], default=None)
+    if tight is None or margin[tight] >= amplitude:
         return amplitude
-    if room[tight] < _LEAST_ROOM_RAD:
+    if margin[tight] < _LEAST_MARGIN_RAD:
         raise InputError(
-            f"excitation: {tight} has {room[tight]:.3f} rad of room on either side of its start "
-            "pose, too little to learn from. Check its limits in the joint map."
+            f"excitation: {tight} has a margin of {margin[tight]:.3f} rad on either side of its "
+            "start pose, too little for a measurement. Check its limits in the joint map."
         )
     warnings.append(
-        f"amplitude reduced from {amplitude:g} to {room[tight]:.3f} rad, the room that the joint "
-        f"map's limits leave {tight}."
+        f"amplitude reduced from {amplitude:g} to {margin[tight]:.3f} rad, the margin within the "
+        f"joint map's limits of {tight}."
     )
-    return room[tight]
+    return margin[tight]
 
 
 def _bounded(
     amplitude: float, speed_per_rad: float, top_speed: float, what: str, warnings: list[str]
 ) -> float:
-    """`amplitude`, or less where its speed would exceed `top_speed`; then with a warning."""
+    """`amplitude`, or with a warning the largest whose speed stays below `top_speed`."""
     if amplitude * speed_per_rad <= top_speed:
         return amplitude
     reduced = top_speed / speed_per_rad
@@ -370,7 +369,7 @@ def _multisine(frequencies: Sequence[float]) -> Offset:
 
 
 def _peaks(offset: Offset, lowest_hz: float) -> tuple[float, float]:
-    """Largest excursion and speed of `offset`, looked for over 20 of its longest periods."""
+    """Largest excursion and speed of `offset` over 20 of its longest periods."""
     t = np.arange(0.0, 20.0 / lowest_hz, 0.001)
     value = offset(t)
     return float(np.abs(value).max()), float(np.abs(np.diff(value)).max() / 0.001)

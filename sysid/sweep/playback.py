@@ -1,8 +1,8 @@
-"""Play recorded commands again: a plan from a CSV of joint angles over time.
+"""Playback of recorded commands: a plan from a CSV of joint angles over time.
 
 The file has a column `time_s` and, for each joint that moves, `<joint>_command_rad` or `<joint>`,
-absolute angles in radians; other columns are ignored. Between its rows a command is held, as a
-policy's would be. A column `loop` (as in a recorded playback) makes each of its values a trial.
+absolute angles in radians; other columns are ignored. A command is held until the next row, as a
+policy holds its own. A column `loop` (as in a recorded playback) makes each of its values a trial.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ _LARGEST_RAD = 2 * np.pi
 
 
 def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
-    """A plan that repeats the commands in `path`; each joint starts at its first command.
+    """Plan that repeats the commands in `path`; each joint starts at its first command.
 
     Parameters
     ----------
     path : Path
     joints : sequence of str, optional
-        Joints to move (default: all that the file commands).
+        Joints to move; by default all that the file commands.
 
     Raises
     ------
     InputError
-        If the file cannot be read, lacks a column, or has values that are no angles or times.
+        If the file cannot be read, lacks a column, or has values that are not angles or times.
     """
     try:
         table = pd.read_csv(path, comment="#")
     except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{path} is no readable CSV file of commands: {error}.") from error
+        raise InputError(f"{path} is not a readable CSV file of commands: {error}.") from error
     columns = {}
     for joint in JOINT_NAMES:
         for name in (f"{joint}_command_rad", joint):
@@ -50,7 +50,7 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     if "time_s" not in table or not moving or missing or not len(table):
         wanted = f"{(missing or ['LF_hip'])[0]}_command_rad"
         raise InputError(
-            f"{path} is no file of commands: it needs rows with the columns time_s and {wanted}; "
+            f"{path} is not a file of commands: it needs rows with columns time_s and {wanted}; "
             f"it has {len(table)} rows of {', '.join(map(str, table.columns[:8]))}."
         )
     used = ["time_s", *(columns[j] for j in moving), *(["loop"] if "loop" in table else [])]
@@ -61,7 +61,7 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     if len(bad):
         row, column = bad[0]
         raise InputError(
-            f"{path}: column {used[column]}, data row {row + 1} is no number; "
+            f"{path}: column {used[column]}, data row {row + 1} is not a number; "
             "every command and time must be one."
         )
     numbers, loops = numbers[:, : len(moving) + 1], numbers[:, len(moving) + 1 :]
@@ -89,7 +89,7 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
 
 
 def _held(time: NDArray[np.float64], value: NDArray[np.float64]):
-    """The value of the last row at or before each instant, after the lead-in at rest."""
+    """Zero-order hold of rows, after the lead-in at rest."""
 
     def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
         t = np.asarray(t, float) - LEAD_IN_S

@@ -1,10 +1,10 @@
-"""Carry out a plan on a servo bus and write down what was sent and what was read, as it happens.
+"""Execute a plan on a servo bus and record commands and readings.
 
 `record` moves the robot to the start pose, runs the trials at a fixed rate, and returns to the
-start pose after each. Every command passes the safety guard, and what the guard made of it is what
-is written down. Rows reach the file tick by tick, so that a recording that is interrupted, or
-killed, is a recording up to there, and can be continued (`sysid.sweep.resume`). Whatever happens,
-the robot is parked and the bus closed at the end.
+start pose after each. Every command passes the safety guard, and the recording holds the command
+that the guard sent. Rows are written at every tick, so that an interrupted recording can be read up
+to there and continued (`sysid.sweep.resume`). The robot is always parked and the bus closed at the
+end.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan, TrialPlan
 from pupper_sysid.sysid.sweep.resume import Resume
 
 REST_S = 0.5
-"""Rest at the start pose before every trial [s], not recorded: servo and bus forget the last."""
+"""Rest at the start pose before every trial [s], not recorded: servo and bus settle."""
 
 RETURN_S = 0.4
-"""Shortest way back to the start pose after a trial [s]."""
+"""Shortest duration of the return to the start pose after a trial [s]."""
 
 Progress = Callable[[float, float, str], None]
-"""Called with seconds done, seconds in all, and what is going on."""
+"""Called with seconds done, seconds in all, and the name of the present work."""
 
 
 def record(
@@ -46,12 +46,12 @@ def record(
     resume: Resume | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Carry out `plan` on `bus` and write the recording to `path`.
+    """Execute `plan` on `bus` and write the recording to `path`.
 
     Parameters
     ----------
     bus : ServoBus
-        Guarded here if it is not yet. Closed when this returns, whatever happened.
+        Wrapped in a guard if it is not yet. Always closed at the end.
     plan : Plan
     path : Path
         CSV file to write.
@@ -69,15 +69,15 @@ def record(
     Returns
     -------
     Path
-        The file. Its footer is there only if the plan was carried out to its end.
+        The file. It has a footer only if the plan was completed.
 
     Raises
     ------
     InputError
-        If the plan names a joint the bus has not, or the file exists.
+        If the plan names a joint that is not on the bus, or the file exists.
     BusError
-        If the bus gives no reading of where the robot is; `SafetyStop` if the guard ended it, or
-        the loop missed too many deadlines: the robot is limp then, where it was.
+        If the bus gives no position reading; `SafetyStop` if the guard ended the recording, or the
+        loop missed too many deadlines: torque is off then.
     KeyboardInterrupt
         On Ctrl-C, after the robot was parked; the file has no footer then.
     """
@@ -101,25 +101,25 @@ class _Session:
         progress: Progress | None,
     ):
         self._loop = FixedRateLoop(bus, period_s)
-        # the ways between the trials keep the rate too, but are not what is recorded
+        # moves between the trials keep the rate, too, but are not recorded
         self._between = FixedRateLoop(bus, period_s)
         unknown = sorted({j for t in plan.trials for j in t.joints} - set(bus.joint_names))
         if unknown or not plan.trials:
             wrong = f"joint {unknown[0]} is not on the bus" if unknown else "it has no trials"
             raise InputError(
-                f"the plan cannot be carried out: {wrong}. "
+                f"the plan cannot be executed: {wrong}. "
                 f"The bus {bus.name} has {', '.join(bus.joint_names)}."
             )
         self._bus, self._plan, self._resume = bus, plan, resume
         self._progress: Progress = progress or (lambda done, total, what: None)
-        # a joint that the plan does not place stays where it is found
+        # a joint without a start pose in the plan stays where it is
         self._start = np.array([plan.start_pose_rad.get(j, np.nan) for j in bus.joint_names])
         self._sent = self._start.copy()
         self._total_s = plan.duration_s
         self._shift_s = 0.0
 
     def run(self, path: Path, metadata: dict[str, Any], force: bool) -> Path:
-        """Everything between opening the file and parking the robot."""
+        """Record all trials, from opening the file to parking the robot."""
         bus, resume = self._bus, self._resume
         present = first_pose(bus, self._loop.period_s)
         self._start = np.where(np.isfinite(self._start), self._start, present)
@@ -143,10 +143,10 @@ class _Session:
                     done += trial.duration_s
                     self._move_to_start()
             except SafetyStop:
-                bus.limp()  # the loop's own stop too, of which the guard does not know
+                bus.limp()  # for the loop's own stop, too, which the guard does not see
                 raise
             finally:
-                bus.park()  # before the disk may take its time
+                bus.park()  # before the disk, which may be slow
             writer.close(
                 {"rows": rows, "loop": self._loop.summary(), "guard": bus.report.summary()}
             )
@@ -174,7 +174,7 @@ class _Session:
         rows = 0
         for elapsed in self._loop.ticks(trial.duration_s):
             goal = self._start.copy()
-            # of the time it is, not of the time it should be: a late tick keeps the tone's phase
+            # at the present time, not the planned one: a late tick keeps the phase of the tone
             goal[index] = trial.command(elapsed, self._start[index])
             sent = bus.write(goal)
             self._sent = sent.position_rad
@@ -187,7 +187,7 @@ class _Session:
         return rows
 
     def _move_to_start(self) -> None:
-        """From the last command to the start pose on a raised cosine, gently."""
+        """Move from the last command to the start pose on a raised cosine."""
         glide(self._between, self._command, self._sent.copy(), self._start, RETURN_S)
 
     def _hold(self, duration_s: float) -> None:
@@ -198,7 +198,7 @@ class _Session:
         self._bus.sleep_until(until)
 
     def _command(self, goal: NDArray[np.float64]) -> None:
-        """A command whose effect the guard watches and nobody records."""
+        """Command and read without recording; the guard monitors the readings."""
         self._sent = self._bus.write(goal).position_rad
         self._bus.read()
 

@@ -1,8 +1,7 @@
-"""Continue a recording that was cut short: which trial comes next, and what time it is there.
+"""Continuation of an interrupted recording: its next trial, and the time on its clock.
 
 A trial is finished if its rows reach its end; the first unfinished one is recorded again from its
-start. Time goes on as it did on the wall: the file's last row was written when the file was last
-changed.
+start. The recording's clock continues with wall time, from the last change of the file.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _LEAST_PAUSE_S = 0.5
 
 
 class Request(BaseModel):
-    """What was asked for, as `sweep` writes it into the header."""
+    """Options of a sweep, as the command writes them into the header."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -42,12 +41,12 @@ class Request(BaseModel):
     duration_s: float | None
     playback: str | None
     loops: int = Field(1, ge=1, le=1000)
-    """Of a playback; recordings of before this could be asked for do not say it."""
+    """Of a playback; absent in recordings of older versions."""
 
 
 @dataclass(frozen=True)
 class Resume:
-    """Where an unfinished recording goes on.
+    """Where an unfinished recording continues.
 
     Attributes
     ----------
@@ -77,30 +76,30 @@ def header_of(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If it is no recording of ours, was finished, or does not say what was planned.
+        If it is not a recording of this project, was completed, or does not hold its plan.
     """
     text = as_text(path, read_bytes(path))
     if not text.startswith(TITLE):
-        raise InputError(f"{path} is no recording of pupper-sysid; only those can be continued.")
+        raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")
     metadata = header(path, text.splitlines())
     if "completed" in metadata:
         raise InputError(f"{path} was recorded to its end; there is nothing to continue.")
     request = metadata.get("sweep")
     if request is None:
         raise InputError(
-            f"{path} does not say what was planned (an older version wrote it). Record it again."
+            f"{path} does not hold its plan (an older version wrote it). Record it again."
         )
     validated(Request, request, f"{path}, header's sweep", remedy="record it again")
     return metadata
 
 
 def footer(path: Path) -> dict[str, Any]:
-    """What a finished recording says of how it went; empty if it was not finished."""
+    """Footer of a completed recording; empty if it was not completed."""
     return header(path, as_text(path, read_bytes(path)).splitlines()).get("completed", {})
 
 
 def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
-    """Where `plan`, partly carried out in the recording at `path`, goes on.
+    """Where `plan`, partly recorded at `path`, continues.
 
     Raises
     ------
@@ -109,8 +108,9 @@ def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
     """
     written_at = path.stat().st_mtime
     text = as_text(path, read_bytes(path))
-    planned = header(path, text.splitlines()).get("excitation")
-    if planned != json.loads(json.dumps(dict(plan.description))):
+    planned = header(path, text.splitlines()).get("excitation") or {}
+    present = json.loads(json.dumps(dict(plan.description)))
+    if {**planned, "warnings": []} != {**present, "warnings": []}:  # their wording may change
         raise InputError(
             f"{path} was recorded with another plan than its header gives today: the played file, "
             "the joint map or the limits have changed since. Record it again."

@@ -157,11 +157,11 @@ def test_frequencies_are_read_as_users_write_them(text, expected):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "no frequency"),
+        ("", "not a frequency"),
         ("fast", "'fast'"),
         ("1,,2", "''"),
         ("0", "above 0"),
-        ("-3", "no frequency"),
+        ("-3", "not a frequency"),
         ("1--3", "above 0"),
         ("nan", "above 0"),
         ("10-1", "write 1-10"),

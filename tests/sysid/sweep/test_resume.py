@@ -90,8 +90,8 @@ def test_a_recording_killed_between_the_last_row_and_the_footer_only_gets_its_fo
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("time_s,x\n1,2\n", "no recording of pupper-sysid"),
-        ("# pupper-sysid recording\n# schema_version: 1\n", "does not say what was planned"),
+        ("time_s,x\n1,2\n", "not a recording of pupper-sysid"),
+        ("# pupper-sysid recording\n# schema_version: 1\n", "does not hold its plan"),
         ("# pupper-sysid recording\n# sweep: {\"bus\": 3}\n", "sweep: bus is 3. Write text"),
     ],
 )  # fmt: skip
