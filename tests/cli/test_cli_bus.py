@@ -1,8 +1,9 @@
-"""The commands that talk to a bus, as a user meets them: the emulators behind real ports."""
+"""Commands that talk to a bus, with emulators behind real ports."""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -18,7 +19,6 @@ from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.servo_servers import moving_servos, on_a_port, still_servos, wait_until
 
-ROOT = Path(__file__).resolve().parents[2]
 SHORT = ("--freqs", "3", "--duration", "1")
 
 
@@ -27,7 +27,7 @@ def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def test_scan_says_who_is_there_at_which_rate(capsys):
+def test_scan_lists_the_servos_and_finds_their_rate(capsys):
     with on_a_port(still_servos(SCS0009, ids=[4, 7], baud=500_000)) as port:
         code, out, _ = run(capsys, "scan", "--bus", f"feetech:{port.device}", "--json")
     found = json.loads(out)
@@ -38,7 +38,7 @@ def test_scan_says_who_is_there_at_which_rate(capsys):
     assert (first["voltage_v"], first["limits"], first["errors"]) == (7.4, [20, 1003], "")
 
 
-def test_scan_of_a_silent_line_says_what_to_check(capsys):
+def test_scan_of_a_silent_line_names_what_to_check(capsys):
     with on_a_port(still_servos(ids=[])) as port:
         code, _, err = run(capsys, "scan", "--bus", f"feetech:{port.device}@1000000")
     assert code == 1 and "no servo answers at 1000000 baud" in err and "power" in err
@@ -60,8 +60,8 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     # half of a turn with a return delay of 500 µs, and what this host adds
     assert 0.0003 < doubt < 0.02 and doubt == bus["read_time_doubt_s"]
     assert {"voltage_v", "temperature_c", "load"} <= set(recording.table.columns)
-    # at 3 Hz and 0.3 rad the servo follows: it moved by most of what it was told (a loaded machine
-    # may miss a reading)
+    # at 3 Hz and 0.3 rad the servo follows most of the command (a loaded machine may miss a
+    # reading)
     trial = recording.trials("LF_thigh")[0]
     assert abs(trial.command_rad - 0.785).max() == pytest.approx(0.3, abs=0.01)
     assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
@@ -89,39 +89,39 @@ def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (("sweep", "--bus", "usb"), "write emulated, esp32"),
         (("sweep", "--bus", "feetech:/dev/ttyUSB0@fast"), "'fast' is no baud rate"),
         (("sweep", "--bus", "esp32", "--truth"), "only a new recording of the emulated robot"),
-        (("sweep", "--bus", "esp32", "--real-time"), "knows no other time"),
+        (("sweep", "--bus", "esp32", "--real-time"), "always runs in real time"),
         (("sweep", "--joint-map", "nowhere.yaml"), "does not exist"),
         (("emulate", "feetech", "--joint-map", "sts3215", "--walking"), "only the Mini Pupper"),
         (("sweep", "--resume", "nothing.csv"), "does not exist"),
         (("emulate", "feetech", "--ids", "1-20"), "has the ids 1 to 12"),
-        (("emulate", "feetech", "--baud", "7"), "servos know 1000000"),
+        (("emulate", "feetech", "--baud", "7"), "choose 1000000"),
         (("emulate", "esp32", "--walking", "--by-hand"), "leave out --walking"),
         (("emulate", "esp32", "--faults", "gremlins=1"), "'gremlins' is not known"),
-        (("emulate", "esp32", "--faults", "lost=2"), "is no probability"),
+        (("emulate", "esp32", "--faults", "lost=2"), "is not a probability"),
         (("emulate", "esp32", "--faults", "lost"), "is not kind=probability"),
     ],
 )
-def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, says):
+def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, expected):
     code, out, err = run(capsys, *arguments)
-    assert code == 2 and says in err and out == ""
+    assert code == 2 and expected in err and out == ""
 
 
 @pytest.mark.parametrize(
-    ("bus", "says"),
+    ("bus", "expected"),
     [
         ("feetech:/dev/no-such-port", "There is no such device"),
         ("esp32:/tmp/no-such-folder-here/socket", "cannot be opened"),
         ("esp32:nobody.socket", "no answer. On the robot"),
     ],
 )
-def test_a_bus_that_is_not_there_says_what_to_check(capsys, bus, says):
+def test_a_missing_bus_is_refused_with_what_to_check(capsys, bus, expected):
     code, _, err = run(capsys, "sweep", *SHORT, "--bus", bus)
-    assert code == 1 and says in err
+    assert code == 1 and expected in err
 
 
 def test_a_map_of_the_other_frame_is_refused(capsys):
@@ -134,13 +134,12 @@ def test_a_map_of_the_other_frame_is_refused(capsys):
 
 
 @pytest.mark.parametrize("kind", ["feetech", "esp32"])
-def test_an_emulator_says_what_to_type_and_ends_on_request(tmp_path, kind):
+def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind):
     place = ("--link", "s") if kind == "feetech" else ("--socket", "s")
     process = subprocess.Popen(
         [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
             "emulate", kind, *place, "--truth", "t.yaml"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
     )  # fmt: skip
     assert process.stdout is not None
     out = "".join(process.stdout.readline() for _ in range(5))
@@ -175,10 +174,10 @@ def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
             "emulate", "feetech", "--walking",
          "--link", "s", "--imu-socket", "i"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "PYTHONUNBUFFERED": "1"},
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     assert process.stdout is not None
-    said = "".join(process.stdout.readline() for _ in range(4))
+    out = "".join(process.stdout.readline() for _ in range(4))
     try:
         imu = Esp32Bus(tmp_path / "i")
         samples: list = []
@@ -188,6 +187,6 @@ def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
     finally:
         process.send_signal(signal.SIGTERM)
         _, err = process.communicate(timeout=10)
-    assert "IMU at i." in said and "monitor --bus feetech:s" in said and "Ctrl-C" in said
-    assert "sweep" not in said, "a sweep is for legs in free air"
+    assert "IMU at i." in out and "monitor --bus feetech:s" in out and "Ctrl-C" in out
+    assert "sweep" not in out, "a sweep is for legs in free air"
     assert "Traceback" not in err and not list(tmp_path.glob("[is]"))

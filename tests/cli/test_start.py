@@ -8,10 +8,12 @@ import sys
 import pytest
 
 from pupper_sysid.cli.dispatch import overview, words
-from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.cli.programs import pupper_analyze, pupper_sysid
 from support.command_line import refused, run
 
-PROGRAMS = ("train", "play", "eval", "deploy", "analyze")
+PROGRAMS = (
+    "pupper_sysid", "pupper_train", "pupper_play", "pupper_eval", "pupper_deploy", "pupper_analyze",
+)  # fmt: skip
 SLOW = ("torch", "rsl_rl", "matplotlib", "pandas", "scipy", "control", "mujoco", "numba", "sklearn")
 
 
@@ -26,36 +28,43 @@ def imported(code: str) -> set[str]:
 
 
 def test_help_and_version_of_every_command_import_no_slow_library():
-    programs = {f"pupper_{name}": [[]] for name in PROGRAMS}
-    programs["pupper_sysid"] = [[], *(name.split() for name in words(pupper_sysid.COMMANDS))]
-    assert (
-        imported(f"""
+    commands = {
+        "pupper_sysid": words(pupper_sysid.COMMANDS),
+        "pupper_analyze": words(pupper_analyze.COMMANDS),
+    }
+    code = f"""
 from contextlib import suppress
 from importlib import import_module
-for module, commands in {programs!r}.items():
-    main = import_module("pupper_sysid.cli.programs." + module).main
-    for words in commands:
+commands = {commands!r}
+for program in {PROGRAMS!r}:
+    main = import_module("pupper_sysid.cli.programs." + program).main
+    for words in ("", *commands.get(program, ())):
         for option in ("--help", "--version"):
             with suppress(SystemExit):
-                main([*words, option])
-""")
-        == set()
-    )
+                main([*words.split(), option])
+"""
+    assert imported(code) == set()
 
 
 def test_the_package_itself_imports_nothing_slow():
     assert imported("import pupper_sysid") == set()
 
 
-def test_the_overview_fits_a_screen_of_24_times_80():
-    lines = overview("pupper-sysid", pupper_sysid.DESCRIPTION, pupper_sysid.COMMANDS).splitlines()
+@pytest.mark.parametrize("program", [pupper_sysid, pupper_analyze])
+def test_the_overview_fits_a_screen_of_24_times_80(program):
+    lines = overview("pupper-analyze", program.DESCRIPTION, program.COMMANDS).splitlines()
     assert len(lines) < 24 and max(map(len, lines)) <= 80
+    assert all(any(f" {word} " in line for line in lines) for word in program.COMMANDS)
+
+
+def test_commands_are_grouped_as_their_folders():
+    for command in pupper_sysid.COMMANDS.values():
+        assert command.where.startswith(f"{command.group}.")
     groups = dict.fromkeys(c.group for c in pupper_sysid.COMMANDS.values())
     assert list(groups) == ["robot", "recording", "model", "use"]
-    assert all(any(f" {word} " in line for line in lines) for word in pupper_sysid.COMMANDS)
 
 
-@pytest.mark.parametrize(("arguments"), [(), ("-h",), ("--help",)])
+@pytest.mark.parametrize("arguments", [(), ("-h",), ("--help",)])
 def test_the_overview_is_what_help_prints(capsys, arguments):
     code, out, _ = run(capsys, *arguments)
     assert code == 0 and "calibrate-joints" in out
