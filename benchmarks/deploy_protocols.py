@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from emulators import KINDS, walking_servers
 
-from pupper_sysid.cli.commands.fit_servo import FitServo
+from pupper_sysid.cli.commands.model.fit_servo import FitServo
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.esp32.bus import Esp32Bus

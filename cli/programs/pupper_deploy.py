@@ -17,7 +17,7 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
-from pupper_sysid.cli.commands.sweep import Sweep
+from pupper_sysid.cli.commands.recording.sweep import Sweep
 from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, trained_actuator
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program

@@ -14,26 +14,39 @@ from pupper_sysid.cli.dispatch import Command, run_command
 DESCRIPTION = """Measure a cheap servo and get a simulator that moves like it. Try it without a
 robot: `pupper-sysid sweep --freqs 1-10`, then `delay`, `calibrate`, `report`.
 """
+_SUMMARIES = {
+    "robot": {
+        "init-robot": "Begin a joint map for another robot.",
+        "scan": "List the servos on a bus.",
+        "monitor": "Watch the joints live; nothing moves.",
+        "calibrate-joints": "Measure zero, range and direction of each joint.",
+        "emulate": "Emulate a robot behind the real protocols.",
+    },
+    "recording": {
+        "sweep": "Move joints in tones or steps and record them.",
+        "doctor": "Check whether a recording is usable.",
+        "delay": "Split the lag into bus, sensor and servo.",
+        "bode": "Measure the frequency response.",
+    },
+    "model": {
+        "calibrate": "Fit DelayedPD per joint; write YAML.",
+        "sindy": "Find a sparse equation of motion per joint.",
+        "fit-servo": "Fit an MLP, LSTM, FIR or other model.",
+        "compare": "Compare models on the same readings.",
+    },
+    "use": {
+        "report": "Write all of it as one HTML page.",
+        "export": "Convert for MuJoCo, Isaac Lab, Newton, CSV …",
+    },
+}
+# `fit-servo` of the group `model` is the class FitServo in commands/model/fit_servo.py
 COMMANDS = {
-    "init-robot": Command("robot", "Begin a joint map for another robot.", "init_robot:InitRobot"),
-    "scan": Command("robot", "List the servos on a bus.", "scan:Scan"),
-    "monitor": Command("robot", "Watch the joints live; nothing moves.", "monitor:Monitor"),
-    "calibrate-joints": Command(
-        "robot", "Measure zero, range and direction of each joint.",
-        "calibrate_joints:CalibrateJoints",
-    ),
-    "emulate": Command("robot", "Emulate a robot behind the real protocols.", "emulate:Emulate"),
-    "sweep": Command("recording", "Move joints in tones or steps and record them.", "sweep:Sweep"),
-    "doctor": Command("recording", "Check whether a recording is usable.", "analyse:Doctor"),
-    "delay": Command("recording", "Split the lag into bus, sensor and servo.", "analyse:Delay"),
-    "bode": Command("recording", "Measure the frequency response.", "analyse:Bode"),
-    "calibrate": Command("model", "Fit DelayedPD per joint; write YAML.", "calibrate:Calibrate"),
-    "sindy": Command("model", "Find a sparse equation of motion per joint.", "sindy:Sindy"),
-    "fit-servo": Command("model", "Fit an MLP, LSTM, FIR or other model.", "fit_servo:FitServo"),
-    "compare": Command("model", "Compare models on the same readings.", "compare:Compare"),
-    "report": Command("use", "Write all of it as one HTML page.", "report:Report"),
-    "export": Command("use", "Convert for MuJoCo, Isaac Lab, Newton, CSV …", "export:Export"),
-}  # fmt: skip
+    word: Command(
+        group, summary, f"{group}.{word.replace('-', '_')}:{word.title().replace('-', '')}"
+    )
+    for group, summaries in _SUMMARIES.items()
+    for word, summary in summaries.items()
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.calibrate_joints import Guide
+from pupper_sysid.cli.commands.robot.calibrate_joints import Guide
 from pupper_sysid.cli.programs.pupper_sysid import main
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.joints import JOINT_NAMES

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.monitor import Watched
+from pupper_sysid.cli.commands.robot.monitor import Watched
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.feetech.frames import FrameReader
@@ -129,7 +129,10 @@ def test_monitoring_the_proxy_only_asks_and_says_what_it_cannot_tell(capsys, tmp
         datagrams.GET_POSITION, datagrams.GET_LOAD, datagrams.GET_POWER
     }  # fmt: skip
     words = " ".join(out.split())
-    assert "unchanged" in words and "the feedback age is unknown, as are goals, temperatures and errors" in words
+    assert (
+        "unchanged" in words
+        and "the feedback age is unknown, as are goals, temperatures and errors" in words
+    )
     row = next(line.split() for line in out.splitlines() if line.startswith("LF_hip"))
     assert row[1] == "–" and row[3] == "512"
 
@@ -144,7 +147,7 @@ def test_ctrl_c_ends_it_as_it_should(capsys, monkeypatch):
     def interrupted(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pupper_sysid.cli.commands.monitor.Watched.look", interrupted)
+    monkeypatch.setattr("pupper_sysid.cli.commands.robot.monitor.Watched.look", interrupted)
     code, _, err = run(capsys, "monitor", "--bus", "emulated")
     assert code == 0 and err == "Stopped."
 

@@ -1,0 +1,1 @@
+"""Commands about a robot: its bus, its joints, its emulation."""

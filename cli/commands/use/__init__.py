@@ -1,0 +1,1 @@
+"""Commands that present results and convert them for other programs."""
