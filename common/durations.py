@@ -1,4 +1,4 @@
-"""Statistics of durations that cost the same memory after a second and after a day."""
+"""Statistics of durations in constant memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BINS = math.ceil(math.log(_LONGEST_S / _SHORTEST_S) / _STEP)
 
 
 class Durations:
-    """Count, mean, standard deviation, largest and quantiles of durations [s], one at a time.
+    """Count, mean, standard deviation, largest and quantiles of durations [s].
 
     Mean and deviation are exact (Welford), quantiles within 1 %: they come from a histogram with
     logarithmic bins from 0.1 µs to 1000 s.
@@ -23,7 +23,7 @@ class Durations:
         self._bins = np.zeros(_BINS, np.int64)
 
     def add(self, seconds: float) -> None:
-        """One more, at least 0."""
+        """Add one duration [s], ≥ 0."""
         self.count += 1
         away = seconds - self.mean_s
         self.mean_s += away / self.count
@@ -34,11 +34,11 @@ class Durations:
 
     @property
     def sd_s(self) -> float:
-        """Standard deviation; 0 of one."""
+        """Standard deviation [s]; 0 for a single duration."""
         return math.sqrt(self._squares / max(self.count, 1))
 
     def quantile(self, share: float) -> float:
-        """The duration that `share` of them stay below; NaN of none."""
+        """Duration [s] that `share` of them stay below; NaN without any."""
         if not self.count:
             return math.nan
         place = int(np.searchsorted(np.cumsum(self._bins), share * self.count))

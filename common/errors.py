@@ -1,4 +1,4 @@
-"""The errors a user can meet; each message says what is wrong, where, and what to do next.
+"""Errors for users; each message names the fault, the place, and what to do next.
 
 The command line prints the message and ends with `exit_code`; a traceback is shown only with
 `--debug`. Anything that is not a `PupperError` is a defect of this project.
@@ -6,24 +6,24 @@ The command line prints the message and ends with `exit_code`; a traceback is sh
 
 
 class PupperError(Exception):
-    """Something went wrong that the user should hear about in one sentence."""
+    """A fault that is reported to the user in one sentence."""
 
     exit_code = 1
 
 
 class InputError(PupperError):
-    """A file, an option or a value the user gave cannot be used."""
+    """A file, an option or a value that cannot be used."""
 
     exit_code = 2
 
 
 class FileExistsRefusal(InputError):
-    """A file would have been overwritten without `--force`."""
+    """A file exists and `force` is not set."""
 
 
 class BusError(PupperError):
-    """The servo bus did not do what it was asked."""
+    """A servo bus failed."""
 
 
 class SafetyStop(BusError):
-    """The robot was stopped because going on could have harmed it."""
+    """The robot was stopped to prevent harm."""

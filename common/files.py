@@ -22,7 +22,7 @@ def refuse_overwrite(path: Path, force: bool = False) -> None:
     """Raise unless `path` is free, or `force` was given."""
     if path.exists() and not force:
         raise FileExistsRefusal(
-            f"{path} exists already. Choose another name, or add --force to replace it."
+            f"{path} exists already. Choose another name, or set `force=True` to replace it."
         )
 
 

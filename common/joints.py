@@ -100,7 +100,7 @@ def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str
             hint = f" Did you mean {near[0]}?" if near else ""
             more = ", legs (LF, …), kinds (hip, …)" if own else ""
             raise InputError(
-                f"--joints: '{word}' is no joint{', leg or kind' if own else ''}.{hint} "
+                f"`joints`: '{word}' is no joint{', leg or kind' if own else ''}.{hint} "
                 f"Use names ({', '.join(available[:3])}, …){more} or all."
             )
         chosen.update(found)

@@ -1,8 +1,7 @@
-"""Keep freed memory: training frees and asks again for the same large blocks thousands of times.
+"""Keep freed memory: training frees and allocates the same large blocks thousands of times.
 
-By default glibc gives large blocks back to the system at once, and the system clears every page of
-them again at the next request. That was measured to take three quarters of the time of an LSTM's
-training step.
+By default glibc returns large blocks to the system at once, which clears every page of them at the
+next request. That was measured to take three quarters of the time of an LSTM's training step.
 """
 
 from __future__ import annotations

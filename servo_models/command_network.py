@@ -6,9 +6,9 @@ normalised by its mean and spread in training,
     position = centre + spread * (fir · x + fir_bias + bound * tanh(network(x) / bound))
 
 The first part is a linear filter (finite impulse response, FIR), the baseline; a model may have no
-other. The second, a feed-forward network with ReLU, corrects it by no more than `bound`, so that the
-model falls back to the linear one far from its training data. No reading is needed: stale feedback
-has no influence.
+other. The second, a feed-forward network with ReLU, corrects it by no more than `bound`, so that
+far from its training data the model is nearly linear. No reading is needed: stale feedback has no
+influence.
 
 With `feedback` the network's last input is the position it predicted last, as in the published
 servo models; then errors can build up over time, and `bound` is infinite.

@@ -1,10 +1,9 @@
-"""Servo model files: weights that run, and the contract under which they may.
+"""Servo model files: a folder with weights and the contract under which they are valid.
 
-A saved model is a folder: `contract.json` says what the model is (joints, inputs and their order,
-time step, units, normalisation, what it was trained on, how well it did, versions) and
-`weights.safetensors` holds its arrays. The contract names the weights' hash, so that one cannot be
-exchanged without the other; nothing in either is code. A model that is asked to run at another
-rate, on another joint, or from a file this version does not know is refused in a sentence.
+`contract.json` describes the model (joints, inputs and their order, time step, units, training
+data, scores, versions); `weights.safetensors` holds its arrays. The contract has the weights' hash,
+so that neither can be exchanged alone; nothing in either is code. `load_servo_model` refuses a
+model for another rate or joint, and any file that is damaged, changed or of an unknown version.
 """
 
 from __future__ import annotations
@@ -58,53 +57,33 @@ Model = CommandNetwork | RecurrentNetwork | AtControlRate
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class JointContract(_Strict):
-    """What is known of one joint's model.
-
-    Attributes
-    ----------
-    scores : dict of str to float or None
-        On data the model has not seen, see the README.
-    band_noise_rad, band_timing_s : float
-        Standard deviation of its error at speed v: sqrt(noise² + (timing · v)²).
-    readings : int
-        It was fitted to.
-    """
+    """Scores and error of one joint's model."""
 
     scores: dict[str, float | None]
+    """On data the model has not seen, see the README."""
     band_noise_rad: Annotated[float, Field(ge=0)]
+    """Standard deviation of the model's error at rest."""
     band_timing_s: Annotated[float, Field(ge=0)]
+    """Its growth with speed v: the whole is sqrt(noise² + (timing · v)²)."""
     readings: Annotated[int, Field(ge=0)]
+    """Number of readings it was fitted to."""
 
 
 class InputRecording(_Strict):
-    """A recording the model was fitted to."""
+    """Recording the model was fitted to."""
 
     name: str
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Contract(_Strict):
-    """What a saved servo model is, and what it needs.
-
-    Attributes
-    ----------
-    time_step_s : float
-        Time between commands; the model answers where the servo is one step later.
-    inputs : tuple of str
-        In the order in which the model takes them.
-    readings_counted : dict of str to str
-        "fresh" (each at its own time) or "all" rows, per joint.
-    warm_up : int
-        Steps at rest after a reset (LSTM).
-    joints : dict of str to JointContract
-        In the order of the arrays' first axis.
-    weights_sha256 : str
-        Of the weights file.
-    """
+    """What a saved servo model is, and what it needs."""
 
     schema_name: Annotated[Literal["pupper-servo-model"], Field(alias="schema")] = SCHEMA
     schema_version: Literal[1, 2] = SCHEMA_VERSION
@@ -112,7 +91,9 @@ class Contract(_Strict):
     preset: str
     created: str
     time_step_s: Annotated[float, Field(ge=1e-4, le=1)]
+    """Time between commands; the output is the position one step later."""
     inputs: Annotated[tuple[str, ...], Field(strict=False)]
+    """Names of the inputs, in order."""
     output: Literal["position_rad, one time step after the newest command"] = (
         "position_rad, one time step after the newest command"
     )
@@ -121,8 +102,11 @@ class Contract(_Strict):
     )
     feedback: bool
     warm_up: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Steps at rest after a reset (LSTM)."""
     joints: Annotated[dict[str, JointContract], Field(min_length=1)]
+    """In the order of the arrays' first axis."""
     readings_counted: dict[str, str]
+    """"fresh" (each at its own time) or "all" rows, per joint."""
     split: str
     choices: dict[str, float]
     recordings: Annotated[tuple[InputRecording, ...], Field(strict=False)]
@@ -134,7 +118,7 @@ class Contract(_Strict):
 
 @dataclass(frozen=True)
 class SavedModel:
-    """A model that runs, its arrays, and its contract."""
+    """A model, its arrays and its contract."""
 
     model: Model
     contract: Contract
@@ -157,22 +141,21 @@ def save_servo_model(
     Parameters
     ----------
     folder : Path
-        Made if missing.
+        Created if missing.
     parameters : dict of str to ndarray
         The joints are the first axis, in the contract's order.
     contract : dict
-        Fields of `Contract` but the weights' hash.
+        Fields of `Contract` without the weights' hash.
     force : bool
-        Replace a model that is there.
+        Replace an existing model.
 
     Raises
     ------
     InputError
-        If there is a model already, if it is none that could be read back, or if it cannot be
-        written.
+        If there is a model already, or if this one cannot be read back or written.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file; a servo model is a folder. Choose another --out.")
+        raise InputError(f"{folder} is a file; a servo model is a folder. Choose another name.")
     for name in (CONTRACT, WEIGHTS):
         refuse_overwrite(folder / name, force)
     data = save_tensors({k: np.ascontiguousarray(v) for k, v in parameters.items()})
@@ -193,15 +176,15 @@ def load_servo_model(
     ----------
     folder : Path
     joints : sequence of str, optional
-        Joints that are needed; the model's batch is then in this order. By default all it has.
+        Joints of the model's batch, in this order; by default all that it has.
     time_step_s : float, optional
-        Time between commands where it will run [s].
+        Time between commands in use [s].
 
     Raises
     ------
     InputError
-        If the folder holds no model, or one that is damaged, was changed, is for another joint or
-        for another rate.
+        If the folder holds no model, or one that is damaged or changed, or is for another joint
+        or rate.
     """
     folder = Path(folder)
     contract = _read_contract(folder)
@@ -209,8 +192,7 @@ def load_servo_model(
         raise InputError(
             f"{folder} is a model for a command every {1e3 * contract.time_step_s:.1f} ms, but "
             f"commands come every {1e3 * time_step_s:.1f} ms. A learned model cannot change its "
-            "rate: record at the new one and run `pupper-sysid fit-servo` on that, or use "
-            "`--arch delayed-pd`, refitted at it."
+            "rate: record at the new one and fit again, or fit the architecture delayed-pd."
         )
     names = list(contract.joints)
     wanted = names if joints is None else list(joints)
@@ -218,8 +200,7 @@ def load_servo_model(
     if missing:
         raise InputError(
             f"{folder} has no model for {', '.join(missing)}; it has {', '.join(names)}. Servos "
-            "differ, so another joint's model is no substitute: fit one with `pupper-sysid "
-            f"fit-servo --joints {missing[0]}`."
+            "differ, so another joint's model is no substitute: fit one of its own."
         )
     data = read_bytes(folder / WEIGHTS, _LARGEST_BYTES, _AGAIN)
     if hashlib.sha256(data).hexdigest() != contract.weights_sha256:
@@ -249,8 +230,8 @@ def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
     Raises
     ------
     InputError
-        If the arrays are not those of the contract's architecture, joints and inputs, or hold
-        numbers that no model can have.
+        If the arrays do not fit the contract's architecture, joints and inputs, or hold impossible
+        numbers.
     """
     joints, step = tuple(contract.joints), contract.time_step_s
     _check_names(contract.arch, set(parameters))
@@ -301,7 +282,7 @@ def _build(contract: Contract, parameters: Mapping[str, NDArray], folder: Path) 
 
 
 def _check_names(arch: str, found: set[str]) -> None:
-    """Refuse missing arrays, and those of another architecture, which would be left unused."""
+    """Refuse missing arrays, and those of another architecture."""
     required, optional = set(_LINEAR), frozenset[str]()
     if arch == "delayed-pd":
         required = {f.name for f in fields(DelayedPDParameters)} | {"offset_rad"}
@@ -323,7 +304,7 @@ def _read_contract(folder: Path) -> Contract:
     if not os.path.exists(path):
         raise InputError(
             f"{folder} holds no servo model ({CONTRACT} is missing). "
-            "Make one with `pupper-sysid fit-servo --out NAME`."
+            "Make one with `pupper-sysid fit-servo`."
         )
     found = read_json(path, _LARGEST_BYTES, _AGAIN)
     if not isinstance(found, dict) or found.get("schema") != SCHEMA:

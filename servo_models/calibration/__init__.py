@@ -1,1 +1,1 @@
-"""The calibration file: what was measured of a robot's servos."""
+"""The calibration file: measured actuators and feedback of a robot's servos."""

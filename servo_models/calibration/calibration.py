@@ -1,11 +1,10 @@
-"""Calibration: what was measured of a robot's servos, in one YAML file that others can read.
+"""Calibration: measured actuators and feedback of a robot's servos, in one YAML file.
 
-A calibration holds, per joint, an actuator (what the servo does with a command) and a feedback
-(what makes its readings old, coarse and off), each number with its 90 % interval and whether the
-data identified it, and beside them what a reader needs to distrust it: scores, input hashes,
-versions, seed. `load_calibration` reads a file or a preset and refuses, in one sentence, whatever
-it cannot trust; `Calibration.save` writes one. `Calibration.delayed_pd` and
-`Calibration.held_feedback` are the models that a simulator runs.
+A calibration holds, per joint, an actuator (from command to motion) and a feedback (from motion to
+reading: stale, quantised, biased), each number with its 90 % interval and whether the data
+identified it, and provenance: scores, input hashes, versions, seed. `load_calibration` reads a file
+or a preset and refuses in a sentence what is not valid; `Calibration.save` writes one.
+`Calibration.delayed_pd` and `Calibration.held_feedback` are the models that a simulator runs.
 
 Presets are published settings in the same form: `paper` is the actuator of the paper
 "Reinforcement Learning on Cost-Constrained Quadrupedal Hardware" (Mini Pupper 2) as its text gives
@@ -53,8 +52,8 @@ UNITS = (
 _HEADER = """\
 # Calibration of a robot's servos, written by pupper-sysid.
 #
-# Per joint: `actuator` is what the servo does with a command, `feedback` is what makes a reading
-# of it old, coarse and off. Simulate them apart: the one on the torque, the other on the reading.
+# Per joint: `actuator` leads from command to motion, `feedback` from motion to reading (stale,
+# quantised, biased). Simulate them apart: the one on the torque, the other on the reading.
 # A number reads {value, low, high, identified, why}: low and high are the ends of its 90 %
 # interval (null: none), and `identified` says whether the recording determined it:
 #   yes         the recording determined it
@@ -65,7 +64,7 @@ _HEADER = """\
 
 
 class InputFile(Part):
-    """A file the calibration was made from."""
+    """A recording the calibration was made from."""
 
     name: str
     """File name, without folders."""
@@ -74,34 +73,32 @@ class InputFile(Part):
 
 
 class Calibration(Part):
-    """What was measured of a robot's servos. See the module's text.
-
-    Built from its parts, or by `load_calibration`. Frozen.
+    """Measured servos of one robot. Frozen; see the module's text.
 
     Raises
     ------
     pydantic.ValidationError
-        If built in Python from parts that do not fit; `load_calibration` raises `InputError`.
+        If its parts do not fit each other; `load_calibration` raises `InputError`.
     """
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
-    """What kind of file this is."""
+    """Kind of the file."""
     schema_version: Literal[2] = SCHEMA_VERSION
-    """Version of the file's form."""
+    """Version of the file's format."""
     robot: str
-    """What was measured."""
+    """The robot that was measured."""
     created: str
-    """When, in UTC and ISO 8601."""
+    """Time of the calibration, in UTC and ISO 8601."""
     inputs: Annotated[tuple[InputFile, ...], Field(strict=False)] = ()
-    """The recordings it was made from."""
+    """Recordings it was made from."""
     seed: Whole | None = None
-    """Seed of the random numbers that were used, or null."""
+    """Seed of its random numbers, or null."""
     versions: dict[str, str] = Field(default_factory=dict)
     """Versions of this project and of the libraries that shape its numbers."""
     units: str = UNITS
-    """What the numbers are in."""
+    """Units of the numbers."""
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """What a reader should know, in sentences."""
+    """Notes for the reader, in sentences."""
     joints: Annotated[dict[str, JointCalibration], Field(min_length=1)]
     """The joints, by name."""
 
@@ -125,7 +122,7 @@ class Calibration(Part):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The joints of this calibration, in the order of `common.joints.in_order`."""
+        """Joints of this calibration, in the order of `common.joints.in_order`."""
         return tuple(self.joints)
 
     def joint(self, name: str) -> JointCalibration:
@@ -134,7 +131,7 @@ class Calibration(Part):
         Raises
         ------
         InputError
-            If this calibration does not have that joint.
+            If this calibration lacks that joint.
         """
         if name not in self.joints:
             raise InputError(
@@ -151,19 +148,19 @@ class Calibration(Part):
         Parameters
         ----------
         joints : sequence of str, optional
-            Their names; all of this calibration if not given.
+            Their names; by default all of this calibration.
         time_step_s : float
             Time step of the model [s].
 
         Returns
         -------
         DelayedPD
-            Its batch has shape (joints,), in the order asked for.
+            Its batch has shape (joints,), in the order of `joints`.
 
         Raises
         ------
         InputError
-            If this calibration does not have one of the joints.
+            If this calibration lacks one of the joints.
         """
         wanted = self.joint_names if joints is None else tuple(joints)
         actuators = [self.joint(name).actuator for name in wanted]
@@ -184,7 +181,7 @@ class Calibration(Part):
         Raises
         ------
         InputError
-            If this calibration does not have that joint.
+            If this calibration lacks that joint.
         """
         feedback = self.joint(joint).feedback
         return HeldFeedback(
@@ -195,7 +192,7 @@ class Calibration(Part):
         )
 
     def to_yaml(self) -> str:
-        """The text of the file: a header that explains it, then the data."""
+        """Text of the file: a header that explains it, then the data."""
         return f"{_HEADER}\n{dump(self.model_dump(mode='json', by_alias=True))}"
 
     def save(self, path: Path | str, force: bool = False) -> None:
@@ -204,13 +201,13 @@ class Calibration(Part):
         Raises
         ------
         InputError
-            If `path` exists and `force` is not given, or if it cannot be written.
+            If `path` exists and `force` is not set, or if it cannot be written.
         """
         write_text(Path(path), self.to_yaml(), force)
 
 
 def utc_now() -> str:
-    """The present time as `Calibration.created` holds it."""
+    """The present time in the form of `Calibration.created`."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -225,8 +222,8 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
     Raises
     ------
     InputError
-        If there is no such file, or if anything in it cannot be trusted: one sentence says the
-        file, the place, what is wrong and what to do.
+        If there is no such file, or anything in it is not valid: one sentence with the file, the
+        place, the fault and what to do.
 
     Examples
     --------

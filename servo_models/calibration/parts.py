@@ -1,10 +1,10 @@
-"""The parts of a calibration file: what is known of one joint, number by number.
+"""Parts of a calibration file: one joint, number by number.
 
-A number is a `Quantity`: its value, its 90 % interval, and whether the data identified it at all.
-`Actuator` is what the servo does with a command; `Feedback` is what makes a reading of it old,
-coarse and off; the two are measured, stored and simulated apart. `Selection` and `Scores` say why
-this model was believed. Every name ends in its unit, and every class refuses unknown keys, text in
-place of numbers, and numbers that only another unit could explain.
+A number is a `Quantity`: its value, its 90 % interval, and whether the data identified it.
+`Actuator` leads from command to motion, `Feedback` from motion to reading; the two are measured,
+stored and simulated apart. `Selection` and `Scores` justify the model. Every name ends in its unit,
+and every class refuses unknown keys, text in place of numbers, and numbers outside their plausible
+range.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def unit_of(name: str) -> str:
 
 
 def _python_number(value: Any) -> Any:
-    """A NumPy scalar as the Python number it is: strict validation and YAML know no other."""
+    """A NumPy scalar as a Python number, the only kind in strict validation and YAML."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -52,7 +52,7 @@ NotNegative = Annotated[Number, Field(ge=0)]
 
 
 class Part(BaseModel):
-    """A strict, frozen piece of a file: no unknown key, no conversion, no NaN, no infinity."""
+    """Strict, frozen part of a file: no unknown key, no conversion, no NaN, no infinity."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -64,14 +64,14 @@ class Part(BaseModel):
 
 
 class Quantity(Part):
-    """One number, how well it is known, and whether the data say anything about it."""
+    """One number with its 90 % interval, and whether the data identify it."""
 
     EXAMPLE: ClassVar[str] = (
         "{value: …, low: …, high: …, identified: yes | ratio only | no, why: …}"
     )
 
     value: Number
-    """The number itself, in the unit that ends the name it stands under."""
+    """The number, in the unit at the end of its name."""
     low: Number | None = None
     """Lower end of the 90 % interval; null where there is none."""
     high: Number | None = None
@@ -92,16 +92,16 @@ class Quantity(Part):
 
 @dataclass(frozen=True)
 class PlausibleRange:
-    """The values a quantity can have at all; beyond them the unit is wrong, not the servo.
+    """Values that a quantity can plausibly have; beyond them the unit is wrong.
 
     Attributes
     ----------
     low, high : float
-        Smallest and largest possible value, in the quantity's unit.
+        Smallest and largest value, in the quantity's unit.
     looks_like : str
-        What a larger number probably is, for example "milliseconds".
+        Probable unit of a larger number, for example "milliseconds".
     factor : float
-        What turns that into the quantity's unit; 0 if unknown.
+        From that unit to the quantity's; 0 if unknown.
     """
 
     low: float
@@ -110,7 +110,7 @@ class PlausibleRange:
     factor: float = 0.0
 
     def __call__(self, quantity: Quantity | None) -> Quantity | None:
-        """`quantity`, unless one of its numbers is impossible."""
+        """`quantity`, unless one of its numbers is outside the range."""
         if quantity is not None:
             for number in (quantity.value, quantity.low, quantity.high):
                 if number is not None and (problem := self.problem(number)):
@@ -118,7 +118,7 @@ class PlausibleRange:
         return quantity
 
     def problem(self, number: float) -> str:
-        """What is wrong with `number`; empty if it is possible."""
+        """Fault of `number` in words; empty if it is in the range."""
         if self.low <= number <= self.high:
             return ""
         text = f"{number:g} is outside the possible {self.low:g} to {self.high:g}"
@@ -140,7 +140,7 @@ _OFFSET = AfterValidator(
 
 
 class RatiosToArmature(Part):
-    """What free-air positions do identify: the actuator's numbers divided by its armature."""
+    """The actuator's numbers over its armature, which positions in free air identify."""
 
     stiffness: Annotated[Quantity, _RATIO]
     """Stiffness over armature [1/s²]."""
@@ -149,18 +149,18 @@ class RatiosToArmature(Part):
     friction_loss: Annotated[Quantity, _RATIO]
     """Dry friction over armature [rad/s²]."""
     effort_limit: Annotated[Quantity, _RATIO]
-    """Effort limit over armature [rad/s²]: the largest acceleration the servo can give."""
+    """Effort limit over armature [rad/s²]: the servo's largest acceleration."""
 
 
 class Scale(Part):
-    """What turned the ratios into torques."""
+    """Torque anchor that turns the ratios into torques."""
 
     anchor: Literal["stall torque", "preset", "loaded recording"]
     """Kind of the anchor."""
     value_nm: NotNegative
-    """The torque that was taken as known [N·m]."""
+    """Torque that is taken as known [N·m]."""
     source: str
-    """Where that torque comes from."""
+    """Source of that torque."""
 
 
 PARAMETER_KEYS = {
@@ -172,14 +172,14 @@ PARAMETER_KEYS = {
     "velocity_limit": "velocity_limit_rad_s",
     "dead_time_s": "dead_time_s",
 }
-"""Field of `DelayedPDParameters` and its name in `Actuator`."""
+"""Fields of `DelayedPDParameters` and their names in `Actuator`."""
 
 
 class Actuator(Part):
-    """What the servo does with a command: see `servo_models.delayed_pd`."""
+    """From command to motion: see `servo_models.delayed_pd`."""
 
     model: Literal["delayed_pd"]
-    """The servo model these numbers belong to."""
+    """Servo model of these numbers."""
     stiffness_nm_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e5))]
     """Torque per position error [N·m/rad]."""
     damping_nm_s_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e4))]
@@ -187,7 +187,7 @@ class Actuator(Part):
     friction_loss_nm: Annotated[Quantity, _TORQUE]
     """Dry (Coulomb) friction [N·m]."""
     armature_kg_m2: Annotated[Quantity, AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))]
-    """All inertia the servo feels, its own rotor's included [kg·m²]."""
+    """Reflected inertia and load at the joint [kg·m²]."""
     effort_limit_nm: Annotated[Quantity, _TORQUE]
     """Largest torque [N·m]."""
     velocity_limit_rad_s: Annotated[
@@ -197,15 +197,15 @@ class Actuator(Part):
     dead_time_s: Annotated[Quantity, _TIME]
     """Dead time from a command's arrival to its first effect on the torque [s]."""
     delay_steps_min: Annotated[Whole, Field(ge=0)]
-    """Smallest delay to train with, in whole physics steps."""
+    """Smallest dead time to train with, in whole physics steps."""
     delay_steps_max: Annotated[Whole, Field(ge=0)]
-    """Largest delay to train with, in whole physics steps."""
+    """Largest dead time to train with, in whole physics steps."""
     physics_step_s: Annotated[Number, Field(gt=0, le=0.1)]
     """Length of a physics step [s]."""
     ratios_to_armature: RatiosToArmature
-    """The ratios that were identified."""
+    """Ratios that were identified."""
     scale: Scale
-    """The torque anchor that set the scale."""
+    """Torque anchor that sets the scale."""
 
     @property
     def parameters(self) -> DelayedPDParameters:
@@ -234,44 +234,44 @@ class Actuator(Part):
 
 
 class Feedback(Part):
-    """Why a reading is old, coarse and off: see `servo_models.held_feedback`."""
+    """From motion to reading: see `servo_models.held_feedback`."""
 
     poll_period_s: Annotated[Quantity, _TIME]
-    """Time between polls of the servo [s]; 0 if every read is fresh."""
+    """Time between polls of the servo [s]; 0 if every reading is fresh."""
     loss: Annotated[Quantity, AfterValidator(PlausibleRange(0, 0.999, "percent", 1e-2))]
-    """Probability that a poll fails silently, a fraction of 1."""
+    """Probability that a poll fails silently, as a fraction of 1."""
     quantum_rad: Annotated[Quantity, _SMALL_ANGLE]
-    """Size of one count [rad]; 0 if readings are continuous."""
+    """Quantisation step [rad]; 0 if readings are continuous."""
     offset_rad: Annotated[Quantity, _OFFSET]
     """Reading minus position, constant [rad]."""
     mean_age_s: Annotated[Quantity, _AGE]
-    """Mean age of a reading when the host takes it [s]."""
+    """Mean feedback age when the host reads [s]."""
 
 
 class Lag(Part):
     """The lag budget; a preset has none."""
 
     lag_s: Annotated[Quantity | None, _LAG] = None
-    """From a command's edge to the motion the host can see [s]: the servo's own lag."""
+    """From a command's edge to the motion [s]: the servo's own lag."""
     naive_lag_s: Annotated[Quantity | None, _LAG] = None
-    """What a cross-correlation of all rows says [s]: lag, feedback age and command hold."""
+    """Cross-correlation of all rows [s]: lag, feedback age and zero-order hold."""
     fresh_lag_s: Annotated[Quantity | None, _LAG] = None
-    """The same on fresh rows only [s]: lag and command hold."""
+    """The same on fresh rows only [s]: lag and zero-order hold."""
 
 
 class Scores(Part):
-    """How far the model is from the recording; null where it was not scored."""
+    """Error of the model on the recording; null where it was not scored."""
 
     rmse_one_step_rad: NotNegative | None = None
     """Root mean square error one loop period ahead [rad]."""
     rmse_free_run_naive_rad: NotNegative | None = None
-    """Free-run error against all rows as they stand, held ones included [rad]."""
+    """Free-run error on all rows as logged (raw) [rad]."""
     rmse_free_run_fresh_rad: NotNegative | None = None
-    """Free-run error against fresh rows [rad]."""
+    """Free-run error on fresh rows [rad]."""
     rmse_free_run_held_rad: NotNegative | None = None
-    """Free-run error against all rows, the model sampled at the poll instants [rad]."""
+    """Free-run error on all rows, the model sampled at the poll instants (held) [rad]."""
     rmse_leave_one_frequency_out_rad: NotNegative | None = None
-    """Free-run error on frequencies the fit has not seen, fresh rows [rad]."""
+    """Free-run error on fresh rows of frequencies that were left out of the fit [rad]."""
     fit_percent: Number | None = None
     """100 · (1 − RMSE / standard deviation of the reading) on fresh rows [%]."""
 
@@ -282,19 +282,19 @@ class CandidateModel(Part):
     model: Annotated[str, Field(min_length=1)]
     """Name of the model."""
     parameter_count: Annotated[Whole, Field(ge=0)]
-    """How many numbers were fitted."""
+    """Number of fitted parameters."""
     rmse_fresh_rad: NotNegative | None = None
     """Free-run error on fresh rows [rad]."""
     rmse_held_rad: NotNegative | None = None
-    """Free-run error on all rows, the model sampled at the poll instants [rad]."""
+    """Free-run error on all rows, the model sampled at the poll instants (held) [rad]."""
     rmse_naive_rad: NotNegative | None = None
-    """Free-run error on all rows as they stand [rad]."""
+    """Free-run error on all rows as logged (raw) [rad]."""
     rmse_leave_one_frequency_out_rad: NotNegative | None = None
-    """Free-run error on frequencies the fit has not seen [rad]."""
+    """Free-run error on frequencies that were left out of the fit [rad]."""
     fit_percent: Number | None = None
-    """Share of the fresh reading's variation that the model explains [%]."""
+    """100 · (1 − RMSE / standard deviation of the reading) on fresh rows [%]."""
     parameters: dict[str, Number] = Field(default_factory=dict)
-    """The fitted numbers by name, each name with its unit."""
+    """Fitted numbers by name; each name ends in its unit."""
 
 
 class Selection(Part):
@@ -307,17 +307,17 @@ class Selection(Part):
 
 
 class JointCalibration(Part):
-    """All that is known of one joint."""
+    """Calibration of one joint."""
 
     actuator: Actuator
-    """What the servo does with a command."""
+    """From command to motion."""
     feedback: Feedback
-    """What makes a reading of it old, coarse and off."""
+    """From motion to reading."""
     lag: Lag = Lag()
     """The lag budget."""
     selection: Selection
-    """Why this model."""
+    """Choice of the model."""
     scores: Scores = Scores()
-    """How good it is."""
+    """Errors of the chosen model."""
     warnings: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """What to distrust, in sentences."""
+    """Reasons for distrust, in sentences."""

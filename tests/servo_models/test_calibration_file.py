@@ -57,7 +57,7 @@ def test_the_file_explains_itself_and_keeps_a_number_on_one_line(file):
 def test_saving_refuses_to_overwrite_without_force(file):
     before = file.read_text()
     other = calibration(RB_calf=joint_calibration())
-    with pytest.raises(FileExistsRefusal, match="--force"):
+    with pytest.raises(FileExistsRefusal, match="force=True"):
         other.save(file)
     assert file.read_text() == before
     other.save(file, force=True)

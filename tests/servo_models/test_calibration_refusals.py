@@ -237,7 +237,7 @@ def test_an_entry_of_the_wrong_kind_is_refused(file, place, value, says):
 def test_a_missing_key_is_refused_with_what_it_means(file):
     message = refusal(file, "      delay_steps_min: 10\n", "")
     assert "joints.LF_hip.actuator.delay_steps_min is missing" in message
-    assert "smallest delay to train with" in message
+    assert "smallest dead time to train with" in message
 
 
 def test_a_misspelt_joint_is_refused_with_the_nearest(file):

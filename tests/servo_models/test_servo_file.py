@@ -99,7 +99,7 @@ def test_training_ended_before_its_first_comparison_leaves_a_linear_model(tmp_pa
 
 def test_a_folder_without_a_model_is_refused(tmp_path: Path):
     assert "holds no servo model" in refusal(tmp_path / "missing")
-    assert "fit-servo --out" in refusal(tmp_path)
+    assert "Make one with `pupper-sysid fit-servo`" in refusal(tmp_path)
     (tmp_path / "file").write_text("")
     assert "holds no servo model" in refusal(tmp_path / "file")
     assert "holds no servo model" in refusal(tmp_path / ("long" * 100))
@@ -253,7 +253,7 @@ def test_another_rate_is_refused_with_the_way_to_get_it(tmp_path: Path):
     saved(tmp_path / "a")
     said = refusal(tmp_path / "a", time_step_s=0.04)
     assert "every 20.0 ms" in said and "every 40.0 ms" in said
-    assert "record at the new one" in said and "--arch delayed-pd" in said
+    assert "record at the new one" in said and "fit the architecture delayed-pd" in said
     assert load_servo_model(tmp_path / "a", time_step_s=0.0203), "a clock may be off by 2 %"
 
 
@@ -261,7 +261,7 @@ def test_a_joint_without_a_model_is_refused_with_those_that_have_one(tmp_path: P
     saved(tmp_path / "a")
     said = refusal(tmp_path / "a", joints=["LF_hip", "LB_hip"])
     assert "no model for LB_hip" in said and "it has LF_hip, RB_calf, RF_thigh" in said
-    assert "fit-servo --joints LB_hip" in said
+    assert "fit one of its own" in said
 
 
 class _Trap:
@@ -283,7 +283,7 @@ def test_a_model_is_replaced_only_when_forced(tmp_path: Path):
     saved(tmp_path / "a", seed=0)
     before = (tmp_path / "a" / WEIGHTS).read_bytes()
     other = arrays("mlp", seed=1)
-    with pytest.raises(FileExistsRefusal, match="--force"):
+    with pytest.raises(FileExistsRefusal, match="force=True"):
         save_servo_model(tmp_path / "a", other, contract("mlp", other))
     assert (tmp_path / "a" / WEIGHTS).read_bytes() == before
     save_servo_model(tmp_path / "a", other, contract("mlp", other), force=True)

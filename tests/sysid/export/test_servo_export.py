@@ -224,7 +224,7 @@ def test_a_file_that_computes_something_else_is_not_written(tmp_path: Path, monk
 def test_nothing_is_overwritten_unless_forced(tmp_path: Path, to):
     path = tmp_path / "out"
     path.write_text("mine")
-    with pytest.raises(FileExistsRefusal, match="--force"):
+    with pytest.raises(FileExistsRefusal, match="force=True"):
         export_servo_model(saved(tmp_path / "a"), to, path)
     assert path.read_text() == "mine"
     export_servo_model(saved(tmp_path / "b"), to, path, force=True)

@@ -96,7 +96,7 @@ def test_the_table_of_a_calibration_says_where_it_comes_from():
 def test_a_table_is_written_only_where_nothing_stands_unless_forced(tmp_path: Path):
     path = tmp_path / "table.csv"
     path.write_text("mine")
-    with pytest.raises(FileExistsRefusal, match="--force"):
+    with pytest.raises(FileExistsRefusal, match="force=True"):
         to_csv(load_calibration("paper"), path)
     assert path.read_text() == "mine"
     text = to_csv(load_calibration("paper"), path, force=True)

@@ -70,7 +70,7 @@ def test_rows_are_on_disk_before_the_next_is_appended(tmp_path):
 def test_an_existing_file_is_kept_without_force(tmp_path):
     path = write(tmp_path, rows())
     before = path.read_bytes()
-    with pytest.raises(FileExistsRefusal, match="--force"):
+    with pytest.raises(FileExistsRefusal, match="force=True"):
         RecordingWriter(path, {})
     assert path.read_bytes() == before
 

@@ -276,7 +276,7 @@ def test_nothing_is_overwritten_without_force(tmp_path):
     for path in (first.path, *first.figures, *first.drawings, *first.tables):
         if path != victim:
             path.unlink()
-    with pytest.raises(InputError, match=r"ladder\.csv exists already.*--force"):
+    with pytest.raises(InputError, match=r"ladder\.csv exists already.*force=True"):
         write(tmp_path)
     assert victim.read_text() == "mine"
     assert not first.path.exists(), "a refused report leaves no half of one behind"
