@@ -3,7 +3,7 @@
 A gait is a limit cycle: along their largest directions of variance, actions and hidden states of a
 policy go round one closed curve. `principal_components` finds these directions for several
 conditions together (no delay, more delay …), so that their orbits share axes; `closure` measures
-how well an orbit returns to itself after a period, `ellipse` and `collapse` its size and roundness.
+how well an orbit returns to itself after a period, `area_ratio` how much of its area is left.
 `orbits` does all of it for a policy with late joints.
 
 Variance explained means little without the closure: three components also explain all of the noise
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,32 +63,6 @@ class PrincipalComponents:
     def orbit(self, states: NDArray[np.floating]) -> Array:
         """States (..., d) along the axes, shape (..., k)."""
         return (np.asarray(states, float) - self.mean) @ self.axes.T
-
-
-class Ellipse(NamedTuple):
-    """Half axes of the ellipse with an orbit's covariance."""
-
-    major: float
-    minor: float
-
-    @property
-    def area(self) -> float:
-        """π · major · minor."""
-        return float(np.pi * self.major * self.minor)
-
-    @property
-    def roundness(self) -> float:
-        """Minor over major axis: 1 for a circle, 0 for a band or a point."""
-        return self.minor / self.major if self.major > 0 else 0.0
-
-
-class Collapse(NamedTuple):
-    """An orbit relative to that of another condition: 1 if unchanged, 0 if nothing is left."""
-
-    area: float
-    """Ratio of the areas."""
-    roundness: float
-    """Ratio of the ratios of minor to major axis; independent of size."""
 
 
 def principal_components(
@@ -166,8 +140,8 @@ def closure(orbit: NDArray[np.floating], step_s: float, frequency_hz: float) -> 
     return float(np.sqrt(away2 / (2 * radius2)))
 
 
-def ellipse(orbit: NDArray[np.floating]) -> Ellipse:
-    """The ellipse with the covariance of an orbit in the plane.
+def area(orbit: NDArray[np.floating]) -> float:
+    """Area of the ellipse with the covariance of an orbit in the plane.
 
     A half axis a has the variance a²/2. Noise makes a band look rounder than it is; `closure`
     distinguishes noise from an orbit.
@@ -180,11 +154,11 @@ def ellipse(orbit: NDArray[np.floating]) -> Ellipse:
     orbit = np.asarray(orbit, float)
     away = (orbit - orbit.mean(axis=0)).reshape(-1, 2)
     minor, major = np.sqrt(2 * np.clip(np.linalg.eigvalsh(away.T @ away / len(away)), 0.0, None))
-    return Ellipse(float(major), float(minor))
+    return float(np.pi * float(major) * float(minor))
 
 
-def collapse(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> Collapse:
-    """Size and roundness of an orbit relative to `reference`, on the same axes.
+def area_ratio(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
+    """Area of an orbit over that of `reference`, on the same axes.
 
     Parameters
     ----------
@@ -195,10 +169,10 @@ def collapse(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> Co
     InputError
         If the reference encloses nothing.
     """
-    now, before = ellipse(orbit), ellipse(reference)
-    if not before.area > 0:
-        raise InputError("The reference orbit encloses no area: nothing of it can be left.")
-    return Collapse(now.area / before.area, now.roundness / before.roundness)
+    before = area(reference)
+    if not before > 0:
+        raise InputError("The reference orbit encloses no area.")
+    return area(orbit) / before
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,13 +223,9 @@ def orbits(
             explained_3=float(axes.explained[:3].sum()),
             participation_ratio=float(axes.participation_ratio),
             closure=[_or_nan(closure, path, plain.step_s, rate) for path in paths],
-            area_ratio=[_or_nan(_area, path[:, :2], paths[0][:, :2]) for path in paths],
+            area_ratio=[_or_nan(area_ratio, path[:, :2], paths[0][:, :2]) for path in paths],
         )
     return found
-
-
-def _area(path: Array, reference: Array) -> float:
-    return collapse(path, reference).area
 
 
 def _or_nan(measure: Callable[..., float], *given: Any) -> float:

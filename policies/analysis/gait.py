@@ -8,7 +8,6 @@ along the first axis, for logs of other origin. Signals are joint angles or targ
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,17 +37,6 @@ SETTLE_S = 2.0
 _FALL_S = 0.5  # before a fall is recognised, it is no gait any more
 _NULL_DRAWS = 100
 _NULL_QUANTILE = 0.95
-
-
-class Correlation(NamedTuple):
-    """Similarity of two recordings of a gait: mean over joints of Pearson's r."""
-
-    r: float
-    """At no lag."""
-    best: float
-    """Largest over lags, the same lag for all joints."""
-    lag_steps: int
-    """That lag; positive if the second is later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,7 +282,7 @@ def amplitude(signal: Signal) -> tuple[Array, Array]:
     return (high - low) / 2, y.std(axis=0)
 
 
-def correlation(actions_a: Signal, actions_b: Signal, most_lag: int) -> Correlation:
+def correlation(actions_a: Signal, actions_b: Signal) -> float:
     """Similarity of two recordings of a gait: mean over joints (and robots) of Pearson's r.
 
     A joint that stands still in the second only counts as r = 0; one that stands still in the first
@@ -304,34 +292,21 @@ def correlation(actions_a: Signal, actions_b: Signal, most_lag: int) -> Correlat
     ----------
     actions_a, actions_b : ndarray, shape (steps, 12) or (steps, n, 12)
         The gait to compare with, and the other.
-    most_lag : int
-        Largest lag tried, in steps to either side; well under half a period, or the next stride
-        fits as well.
 
     Raises
     ------
     InputError
-        If the two are of different shapes or no longer than the lags, or nothing moves in the
-        first.
+        If the two are of different shapes, or nothing moves in the first.
     """
     a, b = (np.asarray(x, float).reshape(len(x), -1) for x in (actions_a, actions_b))
-    if a.shape != b.shape or len(a) <= most_lag + 1:
+    if a.shape != b.shape:
         raise InputError(
-            f"Actions of shapes {np.shape(actions_a)} and {np.shape(actions_b)} cannot be compared "
-            f"over lags of {most_lag} steps: they must be alike, and longer."
+            f"Actions of shapes {np.shape(actions_a)} and {np.shape(actions_b)} cannot be compared."
         )
     moves = a.std(axis=0) > STILL
     if not moves.any():
         raise InputError("Nothing moves in the actions to compare with: there is no gait in them.")
-    lags = range(-most_lag, most_lag + 1)
-    found = []
-    for lag in lags:
-        early, late = (a, b) if lag >= 0 else (b, a)
-        shift = abs(lag)
-        x, y = standardised(early[: len(a) - shift]), standardised(late[shift:])
-        found.append(float((x * y).mean(axis=0)[moves].mean()))
-    best = int(np.argmax(found))
-    return Correlation(found[most_lag], found[best], lags[best])
+    return float((standardised(a) * standardised(b)).mean(axis=0)[moves].mean())
 
 
 # --------------------------------------------------------------------------------- parts

@@ -40,7 +40,6 @@ CHANNELS = {
     for name in ("joint_position_relative", "joint_velocity", "joint_effort", "last_action")
 } | {"all joints": JOINTS}
 """Parts of the observation that are ablated."""
-_MOST_LAG = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +153,6 @@ def terrain(policy: Policy, trial: Trial) -> list[GroundPoint]:
 def _agreement(plain: Rollout, altered: NDArray[np.floating]) -> float:
     """Gait correlation of replayed actions with the walk's, mean over walking robots."""
     return mean(
-        [correlation(plain.action[now, i], altered[now, i], _MOST_LAG).r
+        [correlation(plain.action[now, i], altered[now, i])
          for i, now in walking(plain).items()]
     )  # fmt: skip

@@ -15,8 +15,8 @@ servo model was fitted (see `hardware.joint_map.JointMap.per_servo`); the caller
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import astuple, dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.stacks import ObserverKind
 from pupper_sysid.servo_models.control_rate import substeps as physics_substeps
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters, integrate
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
 
 Array = NDArray[np.float64]
@@ -54,11 +54,25 @@ class JointEstimate:
     effort: Array
 
 
-class Observer(Protocol):
-    """Source of a policy's joint observation; see the module's docstring."""
+class Observer(ABC):
+    """Source of a policy's joint observation; see the module's docstring.
+
+    Parameters
+    ----------
+    period_s : float
+        Control period [s].
+
+    Raises
+    ------
+    InputError
+        If the period is not positive, or another parameter is out of range.
+    """
 
     name: str
-    period_s: float
+
+    def __init__(self, period_s: float):
+        self.period_s = _positive(period_s)
+        self.reset(np.zeros(_JOINTS))
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (..., 12), its target and reading so far.
@@ -68,8 +82,17 @@ class Observer(Protocol):
         InputError
             If it is not of twelve joints, or not finite.
         """
-        ...
+        position = np.array(position, float)
+        if position.shape[-1:] != (_JOINTS,):
+            raise InputError(
+                f"An observer was reset to positions of shape {position.shape}; the last axis must "
+                f"be the {_JOINTS} joints."
+            )
+        if not np.isfinite(position).all():
+            raise InputError("An observer was reset to positions that are not finite.")
+        self._position = position
 
+    @abstractmethod
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """Estimate the joints at the end of one more control period.
 
@@ -85,10 +108,25 @@ class Observer(Protocol):
         InputError
             If one that is used has another shape than at `reset`, or a target is not finite.
         """
-        ...
+
+    def _target(self, target: ArrayLike) -> Array:
+        """A checked target: one NaN would stay in a model's state."""
+        value = self._spread(target, "A target")
+        if not np.isfinite(value).all():
+            raise InputError("A target is not finite: the policy or a filter before it failed.")
+        return value
+
+    def _spread(self, value: ArrayLike, name: str) -> Array:
+        value, batch = np.asarray(value, float), self._position.shape
+        try:
+            return np.broadcast_to(value, batch)
+        except ValueError:
+            raise InputError(
+                f"{name} has shape {value.shape}; the observer was reset with {batch}."
+            ) from None
 
 
-class SyntheticPD:
+class SyntheticPD(Observer):
     """A `DelayedPD` per joint, stopped at joint limits, in free run on targets.
 
     With the parameters of the training, it is the trained actuator in free air.
@@ -120,8 +158,7 @@ class SyntheticPD:
         substeps: int | None = None,
         limits_rad: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
     ):
-        self.period_s = _positive(period_s)
-        substeps = physics_substeps(period_s) if substeps is None else substeps
+        substeps = physics_substeps(_positive(period_s)) if substeps is None else substeps
         if substeps < 1:
             raise InputError(f"SyntheticPD: {substeps} substeps; it must be at least 1.")
         for value in (*astuple(parameters), *limits_rad):
@@ -141,7 +178,7 @@ class SyntheticPD:
                 f"SyntheticPD: {substeps} substeps of {1e3 * period_s / substeps:.3g} ms are too "
                 f"long for so stiff a servo; take {int(np.ceil(period_s / needed))} or more."
             )
-        self.reset(np.zeros(_JOINTS))
+        super().__init__(period_s)
 
     @classmethod
     def paper(
@@ -182,15 +219,18 @@ class SyntheticPD:
 
     def reset(self, position: ArrayLike) -> None:
         """See `Observer`."""
-        self._servo.reset(_resting(position))
+        super().reset(position)
+        self._servo.reset(self._position)
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; `reading` is not used."""
-        return self._servo.advance(_checked_target(target, self._servo.batch), self._substeps)
+        target = self._target(target)
+        self._servo.rollout(np.broadcast_to(target, (self._substeps, *self._servo.batch)))
+        return self._servo.estimate()
 
 
 class _StoppedServo(DelayedPD):
-    """`DelayedPD` whose joint stops at its limits, with its whole state."""
+    """`DelayedPD` whose joint stops at its limits."""
 
     def __init__(
         self, parameters: DelayedPDParameters, time_step_s: float, low: Array, high: Array
@@ -211,30 +251,30 @@ class _StoppedServo(DelayedPD):
             longest = (d + np.sqrt(d * d + 4 * k)) / k
         return float(np.min(np.where(k > 0, longest, np.inf)))
 
-    def advance(self, target: Array, steps: int) -> JointEstimate:
-        """The state after `steps` time steps under `target`, shape of the batch."""
-        arriving = self._delay_line.shift(np.broadcast_to(target, (steps, *self.batch)))
-        start = (self._position, self._velocity, self._setpoint)
-        path, state = integrate(arriving, start, self._values, self.time_step_s)
-        if ((path < self._low) | (path > self._high)).any():
-            # again, one time step after the other: a joint stops where it meets its limit
-            state = start
-            for goal in arriving:
-                _, (position, velocity, setpoint) = integrate(
-                    goal[None], state, self._values, self.time_step_s
-                )
-                within = np.clip(position, self._low, self._high)
-                state = (within, np.where(within == position, velocity, 0.0), setpoint)
-        position, velocity, setpoint = self._position, self._velocity, self._setpoint = state
-        own = self._values
+    def _integrate(self, delayed: Array) -> Array:
+        start = self._state
+        path = super()._integrate(delayed)
+        if not ((path < self._low) | (path > self._high)).any():
+            return path
+        # again, one time step after the other: a joint stops where it meets its limit
+        self._state = start
+        for k in range(len(delayed)):
+            super()._integrate(delayed[k : k + 1])
+            position, velocity, setpoint = self._state
+            path[k] = within = np.clip(position, self._low, self._high)
+            self._state = (within, np.where(within == position, velocity, 0.0), setpoint)
+        return path
+
+    def estimate(self) -> JointEstimate:
+        """The present state; the scale of a torque without a limit is unknown."""
+        (position, velocity, setpoint), own = self._state, self._values
         torque = own["stiffness"] * (setpoint - position) - own["damping"] * velocity
         limit = np.broadcast_to(own["effort_limit"], self.batch)
-        # the scale of a torque without a limit is unknown
         effort = np.where(np.isfinite(limit), np.clip(torque, -limit, limit), 0.0)
         return JointEstimate(position.copy(), velocity.copy(), effort)
 
 
-class ServoModelObserver:
+class ServoModelObserver(Observer):
     """A learned servo model in free run on targets.
 
     Parameters
@@ -253,7 +293,6 @@ class ServoModelObserver:
     name = "servo-model"
 
     def __init__(self, model: JointArrays, period_s: float):
-        self.period_s = _positive(period_s)
         if model.joints != JOINT_NAMES:
             raise InputError(
                 f"The servo model is of {', '.join(model.joints)}; an observer needs all twelve "
@@ -265,87 +304,55 @@ class ServoModelObserver:
                 f"{period_s:g} s. Fit a model at the controller's rate, or run it at the model's."
             )
         self._model = model
-        self.reset(np.zeros(_JOINTS))
+        super().__init__(period_s)
 
     def reset(self, position: ArrayLike) -> None:
         """See `Observer`."""
-        self._position = _resting(position)
+        super().reset(position)
         self._model.reset(self._position)
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; `reading` is not used. Effort is not known."""
-        position = self._model.step(_checked_target(target, self._position.shape)).astype(float)
+        position = self._model.step(self._target(target)).astype(float)
         velocity = (position - self._position) / self.period_s
         self._position = position
         return JointEstimate(position.copy(), velocity, np.zeros_like(position))
 
 
-class HeldEncoder:
+class HeldEncoder(Observer):
     """The readings themselves, as the policy observes them in training.
 
     A missing reading is replaced by the last one. Velocity is the difference of readings
     `velocity_steps` control periods apart: cheap buses poll too rarely for less.
-
-    Parameters
-    ----------
-    period_s : float
-        Control period [s].
-    velocity_steps : int
-        Of the policy's contract.
-
-    Raises
-    ------
-    InputError
-        If the period is not positive or there is no step between readings.
     """
 
     name = "encoder"
 
     def __init__(self, period_s: float, velocity_steps: int):
-        self.period_s = _positive(period_s)
         if velocity_steps < 1:
             raise InputError(f"HeldEncoder: {velocity_steps} velocity steps; at least 1 is needed.")
         self._velocity_steps = velocity_steps
-        self.reset(np.zeros(_JOINTS))
+        super().__init__(period_s)
 
     def reset(self, position: ArrayLike) -> None:
         """See `Observer`."""
-        rest = _resting(position)
+        super().reset(position)
         # readings, newest first
-        self._seen = np.broadcast_to(rest, (self._velocity_steps + 1, *rest.shape)).copy()
+        self._seen = np.stack([self._position] * (self._velocity_steps + 1))
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; `target` is not used. Effort is not known."""
-        now = _spread(reading, self._seen.shape[1:], "A reading")
+        now = self._spread(reading, "A reading")
         self._seen[1:] = self._seen[:-1].copy()
         self._seen[0] = np.where(np.isfinite(now), now, self._seen[1])
         velocity = (self._seen[0] - self._seen[-1]) / (self._velocity_steps * self.period_s)
         return JointEstimate(self._seen[0].copy(), velocity, np.zeros_like(velocity))
 
 
-class Zero:
-    """Joints that always rest: a walk without joint feedback.
-
-    Parameters
-    ----------
-    period_s : float
-        Control period [s].
-
-    Raises
-    ------
-    InputError
-        If the period is not positive.
-    """
+class Zero(Observer):
+    """Joints that always rest: a walk without joint feedback."""
 
     name = "zero"
-
-    def __init__(self, period_s: float):
-        self.period_s = _positive(period_s)
-        self.reset(np.zeros(_JOINTS))
-
-    def reset(self, position: ArrayLike) -> None:
-        """See `Observer`."""
-        self._position = _resting(position)
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; neither is used."""
@@ -357,37 +364,6 @@ def _positive(period_s: float) -> float:
     if not (np.isfinite(period_s) and period_s > 0):
         raise InputError(f"An observer's control period is {period_s} s; it must be positive.")
     return float(period_s)
-
-
-def _resting(position: ArrayLike) -> Array:
-    """A copy of an observer's first position, checked."""
-    position = np.array(position, float)
-    if position.shape[-1:] != (_JOINTS,):
-        raise InputError(
-            f"An observer was reset to positions of shape {position.shape}; the last axis must be "
-            f"the {_JOINTS} joints."
-        )
-    if not np.isfinite(position).all():
-        raise InputError("An observer was reset to positions that are not finite.")
-    return position
-
-
-def _checked_target(target: ArrayLike, batch: tuple[int, ...]) -> Array:
-    """A checked target: one NaN would stay in a model's state."""
-    target = _spread(target, batch, "A target")
-    if not np.isfinite(target).all():
-        raise InputError("A target is not finite: the policy or a filter before it failed.")
-    return target
-
-
-def _spread(value: ArrayLike, batch: tuple[int, ...], name: str) -> Array:
-    value = np.asarray(value, float)
-    try:
-        return np.broadcast_to(value, batch)
-    except ValueError:
-        raise InputError(
-            f"{name} has shape {value.shape}; the observer was reset with {batch}."
-        ) from None
 
 
 def make_observer(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, astuple
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -234,13 +234,11 @@ def test_the_fast_share_counts_what_is_above_the_second_harmonic():
     assert np.isnan(fast_share(np.zeros((100, 2)), STEP_S, 3.0))
 
 
-def test_the_correlation_of_a_delayed_gait_is_low_at_once_and_one_at_its_lag():
+def test_the_correlation_of_a_delayed_gait_is_the_cosine_of_its_phase():
     joints, _ = trot(6.0)
-    found = correlation(joints[4:], joints[:-4], 5)
-    assert found.best == pytest.approx(1.0) and found.lag_steps == 4
-    # sines 4 steps apart; harmonics take some
-    assert found.r == pytest.approx(np.cos(2 * np.pi * 3.25 * 4 * STEP_S), abs=0.25)
-    assert correlation(joints[:-4], joints[4:], 5).lag_steps == -4
+    # harmonics take some
+    expected = np.cos(2 * np.pi * 3.25 * 4 * STEP_S)
+    assert correlation(joints[4:], joints[:-4]) == pytest.approx(expected, abs=0.25)
 
 
 def test_a_joint_that_stopped_keeps_nothing_of_the_gait():
@@ -248,12 +246,12 @@ def test_a_joint_that_stopped_keeps_nothing_of_the_gait():
     stopped = joints.copy()
     stopped[:, :3] = 0.1
     # two of eight: straight ahead, hips stand still in the trot itself
-    assert correlation(joints, stopped, 0).r == pytest.approx(0.75)
-    assert correlation(joints, -joints, 0).r == pytest.approx(-1.0)
-    with pytest.raises(InputError, match="must be alike"):
-        correlation(joints, joints[1:], 0)
+    assert correlation(joints, stopped) == pytest.approx(0.75)
+    assert correlation(joints, -joints) == pytest.approx(-1.0)
+    with pytest.raises(InputError, match="cannot be compared"):
+        correlation(joints, joints[1:])
     with pytest.raises(InputError, match="Nothing moves"):
-        correlation(np.ones((50, 12)), joints[:50], 0)
+        correlation(np.ones((50, 12)), joints[:50])
 
 
 # ------------------------------------------------------------------------------ report
@@ -294,9 +292,12 @@ def test_a_report_is_the_mean_over_robots_with_the_spread_between_them():
     by_joint = np.mean([r.value for r in found.action_r2_by_joint])
     assert found.action_r2.value == pytest.approx(by_joint)
     # actions are in radians: what the joints of this rollout do
-    joints = np.array(found.joint_half_range_rad)
-    np.testing.assert_allclose(np.array(found.half_range_rad), joints, atol=1e-5)
-    json.dumps(asdict(found), allow_nan=False)
+    actions, joints = (
+        [astuple(one) for one in many]
+        for many in (found.half_range_rad, found.joint_half_range_rad)
+    )
+    np.testing.assert_allclose(actions, joints, atol=1e-5)
+    json.dumps(found.to_dict(), allow_nan=False)
 
 
 def test_robots_count_up_to_half_a_second_before_they_fall():
