@@ -124,8 +124,10 @@ class Series:
             If the value does not fit.
         """
         register = self.registers[name]
-        if value < 0 and register.sign_bit is not None:
-            value = -value | 1 << register.sign_bit
+        if register.sign_bit is not None:
+            if abs(value) >> register.sign_bit:
+                raise OverflowError(f"{name}: {value} does not fit beside its sign bit")
+            value = abs(value) | (value < 0) << register.sign_bit
         return int(value).to_bytes(register.size, "big" if self.big_endian else "little")
 
 

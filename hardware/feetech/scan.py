@@ -90,7 +90,7 @@ def scan_line(
 def _report(line: FeetechLine, servo: int) -> ServoReport:
     status = line.ping(servo)
     errors = error_words(status.code) if status else ""
-    series = line.model(servo)
+    series = line.find([servo]).get(servo)
     if not isinstance(series, Series):
         number = "no answer" if series is None else str(series)
         return ServoReport(servo, f"unknown ({number})", errors)

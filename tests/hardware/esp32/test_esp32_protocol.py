@@ -247,6 +247,7 @@ def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
 
 
 @pytest.mark.wall_clock
+@pytest.mark.wall_clock
 def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
     hung = False
     proxy = ScriptedProxy(lambda request: None if hung else answers(request))
@@ -281,6 +282,7 @@ def test_a_restart_of_the_server_is_survived(path):
     assert np.isnan(bus.read().position_rad).all()
 
 
+@pytest.mark.wall_clock
 def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkeypatch):
     monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.05)
 

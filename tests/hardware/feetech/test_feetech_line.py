@@ -88,6 +88,7 @@ def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
         line.close()
 
 
+@pytest.mark.wall_clock
 def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
     late = iter([0.2])
 
@@ -105,6 +106,7 @@ def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
         line.close()
 
 
+@pytest.mark.wall_clock
 def test_b5_3_a_late_reply_that_comes_during_the_next_read_has_another_length():
     counts = iter([900, 123])
 
@@ -142,6 +144,7 @@ def test_b5_4_a_reply_of_another_length_is_no_answer(size):
         line.close()
 
 
+@pytest.mark.wall_clock
 def test_b5_3_late_replies_do_not_shift_the_registers_that_a_recording_keeps():
     """Every first reply comes during the second try, whose own reply comes during the next read."""
     memory = bytes(range(67))
@@ -329,6 +332,7 @@ def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
 
 
 @pytest.mark.wall_clock
+@pytest.mark.wall_clock
 def test_b5_13_waiting_does_not_keep_the_processor_busy():
     with on_a_port(still_servos(ids=[1])) as server:
         line = FeetechLine(server.device, 1_000_000)
@@ -480,6 +484,7 @@ def test_a_map_may_give_a_servo_any_id():
     assert sample.position_rad == pytest.approx([100 * 2 * np.pi / 4096])
 
 
+@pytest.mark.wall_clock
 @pytest.mark.parametrize("series", [STS3215, SCS0009])
 def test_what_is_written_is_read_back_within_friction_and_rounding(series):
     servos = moving_servos(series)

@@ -350,9 +350,7 @@ def test_a_calf_servo_away_from_its_goal_is_not_hidden_by_a_thigh_that_is_away_t
     read = bus.read
     # each joint is 0.2 rad away, and so the calf's servo 0.4
     bus.read = lambda: replace(read(), position_rad=np.full(2, 0.2))
-    with pytest.raises(
-        SafetyStop, match=r"LF_calf is commanded to 0\.00 .* stays 0\.40 rad away"
-    ):
+    with pytest.raises(SafetyStop, match=r"LF_calf is commanded to 0\.00 .* stays 0\.40 rad away"):
         drive(guard, 3.0)
 
 

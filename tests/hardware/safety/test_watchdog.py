@@ -113,6 +113,7 @@ def switched_on(address: str) -> GuardedBus:
     return bus
 
 
+@pytest.mark.wall_clock
 def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second(robot):
     server, address = robot
     found = angles(server)
@@ -125,6 +126,7 @@ def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_se
     np.testing.assert_allclose(angles(server), found, atol=0.06)
 
 
+@pytest.mark.wall_clock
 def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_back(robot):
     server, address = robot
     bus = switched_on(address)
@@ -135,6 +137,7 @@ def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_ba
     wait_for(lambda: limp(server), 8.0)
 
 
+@pytest.mark.wall_clock
 def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
     server, address = robot
     process = drive(address)
@@ -144,6 +147,7 @@ def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
     assert process.wait(2.0) == -signal.SIGKILL
 
 
+@pytest.mark.wall_clock
 def test_a_driver_that_hangs_after_a_stop_for_safety_leaves_its_robot_limp_where_it_is(robot):
     server, address = robot
     found = angles(server)
@@ -211,6 +215,7 @@ def test_files_in_the_users_folder_do_not_stand_in_for_the_watchdogs_modules(tmp
     Watchdog(BusAddress("esp32", "/tmp/none"), None).close()
 
 
+@pytest.mark.wall_clock
 def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp_path):
     server, address = robot
     path = tmp_path / "a.csv"

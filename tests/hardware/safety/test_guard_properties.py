@@ -1,0 +1,159 @@
+"""The guard over arbitrary commands: what reaches the bus obeys limits, speed and acceleration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pupper_sysid.common.errors import BusError, SafetyStop
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
+
+FEW = settings(max_examples=60, deadline=None)
+MAPS = {
+    "servo": load_joint_map("mini_pupper_2").per_servo(),
+    "joint": load_joint_map("mini_pupper_2"),
+}
+JOINTS = 12
+LONGEST_TICK_S = 0.06
+"""A pause gains no more speed than a tick of this length (`guard`)."""
+NEAR = 1e-9
+
+
+class Follower:
+    """A bus in virtual time whose servos are where they are commanded to be."""
+
+    name = "follower"
+
+    def __init__(self, coordinates: str):
+        chosen = MAPS[coordinates]
+        self.joint_names, self.limits = chosen.joint_names, chosen.position_limits()
+        self.metadata: dict = {}
+        self.time, self.position = 0.0, self.limits.clip(chosen.rest_pose())
+        self.received: list[tuple[float, np.ndarray]] = []
+
+    def now(self):
+        return self.time
+
+    def sleep_until(self, time_s):
+        self.time = max(self.time, time_s)
+
+    def write(self, position_rad):
+        self.received.append((self.time, position_rad.copy()))
+        self.position = position_rad
+        return Sent(self.time, position_rad)
+
+    def read(self):
+        count = np.full(JOINTS, 500)
+        return BusSample(np.full(JOINTS, self.time), self.position.copy(), count)
+
+    def torque(self, on):
+        return True
+
+    def close(self):
+        pass
+
+
+def switched_on(coordinates: str) -> tuple[GuardedBus, Follower]:
+    bus = Follower(coordinates)
+    guard = GuardedBus(bus)
+    guard.torque(True)
+    guard.write(bus.position)
+    return guard, bus
+
+
+angle = st.floats(-7, 7) | st.sampled_from([np.inf, -np.inf, 1e300, -1e300])
+command = st.tuples(
+    st.lists(angle, min_size=JOINTS, max_size=JOINTS), st.sampled_from([0.0, 1e-5, 0.002, 0.02, 1])
+)
+
+
+@pytest.mark.parametrize("coordinates", MAPS)
+@FEW
+@given(script=st.lists(command, min_size=1, max_size=12))
+def test_whatever_is_commanded_what_reaches_the_bus_is_within_limits_and_speed(coordinates, script):
+    guard, bus = switched_on(coordinates)
+    for goal, pause_s in script:
+        bus.time += pause_s
+        guard.write(np.array(goal))
+    limits, most = bus.limits, guard.guard
+    sent = np.array([x for _, x in bus.received])
+    assert np.isfinite(sent).all()
+    # inside the box, and inside the coupled bounds wherever the box leaves them a solution
+    assert (sent >= limits.low_rad - NEAR).all() and (sent <= limits.high_rad + NEAR).all()
+    np.testing.assert_allclose([limits.clip(x) for x in sent], sent, atol=NEAR)
+    times = np.array([t for t, _ in bus.received])
+    dt = np.clip(np.diff(times), 1e-4, LONGEST_TICK_S)[:, None]
+    servo = np.array([limits.servo_angles(x) for x in sent])
+    speed = np.abs(np.diff(servo, axis=0)) / dt
+    assert (speed <= most.speed_rad_s + 1e-6).all()
+    assert limits.coupling is not None
+    free = ~np.isin(np.arange(JOINTS), limits.coupling.calf)  # a calf may yield
+    gained = np.diff(speed, axis=0, prepend=0.0)
+    assert (gained[:, free] <= (most.acceleration_rad_s2 * dt + 1e-6)).all()
+
+
+@pytest.mark.parametrize("coordinates", MAPS)
+@FEW
+@given(
+    goal=st.lists(angle, min_size=JOINTS, max_size=JOINTS),
+    nan=st.sets(st.integers(0, JOINTS - 1), min_size=1),
+)
+def test_a_command_that_is_no_number_is_refused_and_leaves_the_guard_as_it_was(
+    coordinates, goal, nan
+):
+    guard, bus = switched_on(coordinates)
+    bad, before = np.array(goal), len(bus.received)
+    bad[list(nan)] = np.nan
+    bus.time += 0.02
+    with pytest.raises(BusError, match="commands must be numbers"):
+        guard.write(bad)
+    assert len(bus.received) == before
+    guard.write(bus.position)
+    assert np.isfinite(bus.received[-1][1]).all()
+
+
+@pytest.mark.parametrize("coordinates", MAPS)
+@FEW
+@given(away=st.lists(st.floats(-1, 1), min_size=JOINTS, max_size=JOINTS))
+def test_a_first_command_is_refused_exactly_when_it_would_move_a_joint_too_far(coordinates, away):
+    bus = Follower(coordinates)
+    guard = GuardedBus(bus)
+    guard.torque(True)
+    start = bus.position.copy()
+    allowed = bus.limits.clip(start + np.array(away))
+    far = np.abs(allowed - start).max()
+    try:
+        guard.write(start + np.array(away))
+        assert far <= guard.guard.first_command_rad and len(bus.received) == 1
+    except SafetyStop:
+        assert far > guard.guard.first_command_rad and not bus.received
+
+
+box = st.floats(-3, 3)
+
+
+@FEW
+@given(
+    low=st.tuples(box, box), width=st.tuples(st.floats(0, 3), st.floats(0, 3)),
+    bound=box, span=st.floats(0, 3), sign=st.sampled_from([1, -1]),
+    position=st.tuples(st.floats(-9, 9), st.floats(-9, 9)),
+)  # fmt: skip
+def test_clipping_is_idempotent_and_its_margin_is_none_outside(
+    low, width, bound, span, sign, position
+):
+    coupling = Coupling(
+        np.array([1]), np.array([0]), sign, np.array([bound]), np.array([bound + span])
+    )
+    limits = PositionLimits(np.array(low), np.array(low) + np.array(width), coupling)
+    clipped = limits.clip(np.array(position))
+    np.testing.assert_allclose(limits.clip(clipped), clipped, atol=NEAR)
+    assert (limits.margin(clipped) >= 0).all()
+    outside = (np.array(position) < limits.low_rad) | (np.array(position) > limits.high_rad)
+    assert (limits.margin(np.array(position))[outside] == 0).all()
+    servo = limits.servo_angles(clipped)
+    np.testing.assert_allclose(limits.from_servo_angles(servo), clipped, atol=NEAR)
