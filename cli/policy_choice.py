@@ -147,9 +147,9 @@ def warn_of_fallbacks(servos: Iterable[ServoRanges]) -> None:
     """Which joints go by another's numbers, once per calibration."""
     warn(
         dict.fromkeys(
-            f"{s.source} has no {', '.join(s.borrowed)}: they take the numbers of "
-            f"{', '.join(sorted(set(s.borrowed.values())))}. Calibrate them to know."
+            f"{s.source} has no {', '.join(s.fallbacks)}: they take the numbers of "
+            f"{', '.join(sorted(set(s.fallbacks.values())))}. Calibrate them to know."
             for s in servos
-            if s.borrowed
+            if s.fallbacks
         )
     )

@@ -1,10 +1,10 @@
-"""Twelve emulated servos behind the same interface as real ones, faults included.
+"""Emulated servos behind the interface of a real bus, errors included.
 
     bus = EmulatedBus(draw_robot(rng), rng)
 
-Commands are truncated to counts, as the robot's own library does it; readings are old (polled in
-turn, polls fail silently), noisy, rounded to counts and off by a constant. Nobody downstream can
-tell more than on the real robot; only `truth`, `truth_rows` and `write_truth` say what was so.
+Commands are truncated to counts, as by the robot's own library. Readings are stale (polled in turn,
+polls fail silently), noisy, quantised and biased (`servo_models.held_feedback`). A host sees no
+more than on the real robot; `truth`, `truth_rows` and `write_truth` give the truth beside it.
 The robot starts at its default pose with the torque on.
 """
 
@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.files import refuse_overwrite, write_text
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.sim.emulator.clocks import Clock, RealClock, VirtualClock
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
 from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
 
 NOMINAL_SPEED_LIMIT_RAD_S = 7.5
-"""What a user would know of the servo before measuring it [rad/s]."""
+"""Speed limit of the servo's data sheet [rad/s]."""
 
 TRUTH_COLUMNS = ("read_time_s", "joint", "true_position_rad", "reading_time_s")
 
@@ -46,12 +46,11 @@ class EmulatedBus:
     rng : numpy.random.Generator
         Decides lost polls, noise and timing.
     real_time : bool
-        Live by the host's clock instead of virtual time.
+        Use the host's clock instead of virtual time.
     plant : ServoPlant, optional
         What moves; by default the robot's servos in free air.
     keep_log : bool
-        Whether the truth of every read is remembered, for `truth_rows`; not for a robot that
-        walks for a day.
+        Whether the truth of every read is remembered, for `truth_rows`; not for runs of days.
     """
 
     name = "emulated"
@@ -118,21 +117,16 @@ class EmulatedBus:
         self._clock.sleep_until(time_s)
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
-        """Send goal positions [rad], shape (12,).
+        """Send commands [rad], shape (12,).
 
         Raises
         ------
         BusError
-            If the bus is closed or a goal is not a number.
+            If the bus is closed or a command is not a number.
         """
         self._refuse_closed()
-        goal = np.asarray(position_rad, float)
-        if goal.shape != self._goal.shape or not np.isfinite(goal).all():
-            raise BusError(
-                f"emulated bus: goals must be {len(self.joint_names)} finite angles, got {goal}."
-            )
-        sent, asked = self._clock.now(), goal
-        goal = self._truncated(goal)
+        asked = finite_angles(position_rad, len(self.joint_names), self.name)
+        sent, goal = self._clock.now(), self._truncated(asked)
         for i in np.flatnonzero(goal != self._goal).tolist():
             self._plant.command(i, sent, goal[i])
             if self._keep_log:
@@ -142,7 +136,7 @@ class EmulatedBus:
         return Sent(sent, asked)
 
     def read(self) -> BusSample:
-        """Read all joints once: whatever the last successful poll of each has left.
+        """Read all joints once: the values of the last successful poll of each.
 
         Raises
         ------
@@ -166,7 +160,7 @@ class EmulatedBus:
         return BusSample(at, self._reading.copy(), self._count.copy())
 
     def torque(self, on: bool) -> bool:
-        """Hold the present pose, or let every joint go limp."""
+        """Hold the present pose, or switch the torque off."""
         self._refuse_closed()
         now = self._clock.now()
         for i in range(len(self.joint_names)):
@@ -176,11 +170,11 @@ class EmulatedBus:
         return True
 
     def close(self) -> None:
-        """Release the bus; what is known of the truth stays."""
+        """Release the bus; the truth can still be read."""
         self._closed = True
 
     def truth(self) -> dict[str, Any]:
-        """Parameters of every servo, as plain numbers: what an identification should find."""
+        """True parameters of every servo, as plain numbers."""
         return self.robot.truth()
 
     def truth_rows(self) -> Iterator[tuple[float, str, float, float]]:
@@ -223,7 +217,7 @@ class EmulatedBus:
         return np.where(succeeded, time_s, self._measured_s)
 
     def _truncated(self, goal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The goal after `int()` of its count, which the servo's travel limits."""
+        """The command after `int()` of its count, within the servo's travel."""
         if self._quantum == 0:
             return goal
         count = np.trunc(self._centre + self._sign * (goal - self._zero) / self._quantum)
@@ -233,7 +227,7 @@ class EmulatedBus:
     def _quantised(
         self, position: NDArray[np.float64], joints: NDArray[np.intp]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """What the encoders of `joints` report of `position`: angle and count."""
+        """Reported angle and count of `position` of `joints`."""
         sign, zero = self._sign[joints], self._zero[joints]
         reported = position + self._offset[joints]
         if self._quantum == 0:

@@ -1,12 +1,12 @@
-"""A robot that is wrong in the ways the real one is: what its twelve servos are, as plain numbers.
+"""Emulated robots as plain numbers: true parameters of their servos, feedback and timing.
 
-`RobotSpec` says how such robots are made: the mean servo, its spread from joint to joint, the
-feedback's faults, the host's timing. `draw_robot` makes one robot from it, whose numbers are then
-the truth that an identification should find; `random_spec` varies the mean servo and the feedback
-too, for benchmarks over many robots. Nothing here moves: `sim.emulator.bus` does.
+`RobotSpec` is a kind of robot: the mean servo, its spread from joint to joint, the feedback's
+errors, the host's timing. `draw_robot` draws one robot of it, whose numbers are the truth that an
+identification should find; `random_spec` varies the mean servo and the feedback too, for benchmarks
+over many robots. `sim.emulator.bus` makes them move.
 
-The defaults are published measurements of a Mini Pupper 2 (pooled fit of three joints, poll
-statistics of twelve recordings), not of any other copy of it.
+The defaults are published measurements of one Mini Pupper 2: pooled fit of three joints, poll
+statistics of twelve recordings.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from pupper_sysid.servo_models.held_feedback import HeldFeedback
 RADIANS_PER_COUNT = np.pi / 550
 CENTRE_COUNT = 512
 SHORTEST_DELAY_S = 0.002
-"""What the emulator can do: two physics steps."""
+"""Shortest dead time that can be emulated [s]: two physics steps."""
 
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """How emulated robots are made. Times in s, angles in rad, torques in N·m."""
+    """A kind of emulated robots. Times in s, angles in rad, torques in N·m."""
 
     dead_time_s: float = 0.025
-    """Mean dead time of a servo, from the host's sending to the first torque. Its reading's way
-    back to the host (about 3 ms on the robot) is counted here: a poll is seen at once."""
+    """Mean dead time of a servo, from the host's sending to the first torque. The transport of a
+    reading to the host (about 3 ms on the robot) is counted here: a poll is seen at once."""
     stiffness_per_inertia: float = 12_700.0
     """Mean stiffness / armature [1/s²]."""
     damping_per_inertia: float = 103.0
@@ -54,7 +54,7 @@ class RobotSpec:
     offset_sd_rad: float = 0.005
     """Standard deviation of each joint's constant reading error."""
     poll_period_s: float = 0.02685
-    """Time between two polls of the same servo; 0 for a bus where every read is a fresh one."""
+    """Time between two polls of the same servo; 0 for a bus where every reading is fresh."""
     loss: float = 0.42
     """Probability that a poll fails and leaves the old reading in place."""
     poll_jitter_s: float = 0.0008
@@ -63,12 +63,12 @@ class RobotSpec:
     """Relative standard deviation of the poll period as it wanders over seconds: half of the
     0.4 % between recordings of 3 s, of which estimation errors are a part."""
     quantum_rad: float = RADIANS_PER_COUNT
-    """One count, of commands (truncated) and of readings (rounded); 0 for neither."""
+    """Quantisation step, of commands (truncated) and of readings (rounded); 0 for none."""
     reading_noise_rad: float = 0.003
-    """Standard deviation of a reading before rounding: half a count. The recordings leave 11 to
-    14 mrad unexplained, but that holds unmodelled friction too; flat tops flicker by a count."""
+    """Standard deviation of a reading before rounding: half a step. The recordings leave 11 to
+    14 mrad unexplained, unmodelled friction included; readings at rest flicker by a step."""
     sleep_overshoot_s: float = 0.0001
-    """Mean of the (exponential) time by which the host wakes too late."""
+    """Mean of the (exponential) time by which a sleep of the host ends late."""
     write_duration_s: float = 0.0003
     """Time the host spends in one write."""
     read_duration_s: float = 0.0005
@@ -85,7 +85,7 @@ class RobotSpec:
 
 @dataclass(frozen=True)
 class EmulatedServo:
-    """The truth about one servo.
+    """True parameters of one servo.
 
     Attributes
     ----------
@@ -110,13 +110,13 @@ class EmulatedServo:
 
     @property
     def command_rounding(self) -> str:
-        """Which way the truncation of counts moves the commanded angle: "up" or "down"."""
+        """Direction in which truncation to counts moves the commanded angle: "up" or "down"."""
         return "down" if self.count_sign > 0 else "up"
 
 
 @dataclass(frozen=True)
 class EmulatedRobot:
-    """The truth about one robot: its spec, and its servos in the order of its joint map."""
+    """One robot: its spec, and its servos in the order of its joint map."""
 
     spec: RobotSpec
     servos: tuple[EmulatedServo, ...]
@@ -128,7 +128,7 @@ class EmulatedRobot:
         return tuple(servo.joint for servo in self.servos)
 
     def truth(self) -> dict:
-        """All of it as plain numbers and strings, ready for YAML."""
+        """All true parameters as plain numbers and strings, ready for YAML."""
         joints = {}
         for servo in self.servos:
             joints[servo.joint] = {
@@ -148,7 +148,7 @@ class EmulatedRobot:
 def draw_robot(
     rng: np.random.Generator, spec: RobotSpec | None = None, joint_map: JointMap | None = None
 ) -> EmulatedRobot:
-    """One robot made to `spec` (default: like the published Mini Pupper 2).
+    """Draw one robot of `spec` (default: the published Mini Pupper 2).
 
     Parameters
     ----------
@@ -191,13 +191,13 @@ def draw_robot(
 
 
 def directly_read(joint_map: JointMap) -> RobotSpec:
-    """Servos of a map on a serial line: each answers for the very moment, nothing is lost."""
+    """Spec of servos on a serial line: every reading is fresh, none is lost."""
     quantum = float(1 / joint_map.counts_per_rad().max())
     return RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=quantum)
 
 
 def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
-    """A spec drawn at random, for benchmarks over many robots.
+    """Draw a spec, for benchmarks over many robots.
 
     Parameters
     ----------

@@ -74,8 +74,7 @@ class ServoBench:
 
     def torque(self, index: int, time_s: float, on: bool) -> None:
         """Hold the present position, or go limp."""
-        limp = np.isfinite(self._limp_since[index])
-        if on == (not limp):
+        if on == self.is_on(index):
             return
         self._limp_since[index] = np.inf if on else time_s
         self.plant.torque(index, time_s, on)
@@ -87,7 +86,7 @@ class ServoBench:
     def angle(self, index: int, time_s: float) -> float:
         """True angle of a servo [rad], servo coordinates."""
         angle = self.plant.angle(index, time_s)
-        if self._by_hand and np.isfinite(self._limp_since[index]):
+        if self._by_hand and not self.is_on(index):
             phase = 2 * np.pi * (time_s - self._limp_since[index]) / _HAND_PERIOD_S
             angle += _HAND_RAD * np.sin(phase)
         return angle

@@ -27,7 +27,7 @@ MASS_KG = 0.465
 THIGH_M, CALF_M = 0.050, 0.056
 FOOT_RADIUS_M, FOOT_THICKNESS_M = 0.0085, 0.006
 STANDING_HEIGHT_M = 0.0835
-"""Of the trunk's origin above the ground, in the default pose."""
+"""Height of the trunk's origin above the ground, in the default pose."""
 
 HIP_X_M = {"LF": 0.05, "RF": 0.05, "LB": -0.066, "RB": -0.066}
 HIP_Y_M, THIGH_Y_M, CALF_Y_M = 0.0235, 0.0197, 0.00475
@@ -61,7 +61,7 @@ _TRUNK_BOX, _TRUNK_BOX_AT = (0.0905, 0.030, 0.0266), (-0.0012, 0.0, -0.00015)
 _TRUNK_TOUCH = (0.1, 0.04, 0.04)
 
 CONTACT_BODIES = ("trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh")))
-"""Bodies that must not touch the ground; sensor `<body>_touch` measures with how many newtons."""
+"""Bodies that must not touch the ground; sensor `<body>_touch` measures the force [N]."""
 
 FLAT_GROUND = (
     '<geom name="ground" type="plane" size="0 0 0.05" material="grid" contype="0" conaffinity="1"/>'
@@ -80,8 +80,8 @@ def robot_xml(
     Parameters
     ----------
     servos : dict of str to DelayedPDParameters
-        One per joint, scalars; `<joint>` names the actuator too. The delay sets how much history
-        the model can hold.
+        One per joint, scalars; the joint's name is the actuator's, too. The dead time sets the
+        length of the delay line.
     time_step_s : float
         Physics step [s].
     knee : {"linkage", "serial"}

@@ -1,9 +1,9 @@
 """RobotBatch: many Mini Puppers in `mujoco.batch`, each with its own servos, friction and payload.
 
-The physics of `sim.walking.env` without its task: draw robots, put them somewhere, step them, look
-at them. Arrays are (environments, …) NumPy; joint angles are in the order of `JOINT_NAMES`,
-absolute. Servo delay, gains, limits and friction are MuJoCo's own, so a control step of ten physics
-steps is one call (`Batch.rollout`) and no Python runs inside.
+The physics of `sim.walking.env` without its task: draw robots, place them, step them, read their
+state. Arrays are (environments, …) NumPy; joint angles are in the order of `JOINT_NAMES`, absolute.
+Servo delay, gains, limits and friction are MuJoCo's own, so a control step of ten physics steps is
+one call (`Batch.rollout`) without Python inside.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class RobotBatch:
     Raises
     ------
     InputError
-        If a servo is not stable in such physics steps, a delay does not fit its buffer, or the
+        If a servo is not stable in such physics steps, a dead time does not fit its buffer, or the
         servo model is of other joints or another rate.
     """
 
@@ -123,15 +123,14 @@ class RobotBatch:
         self._feet_sites = np.array([self.model.site(f"{leg}_foot").id for leg in LEGS])
         self._trunk = self.model.body("trunk").id
         self._low, self._high = limits()
-        # a servo model was fitted to angles told as if the thighs stood at their neutral
-        # (pupper_sysid.hardware.joint_map, servo coordinates)
+        # a servo model is fitted in servo coordinates (`hardware.joint_map`): thighs at neutral
         default = default_pose()
         self._bend = self.to_servo(default) - default
         self._warnings = self.batch.warning.copy()
         self.drawn = {f: np.zeros((environments, len(JOINT_NAMES))) for f in servos.value}
         self.friction = np.zeros(environments)
 
-    # ------------------------------------------------------------------------- looking
+    # ------------------------------------------------------------------------- reading
 
     @property
     def joints(self) -> Array:
@@ -169,10 +168,7 @@ class RobotBatch:
         )
 
     def feet(self) -> tuple[Array, Array]:
-        """Where the feet are along the ground, (n, 4, 2), and their soles' heights, (n, 4) [m].
-
-        As all that MuJoCo derives, one physics step old.
-        """
+        """Feet along the ground, (n, 4, 2), and heights of the soles, (n, 4) [m]; one step old."""
         at = self._site_position[:, self._feet_sites]
         height = at[..., 2] - FOOT_RADIUS_M - self.ground.height(at[..., 0], at[..., 1])
         return at[..., :2].copy(), height
@@ -196,7 +192,7 @@ class RobotBatch:
     # ------------------------------------------------------------------------- stepping
 
     def step(self, target: Array) -> tuple[Array, Array, Array]:
-        """Let one control step pass under joint targets [rad], shape (n, 12).
+        """Let one control step pass under joint set-points [rad], shape (n, 12).
 
         Returns
         -------
@@ -226,7 +222,7 @@ class RobotBatch:
         return position, load, found["sensordata"][:, -3:, :_TOUCHES]
 
     def broken(self) -> NDArray[np.bool_]:
-        """Robots that MuJoCo had to reset since the last call, because they became NaN."""
+        """Robots that MuJoCo has reset since the last call, because they became NaN."""
         now = self.batch.warning
         raised = (now != self._warnings).reshape(self.environments, -1).any(axis=1)
         raised |= ~np.isfinite(self.batch.state).all(axis=1)
@@ -236,7 +232,7 @@ class RobotBatch:
     # ------------------------------------------------------------------------- a new robot
 
     def draw(self, ids: NDArray[np.intp], delay_share: float, rng: np.random.Generator) -> None:
-        """New servos, friction and payload for some robots; `delay_share` of the drawn delays."""
+        """Draw servos, friction and payload of some robots; dead times times `delay_share`."""
         random, f = self.config.randomisation, self._fields
         drawn = self.servos.draw(len(ids), random.torque_scale, rng)
         drawn["dead_time_s"] = drawn["dead_time_s"] * delay_share
@@ -254,24 +250,24 @@ class RobotBatch:
         ids: NDArray[np.intp],
         joints: Array,
         joint_velocity: Array,
-        room_m: float,
+        margin_m: float,
         rng: np.random.Generator,
     ) -> None:
-        """Put some robots down at random places and headings, told for long to hold `joints`.
+        """Place some robots at random, with `joints` as their command for long.
 
         Parameters
         ----------
         ids : ndarray of int
         joints, joint_velocity : ndarray, shape (len(ids), 12)
-        room_m : float
-            How far from the ground's edge they must stay.
+        margin_m : float
+            Least distance from the ground's edge.
         rng : numpy.random.Generator
         """
         random: Randomisation = self.config.randomisation
         n = len(ids)
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._warnings[ids] = self.batch.warning[ids]  # a reset clears the counters of warnings
-        reach = self.ground.half_size_m - room_m
+        reach = self.ground.half_size_m - margin_m
         place = rng.uniform(-1, 1, (n, 2)) * (reach if np.isfinite(reach) else 0.5)
         yaw = rng.uniform(-np.pi, np.pi, n)
         self.qpos[ids, :2] = place
@@ -286,13 +282,12 @@ class RobotBatch:
         self.qvel[ids, 2] = linear[:, 2]
         self.qvel[ids, 3:6] = rng.uniform(-1, 1, (n, 3)) * random.base_rate_rad_s
         self.qvel[ids, 6:] = joint_velocity
-        told = self.to_servo(joints)
-        self._control[ids] = told
-        self._activation[ids] = told
+        held = self.to_servo(joints)
+        self._control[ids] = self._activation[ids] = held
         # MuJoCo empties delay lines to zeros, which would throw the robot on its back
-        self._history[ids] = delay_lines(self._empty_lines, told)
+        self._history[ids] = delay_lines(self._empty_lines, held)
         if self.servo_model is not None:
-            self.servo_model.reset_some(ids, told - self._bend)
+            self.servo_model.reset_some(ids, held - self._bend)
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
     def push(self, ids: NDArray[np.intp], velocity: Array) -> None:
@@ -303,7 +298,7 @@ class RobotBatch:
 
     @property
     def state(self) -> dict[str, NDArray]:
-        """Everything that changes, as copies."""
+        """Everything that changes, as copies, for an exact restart."""
         found = {f"batch.{name}": np.array(v, copy=True) for name, v in self._fields.items()}
         found |= {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
         found |= {"batch.state": self.batch.state.copy(), "friction": self.friction.copy()}
@@ -329,7 +324,7 @@ class RobotBatch:
         self.batch.set_const()
         self.batch.state[:] = state["batch.state"]
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
-        # forward leaves its mark on what warm-starts the solver
+        # forward changes what warm-starts the solver
         self.batch.state[:] = state["batch.state"]
         for k, v in self.drawn.items():
             name = (

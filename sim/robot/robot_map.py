@@ -3,11 +3,10 @@
     joint_map, left_out = joint_map_of(Path("arm.xml"), "sts3215")
 
 Each hinge that an actuator drives, by itself or through a tendon, becomes a joint with a servo;
-in a model without actuators, each hinge. Ids run from 1 in the file's order, a servo's centre is
-taken to stand where the joint is at zero (or in the middle of its range, if zero is outside), and
-the direction of the counts is the joint's. Those three are guesses: `pupper-sysid calibrate-joints`
-measures the centres; ids and signs are for whoever watches `pupper-sysid monitor` while moving a
-joint by hand to correct.
+in a model without actuators, each hinge. Three things are guesses: ids run from 1 in the file's
+order, a servo's centre is at the joint's zero (or in the middle of its range, if zero is outside),
+and counts grow with the joint's angle. `pupper-sysid calibrate-joints` measures the centres; ids
+and signs are checked in `pupper-sysid monitor` while a joint is moved by hand.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ _MOST_SERVOS = 253
 
 
 def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
-    """A joint map of the robot described in `path`, and the hinges that no actuator drives.
+    """Joint map of the robot described in `path`, and the hinges that no actuator drives.
 
     Parameters
     ----------
     path : Path
         MJCF or URDF.
     servo : {"sts3215", "scs0009"}
-        All of the robot's.
+        Type of all servos.
 
     Raises
     ------

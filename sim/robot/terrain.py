@@ -1,4 +1,4 @@
-"""The ground: flat, rough, hills, troughs and steps, as MJCF and as a height anyone can look up.
+"""The ground: flat, rough, hills, troughs and steps, as MJCF and as heights.
 
 Simulations of a batch do not see each other, so one field of tiles serves all of them; a robot
 starts on a tile and its episode ends (as a time-out) before the field does. Sizes follow the
@@ -43,7 +43,7 @@ class Ground:
     heights : ndarray, shape (rows, columns) or None
         Heights [m] at `SPACING_M`, row along y; None for a plane.
     half_size_m : float
-        How far it reaches from the origin; infinite for a plane.
+        Distance of its edge from the origin; infinite for a plane.
     """
 
     xml: str

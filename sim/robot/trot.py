@@ -1,12 +1,12 @@
-"""An open-loop trot: where the twelve joints go, given a phase and a commanded motion.
+"""An open-loop trot: joint set-points from a phase and a commanded motion.
 
 Diagonal pairs of feet are half a cycle apart. A foot on the ground passes under the trunk at the
 commanded speed, so the trunk moves evenly; in the air it swings back and is lifted along a half
-sine. Feet stand for more than half of a cycle: while all four carry, the trunk is not left to turn
-on a diagonal. It is what `sim.walking.env` and `policies.train.imitation` call a reference.
+sine. Feet stand for more than half of a cycle: while all four carry, the trunk does not turn on a
+diagonal. It is the reference of `sim.walking.env` and `policies.train.imitation`.
 
-`phase_of` reads the phase off joint targets, so that the trot can be continued from any action by
-someone who does not see a clock.
+`phase_of` finds the phase of joint set-points, so that the trot can be continued from any action
+without a clock.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Trot:
     lift_m: float = 0.012
     """Height of a swinging foot."""
     duty: float = 0.65
-    """Share of a cycle for which a foot stands."""
+    """Share of a cycle in which a foot stands."""
     gain: float = 1.0
-    """Speed of the feet over the commanded speed; above 1 makes up for slip."""
+    """Speed of the feet over the commanded speed; above 1 corrects slip."""
     turn_gain: float = 0.9
     """The same of turning: this robot turns farther than its feet while it trots."""
 
@@ -49,7 +49,7 @@ class Trot:
     def joints(
         self, phase: NDArray[np.float64], command: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Joint targets [rad], shape (n, 12).
+        """Joint set-points [rad], shape (n, 12).
 
         Parameters
         ----------
@@ -74,10 +74,10 @@ class Trot:
         between_s: float,
         command: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Phase [rad], shape (n,), of the point of the trot that is nearest to joint targets.
+        """Phase [rad], shape (n,), of the point of the trot nearest to joint set-points.
 
-        The targets before them tell feet that rise from feet that come down, which short strokes
-        alone do not.
+        The set-points before them distinguish feet that rise from feet that come down, which short
+        strokes alone do not.
 
         Parameters
         ----------

@@ -2,10 +2,10 @@
 
     bus = GuardedBus(WalkingBus(draw_robot(rng), rng))
 
-Commands and readings are in joint coordinates, as a controller's are (a calf relative to its
-thigh; `hardware.joint_map`), and pass through `EmulatedBus`: counts, polls in turn, lost ones, an
-offset, noise. The calf's reading is that of two servos, polled at different times. In virtual time
-it runs as fast as the machine can; `robot.trunk` tells where it really went.
+Commands and readings are in joint coordinates (a calf relative to its thigh; `hardware.joint_map`)
+and pass through `EmulatedBus`: quantisation, polls in turn, lost polls, offset, noise. The calf's
+reading is that of two servos, polled at different times. In virtual time it runs as fast as the
+machine can; `robot.trunk` gives the true motion.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.imu import ImuSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -36,17 +35,17 @@ class WalkingBus:
     rng : numpy.random.Generator
         Decides lost polls, noise and timing.
     real_time : bool
-        Live by the host's clock instead of virtual time.
+        Use the host's clock instead of virtual time.
 
     Attributes
     ----------
     robot : WalkingRobot
-        What the bus is connected to.
+        The robot behind the bus.
 
     Raises
     ------
     InputError
-        If a servo's delay is too short to emulate.
+        If a servo's dead time is too short to emulate.
     """
 
     name = "emulated"
@@ -72,21 +71,19 @@ class WalkingBus:
         self._bus.sleep_until(time_s)
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
-        """Send goal positions of the joints [rad], shape (12,).
+        """Send commands of the joints [rad], shape (12,).
 
         Raises
         ------
         BusError
-            If the bus is closed or a goal is not a number.
+            If the bus is closed or a command is not a number.
         """
-        goal = np.asarray(position_rad, float)
-        if goal.shape != (len(JOINT_NAMES),):
-            raise BusError(f"{self.name}: commands must be 12 finite angles, got {goal}.")
+        goal = finite_angles(position_rad, len(JOINT_NAMES), self.name)
         sent = self._bus.write(self._servo_map.to_angles(self._map.to_counts(goal)))
         return Sent(sent.time_s, goal)
 
     def read(self) -> BusSample:
-        """Read all joints once: whatever the last successful poll of each servo has left.
+        """Read all joints once: the values of the last successful poll of each servo.
 
         Raises
         ------
@@ -98,13 +95,13 @@ class WalkingBus:
         return replace(sample, position_rad=joints)
 
     def imu(self) -> ImuSample | None:
-        """The IMU's latest sample."""
+        """Latest sample of the IMU."""
         now = self.now()
         sample = self.robot.imu(now)
         return None if sample is None else replace(sample, time_s=now)
 
     def torque(self, on: bool) -> bool:
-        """Hold the present pose, or let every servo go limp."""
+        """Hold the present pose, or switch the torque off."""
         return self._bus.torque(on)
 
     def close(self) -> None:

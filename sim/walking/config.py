@@ -19,7 +19,7 @@ from pupper_sysid.sim.walking.rewards import DEFAULT, PAPER, RELEASE, Rewards
 
 @dataclass(frozen=True)
 class Commands:
-    """What robots are told to do, drawn anew at random times."""
+    """Commanded motion, drawn anew at random times."""
 
     forward_m_s: tuple[float, float] = (-0.2, 0.2)
     """Range of the forward speed."""
@@ -28,7 +28,7 @@ class Commands:
     yaw_rad_s: tuple[float, float] = (-0.5, 0.5)
     """Range of the turn rate to the left."""
     standing: float = 0.15
-    """Share of commands that say: stand."""
+    """Share of commands of zero: stand."""
     single: float = 0.3
     """Share of commands along one of the three axes only."""
     every_s: float = 5.0
@@ -46,12 +46,12 @@ class Observation:
     noise: bool = True
     """Whether the published uniform noise is added."""
     base_velocity: Literal["zero", "true"] = "zero"
-    """The trunk's speed, which this robot cannot measure: zeros, or (as published) the truth."""
+    """The trunk's speed, which this robot cannot measure: zeros, or (as published) the true one."""
 
 
 @dataclass(frozen=True)
 class Randomisation:
-    """What differs from episode to episode. Servos vary within the calibration's intervals."""
+    """Random differences between episodes. Servos vary within the calibration's intervals."""
 
     friction: tuple[float, float] = (0.3, 1.0)
     """Of feet on the ground, sliding."""
@@ -111,8 +111,8 @@ class Walking:
     episode_s: float = 20.0
     """Length of an episode."""
     physics_step_s: float = 0.002
-    """Time step of the physics. In others than 2 ms the servos get the delay with which they lag as
-    they were measured."""
+    """Time step of the physics. In steps other than 2 ms the servos' delay is adapted so that they
+    keep the lag that was measured."""
     control_step_s: float = 0.02
     """Time between two actions."""
     action_scale: float = 0.5

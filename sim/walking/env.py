@@ -167,11 +167,6 @@ class PupperEnv:
 
     # ------------------------------------------------------------------------- public
 
-    @property
-    def privileged_size(self) -> int:
-        """How many numbers the critic sees beside the observation."""
-        return self._privileged().shape[1]
-
     def reset(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Start every episode anew; returns observation and privileged observation."""
         self._restart(np.arange(self.environments))

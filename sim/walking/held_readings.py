@@ -1,10 +1,8 @@
-"""Held feedback of many robots at once: what a controller reads while the bus polls its own way.
+"""Held feedback of many robots at once (`servo_models.held_feedback`), one control step at a time.
 
-The same feedback as `servo_models.held_feedback.HeldFeedback`, vectorised over environments and
-advanced one control step at a time: the simulator hands over the positions after each physics step,
-and each poll that falls between them is looked up there. A poll that fails leaves the old reading.
-Servo `i` of twelve is polled a share `i / 12` of a round after the first, in the order of the
-joints (the robot's firmware, and so the emulated bus, goes by the servos' ids).
+The simulator gives the positions after each physics step, and each poll that falls between them is
+interpolated there. Servo `i` of twelve is polled a share `i / 12` of a round after the first, in
+the order of the joints (the robot's firmware, and so the emulated bus, goes by the servos' ids).
 """
 
 from __future__ import annotations
@@ -36,9 +34,9 @@ class HeldReadings:
     Attributes
     ----------
     position, load : ndarray, shape (environments, servos)
-        What the controller reads: angle [rad] and torque [N·m] at the last successful poll.
+        Readings: angle [rad] and torque [N·m] at the last successful poll.
     age_s : ndarray, shape (environments, servos)
-        How old that is [s].
+        Age of the readings [s].
     """
 
     def __init__(
@@ -77,7 +75,7 @@ class HeldReadings:
         self._rng.bit_generator.state = state
 
     def reset(self, ids: NDArray[np.intp], position: NDArray[np.float64]) -> None:
-        """Robots `ids` have rested at `position` [rad], shape (len(ids), servos), for long."""
+        """Start robots `ids` at rest at `position` [rad], shape (len(ids), servos)."""
         servos = len(self._period)
         wander = 1.0 + _DRIFT * self._rng.standard_normal((len(ids), 1))
         self._lattice[ids] = self._period * wander
@@ -109,11 +107,11 @@ class HeldReadings:
                 break
             row, servo = np.nonzero(due)
             chance = self._rng.random((2, len(row)))
-            heard = chance[0] >= self._loss[servo]
+            succeeded = chance[0] >= self._loss[servo]
             at = self._next[row, servo]
             # a uniform jitter of the same variance stays within bounds
             jittered = np.clip(at + _JITTER_S * np.sqrt(12) * (chance[1] - 0.5), 0.0, span)
-            row_, servo_, jittered = row[heard], servo[heard], jittered[heard]
+            row_, servo_, jittered = row[succeeded], servo[succeeded], jittered[succeeded]
             place = jittered / self._step
             before = np.minimum(place.astype(int), steps - 1)
             share = place - before
@@ -128,7 +126,7 @@ class HeldReadings:
     def _reported(
         self, angle: NDArray[np.float64], servo: NDArray[np.intp] | slice = slice(None)
     ) -> NDArray[np.float64]:
-        """`angle` as encoders report it: offset, and rounded to whole counts."""
+        """`angle` as the encoder reports it: with its offset, in whole quantisation steps."""
         quantum = self._quantum[servo]
         shifted = angle + self._offset[servo]
         whole = np.round(shifted / np.where(quantum > 0, quantum, 1.0)) * quantum

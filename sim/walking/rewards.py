@@ -1,18 +1,17 @@
 """Reward terms of the walking task: each a small function of what happened in one control step.
 
-A term takes a `Step` and its own parameters and gives one number per environment; `Rewards` says
-with which weight each counts, per second (the sum is multiplied by the control period, as Isaac
-Lab does). `PAPER` and `RELEASE` hold the weights of the paper's text and of the training
-configuration its authors released; `DEFAULT` are this project's own. A weight of 0 leaves a term
-out.
+A term takes a `Step` and its parameters and gives one number per environment; `Rewards` holds the
+weight of each, per second (the sum is multiplied by the control period, as in Isaac Lab); 0 leaves
+a term out. `PAPER` and `RELEASE` hold the weights of the paper's text and of the training
+configuration its authors released; `DEFAULT` are this project's own.
 
-Two known traps of the published terms are not repeated: penalties act on the joints they name, and
-foot terms look at the foot, not at the knee whose frame the published robot model calls a foot.
+Two errors of the published terms are not repeated: penalties act on the joints they name, and foot
+terms use the foot, not the knee, whose frame the published robot model calls a foot.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +39,9 @@ class Step:
         Raw outputs of the policy: this, the one before, and the one before that.
     contact : ndarray of bool, shape (n, 4)
     air_s, contact_s : ndarray, shape (n, 4)
-        For how long each foot has been in the air, on the ground; 0 if it is not.
+        Time that each foot has been in the air, on the ground; 0 if it is not.
     last_air_s, last_contact_s : ndarray, shape (n, 4)
-        How long the last swing and stance took.
+        Duration of the last swing and stance.
     stride_velocity : ndarray, shape (n, 3)
         Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
     foot_height_m, foot_speed_m_s : ndarray, shape (n, 4)
@@ -70,9 +69,9 @@ class Step:
     stride_velocity: Array
 
     def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
-        """Whether a robot is told to move, or moves, shape (n,)."""
-        told = np.abs(self.command).max(axis=1) > 0
-        return told | (np.linalg.norm(self.linear_velocity[:, :2], axis=1) > threshold_m_s)
+        """Whether a robot is commanded to move, or moves, shape (n,)."""
+        commanded = np.abs(self.command).max(axis=1) > 0
+        return commanded | (np.linalg.norm(self.linear_velocity[:, :2], axis=1) > threshold_m_s)
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ class Rewards:
     air_time: float = 0.0
     """Published: long swings and stances while moving, all feet down while standing."""
     air_time_most: float = 0.25
-    """Longest swing that `air_time` pays for [s]."""
+    """Longest swing that counts for `air_time` [s]."""
     gait: float = 0.3
     """Diagonal feet together, the two pairs in turn (a trot)."""
     gait_threshold: float = 0.1
@@ -122,7 +121,7 @@ class Rewards:
     clearance_sigma: float = 0.05
     """Its width [m]."""
     clearance_speed: float = 2.0
-    """How fast counts as moving [s/m]."""
+    """Inverse of the speed that counts as moving [s/m]."""
     swing_height: float = -400.0
     """Squared shortfall of a moving foot's height below `clearance_height`, by its speed [1/m³]."""
     action_smoothness: float = 0.0
@@ -142,9 +141,9 @@ class Rewards:
     joint_position: float = -0.1
     """Distance from the default pose."""
     standing_factor: float = 10.0
-    """How much more that counts while standing."""
+    """Factor on `joint_position` while standing."""
     moving_threshold: float = 0.15
-    """Speed from which a robot counts as moving without being told to [m/s]."""
+    """Speed from which a robot counts as moving without a command to [m/s]."""
     hip_abduction: float = 0.0
     """Distance of the hips from the default pose."""
     joint_torques: float = -5e-3
@@ -175,7 +174,7 @@ PAPER = replace(RELEASE, action_smoothness=-1.0, joint_position=-0.7)
 
 
 def base_linear_velocity(s: Step, p: Rewards) -> Array:
-    """How well the commanded speed is followed, 0 to 1 (more with `fast_bonus`)."""
+    """Tracking of the commanded speed, 0 to 1 (more with `fast_bonus`)."""
     error = np.linalg.norm(s.command[:, :2] - s.linear_velocity[:, :2], axis=1)
     speed = np.linalg.norm(s.command[:, :2], axis=1)
     bonus = np.maximum(1.0, 1.0 + p.fast_bonus * (speed - p.fast_above))
@@ -183,18 +182,18 @@ def base_linear_velocity(s: Step, p: Rewards) -> Array:
 
 
 def base_angular_velocity(s: Step, p: Rewards) -> Array:
-    """How well the commanded turn rate is followed, 0 to 1."""
+    """Tracking of the commanded turn rate, 0 to 1."""
     return _tracking(np.abs(s.command[:, 2] - s.angular_velocity[:, 2]), p.angular_sigma, p)
 
 
 def stride_linear_velocity(s: Step, p: Rewards) -> Array:
-    """How well the commanded speed is followed on average over a stride, 0 to 1."""
+    """Tracking of the commanded speed on average over a stride, 0 to 1."""
     error = np.linalg.norm(s.command[:, :2] - s.stride_velocity[:, :2], axis=1)
     return _tracking(error, p.stride_linear_sigma, p)
 
 
 def stride_angular_velocity(s: Step, p: Rewards) -> Array:
-    """How well the commanded turn rate is followed on average over a stride, 0 to 1."""
+    """Tracking of the commanded turn rate on average over a stride, 0 to 1."""
     return _tracking(np.abs(s.command[:, 2] - s.stride_velocity[:, 2]), p.stride_angular_sigma, p)
 
 
@@ -214,7 +213,7 @@ def air_time(s: Step, p: Rewards) -> Array:
 
 
 def gait(s: Step, p: Rewards) -> Array:
-    """Product over pairs of feet of how well they move together, or in turn."""
+    """Product over pairs of feet: 1 if they move together, or in turn, as in a trot."""
     most = p.gait_most**2
     product = np.ones(len(s.command))
     for a, b in _TOGETHER:
@@ -229,7 +228,7 @@ def gait(s: Step, p: Rewards) -> Array:
 
 
 def foot_clearance(s: Step, p: Rewards) -> Array:
-    """How near moving feet are to `clearance_height`, 0 to 1."""
+    """Nearness of moving feet to `clearance_height`, 0 to 1."""
     moves = np.tanh(p.clearance_speed * s.foot_speed_m_s)
     error = ((s.foot_height_m - p.clearance_height) ** 2 * moves).sum(axis=1)
     return np.exp(-error / p.clearance_sigma)
@@ -337,11 +336,6 @@ def weighted(step: Step, rewards: Rewards, penalties: float = 1.0) -> dict[str, 
         if weight:
             found[name] = (weight * penalties if weight < 0 else weight) * term(step, rewards)
     return found
-
-
-def weights(rewards: Rewards) -> dict[str, float]:
-    """Weights of all terms, by name."""
-    return {f.name: getattr(rewards, f.name) for f in fields(rewards) if f.name in TERMS}
 
 
 def _tracking(error: Array, sigma: float, p: Rewards) -> Array:

@@ -1,16 +1,11 @@
-"""One emulated Mini Pupper 2 standing on flat ground, walking where its servos carry it.
+"""One emulated Mini Pupper 2 that walks on flat ground, as a `ServoPlant` with an IMU.
 
-The same servos as `sim.emulator.free_air_servo`, under a robot: `WalkingRobot` is a `ServoPlant`,
-so every emulated bus can have it behind it, with an IMU. MuJoCo steps it only as far as someone
-asks; a robot that has come to rest is not stepped until it is told to move.
-
-Commands come at any instant, not only on physics steps: each actuator gets the mean of its held
-command over the step before, and its delay is shortened by that one step, so that a command's
-timing is kept although MuJoCo reads one value per step. The last two seconds are remembered,
-because servos are polled one after the other, each a little before what was asked last.
-
-`trunk` tells the truth about where the robot is and how it moves, for scoring; nothing on a real
-robot could.
+Its servos are those of `sim.emulator.free_air_servo`. MuJoCo steps it only as far as a call asks; a
+robot at rest is not stepped until a command moves it. Commands come at any instant, not only on
+physics steps: each actuator gets the mean of its held command over the step before
+(`sim.robot.servo_mjcf.for_commands_between_steps`). The last two seconds are kept, because servos
+are polled one after the other, each a little before the last instant asked for. `trunk` gives the
+true motion, for scoring.
 """
 
 from __future__ import annotations
@@ -31,10 +26,10 @@ from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
 from pupper_sysid.sim.robot.servo_mjcf import for_commands_between_steps, hold, switch_torque
 
 PHYSICS_STEP_S = 0.001
-"""Half the step of training, so that a policy is not judged in the simulator that it learnt in."""
+"""Half the step of training, so that a policy is not scored in the simulator it learnt in."""
 
 ACCELERATION_NOISE_G, RATE_NOISE_DEG_S = 0.002, 0.15
-"""Standard deviations of a chip of this class over its whole bandwidth. This one was not measured;
+"""Standard deviations of a chip of this class over its whole bandwidth, not measured on this one;
 white, without bias."""
 
 _MEMORY_STEPS = 2048
@@ -47,15 +42,15 @@ _NOISE = np.repeat([ACCELERATION_NOISE_G, RATE_NOISE_DEG_S], 3)
 
 @dataclass(frozen=True)
 class Trunk:
-    """The truth about the trunk.
+    """True motion of the trunk.
 
     Attributes
     ----------
     time_s : float
     position_m : ndarray, shape (3,)
-        Of its origin, from where the robot stood at time 0, above the ground.
+        Of its origin, from its place at time 0; z above the ground.
     heading_rad : float
-        Direction of its nose along the ground, to the left of where it was at time 0; ±pi.
+        Its direction along the ground, to the left of that at time 0; ±pi.
     velocity_m_s : ndarray, shape (3,)
         In its own axes: forward, to the left, up.
     yaw_rate_rad_s : float
@@ -73,12 +68,12 @@ class Trunk:
 
 
 class WalkingRobot:
-    """A robot that walks: a `ServoPlant`. May be used by several threads.
+    """A robot that walks: a `ServoPlant`, for any number of threads.
 
     Parameters
     ----------
     robot : EmulatedRobot
-        Its servos; every delay at least two physics steps.
+        Its servos; every dead time at least two physics steps.
     rng : numpy.random.Generator
         The IMU's noise.
     time_step_s : float
@@ -87,7 +82,7 @@ class WalkingRobot:
     Raises
     ------
     InputError
-        If a delay is shorter than two physics steps.
+        If a dead time is shorter than two physics steps.
     """
 
     def __init__(
@@ -114,7 +109,7 @@ class WalkingRobot:
             self._data.sensor(name).data for name in ("accelerometer", "gyro")
         )
         layout = load_joint_map("mini_pupper_2")
-        # servo coordinates of absolute angles: a calf's is told as if its thigh stood at neutral
+        # servo coordinates of absolute angles: a calf's is that with its thigh at neutral
         self._shift = layout.per_servo().to_angles(layout.to_counts(np.zeros(_SERVOS)))
         delays = [float(np.asarray(s.actuator.dead_time_s)) for s in robot.servos]
         self._settled_after = int(max(delays) / time_step_s) + 3
@@ -131,7 +126,7 @@ class WalkingRobot:
         self._stand()
 
     def command(self, index: int, time_s: float, angle_rad: float) -> None:
-        """Goal of one servo [rad] from `time_s` on, which must not go backwards.
+        """Command one servo [rad] from `time_s` on, which must not go backwards.
 
         A limp servo ignores it.
         """
@@ -152,7 +147,7 @@ class WalkingRobot:
             self._changed = self._step
 
     def angle(self, index: int, time_s: float) -> float:
-        """True angle of one servo [rad], at most two seconds before the latest asked."""
+        """True angle of a servo [rad], at most two seconds before the latest asked."""
         with self._lock:
             before, after, share = self._moment(time_s)
             self._asked[index] = after
@@ -161,12 +156,12 @@ class WalkingRobot:
             return float(first + share * (second - first) + self._shift[index])
 
     def load(self, index: int) -> float:
-        """Share of a servo's effort limit at work, signed, when its angle was last asked for."""
+        """Signed share of a servo's effort limit in use at the time of the last `angle` call."""
         with self._lock:
             return float(self._forces[self._asked[index], index] / self._effort[index])
 
     def imu(self, time_s: float) -> ImuSample | None:
-        """The chip's latest sample, of at most 1/235 s ago.
+        """Latest sample of the chip, at most 1/235 s old.
 
         True rate and specific force with white noise, in whole counts, clipped as the chip clips.
         """
@@ -180,7 +175,7 @@ class WalkingRobot:
             return self._sample
 
     def trunk(self, time_s: float) -> Trunk:
-        """Where the trunk is and how it moves, at `time_s` or the latest asked."""
+        """True motion of the trunk at `time_s`, or at the latest instant asked for."""
         with self._lock:
             self._advance(self._steps(time_s))
             position, velocity = self._data.qpos[:3].copy(), self._data.qvel[:3]
@@ -221,12 +216,11 @@ class WalkingRobot:
         self._remember()
 
     def _hold(self, index: int, held: float) -> None:
-        """Let a servo have been commanded to `held` [rad, absolute] for ever."""
+        """Set a servo as if commanded to `held` [rad, absolute] for long."""
         self._goal[index] = held
         hold(self._model, self._data, index, held)
 
     def _steps(self, time_s: float) -> int:
-        """Physics steps after which `time_s` is reached."""
         return int(np.ceil(time_s / self._dt - 1e-9))
 
     def _moment(self, time_s: float) -> tuple[int, int, float]:
@@ -242,7 +236,7 @@ class WalkingRobot:
     def _advance(self, last: int) -> None:
         """Take physics steps until the state is that of the start of step `last`."""
         while self._step < last:
-            # step k sees what was commanded during step k - 1
+            # step k sees the commands of step k - 1
             event = int(self._queue[0][0] / self._dt) + 1 if self._queue else last
             if event <= self._step:
                 self._data.ctrl[:] = self._mean_of_last_step()
@@ -260,10 +254,7 @@ class WalkingRobot:
         self._remember()
 
     def _remember(self) -> None:
-        """Write the present state into the memory.
-
-        Forces and sensors are those of one step before, as MuJoCo leaves them.
-        """
+        """Write the present state into the memory; forces and sensors are one step old."""
         row = self._step % _MEMORY_STEPS
         angles, chip = self._angles[row], self._chip[row]
         angles[:] = self._data.qpos[7:]
@@ -272,7 +263,7 @@ class WalkingRobot:
         chip[:3], chip[3:] = self._acceleration, self._rate
 
     def _stay(self, until: int) -> None:
-        """Let time pass, and nothing else, until step `until`."""
+        """Let time pass without motion until step `until`."""
         now = self._step % _MEMORY_STEPS
         rows = np.arange(max(self._step, until - _MEMORY_STEPS) + 1, until + 1) % _MEMORY_STEPS
         for memory in (self._angles, self._forces, self._chip):
@@ -294,7 +285,7 @@ class WalkingRobot:
         return not self._model.actuator_biasprm[index].any()
 
     def _resting(self) -> bool:
-        """Whether another step would change nothing that anyone could see."""
+        """Whether another step would change nothing visible."""
         return (
             self._step - self._changed > self._settled_after
             and np.abs(self._data.qvel).max() < _STILL_RAD_S

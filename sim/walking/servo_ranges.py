@@ -1,9 +1,9 @@
-"""What twelve servos may be, drawn anew for every episode from a calibration's intervals.
+"""Plausible ranges of twelve servos: a calibration's intervals, from which episodes draw.
 
-`servo_ranges` turns what a user gives as `--actuator` (a calibration file or preset, or `ideal`)
-into arrays of twelve: the middle and the ends of every interval. Joints that the calibration does
-not have take the numbers of the same kind of joint on another leg, and the result says so. `draw`
-makes one set of servos per environment. The feedback comes along, apart from the actuator.
+`servo_ranges` turns an actuator's name (a calibration file or preset, or `ideal`) into arrays of
+twelve: the value and the ends of every interval. A joint that the calibration does not have falls
+back on the same kind of joint on another leg (`fallbacks`). `draw` makes one set of servos per
+environment. The feedback comes along, apart from the actuator.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class ServoRanges:
     Attributes
     ----------
     source : str
-        What was given: a path, a preset's name or `ideal`.
+        A path, a preset's name or `ideal`.
     low, value, high : dict of str to ndarray, shape (12,)
-        By field of `DelayedPDParameters`: ends of the interval, and its middle.
+        By field of `DelayedPDParameters`: ends of the interval, and the value.
     feedback : tuple of HeldFeedback
         Of each servo.
-    borrowed : dict of str to str
-        Joints that were not calibrated, and whose numbers they took.
+    fallbacks : dict of str to str
+        Joints that were not calibrated, and the joint whose numbers they have.
     """
 
     source: str
@@ -49,11 +49,11 @@ class ServoRanges:
     value: dict[str, NDArray[np.float64]]
     high: dict[str, NDArray[np.float64]]
     feedback: tuple[HeldFeedback, ...]
-    borrowed: dict[str, str]
+    fallbacks: dict[str, str]
 
     @property
     def longest_dead_time_s(self) -> float:
-        """The longest dead time that can be drawn [s]."""
+        """Longest dead time that can be drawn [s]."""
         return float(self.high["dead_time_s"].max())
 
     def later(self, extra_s: ArrayLike) -> ServoRanges:
@@ -65,7 +65,7 @@ class ServoRanges:
         return replace(self, **moved)
 
     def in_steps_of(self, time_step_s: float) -> ServoRanges:
-        """The same servos for a simulation in other steps, with the lag they were measured with.
+        """The same servos for a simulation in other steps, with the lag that was measured.
 
         Raises
         ------
@@ -76,7 +76,7 @@ class ServoRanges:
         return self.later(delay_at_step(middle, time_step_s) - self.value["dead_time_s"])
 
     def nominal(self) -> dict[str, DelayedPDParameters]:
-        """The middle of every interval, by joint."""
+        """The value of every number, by joint."""
         return {
             name: DelayedPDParameters(**{f: self.value[f][i] for f in PARAMETER_KEYS})
             for i, name in enumerate(JOINT_NAMES)
@@ -111,16 +111,16 @@ class ServoRanges:
 
 
 def servo_ranges(actuator: str | Path, feedback: str | Path = "held") -> ServoRanges:
-    """Ranges from what a user gave.
+    """Ranges of the servos of an actuator, and its feedback or another.
 
     Parameters
     ----------
     actuator : str or Path
-        A calibration file, a preset, or `ideal`: at once, without friction, as strong as needed;
-        so is the folder of a learned servo model, which says itself where the servo will be.
+        A calibration file, a preset, or `ideal`: no delay, no friction, no limits. The folder of a
+        learned servo model gives the same: that model predicts the position itself.
     feedback : str or Path
-        `held`: as the calibration measured it; `ideal`: every reading fresh and exact; or another
-        calibration whose feedback to take.
+        `held`: the calibration's own; `ideal`: every reading fresh and exact; or another
+        calibration, whose feedback is taken.
 
     Raises
     ------
@@ -142,12 +142,12 @@ def servo_ranges(actuator: str | Path, feedback: str | Path = "held") -> ServoRa
 
 def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     parts: list[JointCalibration] = []
-    borrowed = {}
+    fallbacks = {}
     for name in JOINT_NAMES:
-        lender = _lender(name, calibration)
-        if lender != name:
-            borrowed[name] = lender
-        parts.append(calibration.joint(lender))
+        nearest = _nearest(name, calibration)
+        if nearest != name:
+            fallbacks[name] = nearest
+        parts.append(calibration.joint(nearest))
     low, value, high = {}, {}, {}
     for field, key in PARAMETER_KEYS.items():
         found: list[Quantity] = [getattr(p.actuator, key) for p in parts]
@@ -158,12 +158,12 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     low["dead_time_s"], high["dead_time_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
-    feedback = tuple(calibration.held_feedback(borrowed.get(n, n)) for n in JOINT_NAMES)
-    return ServoRanges(source, low, value, high, feedback, borrowed)
+    feedback = tuple(calibration.held_feedback(fallbacks.get(n, n)) for n in JOINT_NAMES)
+    return ServoRanges(source, low, value, high, feedback, fallbacks)
 
 
-def _lender(name: str, calibration: Calibration) -> str:
-    """The calibrated joint that is most like `name`: itself, its kind on another leg, any."""
+def _nearest(name: str, calibration: Calibration) -> str:
+    """The calibrated joint nearest to `name`: itself, its kind on another leg, any."""
     leg, kind = name.split("_")
     return min(
         calibration.joint_names,
@@ -172,7 +172,7 @@ def _lender(name: str, calibration: Calibration) -> str:
 
 
 def _ideal(source: str) -> ServoRanges:
-    """Servos that are where they are told to be, as nearly as a 2 ms step can hold."""
+    """Servos that follow their command, as nearly as a 2 ms step can hold."""
     own = {
         "stiffness": 20.0, "damping": 0.25, "friction_loss": 0.0, "armature": 8e-4,
         "effort_limit": _NO_LIMIT_NM, "velocity_limit": _NO_LIMIT_RAD_S, "dead_time_s": 0.0,
@@ -211,11 +211,11 @@ def check_actuator(actuator: str) -> None:
     Raises
     ------
     InputError
-        With what can be given.
+        If it is none of them.
     """
     if actuator not in (*PRESETS, IDEAL) and not Path(actuator).exists():
         raise InputError(
-            f"--actuator {actuator}: there is no such file. Give a calibration "
+            f"`actuator` {actuator}: there is no such file. Give a calibration "
             f"(`pupper-sysid calibrate` writes one), a servo model's folder, or one of "
             f"{', '.join((*PRESETS, IDEAL))}."
         )

@@ -128,6 +128,7 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
     assert arm.nu == 2 and arm.nsensor == 2
 
 
+@pytest.mark.wall_clock
 def test_one_servo_on_a_bench_is_swept_over_a_serial_line_and_calibrated(capsys):
     code, _, err = run(capsys, "init-robot", "bench.xml")
     assert code == 0, err

@@ -64,11 +64,11 @@ def test_presets_delays_are_their_whole_physics_steps(preset, steps, stiffness, 
     np.testing.assert_allclose(ranges.high["dead_time_s"], steps[1] * 0.002)
     np.testing.assert_array_equal(ranges.value["stiffness"], stiffness)
     np.testing.assert_array_equal(ranges.high["effort_limit"], effort)
-    assert ranges.borrowed == {}
+    assert ranges.fallbacks == {}
     assert set(ranges.feedback) == {HeldFeedback()}
 
 
-def test_joints_that_were_not_calibrated_borrow_from_their_own_kind_and_say_so(tmp_path):
+def test_joints_without_a_calibration_fall_back_on_their_own_kind(tmp_path):
     joints = {
         "LF_hip": joint_calibration(5.0),
         "RB_thigh": joint_calibration(6.0),
@@ -78,22 +78,22 @@ def test_joints_that_were_not_calibrated_borrow_from_their_own_kind_and_say_so(t
     expected = {"hip": 5.0, "thigh": 6.0, "calf": 7.0}
     for name, stiffness in zip(JOINT_NAMES, ranges.value["stiffness"], strict=True):
         assert stiffness == expected[name.split("_")[1]]
-    lenders = {"hip": "LF_hip", "thigh": "RB_thigh", "calf": "LF_calf"}
-    assert ranges.borrowed == {
-        name: lenders[name.split("_")[1]] for name in JOINT_NAMES if name not in joints
+    nearest = {"hip": "LF_hip", "thigh": "RB_thigh", "calf": "LF_calf"}
+    assert ranges.fallbacks == {
+        name: nearest[name.split("_")[1]] for name in JOINT_NAMES if name not in joints
     }
 
 
-def test_a_joint_whose_kind_nobody_calibrated_borrows_from_its_own_leg(tmp_path):
+def test_a_joint_whose_kind_was_not_calibrated_falls_back_on_its_own_leg(tmp_path):
     joints = {"LF_hip": joint_calibration(5.0), "RB_thigh": joint_calibration(6.0)}
     ranges = ranges_of(tmp_path, calibration(**joints))
-    assert ranges.borrowed["LF_calf"] == "LF_hip"
-    assert ranges.borrowed["RB_calf"] == "RB_thigh"
+    assert ranges.fallbacks["LF_calf"] == "LF_hip"
+    assert ranges.fallbacks["RB_calf"] == "RB_thigh"
 
 
 def test_one_servo_on_a_bench_lends_to_all_joints(tmp_path):
     ranges = ranges_of(tmp_path, calibration(bench=joint_calibration(5.0)))
-    assert ranges.borrowed == dict.fromkeys(JOINT_NAMES, "bench")
+    assert ranges.fallbacks == dict.fromkeys(JOINT_NAMES, "bench")
 
 
 def test_feedback_comes_with_the_calibration_and_can_be_exchanged(tmp_path):
