@@ -19,12 +19,12 @@ def run_program(capsys, module: ModuleType, *arguments) -> tuple[int, str, str]:
         code = 0
     except SystemExit as end:
         code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, " ".join(said.err.split())
+    printed = capsys.readouterr()
+    return code, printed.out, " ".join(printed.err.split())
 
 
 def refused(capsys, module: ModuleType, *arguments) -> str:
-    """What is said to input that cannot be used: no traceback, no blame on the program."""
+    """Message for input that cannot be used: exit code 2, no traceback, no mention of a defect."""
     code, out, err = run_program(capsys, module, *arguments)
     assert code == 2, err
     assert out == "" and "Traceback" not in err and "defect" not in err
