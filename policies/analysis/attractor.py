@@ -35,20 +35,14 @@ DELAYS_MS = (0.0, 160.0, 320.0)
 
 @dataclass(frozen=True)
 class PrincipalComponents:
-    """Directions of largest variance of states with d numbers.
-
-    Attributes
-    ----------
-    mean : ndarray, shape (d,)
-    axes : ndarray, shape (k, d)
-        Orthonormal, largest variance first; the largest number of each is positive.
-    variance : ndarray, shape (d,)
-        Along all d directions, largest first.
-    """
+    """Directions of largest variance of states with d numbers."""
 
     mean: Array
+    """Shape (d,)."""
     axes: Array
+    """Orthonormal, largest variance first; the largest number of each is positive; shape (k, d)."""
     variance: Array
+    """Along all d directions, largest first; shape (d,)."""
 
     @property
     def explained(self) -> Array:

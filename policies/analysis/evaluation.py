@@ -39,29 +39,21 @@ RANDOM = Commands((-0.2, 0.2), (-0.1, 0.1), (-0.5, 0.5), standing=0.0, single=0.
 
 @dataclass(frozen=True)
 class Walk:
-    """Episodes of one or more robots.
-
-    Attributes
-    ----------
-    fell : ndarray of bool, shape (episodes,)
-    command, velocity : ndarray, shape (steps, episodes, 3)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    contact : ndarray of bool, shape (steps, episodes, 4)
-        Feet on the ground.
-    alive : ndarray of bool, shape (steps, episodes)
-    swing_s : float
-        Mean length of a swing [s].
-    slip_m_s : float
-        Mean speed of feet on the ground.
-    """
+    """Episodes of one or more robots."""
 
     fell: NDArray[np.bool_]
+    """Shape (episodes,)."""
     command: NDArray[np.float64]
+    """Forward and sideways speed [m/s], turn rate [rad/s]; shape (steps, episodes, 3)."""
     velocity: NDArray[np.float64]
     contact: NDArray[np.bool_]
+    """Feet on the ground; shape (steps, episodes, 4)."""
     alive: NDArray[np.bool_]
+    """Shape (steps, episodes)."""
     swing_s: float
+    """Mean length of a swing [s]."""
     slip_m_s: float
+    """Mean speed of feet on the ground."""
 
     @property
     def error(self) -> NDArray[np.float64]:

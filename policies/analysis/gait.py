@@ -275,7 +275,8 @@ def amplitude(signal: Signal) -> tuple[Array, Array]:
 
     Returns
     -------
-    half_range, deviation : ndarray, shape (…)
+    half_range : ndarray, shape (…)
+    deviation : ndarray, shape (…)
     """
     y = np.asarray(signal, float)
     low, high = np.quantile(y, [0.05, 0.95], axis=0)

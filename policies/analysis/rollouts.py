@@ -48,44 +48,31 @@ class Rollout:
 
     Observation, action and hidden state belong to the start of a control step, all else to its
     end. Rows of a robot that is no longer `alive` are meaningless: it was reset.
-
-    Attributes
-    ----------
-    step_s : float
-        Control step [s].
-    command : (float, float, float)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    action_scale : float
-        Radians per unit of action.
-    observation : ndarray of float32, shape (steps, n, 60)
-        As given to the policy, changes included.
-    action : ndarray of float32, shape (steps, n, 12)
-        Raw outputs of the policy.
-    hidden : ndarray of float32, shape (steps, n, k)
-        LSTM: cell; GRU: state; Transformer: latent; MLP: last hidden layer.
-    joint_position : ndarray, shape (steps, n, 12)
-        True joint angles [rad], not readings.
-    contact : ndarray of bool, shape (steps, n, 4)
-        Which feet were on the ground.
-    velocity : ndarray, shape (steps, n, 3)
-        Forward and sideways speed in the trunk's frame [m/s], turn rate [rad/s].
-    position : ndarray, shape (steps, n, 3)
-        Trunk's x and y [m] and heading [rad, continuous] in the world.
-    alive : ndarray of bool, shape (steps, n)
-        Whether the robot has neither fallen nor left the ground's edge so far.
     """
 
     step_s: float
+    """Control step [s]."""
     command: tuple[float, float, float]
+    """Forward and sideways speed [m/s], turn rate [rad/s]."""
     action_scale: float
+    """Radians per unit of action."""
     observation: NDArray[np.float32]
+    """As given to the policy, changes included; shape (steps, n, 60)."""
     action: NDArray[np.float32]
+    """Raw outputs of the policy; shape (steps, n, 12)."""
     hidden: NDArray[np.float32]
+    """LSTM: cell; GRU: state; Transformer: latent; MLP: last hidden layer; shape (steps, n, k)."""
     joint_position: Array
+    """True joint angles [rad], not readings; shape (steps, n, 12)."""
     contact: NDArray[np.bool_]
+    """Which feet were on the ground; shape (steps, n, 4)."""
     velocity: Array
+    """Forward and sideways speed in the trunk's frame [m/s], turn rate [rad/s]; shape (steps, n,
+    3)."""
     position: Array
+    """Trunk's x and y [m] and heading [rad, continuous] in the world; shape (steps, n, 3)."""
     alive: NDArray[np.bool_]
+    """Whether the robot has neither fallen nor left the ground's edge so far; shape (steps, n)."""
 
     @property
     def action_rad(self) -> Array:

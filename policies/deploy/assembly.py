@@ -23,20 +23,13 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 
 @dataclass(frozen=True)
 class Assembly:
-    """A controller, with the comparison of its observer and the header of its log.
-
-    Attributes
-    ----------
-    controller : Controller
-    match : Match
-        The observer on this robot compared with the actuator the policy was trained with.
-    header : dict
-        Everything that `reassemble` needs.
-    """
+    """A controller, with the comparison of its observer and the header of its log."""
 
     controller: Controller
     match: Match
+    """The observer on this robot compared with the actuator the policy was trained with."""
     header: dict[str, Any]
+    """Everything that `reassemble` needs."""
 
 
 def assemble(

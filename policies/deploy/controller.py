@@ -31,49 +31,33 @@ _PUBLISHED_SPEED_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Senses:
-    """Inputs of a tick.
-
-    Attributes
-    ----------
-    elapsed_s : float
-        Since the first tick.
-    command : ndarray, shape (3,)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    position : ndarray, shape (12,)
-        Reported joint angles [rad]; NaN where a reading is missing.
-    load : ndarray, shape (12,)
-        Reported torque [N·m]; 0 where the bus has none.
-    rate, acceleration : ndarray, shape (3,)
-        Of the IMU, in the trunk's frame [rad/s, m/s²]; NaN if it did not answer.
-    """
+    """Inputs of a tick."""
 
     elapsed_s: float
+    """Since the first tick."""
     command: Array
+    """Forward and sideways speed [m/s], turn rate [rad/s]; shape (3,)."""
     position: Array
+    """Reported joint angles [rad]; NaN where a reading is missing; shape (12,)."""
     load: Array
+    """Reported torque [N·m]; 0 where the bus has none; shape (12,)."""
     rate: Array
+    """Of the IMU, in the trunk's frame [rad/s, m/s²]; NaN if it did not answer; shape (3,)."""
     acceleration: Array
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Outputs of a tick.
-
-    Attributes
-    ----------
-    observation : ndarray of float32, shape (60,)
-    action : ndarray of float32, shape (12,)
-        Raw output of the policy.
-    target : ndarray, shape (12,)
-        Joint angles to send [rad], within the limits.
-    margin : ndarray, shape (12,)
-        Distance of each target from its nearest limit [rad].
-    """
+    """Outputs of a tick."""
 
     observation: NDArray[np.float32]
+    """Shape (60,)."""
     action: NDArray[np.float32]
+    """Raw output of the policy; shape (12,)."""
     target: Array
+    """Joint angles to send [rad], within the limits; shape (12,)."""
     margin: Array
+    """Distance of each target from its nearest limit [rad]; shape (12,)."""
 
 
 class Controller:

@@ -53,45 +53,24 @@ class Rows(Protocol):
 
 @dataclass(frozen=True)
 class Tick:
-    """One tick of a walk, for whoever watches.
-
-    Attributes
-    ----------
-    elapsed_s : float
-    senses : Senses
-    decision : Decision
-    sent : ndarray, shape (12,)
-        What the guard let out [rad].
-    reading : BusSample
-    """
+    """One tick of a walk, for whoever watches."""
 
     elapsed_s: float
     senses: Senses
     decision: Decision
     sent: Array
+    """What the guard let out [rad]; shape (12,)."""
     reading: BusSample
 
 
 @dataclass
 class Outcome:
-    """How a walk went.
-
-    Attributes
-    ----------
-    seconds : float
-        Walked.
-    steps : Durations
-        What the controller took per tick, on the host's clock.
-    deadline_misses : int
-    fell : bool
-    stop_reason : str
-    guard : dict
-    loop : dict
-    clipped_imu_samples, missing_imu_samples : int
-    """
+    """How a walk went."""
 
     seconds: float = 0.0
+    """Walked."""
     steps: Durations = field(default_factory=Durations)
+    """What the controller took per tick, on the host's clock."""
     deadline_misses: int = 0
     fell: bool = False
     stop_reason: str = "time is up"

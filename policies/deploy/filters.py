@@ -93,37 +93,25 @@ class LowPass:
 
 @dataclass(frozen=True)
 class Attitude:
-    """The trunk's motion from an IMU.
-
-    Attributes
-    ----------
-    rate_rad_s : ndarray, shape (3,)
-        Angular velocity in the trunk's frame, without the gyro's bias.
-    gravity : ndarray, shape (3,)
-        Unit vector, the direction of gravity in the trunk's frame: (0, 0, -1) when level.
-    clipped : bool
-        Whether the accelerometer was at its limit, and so was ignored.
-    """
+    """The trunk's motion from an IMU."""
 
     rate_rad_s: Array
+    """Angular velocity in the trunk's frame, without the gyro's bias; shape (3,)."""
     gravity: Array
+    """Unit vector, the direction of gravity in the trunk's frame: (0, 0, -1) when level; shape
+    (3,)."""
     clipped: bool
+    """Whether the accelerometer was at its limit, and so was ignored."""
 
 
 @dataclass(frozen=True)
 class Rest:
-    """Start of a `ComplementaryFilter`.
-
-    Attributes
-    ----------
-    gravity : ndarray, shape (3,)
-        Unit vector in the trunk's frame.
-    bias_rad_s : ndarray, shape (3,)
-        Gyro reading of a robot that does not turn.
-    """
+    """Start of a `ComplementaryFilter`."""
 
     gravity: Array
+    """Unit vector in the trunk's frame; shape (3,)."""
     bias_rad_s: Array
+    """Gyro reading of a robot that does not turn; shape (3,)."""
 
 
 class ComplementaryFilter:

@@ -73,17 +73,12 @@ def response(
 
 @dataclass(frozen=True)
 class Match:
-    """An observer's frequency response beside that of the trained actuator.
-
-    Attributes
-    ----------
-    frequencies_hz : ndarray, shape (frequencies,)
-    observer, actuator : ndarray of complex, shape (frequencies, 12)
-        See `response`.
-    """
+    """An observer's frequency response beside that of the trained actuator."""
 
     frequencies_hz: NDArray[np.float64]
+    """Shape (frequencies,)."""
     observer: NDArray[np.complex128]
+    """See `response`; shape (frequencies, 12)."""
     actuator: NDArray[np.complex128]
 
     @property

@@ -37,21 +37,14 @@ _PAPER_DELAY_STEPS = {0.02: 9, 0.04: 5}  # by control period: 180 and 200 ms
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """An observer's estimate of the joints at the end of a control period.
-
-    Attributes
-    ----------
-    position : ndarray, shape (..., 12)
-        [rad], servo coordinates.
-    velocity : ndarray, shape (..., 12)
-        [rad/s]
-    effort : ndarray, shape (..., 12)
-        Torque [N·m]; 0 where unknown.
-    """
+    """An observer's estimate of the joints at the end of a control period."""
 
     position: Array
+    """[rad], servo coordinates; shape (..., 12)."""
     velocity: Array
+    """[rad/s]; shape (..., 12)."""
     effort: Array
+    """Torque [N·m]; 0 where unknown; shape (..., 12)."""
 
 
 class Observer(ABC):

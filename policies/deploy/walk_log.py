@@ -83,30 +83,21 @@ class WalkLog:
 
 @dataclass(frozen=True)
 class Walk:
-    """A log that was read.
-
-    Attributes
-    ----------
-    header : dict
-    rest : Rest
-        At the start.
-    start : ndarray, shape (12,)
-        Joint angles at the start [rad].
-    senses : list of Senses
-    observation, action, target, sent : ndarray, shape (ticks, 60 or 12)
-    ended : str or None
-        Why; None if the log was cut short.
-    """
+    """A log that was read."""
 
     header: dict[str, Any]
     rest: Rest
+    """At the start."""
     start: NDArray[np.float64]
+    """Joint angles at the start [rad]; shape (12,)."""
     senses: list[Senses]
     observation: NDArray[np.float32]
+    """Shape (ticks, 60 or 12)."""
     action: NDArray[np.float32]
     target: NDArray[np.float64]
     sent: NDArray[np.float64]
     ended: str | None
+    """Why; None if the log was cut short."""
 
 
 def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:

@@ -91,7 +91,7 @@ class CausalAttention(nn.Module):
 
 
 class TransformerModel(MLPModel):
-    """rsl_rl's actor with `CausalAttention` before the head."""
+    """Actor of rsl_rl with `CausalAttention` before the head."""
 
     is_recurrent = True
 

@@ -137,7 +137,7 @@ class Learner:
         if actor.is_recurrent and env.num_envs < hyper.minibatches:
             raise InputError(
                 f"{env.num_envs} environments cannot be split into {hyper.minibatches} "
-                "minibatches. Give more --environments or fewer --learner.minibatches."
+                "minibatches. Give more `environments` or fewer `minibatches`."
             )
         storage = RolloutStorage(
             "rl", env.num_envs, hyper.steps_per_environment, self.observations,
@@ -250,7 +250,7 @@ class Learner:
         if content["architecture"] != self.architecture.kind:
             raise InputError(
                 f"{path} holds a policy of kind {content['architecture']}, but the run says "
-                f"{self.architecture.kind}. Resume without --policy, or start a new run."
+                f"{self.architecture.kind}. Resume without `policy`, or start a new run."
             )
         try:
             self.take_back(content)

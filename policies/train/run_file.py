@@ -192,8 +192,8 @@ def refuse_taken(folder: Path) -> None:
     """
     if (folder / RUN_FILE).exists():
         raise InputError(
-            f"{folder} holds a run already. Resume it with --resume {folder}, or give another "
-            "--name."
+            f"{folder} holds a run already. Go on with it with `resume={folder}`, or give another "
+            "`name`."
         )
 
 

@@ -276,8 +276,8 @@ class _Session:
         self.save(LAST)
         raise PupperError(
             f"The policy's numbers stopped being numbers after update {learner.iteration}. The "
-            f"networks before that are in {last}: pupper-train --resume {self.folder} goes on "
-            "from them; if it happens again, start a run with a lower --learner.learning-rate."
+            f"networks before that are in {last}: `resume={self.folder}` goes on "
+            "from them; if it happens again, start a run with a lower `learning_rate`."
         )
 
 
