@@ -1,8 +1,7 @@
-"""How the report's figures look, and how they become PNG and SVG files.
+"""Style of the report's figures, and their PNG and SVG files.
 
-Figures are narrow, with large letters, so that they can be read on a phone and in print; colours
-are those of Okabe and Ito, which colour-blind readers can tell apart. pyplot's global state is not
-touched.
+Figures are narrow, with large letters, for phones and print; colours are those of Okabe and Ito,
+which are distinct to colour-blind readers. pyplot's global state is not used.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ _P = ParamSpec("_P")
 
 
 def styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
-    """A drawing function in the house style; matplotlib's settings are as before afterwards."""
+    """Draw in this style; matplotlib's settings are restored afterwards."""
 
     @wraps(draw)
     def drawn(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
@@ -100,15 +99,17 @@ def svg(figure: Figure) -> bytes:
 
 
 def refuse_picture(path: Path, force: bool = False) -> None:
-    """Raise unless a picture can be written to `path`, or `force` was given.
+    """Refuse a path to which no picture can be written.
 
     Raises
     ------
     InputError
-        If `path` is neither PNG nor SVG, or exists already.
+        If `path` is neither PNG nor SVG, or exists and `force` is not given.
     """
     if path.suffix.lower() not in (".png", ".svg"):
-        raise InputError(f"{path}: pictures are written as .png or .svg; name it so.")
+        raise InputError(
+            f"{path}: pictures are written as .png or .svg; choose one of them."
+        )
     refuse_overwrite(path, force)
 
 

@@ -1,8 +1,8 @@
-"""Reports as one HTML page that opens anywhere: figures inside, no network, no scripts.
+"""Reports as one HTML page without network or scripts: figures are inside.
 
-A page is a list of `Section` objects, each of words, pictures and tables, set by one template for
-phone, desk and paper, light and dark. `write_page` writes it with its figures as PNG and SVG and
-its tables as CSV beside it.
+A page is a list of `Section` objects of text, pictures and tables, set by one template for screens
+of all sizes and for print. `write_page` writes it, and beside it its figures as PNG and SVG and its
+tables as CSV.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -24,18 +23,19 @@ from matplotlib.figure import Figure
 
 from pupper_sysid.common.figure_style import png, svg
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
+from pupper_sysid.common.results import plain
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the page: its heading and what it shows of a row."""
+    """A column of a table: its heading, and the text of a row's cell."""
 
     heading: str
     show: Callable[[Row], str]
     kind: Literal["key", "number", "words", "prose"] = "number"
-    """How it is set: a key stays in sight when a table is scrolled, prose is broken into lines."""
+    """Layout: a key stays visible when a table is scrolled, prose is broken into lines."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Table:
     Attributes
     ----------
     name : str
-        Of its CSV file, without ending.
+        Name of its CSV file, without ending.
     title : str
     columns : tuple of Column
-        What the page shows.
+        On the page.
     rows : tuple of dict
-        What the CSV holds; all rows have the same keys.
+        In the CSV file; all rows have the same keys.
     marked : str
-        Rows in which this key is true are set in bold on the page.
+        Rows in which this key is true are bold on the page.
     """
 
     name: str
@@ -61,22 +61,14 @@ class Table:
     rows: tuple[Row, ...]
     marked: str = ""
 
-    def cells(self, row: Row) -> list[tuple[str, str]]:
-        """The page's cells of `row`: their text and how each is set."""
-        return [(c.show(row), c.kind) for c in self.columns]
-
-    def is_marked(self, row: Row) -> bool:
-        """Whether `row` is to stand out."""
-        return bool(self.marked and row[self.marked])
-
     def to_csv(self) -> str:
-        """All values of all rows; a number that is none is an empty cell."""
+        """All values of all rows; a cell is empty where a number is not finite."""
         buffer = io.StringIO()
         writer = csv.DictWriter(
             buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n"
         )
         writer.writeheader()
-        writer.writerows({k: _plain(v) for k, v in row.items()} for row in self.rows)
+        writer.writerows(plain(row) for row in self.rows)
         return buffer.getvalue()
 
 
@@ -85,19 +77,19 @@ class Picture:
     """A figure of the report."""
 
     name: str
-    """Of its files, without ending."""
+    """Name of its files, without ending."""
     caption: str
-    """What to see in it; also its text for those who cannot see it."""
+    """What it shows; also its text for screen readers."""
     figure: Figure
 
     @cached_property
     def png(self) -> bytes:
-        """As the page shows it."""
+        """The figure as a PNG image, for the page."""
         return png(self.figure)
 
     @cached_property
     def svg(self) -> bytes:
-        """To be set in print, or worked on."""
+        """The figure as an SVG drawing, for print."""
         return svg(self.figure)
 
     @property
@@ -106,19 +98,14 @@ class Picture:
         return base64.b64encode(self.png).decode("ascii")
 
     @property
-    def width(self) -> int:
-        """Width [pixels], from the PNG's header."""
-        return int.from_bytes(self.png[16:20], "big")
-
-    @property
-    def height(self) -> int:
-        """Height [pixels]."""
-        return int.from_bytes(self.png[20:24], "big")
+    def size(self) -> tuple[int, int]:
+        """Width and height [pixels], from the PNG's header."""
+        return int.from_bytes(self.png[16:20], "big"), int.from_bytes(self.png[20:24], "big")
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page; what it does not have is left out.
+    """A part of the page.
 
     Attributes
     ----------
@@ -126,11 +113,11 @@ class Section:
     text : sequence of str
         Paragraphs.
     findings : sequence of (str, str)
-        What was found, each under a name that may be empty.
+        Each with its name, which may be empty.
     figures : sequence of Picture
     tables : sequence of Table
     notes : sequence of str
-        What to keep in mind.
+        In small print.
     """
 
     anchor: str
@@ -160,8 +147,7 @@ def write_page(
     Parameters
     ----------
     path : Path
-        Of the page; its folder gets `figures/*.png`, the same as `*.svg`, and
-        `tables/*.csv`.
+        Of the page; its folder gets `figures/*.png`, `figures/*.svg` and `tables/*.csv`.
     title, subtitle : str
     sections : sequence of Section
     force : bool
@@ -204,15 +190,6 @@ def render(title: str, subtitle: str, sections: Sequence[Section]) -> str:
 
 
 def _code(text: str) -> Markup:
-    """The text, escaped, with what stands between backticks as code."""
+    """The text, escaped; between backticks as code."""
     quoted = str(escape(text))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", quoted))
-
-
-def _plain(value: Any) -> Any:
-    """A value for a CSV cell: no NaN, no NumPy, no infinity."""
-    if hasattr(value, "item"):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -4,6 +4,13 @@ The bus polls each servo once per `poll_period_s`. A poll fails with probability
 leaves the previous value in place, which the host reads. So a reading is the position at the last
 successful poll, plus `offset_rad`, rounded to `quantum_rad`; its age is between zero and many
 periods, on average `mean_age_s = poll_period_s * (1/2 + loss / (1 - loss))`.
+
+This is the definition; three modules simulate it. They stay apart because each has a random stream
+of its own, which recordings, checkpoints and exports repeat bit for bit, and needs other parts:
+`sim.emulator.poll_schedule` gives the poll instants of one robot at any time, with jitter and drift
+(the emulated buses measure there); `sim.walking.held_readings` gives readings of many robots, a
+control step at a time; `sim.export.held_feedback_torch` is copied into exports and needs only torch
+(`tests/sim` holds each to the mean age above).
 """
 
 from __future__ import annotations

@@ -1,15 +1,12 @@
-"""Readings of cheap servos, for a simulator on torch: old, coarse and off, as the robot's are.
+"""Held feedback for a simulator on torch (`servo_models.held_feedback`): stale, quantised, biased.
 
     feedback = HeldFeedback(FEEDBACK, joint_names, num_envs, physics_dt, device)
     feedback.reset(joint_positions)                 # at an episode's start; env_ids for some
     reading = feedback.step(joint_positions)        # after every physics step
 
-The servos are polled one after the other, each once per period. A poll that fails leaves the old
-value in place. A reading is the position at the last poll that succeeded, plus an offset, in whole
-counts. Give the readings to the policy in place of the joint positions, and take velocities from
-differences of readings: such servos measure none.
-
-`pupper-sysid export` writes this text beside the actuators, so it needs nothing but torch.
+Give the readings to the policy in place of the joint positions, and take velocities from
+differences of readings: such servos measure none. `pupper-sysid export` copies the class into its
+files, so it needs nothing but torch.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
         *origin(calibration),
         f"Delays are whole physics steps of {1e3 * physics_step_s:g} ms, the measured interval "
         "rounded outward; one delay is drawn per robot and reset, for each joint alone. Set "
-        "sim.dt to this, or export again with --physics-step.",
+        "sim.dt to this, or export again for its physics step.",
         *step_note(calibration, delays, physics_step_s),
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave both "
         "friction lines out with it.",

@@ -62,7 +62,7 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
         "delay_hold_prob=1, or with a long delay_update_period, robots begin without any delay.",
         "Not carried over: the limit on the set-point's speed, parts of a step, and the stiffness "
         "of dry friction (MuJoCo's default lets a held joint creep: set solreffriction of the "
-        "joints as `--to mjcf` writes it).",
+        "joints as the export to MJCF writes it).",
         NOT_CARRIED,
     )
     return torch_module(

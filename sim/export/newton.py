@@ -143,7 +143,7 @@ def _module(calibration: Calibration, delays: dict[str, Delay], physics_step_s: 
         *step_note(calibration, delays, physics_step_s),
         "Not carried over: the limit on the set-point's speed, parts of a step, and the feedback, "
         "which is no part of an actuator: readings are old, lost at times, coarse and off. See "
-        "FEEDBACK, and the HeldFeedback that `pupper-sysid export --to isaaclab` writes.",
+        "FEEDBACK, and the HeldFeedback that the export to Isaac Lab writes.",
     )
     return (
         f"{docstring('Servos for Newton.', notes)}\n"
