@@ -161,8 +161,10 @@ def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArr
 
     Returns
     -------
-    mean, strayed : ndarray, shape (joints,)
-        NaN where there is no reading. `strayed` is the highest less the lowest reading.
+    mean : ndarray, shape (joints,)
+        NaN where there is no reading.
+    strayed : ndarray, shape (joints,)
+        The highest less the lowest reading.
     """
     known = np.where(readings < 0, np.nan, readings.astype(float))
     mean, strayed = np.full((2, readings.shape[1]), np.nan)

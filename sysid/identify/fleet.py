@@ -203,8 +203,11 @@ def run_fleet(
     quantities : sequence of str
     out : Path
         Folder for the table.
-    jobs, cluster, force, progress
-        As for `calibrate_fleet`.
+    jobs : int
+    cluster : str, optional
+    force : bool
+    progress : callable, optional
+        These four as for `calibrate_fleet`.
 
     Raises
     ------
@@ -213,7 +216,7 @@ def run_fleet(
         be reached.
     """
     if jobs < 1:
-        raise InputError(f"--jobs is {jobs}; it must be at least 1.")
+        raise InputError(f"`jobs` is {jobs}; it must be at least 1.")
     fleet, todo = Fleet(), []
     for path, target in targets.items():
         if target.exists() and is_of(target, path):
@@ -221,7 +224,7 @@ def run_fleet(
         elif target.exists() and not force:
             raise InputError(
                 f"{target} was made from another recording or with other settings. Choose another "
-                "--out, or add --force to replace it."
+                "`out`, or replace it with `force=True`."
             )
         else:
             todo.append((path, target))
@@ -308,13 +311,13 @@ def _backend(cluster: str | None) -> Iterator[Callable[[int], Parallel]]:
         from distributed import Client
     except ImportError:
         raise InputError(
-            "--cluster needs Dask, which is not installed: `pip install 'pupper-sysid[dask]'`."
+            "`cluster` needs Dask, which is not installed: `pip install 'pupper-sysid[dask]'`."
         ) from None
     try:
         client = Client(cluster, timeout=10)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"--cluster {cluster}: no Dask scheduler answers there ({error}). Start one with "
+            f"`cluster={cluster}`: no Dask scheduler answers there ({error}). Start one with "
             "`dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from None
     with client, parallel_config(backend="dask"):
