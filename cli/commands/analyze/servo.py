@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Servo(Analysis):
-    """Servo models on a recording, or on a walk of an emulated robot: published DelayedPD, fitted
-    DelayedPD, LSTM and MLP.
+    """Compare servo models on a recording, or on a walk of an emulated robot.
 
+    These are the published DelayedPD, a fitted DelayedPD, an LSTM and an MLP.
     Give one recording or one policy. --command, --seconds and --actuator are for a policy's walk.
 
     Example: pupper-analyze servo recordings/playback.csv

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Delay:
-    """How late is each joint, and is it the bus, the sensor or the servo?
+    """Split the lag of each joint into the bus's, the sensor's and the servo's share.
 
     Example: pupper-sysid delay recordings/sweep.csv --joints LF_thigh
     """

@@ -13,7 +13,7 @@ from pupper_sysid.cli import terminal
 
 @dataclass(frozen=True)
 class Doctor:
-    """Is this log usable, and what is wrong with it?
+    """Check whether a recording is usable, and what is wrong with it.
 
     Example: pupper-sysid doctor recordings/sweep.csv
     """
