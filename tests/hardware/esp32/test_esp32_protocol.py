@@ -247,7 +247,6 @@ def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
 
 
 @pytest.mark.wall_clock
-@pytest.mark.wall_clock
 def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
     hung = False
     proxy = ScriptedProxy(lambda request: None if hung else answers(request))

@@ -68,7 +68,6 @@ def test_b5_1_both_series_in_one_process_are_read_right():
 
 
 @pytest.mark.wall_clock
-@pytest.mark.wall_clock
 def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
     monkeypatch.undo()  # the product's own patience, not that of these tests
 
@@ -331,7 +330,6 @@ def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
     ]
 
 
-@pytest.mark.wall_clock
 @pytest.mark.wall_clock
 def test_b5_13_waiting_does_not_keep_the_processor_busy():
     with on_a_port(still_servos(ids=[1])) as server:
