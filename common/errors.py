@@ -1,7 +1,7 @@
 """Errors for users; each message names the fault, the place, and what to do next.
 
-The command line prints the message and ends with `exit_code`; a traceback is shown only with
-`--debug`. Anything that is not a `PupperError` is a defect of this project.
+The command line prints the message and ends with `exit_code`, without a traceback. Anything that is
+not a `PupperError` is a defect of this project.
 """
 
 

@@ -35,7 +35,7 @@ _SUMMARIES = {
         "compare": "Compare models on the same readings.",
     },
     "use": {
-        "report": "Write all of it as one HTML page.",
+        "report": "Write figures and tables as one HTML page.",
         "export": "Convert for MuJoCo, Isaac Lab, Newton, CSV …",
     },
 }

@@ -7,14 +7,14 @@ kind of policy. `save_run` writes `run.yaml` into a run's folder, with hashes an
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_origin, get_type_hints
 
 import yaml
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from pupper_sysid.common.border import read_yaml, refuse_other_version
+from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.policies.network.hyperparameters import (
@@ -94,7 +94,9 @@ def load_run(folder: Path) -> Run:
         If there is none, or they cannot be understood.
     """
     path = folder / RUN_FILE
-    return _from_dict(Run, _read(path).get("settings"), str(path))
+    model = create_model("File", settings=(_model_of(Run), ...))
+    found: Any = validated(model, _read(path), path)
+    return _dataclass_of(Run, found.settings)
 
 
 def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
@@ -133,42 +135,26 @@ def _read(path: Path) -> dict[str, Any]:
     return found
 
 
-def _from_dict(kind: type, given: Any, where: str) -> Any:
-    """A frozen dataclass from plain data, checked against its own types."""
-    if not isinstance(given, dict):
-        raise InputError(f"{where}: expected settings by name.")
-    given = {k: v for k, v in given.items() if k not in _DROPPED.get(kind, ())}
-    default, types = kind(), get_type_hints(kind)
-    unknown = [name for name in given if name not in types]
-    if unknown:
-        raise InputError(f"{where}: unknown setting {unknown[0]}.")
-    values = {}
-    for name, value in given.items():
-        if is_dataclass(types[name]):
-            values[name] = _from_dict(type(getattr(default, name)), value, f"{where}, {name}")
-        else:
-            values[name] = _value(types[name], value, f"{where}: {name}")
-    return replace(default, **values)
+def _model_of(kind: type) -> type[BaseModel]:
+    """Strict pydantic model with the fields of the dataclass `kind`, none of them required."""
+    kinds: dict[str, Any] = dict.fromkeys(_DROPPED.get(kind, ()), Any) | get_type_hints(kind)
+    for name, wanted in kinds.items():
+        if is_dataclass(wanted):
+            kinds[name] = _model_of(cast("type", wanted))
+        elif get_origin(wanted) is tuple:
+            kinds[name] = Annotated[wanted, Field(strict=False)]  # files have lists
+    optional: dict[str, Any] = {name: (wanted, None) for name, wanted in kinds.items()}
+    config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    return create_model(kind.__name__, __config__=config, **optional)
 
 
-def _value(kind: Any, given: Any, where: str) -> Any:
-    """A setting that is no dataclass: a number, a word, a list of them."""
-    if get_origin(kind) is tuple and isinstance(given, list):
-        kinds = get_args(kind)
-        if kinds[-1] is Ellipsis:
-            kinds = kinds[:1] * len(given)
-        if len(kinds) == len(given):
-            return tuple(_value(k, g, where) for k, g in zip(kinds, given, strict=True))
-    elif get_origin(kind) is Literal:
-        if given in get_args(kind):
-            return given
-        raise InputError(f"{where} is {given!r}; expected one of {', '.join(get_args(kind))}.")
-    elif kind is float and type(given) in (int, float) and math.isfinite(given):
-        return float(given)
-    elif type(given) is kind and kind is not float:
-        return given
-    wanted = {float: "a number", int: "a whole number", str: "a word", bool: "true or false"}
-    raise InputError(f"{where} is {given!r}; expected {wanted.get(kind, 'a list of numbers')}.")
+def _dataclass_of(kind: type, settings: Any) -> Any:
+    """The dataclass `kind` with `settings`; the others have their defaults."""
+    kinds, given = get_type_hints(kind), {}
+    for name in settings.model_fields_set & set(kinds):
+        value = getattr(settings, name)
+        given[name] = _dataclass_of(kinds[name], value) if is_dataclass(kinds[name]) else value
+    return kind(**given)
 
 
 def save_run(folder: Path, run: Run) -> None:

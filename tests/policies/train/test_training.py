@@ -265,7 +265,7 @@ def test_when_numbers_stop_being_numbers_the_networks_before_are_saved_and_go_on
     began = spoil(monkeypatch, when, where)
     with pytest.raises(PupperError, match=f"stopped being numbers after update {when}") as said:
         train(tmp_path, tiny_run())
-    assert f"--resume {tmp_path}" in str(said.value) and "\n" not in str(said.value)
+    assert f"`resume={tmp_path}`" in str(said.value) and "\n" not in str(said.value)
     found = read_checkpoint(tmp_path / LAST)
     assert found["iteration"] == when
     assert different(found["actor_state_dict"], began[0]) == []
@@ -357,26 +357,26 @@ def with_settings(folder: Path, *path_and_value) -> Path:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("colour", "blue"), "unknown setting colour"),
-        ((7, "blue"), "unknown setting 7"),
-        (("learner", "momentum", 0.9), "learner: unknown setting momentum"),
-        (("environments", "many"), "environments is 'many'; expected a whole number"),
-        (("environments", 4.5), "environments is 4.5; expected a whole number"),
+        (("colour", "blue"), "settings.colour is not a key of this file"),
+        ((7, "blue"), "settings.7 is not a key of this file"),
+        (("learner", "momentum", 0.9), "learner.momentum is not a key of this file"),
+        (("environments", "many"), "environments is the text 'many'. Write the number"),
+        (("environments", 4.5), "environments is 4.5. Write a whole number"),
         (("environments", True), "environments is True"),
         (("minutes", [1.0]), "minutes"),
         (("minutes", float("nan")), "minutes is nan"),
-        (("learner", "normalise", 1), "normalise is 1; expected true or false"),
-        (("learner", 5), "learner: expected settings by name"),
+        (("learner", "normalise", 1), "normalise is 1. Write true or false"),
+        (("learner", 5), "learner is 5 where a mapping"),
         (("learner", "minibatches", 0), "minibatches is 0"),
-        (("architecture", "kind", "perceptron"), "expected one of mlp, lstm"),
-        (("architecture", "kind", ["mlp"]), "expected one of mlp, lstm"),
-        (("architecture", "hidden", [16, "x"]), "hidden is 'x'"),
+        (("architecture", "kind", "perceptron"), "Write 'mlp', 'lstm'"),
+        (("architecture", "kind", ["mlp"]), "Write 'mlp', 'lstm'"),
+        (("architecture", "hidden", [16, "x"]), "hidden[1] is the text 'x'"),
         (("architecture", "hidden", [0]), "at least 1"),
-        (("architecture", "hidden", 16), "hidden is 16; expected a list"),
-        (("task", "terrain", "lava"), "terrain is 'lava'"),
+        (("architecture", "hidden", 16), "hidden is 16. Write a list"),
+        (("task", "terrain", "lava"), "terrain is lava. Write"),
         (("task", "commands", "forward_m_s", [1.0]), "forward_m_s"),
         (("task", "control_step_s", 0.003), "whole multiple"),
-        (("actuator", None), "actuator is None; expected a word"),
+        (("actuator", None), "actuator is null. Write text"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_refused_by_name(tmp_path, change, words):
