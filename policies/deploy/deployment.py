@@ -1,9 +1,8 @@
-"""Run a policy on a robot: stand up, find out what rest is, walk, stop, sit down.
+"""Run a policy on a robot: stand up, measure rest, walk, stop, sit down.
 
-`deploy` owns the order of things and the way out of all of them. Whatever happens, the robot ends
-parked, or limp after a fault, within a second, and the log's last line says why. The controller
-itself (`policies.deploy.controller`) is pure, the guard (`hardware.safety.guard`) stands before
-every servo.
+However a walk ends, the robot is parked, or limp after a fault, within a second, and the log's last
+line gives the reason. The controller itself (`policies.deploy.controller`) is pure, and the guard
+(`hardware.safety.guard`) is before every servo.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ SETTLE_S = 0.5
 REST_SAMPLES = 50
 IMU_SILENT_S = 0.2
 STALL_S = 0.25
-"""A loop that stood still for so long does not go on: the robot has gone on without it."""
+"""A longer pause of the loop ends the walk: the robot moved without control."""
 _REST_PERIOD_S = 0.02
 _GRAVITY = OBSERVATION_PARTS["projected_gravity"]
 
 
 class Rows(Protocol):
-    """Where the servos' rows go: a recording's writer."""
+    """Writer of the servos' rows, such as that of a recording."""
 
     def append(self, rows: list[dict[str, Any]]) -> None:
         """Write rows."""
@@ -53,24 +52,24 @@ class Rows(Protocol):
 
 @dataclass(frozen=True)
 class Tick:
-    """One tick of a walk, for whoever watches."""
+    """One tick of a walk, for watchers."""
 
     elapsed_s: float
     senses: Senses
     decision: Decision
     sent: Array
-    """What the guard let out [rad]; shape (12,)."""
+    """Targets that passed the guard [rad]; shape (12,)."""
     reading: BusSample
 
 
 @dataclass
 class Outcome:
-    """How a walk went."""
+    """Outcome of a walk."""
 
     seconds: float = 0.0
-    """Walked."""
+    """Duration of the walk."""
     steps: Durations = field(default_factory=Durations)
-    """What the controller took per tick, on the host's clock."""
+    """Computing time of the controller per tick, on the host's clock."""
     deadline_misses: int = 0
     fell: bool = False
     stop_reason: str = "time is up"
@@ -92,7 +91,7 @@ def deploy(
     watchers: Sequence[Callable[[Tick], None]] = (),
     force: bool = False,
 ) -> Outcome:
-    """Walk for `seconds`, or until `commands` says to stop, or something goes wrong.
+    """Walk for `seconds`, or until `commands` ends or a fault occurs.
 
     The bus is parked at the end; closing it is the caller's.
 
@@ -109,7 +108,7 @@ def deploy(
     header : dict
         More keys for its header.
     rows : Rows, optional
-        Is given the servos' rows of each tick, as of a recording.
+        Takes the servos' rows of each tick, as of a recording.
     watchers : sequence of callable
         Each called with each tick.
     force : bool
@@ -118,12 +117,12 @@ def deploy(
     Returns
     -------
     Outcome
-        Also of a walk that a fault ended; `stop_reason` says which.
+        Also of a walk that a fault ended; `stop_reason` names it.
 
     Raises
     ------
     BusError
-        If the robot does not say where it is, or cannot be switched on.
+        If the robot's position cannot be read, or torque not be enabled.
     InputError
         If it moves when it should stand still, or the log cannot be written.
     """
@@ -142,7 +141,7 @@ def deploy(
             glide(standing, lambda pose: _send(bus, pose), bus.sent, controller.default, SETTLE_S)
         except (SafetyStop, BusError) as fault:
             outcome.stop_reason = str(fault)
-            # first: a bus in trouble takes its time, and the watchdog may lose its patience
+            # first: a faulty bus is slow, and the watchdog may end the process
             writer.close(outcome.stop_reason)
             bus.limp()
         except KeyboardInterrupt:
@@ -175,7 +174,7 @@ def _walk(
     """The control loop."""
     period = controller.period_s
     loop = FixedRateLoop(bus, period, most_misses=max(round(STALL_S / period) - 1, 1))
-    # what is there already is not searched for garbage in the middle of a step
+    # existing objects are not searched by the garbage collector in the middle of a step
     gc.collect()
     gc.freeze()
     imu_s = bus.now()
@@ -184,7 +183,7 @@ def _walk(
         for elapsed in loop.ticks(seconds):
             command = commands(elapsed)
             if command is None:
-                outcome.stop_reason = "told to stop"
+                outcome.stop_reason = "end of commands"
                 return
             reading = bus.read()
             sample = imu.imu()
@@ -193,8 +192,8 @@ def _walk(
                 outcome.clipped_imu_samples += sample.clipped
             elif bus.now() - imu_s > IMU_SILENT_S:
                 raise SafetyStop(
-                    f"the IMU has not answered for {bus.now() - imu_s:.2f} s: which way is down is "
-                    "not known. Check its cable."
+                    f"the IMU has not answered for {bus.now() - imu_s:.2f} s: the direction of "
+                    "gravity is unknown. Check its cable."
                 )
             else:
                 outcome.missing_imu_samples += 1
@@ -240,7 +239,7 @@ def _rest(bus: GuardedBus, imu: Imu, loop: FixedRateLoop, pose: Array) -> Rest:
 
 
 def _send(bus: GuardedBus, pose: Array) -> None:
-    """A goal whose effect the guard watches."""
+    """Send a target and read, so that the guard can monitor its effect."""
     bus.write(pose)
     bus.read()
 
@@ -252,8 +251,8 @@ def _motion(sample: ImuSample | None) -> tuple[Array, Array]:
 
 
 def _rows(controller: Controller, sent: Sent, reading: BusSample) -> list[dict[str, Any]]:
-    """One row per joint, as a recording has them: of the servos' own angles."""
-    goal = controller.to_servo(sent.position_rad)
+    """One row per joint, as in a recording, in servo coordinates."""
+    command = controller.to_servo(sent.position_rad)
     position = controller.to_servo(reading.position_rad)
     optional = {
         name: values
@@ -263,7 +262,7 @@ def _rows(controller: Controller, sent: Sent, reading: BusSample) -> list[dict[s
     return [
         {
             "send_time_s": sent.time_s, "read_time_s": float(reading.time_s[i]), "trial": 0,
-            "joint": joint, "frequency_hz": float("nan"), "command_rad": float(goal[i]),
+            "joint": joint, "frequency_hz": float("nan"), "command_rad": float(command[i]),
             "position_rad": float(position[i]),
             "position_count": int(reading.position_count[i]),
         }

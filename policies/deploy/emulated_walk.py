@@ -30,11 +30,7 @@ from pupper_sysid.sim.walking.robot import WalkingRobot
 class WalkScore:
     """Tracking errors of an emulated robot; a watcher of `policies.deploy.deployment.deploy`.
 
-    Parameters
-    ----------
-    bus : ServoBus
-        For its clock.
-    robot : WalkingRobot
+    Times are those of `bus`.
     """
 
     def __init__(self, bus: ServoBus, robot: WalkingRobot):

@@ -130,11 +130,6 @@ class ComplementaryFilter:
         Full scale of the accelerometer's axes [m/s²]. Footfalls of small robots exceed ±2 g; a
         clipped sample has lost its direction.
 
-    Attributes
-    ----------
-    clipped_samples : int
-        Number of samples with an axis at the limit since `reset`.
-
     Raises
     ------
     InputError
@@ -168,7 +163,6 @@ class ComplementaryFilter:
             raise InputError("The direction of gravity is (0, 0, 0), which is no direction.")
         self._gravity = gravity / length
         self._bias = _finite(rest.bias_rad_s, (3,), "The gyro's bias")
-        self.clipped_samples = 0
 
     def step(self, gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike, dt_s: float) -> Attitude:
         """Rate and gravity after one more sample.
@@ -193,7 +187,6 @@ class ComplementaryFilter:
         # seen from the body, the world turns backwards
         gravity = _turned(self._gravity, -rate * span)
         clipped = bool((np.abs(force) >= _FULL_SCALE * self.limit_m_s2).any())
-        self.clipped_samples += clipped
         size = np.linalg.norm(force)
         if not clipped and size > _NO_FORCE_M_S2:
             gravity = (1 - self.weight) * gravity - self.weight * force / size

@@ -1,9 +1,9 @@
 """The log of a deployment: every input and output of the controller, tick by tick, as one CSV file.
 
-It begins with comment lines (`# pupper-sysid walk`, then one `# key: JSON` per line: schema, policy
-and its hash, stack, bus, start), then has one row per tick with all numbers in full, so that
-`replay` gives the same actions again bit for bit. Rows are on the disk within a second. A log that
-ended properly says why in its last line, `# ended: …`; one without it was cut short.
+Comment lines come first (`# pupper-sysid walk`, then one `# key: JSON` per line: schema, policy and
+its hash, stack, bus, start), then one row per tick with all digits, so that `replay` gives the same
+actions bit for bit. Rows are on the disk within a second. The last line, `# ended: …`, is the
+reason of the end; a log without it was cut short.
 """
 
 from __future__ import annotations
@@ -49,16 +49,7 @@ COLUMNS = (
 
 
 class WalkLog:
-    """Writes a log.
-
-    Parameters
-    ----------
-    path : Path
-    header : dict
-        What is known at the start; each value must be JSON.
-    force : bool
-        Replace an existing file.
-    """
+    """Writer of a log; every value of `header` must be JSON."""
 
     def __init__(self, path: Path, header: dict[str, Any], force: bool = False):
         self._file = SyncedText(path, force)
@@ -67,7 +58,7 @@ class WalkLog:
         self._file.write([TITLE, *lines, ",".join(COLUMNS)])
 
     def append(self, senses: Senses, decision: Decision, sent: NDArray[np.float64]) -> None:
-        """One tick: what came in, what was decided, and what the guard let out [rad]."""
+        """Write one tick: inputs, outputs, and the targets that passed the guard [rad]."""
         numbers = np.concatenate(
             [
                 [senses.elapsed_s], *(getattr(senses, name) for name, _ in _SENSES),
@@ -83,7 +74,7 @@ class WalkLog:
 
 @dataclass(frozen=True)
 class Walk:
-    """A log that was read."""
+    """Content of a log."""
 
     header: dict[str, Any]
     rest: Rest
@@ -97,7 +88,7 @@ class Walk:
     target: NDArray[np.float64]
     sent: NDArray[np.float64]
     ended: str | None
-    """Why; None if the log was cut short."""
+    """Reason of the end; None if the log was cut short."""
 
 
 def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:
@@ -109,12 +100,12 @@ def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:
 
 
 def read_walk(path: Path) -> Walk:
-    """Read a log; a torn last line is left out.
+    """Read a log; an incomplete last line is left out.
 
     Raises
     ------
     InputError
-        If it is none, or damaged; the sentence says where.
+        If it is none, or damaged.
     """
     text = read_text(path, _LARGEST_BYTES)
     lines = text[: text.rfind("\n") + 1].splitlines()
@@ -158,7 +149,7 @@ def read_walk(path: Path) -> Walk:
 
 
 def replay(walk: Walk, controller: Controller) -> int | None:
-    """Run a controller over a log's inputs; the first tick that differs, None if none does."""
+    """Run a controller over a log's inputs; the first tick with another output, or None."""
     controller.reset(walk.start, walk.rest)
     for i, senses in enumerate(walk.senses):
         found = controller.step(senses)

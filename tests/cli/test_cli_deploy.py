@@ -65,7 +65,7 @@ def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(caps
 def test_a_script_is_followed(capsys, here):
     Path("s.csv").write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0.1,0,0\n0.5,0,0,0\n")
     found = deploy(capsys, "--script", "s.csv", "--name", "walk")
-    assert found["stop_reason"] == "told to stop"
+    assert found["stop_reason"] == "end of commands"
     assert found["seconds"] == pytest.approx(1.5, abs=0.05)
 
 
