@@ -24,8 +24,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pupper_sysid.cli.terminal import err, out, print_json
 from pupper_sysid.cli.user_errors import parse, user_errors
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import Kind
-from pupper_sysid.policies.train.run_file import Run, plain, preset
+from pupper_sysid.policies.train.run_file import Run, preset
 from pupper_sysid.sim.walking.servo_ranges import check_actuator
 
 DESCRIPTION = """Train a walking policy in a simulator that moves like the measured robot.

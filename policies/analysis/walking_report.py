@@ -14,10 +14,11 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, RED, WIDTH_IN, axes_column, styled
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.page import Column, Picture, Section, Table
+from pupper_sysid.common.results import plain
 from pupper_sysid.policies.analysis.evaluation import Evaluation, Figures, Standing
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import PROGRESS
-from pupper_sysid.policies.train.run_file import RUN_FILE, Run, plain
+from pupper_sysid.policies.train.run_file import RUN_FILE, Run
 
 ERRORS = {
     "mae_vx_m_s": ("forward", "m/s"),

@@ -1,7 +1,4 @@
-"""Settings of policies and of their training: one table for all architectures.
-
-Plain values, without torch: the command line shows them before anything heavy is imported.
-"""
+"""Settings of policies and of their training, one table for all architectures; without torch."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ import tyro
 from pupper_sysid.common.errors import InputError
 
 Kind = Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
-KINDS: tuple[Kind, ...] = ("mlp", "lstm", "gru", "transformer", "mlp-actions")
 
 
 @dataclass(frozen=True)
@@ -29,7 +25,7 @@ class Architecture:
     critic_hidden: tuple[int, ...] = (256, 128, 64)
     """Units of the layers of the critic."""
     privileged_critic: bool = True
-    """Whether the critic sees the truth beside the observation."""
+    """Whether the critic has the true state beside the observation."""
 
     def __post_init__(self):
         for name in ("hidden", "critic_hidden"):
@@ -50,8 +46,7 @@ class Hyperparameters:
     minibatches: int = 4
     """Parts of the data per pass."""
     learning_rate: float = 1e-5
-    """At the start, small enough not to spoil an imitated gait; adapted to the KL divergence
-    afterwards."""
+    """At the start, small enough to keep an imitated gait; then adapted to the KL divergence."""
     desired_kl: float = 0.01
     """KL divergence per update that the learning rate aims at."""
     discount: float = 0.99
@@ -67,8 +62,8 @@ class Hyperparameters:
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
     initial_std: float = 0.015
-    """Standard deviation of the actions at the start. More, and dry friction in the servos is
-    shaken loose: the policy learns to walk on other servos than those it will have."""
+    """Standard deviation of the actions at the start. Larger noise shakes dry friction in the
+    servos loose: the policy would learn to walk on servos without it."""
     normalise: bool = True
     """Whether observations are normalised by their running mean and deviation."""
     mixed_precision: bool = False
@@ -83,10 +78,10 @@ class Hyperparameters:
 
 @dataclass(frozen=True)
 class Imitation:
-    """How the first gait is learned."""
+    """Settings of the first gait's imitation."""
 
     iterations: int = 80
-    """How many rounds; 0 to start PPO from nothing."""
+    """Rounds; 0 to start PPO from random weights."""
     epochs: int = 12
     """Passes over the data of a round."""
     minibatches: int = 16

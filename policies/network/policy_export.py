@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from pupper_sysid.common.files import sha256
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.network.policy_file import (
     ObservationPart,
     Policy,
-    default_pose,
     save_policy,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
@@ -70,7 +70,7 @@ def write_policy(
         "velocity_steps": VELOCITY_STEPS,
         "action_history": action_history,
         "action_scale_rad": task.action_scale,
-        "default_pose_rad": default_pose(),
+        "default_pose_rad": {name: DEFAULT_POSE[name] for name in JOINT_NAMES},
         "control_step_s": task.control_step_s,
         "physics_step_s": task.physics_step_s,
         "knee": task.knee,
@@ -88,17 +88,7 @@ def export_policy(
 ) -> float:
     """Write a policy as one file for other runtimes, checked against the policy.
 
-    Parameters
-    ----------
-    policy : Policy
-    to : {"onnx", "torchscript"}
-    path : Path
-    force : bool
-
-    Returns
-    -------
-    float
-        Largest difference of actions.
+    Returns the largest difference of actions.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """Policy files: a folder with weights (safetensors) and a contract (JSON); nothing is unpickled.
 
-The contract says what a policy must be given and what its numbers mean: names and order of the
-observation, scales, default pose, joint order, rates, the actuator and feedback it was trained
-with, and how. `load_policy` refuses what does not keep it. `refuse_bad` is the gate every policy
-passes before it is written: no NaN, right shapes, and actions that depend on what is seen.
+The contract defines a policy's inputs and outputs: names and order of the observation, scales,
+default pose, joint order, rates, and the actuator and feedback of its training. `load_policy`
+refuses other files. Every policy passes the gate `refuse_bad` before it is written: no NaN, right
+shapes, and actions that depend on the observation.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from pupper_sysid.common.border import (
 )
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
-from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
 from pupper_sysid.sim.walking.observation import OBSERVATION, VELOCITY_STEPS
 
@@ -48,7 +49,7 @@ class _Part(BaseModel):
 
 
 class ObservationPart(_Part):
-    """One part of what the policy sees, in order."""
+    """One part of the observation, in order."""
 
     name: str
     size: Annotated[int, Field(gt=0, le=10_000)]
@@ -56,21 +57,21 @@ class ObservationPart(_Part):
 
 
 class Contract(_Part):
-    """What a policy must be given, and what it gives."""
+    """Inputs, outputs and training of a policy."""
 
     schema_name: Annotated[Literal["pupper-policy"], Field(alias="schema")]
     schema_version: Literal[1, 2]
-    kind: Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
+    kind: Kind
     hidden: Annotated[list[Annotated[int, Field(gt=0, le=8192)]], Field(max_length=16)]
     memory: Annotated[int, Field(gt=0, le=8192)]
     normalise: bool
     observation: Annotated[list[ObservationPart], Field(min_length=1, max_length=32)]
     base_velocity: Literal["zero", "true"]
-    """Whether the trunk's speed is zeros or must be known."""
+    """Whether the trunk's speed is zeros or the true one."""
     velocity_steps: int
-    """Joint velocity is the difference of readings so many control steps apart."""
+    """Control steps between the two readings of a joint velocity."""
     action_history: Annotated[int, Field(ge=0, le=1000)]
-    """How many past actions it sees, newest first."""
+    """Number of past actions in the observation, newest first."""
     action_scale_rad: Annotated[float, Field(gt=0, le=10)]
     default_pose_rad: dict[str, float]
     """Target = default pose + scale · action, in this order of joints."""
@@ -90,18 +91,12 @@ class Contract(_Part):
 
     @property
     def observation_size(self) -> int:
-        """Of everything it sees, past actions included."""
+        """Length of the observation, past actions included."""
         return sum(p.size for p in self.observation) + ACTIONS * self.action_history
 
 
 class Policy:
-    """A policy that acts for many robots at once and keeps their states.
-
-    Parameters
-    ----------
-    network : PolicyNetwork
-    contract : Contract
-    """
+    """A policy that acts for many robots at once and keeps their states."""
 
     def __init__(self, network: PolicyNetwork, contract: Contract):
         self.network, self.contract = network, contract
@@ -110,17 +105,17 @@ class Policy:
         self._past = np.zeros((0, 0, ACTIONS), np.float32)
 
     def reset(self, action: np.ndarray) -> None:
-        """Start anew for all robots, whose last action was `action`, shape (n, 12)."""
+        """Start an episode of all robots after their last `action`, shape (n, 12)."""
         self._state = self.network.initial_state(len(action))
         history = self.contract.action_history
         self._past = np.repeat(np.asarray(action, np.float32)[:, None], history, axis=1)
 
     def for_one(self) -> Policy:
-        """A copy with a state of its own that acts for one robot: same bits in half the time."""
+        """A copy with its own state for one robot: the same bits in half the time."""
         own = copy(self)
         shown = torch.zeros(1, self.contract.observation_size)
         with warnings.catch_warnings(), torch.inference_mode():
-            warnings.simplefilter("ignore")  # a trace is of one size, which is what is wanted
+            warnings.simplefilter("ignore")  # a trace is of one size, as intended
             state = self.network.initial_state(1)
             traced: Any = torch.jit.trace(self.network.eval(), (shown, *state))
             own._run = torch.jit.freeze(traced)
@@ -148,7 +143,7 @@ def save_policy(
     InputError
         If the gate refuses it, or the folder holds one and `force` is not given.
     """
-    refuse_bad(network, "This policy")
+    refuse_bad(network, "this policy")
     refuse_overwrite(folder / CONTRACT, force)
     data = save_tensors({k: v.contiguous() for k, v in network.state_dict().items()})
     write_bytes(folder / WEIGHTS, data, force=True)
@@ -169,7 +164,7 @@ def load_policy(folder: Path) -> Policy:
     Raises
     ------
     InputError
-        If anything about it cannot be trusted; one sentence says what.
+        If a file is missing, damaged, of another version, or fails the gate.
     """
     path, weights = folder / CONTRACT, folder / WEIGHTS
     for file in (path, weights):
@@ -200,7 +195,7 @@ def load_policy(folder: Path) -> Policy:
 
 
 def refuse_other_observation(contract: Contract) -> None:
-    """A policy that expects other numbers than it would be given only looks confused.
+    """Refuse a policy of another observation, which would act wrongly without an error.
 
     Raises
     ------
@@ -217,24 +212,22 @@ def refuse_other_observation(contract: Contract) -> None:
 
 
 def refuse_bad(network: PolicyNetwork, name: str) -> None:
-    """The gate: refuse a policy that is not finite, or does not depend on what it sees.
+    """The gate: refuse a policy that is not finite, or whose output is constant.
 
     Raises
     ------
     InputError
     """
     if not all(torch.isfinite(p).all() for p in network.state_dict().values()):
-        raise InputError(f"{name} has weights that are not numbers. Train it again.")
+        raise InputError(f"Weights of {name} are not numbers. Train it again.")
     generator = torch.Generator().manual_seed(0)
     seen = torch.randn(64, network.observation_size, generator=generator)
     with torch.inference_mode():
         action = network(seen, *network.initial_state(64))[0]
     if action.shape != (64, ACTIONS) or not torch.isfinite(action).all():
-        raise InputError(f"{name} gives actions that are not 12 numbers. Train it again.")
+        raise InputError(f"Actions of {name} are not 12 numbers. Train it again.")
     if float(action.std(0).max()) < 1e-5:
-        raise InputError(f"{name} does the same whatever it sees. Train it again.")
-
-
-def default_pose() -> dict[str, float]:
-    """Default pose by joint, in order [rad]."""
-    return {name: DEFAULT_POSE[name] for name in JOINT_NAMES}
+        raise InputError(
+            f"The output of {name} is constant (standard deviation below 1e-5 over 64 random "
+            "observations). Train it again."
+        )

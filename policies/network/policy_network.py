@@ -1,8 +1,8 @@
 """PolicyNetwork: a trained policy without its trainer, for playing, deploying and exporting.
 
-Observation and state in, action and state out; nothing is remembered inside. It takes the weights
-of rsl_rl's models under their own names and computes the same (a test holds the two together), but
-needs torch only, and is what ONNX and TorchScript files are made of.
+Maps observation and state to action and state, and keeps no state inside. It takes the weights of
+rsl_rl's models under their own names and computes the same (a test compares the two), but needs
+torch only; ONNX and TorchScript files are made from it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class PolicyNetwork(nn.Module):
     ----------
     kind : str
     observation_size : int
-        Of everything it sees, past actions included.
+        Length of the observation, past actions included.
     hidden : sequence of int
         Units of the head's layers.
     memory : int

@@ -1,13 +1,13 @@
 """A Transformer policy with a context of 16 steps, trained on whole sequences.
 
-One layer of causal attention over the last `CONTEXT` observations of the episode. Because there is
-one layer, an output depends on exactly those observations, so the update can run one pass over a
-rollout (each step attends to the band of 16 before it) instead of one window per sample, which
-costs an order of magnitude more. Rollout and update see the same window, end on the present
-observation, and both leave out what was before the episode's start.
+One layer of causal attention over the last `CONTEXT` observations of the episode. With one layer,
+an output depends on exactly those observations, so the update runs one pass over a rollout (each
+step attends to the band of 16 before it) instead of one window per sample, at a tenth of the cost.
+Rollout and update have the same window, which ends on the present observation and begins not before
+the episode.
 
-The state between steps is the last 15 raw observations and whether each is there: an empty place is
-never attended to.
+The state between steps is the last 15 raw observations and a flag for each; an empty place is never
+attended to.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class CausalAttention(nn.Module):
         super().__init__()
         self.heads, self.width = heads, width
         self.embed = nn.Linear(size, width)
-        # how much a head prefers observations so many steps old: positions are relative, so that
-        # a sequence and a window mean the same
+        # bias per head and age in steps: positions are relative, so that a sequence and a window
+        # give the same
         self.age_bias = nn.Parameter(torch.zeros(heads, CONTEXT))
         self.before_attention = nn.LayerNorm(width)
         self.query_key_value = nn.Linear(width, 3 * width)
@@ -81,7 +81,7 @@ class CausalAttention(nn.Module):
         inside = (age >= 0) & (age < CONTEXT)
         bias = self.age_bias[:, age.clamp(0, CONTEXT - 1)]
         allowed = inside[None, None] & present[:, None, None, :]
-        # a step always sees itself, or a step that is only padding would divide by nothing
+        # a step always attends to itself, or padding would divide by zero
         allowed = allowed | (age == 0)[None, None]
         mask = torch.where(allowed, bias[None], torch.full_like(bias[None], -1e9))
         mixed = nn.functional.scaled_dot_product_attention(split(q), split(k), split(v), mask)
@@ -124,7 +124,7 @@ class TransformerModel(MLPModel):
         return unpad_trajectories(latent.transpose(0, 1), masks)
 
     def reset(self, dones: torch.Tensor | None = None, hidden_state: Any = None) -> None:
-        """Forget all, or what was before the end of episodes."""
+        """Clear the context of all robots, or of those whose episodes ended."""
         if dones is None:
             self._context = hidden_state
         elif self._context is not None:

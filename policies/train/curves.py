@@ -84,7 +84,7 @@ class CurveWriter:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """A full disk, or a folder that may not be written, is said in a sentence."""
+    """Turn a failed write (full disk, no permission) into an `InputError`."""
     try:
         yield
     except OSError as error:

@@ -1,10 +1,9 @@
 """A first gait: the policy learns to continue an open-loop trot before PPO begins.
 
-Rewards alone seldom find a walk within the samples that two cores can give. So the policy is first
-shown one (DAgger: it acts, the teacher says what it would have done). The teacher has no clock
-either: it reads the phase of the trot off the last two actions and returns the next point, so
-the rhythm that is learned needs none. PPO then owns the policy; nothing of the trot is left in
-its rewards.
+Rewards alone seldom find a walk within the samples of two cores. So the policy first imitates one
+(DAgger: the policy acts, the teacher gives the action it would have taken). The teacher needs no
+clock: it computes the phase of the trot from the last two actions and returns the next point. The
+rewards of PPO afterwards contain nothing of the trot.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from pupper_sysid.sim.walking.env import PupperEnv
 
 
 def teacher_actions(env: PupperEnv) -> np.ndarray:
-    """What the trot would do next in every environment, shape (n, 12), in units of actions."""
+    """Next actions of the trot in every environment, shape (n, 12)."""
     trot, scale = env.trot, env.config.action_scale
     span = env.config.control_step_s
     now, before = (env.default + scale * a for a in (env.action, env.last_action))
@@ -27,27 +26,27 @@ def teacher_actions(env: PupperEnv) -> np.ndarray:
 
 
 def imitate(learner: Learner, how: Imitation, round_: int) -> float:
-    """One round: act, ask the teacher, learn; root mean square difference to it.
+    """One round: act, query the teacher, learn; root mean square difference to it.
 
-    Early rounds let the teacher act in some environments, so that the policy sees a walk.
+    In early rounds the teacher acts in some environments, so that the data contain a walk.
     """
     env, ppo = learner.env.env, learner.ppo
     share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
     led = torch.from_numpy(env.rng.random(env.environments) < share)
-    asked: list[torch.Tensor] = []
+    targets: list[torch.Tensor] = []
     with torch.inference_mode():
         for _ in range(learner.hyper.steps_per_environment):
             teacher = torch.from_numpy(teacher_actions(env).astype(np.float32))
-            asked.append(teacher)
+            targets.append(teacher)
             actions = ppo.act(learner.observations)
             noise = actions - ppo.actor.output_mean
             actions = torch.where(led[:, None], teacher + noise, actions)
             learner.observations, rewards, dones, extras = learner.env.step(actions)
             ppo.process_env_step(learner.observations, rewards, dones, extras)
         ppo.compute_returns(learner.observations)
-    # where PPO would find the actions taken, put those it should have taken
+    # the teacher's actions in place of those taken
     storage = ppo.storage
-    storage.actions = torch.stack(asked)
+    storage.actions = torch.stack(targets)
     seen = storage.observations.flatten(0, 1)
     if round_ == 0:
         ppo.actor.update_normalization(seen)

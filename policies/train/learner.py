@@ -1,11 +1,10 @@
-"""PPO: rsl_rl's, with what it lacks, in thin subclasses.
+"""PPO of rsl_rl, with three additions in thin subclasses.
 
 - At a time-out the value of the state reached is added, not that of the state before it.
-- A checkpoint holds everything that a run needs to go on as if it had never stopped: networks,
-  optimiser, learning rate, random numbers, recurrent state, environments with their delay lines,
-  the last observation and the counters. It is written atomically and read with `weights_only`.
-- Several processes exchange gradients through gloo: all of it runs on processors, as the physics
-  does, whatever else the machine has.
+- A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
+  rate, random numbers, recurrent state, environments with their delay lines, the last observation
+  and the counters. It is written atomically and read with `weights_only`.
+- Several processes exchange gradients through gloo, on processors, as the physics.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ class Ranks:
         return found[0]
 
     def any(self, here: bool) -> bool:
-        """Whether it is so in any process: what all must decide alike, or they wait for ever."""
+        """Whether it is so in any process; all must decide alike, or they would deadlock."""
         return bool(self._reduced(float(here), "MAX"))
 
     def mean(self, here: float) -> float:
@@ -103,14 +102,6 @@ class Ranks:
 class Learner:
     """An environment, a policy, a critic and PPO.
 
-    Parameters
-    ----------
-    env : WalkingVecEnv
-    architecture : Architecture
-    hyper : Hyperparameters
-    seed : int
-    ranks : Ranks
-
     Raises
     ------
     InputError
@@ -127,9 +118,9 @@ class Learner:
     ):
         self.env, self.architecture, self.hyper = env, architecture, hyper
         self.ranks = ranks or Ranks()
-        # the networks of all ranks start alike; what they sample later must differ
+        # the networks of all ranks start alike; their samples must differ
         torch.manual_seed(seed)
-        # as if begun at different times: not all episodes shall end in the same update
+        # at different steps, so that not all episodes end in the same update
         env.episode_length_buf = torch.randint(0, env.max_episode_length, (env.num_envs,))
         self.observations = env.get_observations()
         actor, critic = build(architecture, self.observations, hyper)
@@ -168,7 +159,7 @@ class Learner:
         return self.ppo.actor
 
     def rollout(self, watch=None) -> None:
-        """Act for one update's worth of steps; `watch(rewards, dones, extras)` sees each."""
+        """Act for the steps of one update; `watch(rewards, dones, extras)` is called for each."""
         with torch.inference_mode():
             for _ in range(self.hyper.steps_per_environment):
                 actions = self.ppo.act(self.observations)
@@ -179,7 +170,7 @@ class Learner:
             self.ppo.compute_returns(self.observations)
 
     def update(self) -> dict[str, float]:
-        """Improve policy and critic on what `rollout` collected; mean losses."""
+        """Update policy and critic on the data of `rollout`; mean losses."""
         losses = self.ppo.update()
         self.iteration += 1
         return losses
@@ -187,13 +178,13 @@ class Learner:
     # ------------------------------------------------------------------------- checkpoints
 
     def networks(self) -> dict[str, Any]:
-        """A copy of networks, optimiser and learning rate; `take_back` returns to it."""
+        """A copy of networks, optimiser and learning rate, for `take_back`."""
         return copy.deepcopy(self.ppo.save()) | {
             "learning_rate": self.ppo.learning_rate, "iteration": self.iteration,
         }  # fmt: skip
 
     def take_back(self, networks: dict[str, Any]) -> None:
-        """Undo what was learned since `networks`; the environments stay where they are."""
+        """Return to `networks`; the environments stay as they are."""
         self.ppo.load(networks, None, True)
         self.ppo.learning_rate = networks["learning_rate"]
         self.iteration = networks["iteration"]
@@ -239,7 +230,7 @@ class Learner:
         write_bytes(path, buffer.getvalue(), force=True)
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Go back to a checkpoint exactly; returns what `save` was given as `more`.
+        """Return to a checkpoint exactly; returns the `more` of `save`.
 
         Raises
         ------
@@ -278,7 +269,7 @@ class Learner:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's content, nothing in it executed.
+    """Content of a checkpoint, without executing anything in it.
 
     Raises
     ------

@@ -1,13 +1,12 @@
 """Settings of a training run, and the file in its folder that holds them.
 
-`Run` is all settings (every field a flag of `pupper-train`); `preset` gives complete ones for a
-kind of policy. `save_run` writes `run.yaml` into a run's folder, with hashes and versions;
-`load_run` reads it back and refuses, in a sentence, what it does not understand.
+`Run` holds all settings; `preset` gives complete ones for a kind of policy. `save_run` writes
+`run.yaml` into a run's folder, with hashes and versions; `load_run` reads and checks it.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_origin, get_type_hints
 
@@ -17,6 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256, versions, write_text
+from pupper_sysid.common.results import plain
+from pupper_sysid.common.strict_yaml import Place
 from pupper_sysid.policies.network.hyperparameters import (
     Architecture,
     Hyperparameters,
@@ -34,7 +35,7 @@ _DROPPED: dict[type, set[str]] = {Observation: {"privileged_critic"}}
 
 @dataclass(frozen=True)
 class Run:
-    """Everything that a training run is made of."""
+    """All settings of a training run."""
 
     actuator: str = "calibrated.yaml"
     """A calibration (`pupper-sysid calibrate` writes one), `paper`, `release` or `ideal`; or a
@@ -47,7 +48,7 @@ class Run:
     learner: Hyperparameters = field(default_factory=Hyperparameters)
     imitation: Imitation = field(default_factory=Imitation)
     environments: int = 512
-    """How many robots learn together (per process)."""
+    """Number of robots that learn together (per process)."""
     iterations: int = 400
     """Updates of PPO, after imitation; training ends when they are done."""
     minutes: float = 120.0
@@ -95,12 +96,13 @@ def load_run(folder: Path) -> Run:
     """
     path = folder / RUN_FILE
     model = create_model("File", settings=(_model_of(Run), ...))
-    found: Any = validated(model, _read(path), path)
+    data, lines = _read(path)
+    found: Any = validated(model, data, path, lines)
     return _dataclass_of(Run, found.settings)
 
 
 def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
-    """Settings of a run that goes on, perhaps for longer than it was meant to; kept in its file.
+    """Settings of a resumed run, perhaps with a new end, which is written to its file.
 
     Raises
     ------
@@ -108,7 +110,7 @@ def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> R
         If they cannot be understood, or the actuator's file is not what it was.
     """
     path, run = folder / RUN_FILE, load_run(folder)
-    before, source = _read(path).get("actuator_sha256"), Path(run.actuator)
+    before, source = _read(path)[0].get("actuator_sha256"), Path(run.actuator)
     if before and not source.is_file():
         raise InputError(
             f"{run.actuator}, with which {folder} was trained, is not there. Put it back, or go to "
@@ -125,14 +127,14 @@ def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> R
     return longer
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> tuple[dict[str, Any], dict[Place, int]]:
     if not path.exists():
         raise InputError(f"{path.parent} holds no run: there is no {RUN_FILE} in it.")
-    found, _ = read_yaml(path)
+    found, lines = read_yaml(path)
     if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
     refuse_other_version(path, found.get("schema_version"), RUN_VERSION)
-    return found
+    return found, lines
 
 
 def _model_of(kind: type) -> type[BaseModel]:
@@ -194,14 +196,3 @@ def _write(path: Path, run: Run) -> None:
     }
     text = "# Settings of a training run, written by pupper-train.\n"
     write_text(path, text + yaml.safe_dump(found, sort_keys=False), force=True)
-
-
-def plain(value: Any) -> Any:
-    """Settings as dictionaries and lists."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {k: plain(v) for k, v in asdict(value).items()}
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain(v) for v in value]
-    return value

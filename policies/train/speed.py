@@ -1,9 +1,9 @@
 """How fast training is here: the environment against the bare simulator, and PPO end to end.
 
-Everything is measured in one run, so the ratios hold whatever the machine does: `env_ratio` is the
-rate of `PupperEnv.step` over that of a bare `Batch.step` on the same model, threads and substeps;
-`end_to_end_ratio` is the rate of whole updates over what environment and update would give one
-after the other.
+Everything is measured in one run, so that the ratios hardly depend on the machine's load:
+`env_ratio` is the rate of `PupperEnv.step` over that of a bare `Batch.step` on the same model,
+threads and substeps; `end_to_end_ratio` is the rate of whole updates over that of environment and
+update one after the other.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class _Paces:
         return time.perf_counter() - begun
 
     def bare(self) -> float:
-        """Seconds of `Batch.step`s under the controls of the last `own`, from where that ended."""
+        """Seconds of `Batch.step`s under the controls of the last `own`, from its end."""
         batch, begun = self.env.robots.batch, time.perf_counter()
         for control in self._controls:
             batch.bind("ctrl")[:] = control

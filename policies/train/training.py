@@ -39,7 +39,7 @@ _SMOOTHED = 0.1  # weight of the newest update in the mean reward that decides w
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands; handed to whoever watches it."""
+    """Progress of a run, for its watcher."""
 
     phase: Literal["imitation", "ppo"]
     done: int
@@ -60,7 +60,7 @@ def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> Puppe
 
 
 def threads_of(run: Run, ranks: Ranks) -> int:
-    """How many threads physics and torch may use, each in turn."""
+    """Number of threads of physics and of torch, each in turn."""
     return run.threads or (1 if ranks.size > 1 else os.cpu_count() or 1)
 
 
@@ -76,7 +76,7 @@ def make_learner(run: Run, ranks: Ranks) -> Learner:
 
 
 def action_history(run: Run, servos: ServoRanges) -> int:
-    """How many past actions make the delayed system Markov: those still on their way, and one."""
+    """Number of past actions that make the delayed system Markov: those under way, and one."""
     if run.architecture.kind != "mlp-actions":
         return 0
     return int(np.ceil(servos.longest_dead_time_s / run.task.control_step_s)) + 1
@@ -100,14 +100,14 @@ def train(
     watch : callable, optional
         Called after each update.
     iterations, minutes : optional
-        Until when a resumed run goes on, instead of what it was begun with.
+        New end of a resumed run.
 
     Raises
     ------
     InputError
         If the folder is in use, or holds no run to resume.
     PupperError
-        If the numbers stop being numbers; the networks before are saved.
+        If a value is no longer finite; the networks before are saved.
     """
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run
@@ -121,7 +121,7 @@ def train(
 
 
 class _Session:
-    """One sitting of a run: from its beginning, or from a checkpoint, until someone stops it."""
+    """One session of a run: from its beginning, or from a checkpoint, until its end or a stop."""
 
     def __init__(
         self,
@@ -149,17 +149,17 @@ class _Session:
         self.phase_began = self.started
 
     def _begin(self) -> None:
-        """A first checkpoint, then the settings: from then on a run that dies can be resumed."""
+        """Write a first checkpoint, then the settings: from then on the run can be resumed."""
         if self.ranks.rank == 0:
             refuse_taken(self.folder)
-        self.ranks.any(False)  # before that is known, nobody writes
+        self.ranks.any(False)  # no process writes before that
         self.save(LAST)
-        self.ranks.any(False)  # all have one before there is a run to resume
+        self.ranks.any(False)  # all have a checkpoint before there is a run to resume
         if self.ranks.rank == 0:
             save_run(self.folder, self.run)
 
     def learn_first_gait(self, asked: Callable[[], bool]) -> None:
-        """Rounds of imitation that are still to do."""
+        """The remaining rounds of imitation."""
         learner, rounds = self.learner, self.run.imitation.iterations
         self.phase_began = time.monotonic()
         while self.counters["imitated"] < rounds and not self.ranks.any(asked()):
@@ -174,7 +174,7 @@ class _Session:
                 self.save(LAST)
 
     def improve(self, asked: Callable[[], bool]) -> None:
-        """Updates of PPO, until they are done, time is up or someone asks to stop."""
+        """Updates of PPO, until they are done, time is up or a stop is requested."""
         if self.counters["imitated"] < self.run.imitation.iterations:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
@@ -220,7 +220,7 @@ class _Session:
 
     @property
     def samples(self) -> int:
-        """Control steps of all robots of all processes that PPO has learned from."""
+        """Control steps of all robots of all processes in PPO so far."""
         env = self.learner.env
         per_update = self.learner.hyper.steps_per_environment * env.num_envs * self.ranks.size
         return self.learner.iteration * per_update
@@ -247,7 +247,7 @@ class _Session:
     def report(
         self, phase: Literal["imitation", "ppo"], done: int, total: int, row: dict[str, float]
     ) -> None:
-        """One row of the curves, and word to whoever watches."""
+        """Write one row of the curves and call the watcher."""
         now = time.monotonic()
         elapsed = self.counters["elapsed_s"] = now - self.started
         row = {"elapsed_s": elapsed, **row}
@@ -261,7 +261,7 @@ class _Session:
             self.watch(Progress(phase, done, total, elapsed, row, max(left, 0.0)))
 
     def refuse_nan(self, before: dict[str, Any], numbers: Iterable[float]) -> None:
-        """Raise if anything stopped being a number; the networks of before are then saved."""
+        """Raise if any value is not finite; the networks `before` are then saved."""
         learner, last = self.learner, self.folder / LAST
         fine = all(np.isfinite(x) for x in numbers) and learner.finite
         if not self.ranks.any(not fine):
@@ -275,19 +275,19 @@ class _Session:
         # a resumed run then collects other data with the networks from before
         self.save(LAST)
         raise PupperError(
-            f"The policy's numbers stopped being numbers after update {learner.iteration}. The "
+            f"The policy's numbers are not finite after update {learner.iteration}. The "
             f"networks before that are in {last}: `resume={self.folder}` goes on "
             "from them; if it happens again, start a run with a lower `learning_rate`."
         )
 
 
 def _rank_file(name: str, ranks: Ranks) -> str:
-    """Each rank has environments of its own, so each keeps a checkpoint."""
+    """Name of a rank's checkpoint; each rank has its own environments."""
     return name if ranks.rank == 0 else name.replace(".pt", f".rank{ranks.rank}.pt")
 
 
 def _fresh_optimiser(learner: Learner) -> None:
-    """Forget imitation's momentum, and give PPO its own learning rate."""
+    """Replace the optimiser of the imitation by one with PPO's learning rate."""
     ppo = learner.ppo
     ppo.optimizer = torch.optim.Adam(
         [*ppo.actor.parameters(), *ppo.critic.parameters()], lr=learner.hyper.learning_rate
@@ -297,7 +297,7 @@ def _fresh_optimiser(learner: Learner) -> None:
 
 @contextmanager
 def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and termination become a question that is asked between updates."""
+    """Ctrl-C and termination as a flag that is checked between updates."""
     asked = False
 
     def note(number, frame) -> None:

@@ -1,9 +1,8 @@
 """WalkingVecEnv: `sim.walking.env.PupperEnv` with the contract that rsl_rl's learner expects.
 
-Observation groups: `policy` is the observation of 60 numbers, `privileged` what a critic in the
-simulator may know beside it, and `actions` the last `action_history` actions, newest first: with
-them the delayed system is Markov again (the paper's augmented state). Tensors are copies, since the
-learner keeps them.
+Observation groups: `policy` is the observation of 60 numbers, `privileged` the true state for the
+critic, and `actions` the last `action_history` actions, newest first: with them the delayed system
+is Markov again (the paper's augmented state). Tensors are copies, since the learner keeps them.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class WalkingVecEnv:
         self.env.episode_step[:] = steps.cpu().numpy()
 
     def get_observations(self) -> TensorDict:
-        """Observations of the present state; lets no time pass."""
+        """Observations of the present state, without a step."""
         return self._groups(*self.env.observe(), self._past)
 
     def step(
@@ -82,7 +81,7 @@ class WalkingVecEnv:
 
     @property
     def state(self) -> dict[str, Any]:
-        """Everything that changes; `restore` takes it back exactly."""
+        """The whole state, for `restore`."""
         return self.env.state | {"past_actions": self._past.copy()}
 
     def restore(self, state: dict[str, Any]) -> None:

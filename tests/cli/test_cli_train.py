@@ -14,8 +14,9 @@ import pytest
 import yaml
 
 from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
+from pupper_sysid.common.results import plain
 from pupper_sysid.policies.train.learner import read_checkpoint
-from pupper_sysid.policies.train.run_file import load_run, plain, preset
+from pupper_sysid.policies.train.run_file import load_run, preset
 from support.browser import looks_right
 from support.command_line import refused
 from support.command_line import run_program as run

@@ -20,13 +20,14 @@ import torch
 import yaml
 
 from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.imitation import imitate, teacher_actions
 from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
-from pupper_sysid.policies.train.run_file import RUN_FILE, load_run, plain, preset, save_run
+from pupper_sysid.policies.train.run_file import RUN_FILE, load_run, preset, save_run
 from pupper_sysid.policies.train.training import LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import Walking
