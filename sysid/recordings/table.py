@@ -197,8 +197,8 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
     usable = ~pd.MultiIndex.from_arrays([table["joint"], table["trial"]]).isin(short)
     if usable.sum() < _LEAST_ROWS:
         raise InputError(
-            f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed to say "
-            "anything. Record for longer."
+            f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed. "
+            "Record for longer."
         )
     return table.loc[usable].reset_index(drop=True), warnings
 

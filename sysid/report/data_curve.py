@@ -1,8 +1,7 @@
-"""How much data a servo model needs: what the benchmark measured, for the report.
+"""Error of servo models against the amount of data, measured by a benchmark.
 
 `benchmarks/servo_data_curve.py` fits every kind of model to more and more samples of the emulated
-robot and writes `data/servo_data_curve.csv`, which this module reads and draws, so that a user
-sees where the own recording stands.
+robot and writes `data/servo_data_curve.csv`, which this module reads and draws.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class DataCurve:
 
 
 def measured() -> DataCurve:
-    """The curve that the benchmark measured last."""
+    """The curve as measured last."""
     with (resources.files("pupper_sysid.sysid.report") / "data" / FILE).open() as file:
         table = pd.read_csv(file)
     by_model = table.pivot(

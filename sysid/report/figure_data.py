@@ -1,8 +1,8 @@
-"""What the report's figures show, computed: curves and numbers, no drawing.
+"""Data of the report's figures.
 
-`lag_parts` splits one joint's lag into the parts of the lag budget, in milliseconds; `tracks` runs
-the fitted model along every trial, beside what was commanded and read; `hold_runs` sets for how
-many rows each reading stayed the same beside what the poll lattice would make of it.
+`lag_parts` splits one joint's lag into the parts of the lag budget; `tracks` is the free run of a
+fitted model beside commands and readings; `hold_runs` counts for how many rows readings stay the
+same, beside the prediction of the poll lattice.
 """
 
 from __future__ import annotations
@@ -33,53 +33,41 @@ LONGEST_RUN = 12
 
 @dataclass(frozen=True)
 class LagParts:
-    """The lag budget of one joint [ms], in the order in which the parts happen.
+    """The lag budget of one joint [s], in the order in which the parts happen.
 
     naive = command hold + dead time + dynamics + feedback age
     """
 
-    joint: str
-    command_hold_ms: float
-    dead_time_ms: Interval
-    dynamics_ms: float
-    feedback_age_ms: float
-    lag_ms: Interval
-    naive_ms: Interval
+    naive_lag_s: Interval
+    feedback_age_s: float
+    command_hold_s: float
+    lag_s: Interval
+    dead_time_s: Interval
+    dynamics_s: float
 
     def sentence(self) -> str:
         """The finding in words."""
-        if abs(self.feedback_age_ms) < 1.0:
-            feedback = "next to nothing is stale feedback"
-        else:
-            feedback = f"{self.feedback_age_ms:.0f} ms is stale feedback"
+        age = f"{1e3 * self.feedback_age_s:.0f} ms" if abs(self.feedback_age_s) >= 1e-3 else "none"
         return (
-            f"of the naive {self.naive_ms.value:.0f} ms, {feedback}, "
-            f"{self.command_hold_ms:.0f} ms command hold, {self.lag_ms.value:.0f} ms the servo: "
-            f"{self.dead_time_ms.value:.0f} ms dead time + {self.dynamics_ms:.0f} ms dynamics."
+            f"of the naive {1e3 * self.naive_lag_s.value:.0f} ms, {age} is feedback age, "
+            f"{1e3 * self.command_hold_s:.0f} ms command hold, {1e3 * self.lag_s.value:.0f} ms the "
+            f"servo: {1e3 * self.dead_time_s.value:.0f} ms dead time + "
+            f"{1e3 * self.dynamics_s:.0f} ms dynamics."
         )
 
 
 def lag_parts(result: JointCalibrationResult) -> LagParts:
-    """Where the lag of `result`'s joint comes from."""
+    """The parts of a joint's lag."""
     budget = result.budget
     return LagParts(
-        result.joint,
-        1e3 * budget.command_hold_s,
-        _ms(result.dead_time),
-        1e3 * (budget.lag.value - result.dead_time.value),
-        1e3 * budget.feedback_age_s,
-        _ms(budget.lag),
-        _ms(budget.naive),
-    )
-
-
-def _ms(interval: Interval) -> Interval:
-    return Interval(1e3 * interval.value, 1e3 * interval.low, 1e3 * interval.high)
+        budget.naive, budget.feedback_age_s, budget.command_hold_s, budget.lag, result.dead_time,
+        budget.lag.value - result.dead_time.value,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Track:
-    """One trial as it was commanded, simulated and read; angles from rest [rad], times [s].
+    """One trial: command, model and readings; angles from rest [rad], times [s].
 
     Attributes
     ----------
@@ -118,7 +106,7 @@ def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track
     ----------
     result : JointCalibrationResult
     model : str
-        Name of a rung of the ladder.
+        Name of a candidate model.
     """
     if not result.trials:
         return []
@@ -145,7 +133,7 @@ def _track(trial: TrialData, simulated: NDArray) -> Track:
 
 
 def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[float, float]:
-    """A stretch of `track` worth looking at [s]: steady tone, or the liveliest part."""
+    """Start and end of the stretch of `track` to show [s]: steady tone, or largest motion."""
     end = float(track.time_s[-1])
     if track.frequency_hz > 0:
         length = min(periods / track.frequency_hz, end)
@@ -160,7 +148,7 @@ def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[
 
 
 def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
-    """At most `count` of the tracks, spread over their frequencies, slowest first."""
+    """At most `count` tracks, spread over their frequencies, slowest first."""
     order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
     seen: dict[float, Track] = {}
     for n, track in enumerate(order):
@@ -193,7 +181,7 @@ class HoldRuns:
     count : ndarray of int, shape (LONGEST_RUN,)
         Runs of 1, 2, … rows; the last holds all longer ones.
     expected : ndarray, shape (LONGEST_RUN,), or None
-        What the poll period and the share of lost polls predict; None without a lattice.
+        Predicted by the poll period and the share of lost polls; None without a lattice.
     """
 
     lattice: PollLattice
@@ -202,7 +190,7 @@ class HoldRuns:
 
 
 def hold_runs(examined: Sequence[JointExamination], lattice: PollLattice) -> HoldRuns:
-    """The doctor's hold runs of one joint, and what its poll lattice predicts.
+    """Hold runs of one joint, counted by the doctor and predicted by its poll lattice.
 
     Parameters
     ----------

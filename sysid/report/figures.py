@@ -1,7 +1,7 @@
 """The report's figures: each function takes results and returns a matplotlib `Figure`.
 
-They only draw: curves come from `sysid.report.figure_data`, looks from `common.figure_style`. Every
-curve differs from the others in more than its colour.
+They only draw: curves come from `sysid.report.figure_data`, the style from `common.figure_style`.
+Curves differ from each other in more than colour.
 """
 
 from __future__ import annotations
@@ -50,20 +50,17 @@ if TYPE_CHECKING:  # it brings python-control, which is not needed to draw
 
 @styled
 def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
-    """One stacked bar per joint: what happens between a command's row and its position's row.
+    """One stacked bar per joint: the parts of the time from a command's row to its position's row.
 
     Parameters
     ----------
     results : dict of joint to JointCalibrationResult
     """
-    parts = [lag_parts(r) for r in results.values()]
-    figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(parts))
-    for row, part in enumerate(parts):
-        _lag_bar(axes, row, part)
-    axes.set_yticks(range(len(parts)), [p.joint for p in parts])
-    axes.set_ylim(len(parts) - 0.4, -0.6)
-    longest = max(max(p.naive_ms.value, _bar_length(p)) for p in parts)
-    axes.set_xlim(0, longest * 1.14)
+    figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(results))
+    ends = [_lag_bar(axes, row, lag_parts(r)) for row, r in enumerate(results.values())]
+    axes.set_yticks(range(len(results)), list(results))
+    axes.set_ylim(len(results) - 0.4, -0.6)
+    axes.set_xlim(0, max(ends) * 1.14)
     axes.set_xlabel("time after the command's row [ms]")
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
@@ -88,26 +85,13 @@ _LAG_KINDS = (
 )
 
 
-def _bar_length(part: LagParts) -> float:
-    lengths = (
-        part.command_hold_ms,
-        part.dead_time_ms.value,
-        part.dynamics_ms,
-        part.feedback_age_ms,
-    )
-    return sum(max(x, 0.0) for x in lengths)
-
-
-def _lag_bar(axes: Axes, row: int, part: LagParts) -> None:
-    lengths = (
-        part.command_hold_ms,
-        part.dead_time_ms.value,
-        part.dynamics_ms,
-        part.feedback_age_ms,
-    )
+def _lag_bar(axes: Axes, row: int, part: LagParts) -> float:
+    """Draw one joint's bar; returns where it ends [ms]."""
+    naive, dead_time = 1e3 * part.naive_lag_s.value, part.dead_time_s
+    lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.feedback_age_s)
     left = 0.0
     for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
-        shown = max(length, 0.0)
+        shown = max(1e3 * length, 0.0)
         axes.barh(
             row, shown, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0
         )
@@ -115,21 +99,22 @@ def _lag_bar(axes: Axes, row: int, part: LagParts) -> None:
             # the feedback's hatching would run through its number
             box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
             axes.text(
-                left + 0.5 * shown, row - 0.13 * (name == "dead time"), f"{length:.0f}",
+                left + 0.5 * shown, row - 0.13 * (name == "dead time"), f"{shown:.0f}",
                 ha="center", va="center", color="white" if colour in (BLUE, GREEN) else "black",
                 bbox=box if hatch else None,
             )  # fmt: skip
         left += shown
-    end = part.command_hold_ms + part.dead_time_ms.value
-    below = max(part.dead_time_ms.value - part.dead_time_ms.low, 0.0)
-    above = max(part.dead_time_ms.high - part.dead_time_ms.value, 0.0)
-    axes.errorbar(
-        end, row + 0.17, xerr=[[below], [above]], color="white", capsize=4, lw=3.2, capthick=3.2
-    )
-    axes.errorbar(end, row + 0.17, xerr=[[below], [above]], color=INK, capsize=4, lw=1.5)
-    naive = part.naive_ms.value
+    middle = 1e3 * (part.command_hold_s + dead_time.value)
+    below = 1e3 * max(dead_time.value - dead_time.low, 0.0)
+    above = 1e3 * max(dead_time.high - dead_time.value, 0.0)
+    for colour, width in (("white", 3.2), (INK, 1.5)):
+        axes.errorbar(
+            middle, row + 0.17, xerr=[[below], [above]], color=colour, capsize=4, lw=width,
+            capthick=width,
+        )  # fmt: skip
     axes.plot([naive, naive], [row - 0.4, row + 0.4], color=INK, lw=2.2)
     axes.text(naive + 0.015 * max(naive, 1.0), row, f"{naive:.0f}", va="center", weight="bold")
+    return max(naive, left)
 
 
 @styled
@@ -154,7 +139,7 @@ def overlay_figure(
         fresh = _inside(track.fresh_time_s, start, stop)
         axes.plot(
             track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
-            label="command, as held",
+            label="command, held",
         )  # fmt: skip
         axes.plot(
             track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5,
@@ -175,7 +160,7 @@ def overlay_figure(
 
 @styled
 def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
-    """For how many rows each reading stayed the same, beside what poll and loss predict.
+    """For how many rows each reading stayed the same, counted and predicted by poll and loss.
 
     Parameters
     ----------
@@ -217,7 +202,7 @@ _LATTICE_WORDS = {
 
 @styled
 def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
-    """Gain and phase over frequency: measured, from all rows, and as a fitted transfer function.
+    """Gain and phase over frequency: measured, from all rows, and of the fitted transfer function.
 
     Parameters
     ----------
@@ -264,7 +249,7 @@ _FREQUENCY_TICKS = (0.1, 0.2, 0.5, 1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 @styled
 def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
-    """What the model leaves unexplained: over speed, fresh against naive; and over time.
+    """Residuals of the model: over speed, fresh and raw; and over time.
 
     Parameters
     ----------
@@ -317,14 +302,14 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
 
 @styled
 def sweep_figure(trials: Sequence[Trial], periods: float = 3.0) -> Figure:
-    """Commands and what the encoder said, a panel per frequency; old readings are faint.
+    """Commands and readings, a panel per frequency; stale readings are faint.
 
     Parameters
     ----------
     trials : sequence of Trial
         Tones of one joint.
     periods : float
-        How many to show, from the middle of each trial.
+        Number of periods to show, from the middle of each trial.
     """
     figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
     for axes, trial in zip(panels, trials, strict=True):
@@ -334,7 +319,7 @@ def sweep_figure(trials: Sequence[Trial], periods: float = 3.0) -> Figure:
         reading = trial.position_rad[shown]
         fresh = np.diff(reading, prepend=np.nan) != 0
         axes.plot(time, trial.command_rad[shown], "--", color=BLUE, lw=1.2, label="command")
-        axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="old reading")
+        axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="stale reading")
         axes.plot(time[fresh], reading[fresh], "o", ms=3.0, color=RED, label="fresh reading")
         axes.set_title(f"{trial.joint}, {trial.frequency_hz:g} Hz")
         axes.set_ylabel("rad")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, versions
-from pupper_sysid.common.page import Column, Picture, Section, Table, WrittenPage, write_page
+from pupper_sysid.common.page import Picture, Section, Table, WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, calibrate
 from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
@@ -320,7 +320,7 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
     misled = [
         f"On {joint} it prefers {tables.model_name(best)}."
         for joint, result in results.items()
-        if (best := _best_by_naive_score(result)) != result.chosen
+        if (best := _best_by_raw_score(result)) != result.chosen
     ]
     return Section(
         "models",
@@ -331,16 +331,16 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
             f"best at that is chosen ({MODEL_NAMES[PREFERRED]} where it comes within 5 %, because "
             "simulators run it). Presets are published settings, scored the same way.",
         ],
-        tables=[tables.ladder_table(results)],
+        tables=[tables.model_table(results)],
         notes=[
-            "The naive score takes every row as if it had been measured when it was logged. Held "
-            "readings then count as errors, no model can get below them, and a model with too much "
-            "delay wins: do not choose by it. " + " ".join(misled),
+            "The raw score takes every row as measured when it was logged. Held readings then "
+            "count as errors, no model can get below them, and a model with too much delay is "
+            "best: do not choose by it. " + " ".join(misled),
         ],
     )
 
 
-def _best_by_naive_score(result: JointCalibrationResult) -> str:
+def _best_by_raw_score(result: JointCalibrationResult) -> str:
     scores = {name: r.scores.naive for name, r in result.rungs.items()}
     scores |= {name: s.naive for name, s in result.presets.items()}
     return min(scores, key=lambda name: scores[name])
@@ -369,15 +369,15 @@ def _provenance(found: Findings) -> Section:
             "sha256": r.sha256,
             "joints": " ".join(r.joints),
             "rows": len(r.table),
-            "loop_period_ms": 1e3 * r.loop_period_s,
+            "loop_period_s": r.loop_period_s,
         }
         for r in recordings
     )
     columns = (
-        Column("recording", lambda row: row["recording"], "words"),
-        Column("rows", lambda row: str(row["rows"])),
-        Column("loop, ms", lambda row: f"{row['loop_period_ms']:.2f}"),
-        Column("SHA-256", lambda row: row["sha256"], "words"),
+        tables.text("recording", "recording"),
+        tables.number("rows", "rows", 0),
+        tables.number("loop, ms", "loop_period_s", 2, 1e3),
+        tables.text("SHA-256", "sha256"),
     )
     made_with = ", ".join(f"{name} {version}" for name, version in versions().items())
     return Section(

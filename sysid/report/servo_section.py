@@ -1,45 +1,46 @@
-"""The report's section on servo models: what `compare` finds, as table and pictures."""
+"""Section of the report on servo models: a comparison as table and figures."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pupper_sysid.common.page import Column, Picture, Section, Table
 from pupper_sysid.sysid.report.data_curve import MODELS, DataCurve, data_curve_figure, measured
-from pupper_sysid.sysid.servo_fit.compare import LINEAR, Comparison
+from pupper_sysid.sysid.report.tables import KEY, number, text
+from pupper_sysid.sysid.servo_fit.scores import LINEAR
+
+if TYPE_CHECKING:  # it brings torch
+    from pupper_sysid.sysid.servo_fit.compare import Comparison
 
 
 def servo_section(found: Comparison) -> Section:
     """Section of a comparison of servo models on the report's recordings."""
     rows = tuple(found.to_frame().reset_index().to_dict("records"))
     columns = (
-        Column("joint", lambda row: row["joint"], "key"),
-        Column("model", lambda row: row["model"], "words"),
-        *(
-            Column(heading, lambda row, key=key: _mrad(row[key]))
-            for heading, key in (
-                ("free run, mrad", "rmse_free_run_rad"),
-                ("through the hold", "rmse_held_rad"),
-                ("rows as logged", "rmse_raw_rad"),
-                ("one step", "rmse_one_step_rad"),
-                ("stays put", "persistence_rmse_rad"),
-                ("robot repeats", "repeatability_rad"),
-            )
-        ),
+        KEY,
+        text("model", "model"),
+        number("free run, mrad", "rmse_free_run_rad", 1, 1e3),
+        number("held", "rmse_held_rad", 1, 1e3),
+        number("raw", "rmse_raw_rad", 1, 1e3),
+        number("one step", "rmse_one_step_rad", 1, 1e3),
+        number("persistence", "persistence_rmse_rad", 1, 1e3),
+        number("repeatability", "repeatability_rad", 1, 1e3),
     )
     pictures = [
         Picture(
             f"servo_{joint}",
             f"{joint}: models in free run, commands only. The shaded band is where the first "
-            "model expects nine readings in ten, from its errors on data held out of its fit; it "
-            "widens with speed, because a polled reading's time is uncertain.",
+            "model predicts nine readings in ten, from its errors on data held out of its fit; it "
+            "widens with speed, because the time of a polled reading is uncertain.",
             found.plot([joint]),
         )
         for joint in found.data.joints
     ]
     curve = measured()
-    own = int(np.median([sum(len(r.readings.rows) for r in found.data.runs[j])
-                         for j in found.data.joints]))  # fmt: skip
+    runs = found.data.runs.values()
+    own = int(np.median([sum(len(r.readings.rows) for r in joint) for joint in runs]))
     pictures.append(
         Picture(
             "servo_data_curve",
@@ -53,9 +54,9 @@ def servo_section(found: Comparison) -> Section:
         "servo",
         "Servo models",
         text=[
-            "How far each model is from the readings when it is shown commands only. "
-            f"“{LINEAR}” predicts each group from a filter fitted to the others; “stays put” is "
-            "the reading before, which makes no prediction at all."
+            "Error of each model in free run, from commands only. "
+            f"“{LINEAR}” predicts each group from a filter fitted to the others; persistence is "
+            "the reading before as the prediction of the next."
         ],
         figures=pictures,
         tables=[
@@ -73,13 +74,6 @@ def _curve_table(curve: DataCurve) -> Table:
     ]
     columns = (
         Column("samples per joint", lambda row: f"{row['samples_per_joint']:,}", "key"),
-        *(
-            Column(f"{MODELS[m][0]}, mrad", lambda row, m=m: _mrad(row[f"{m}_rad"]))
-            for m in curve.error_rad
-        ),
+        *(number(f"{MODELS[m][0]}, mrad", f"{m}_rad", 1, 1e3) for m in curve.error_rad),
     )
     return Table("servo_data_curve", "Error against samples, emulated robot", columns, tuple(rows))
-
-
-def _mrad(value: float) -> str:
-    return f"{1e3 * value:.1f}" if value == value else "–"

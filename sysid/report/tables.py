@@ -1,7 +1,7 @@
-"""The report's tables: every number once, for the page with few digits, for CSV with all of them.
+"""Tables of the report: full numbers for CSV, rounded ones for the page.
 
-Each function turns results into a `Table`. Its rows hold plain values under names that end in their
-unit, which is what goes to CSV; its columns say which of them the page shows, and how.
+Each function turns results into a `Table`. The rows hold the results' own fields under their names,
+in SI units; the columns say which of them the page shows, and in which unit.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.page import Column, Row, Table
+from pupper_sysid.common.results import flat, plain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
 from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
-from pupper_sysid.sysid.identify.scores import Scores
 from pupper_sysid.sysid.report.figure_data import lag_parts
 
 if TYPE_CHECKING:  # it brings python-control, which a table does not need
@@ -31,157 +30,122 @@ MODEL_NAMES = {
 }
 
 _LEVEL = "(90\N{NO-BREAK SPACE}%)"
-_KEY = Column("joint", lambda row: row["joint"], "key")
+KEY = Column("joint", lambda row: row["joint"], "key")
+_MS = 1e3
 
 
 def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """The lag budget per joint."""
     rows = []
     for joint, result in results.items():
-        part, lattice = lag_parts(result), result.budget.lattice
+        lattice, steps = result.budget.lattice, result.delay_steps
         rows.append(
-            {
-                "joint": joint,
-                **_interval("naive_lag_ms", part.naive_ms),
-                "feedback_age_ms": part.feedback_age_ms,
-                "command_hold_ms": part.command_hold_ms,
-                **_interval("lag_ms", part.lag_ms),
-                **_interval("dead_time_ms", part.dead_time_ms),
-                "dynamics_ms": part.dynamics_ms,
-                "delay_steps_min": result.delay_steps[0],
-                "delay_steps_max": result.delay_steps[1],
-                "poll_period_ms": 1e3 * lattice.period_s,
+            {"joint": joint}
+            | flat(plain(lag_parts(result)))
+            | {
+                "delay_steps_min": steps[0],
+                "delay_steps_max": steps[1],
+                "poll_period_s": lattice.period_s,
                 "loss": lattice.loss,
-                "mean_age_from_poll_ms": 1e3 * lattice.mean_age_s,
+                "mean_age_from_poll_s": lattice.mean_age_s,
             }
         )
     columns = (
-        _KEY,
-        _number("naive, ms", "naive_lag_ms"),
-        _number("= feedback age", "feedback_age_ms"),
-        _number("+ command hold", "command_hold_ms"),
-        _ranged(f"+ servo lag {_LEVEL}", "lag_ms"),
-        _ranged(f"of it dead time {_LEVEL}", "dead_time_ms"),
-        _number("and dynamics", "dynamics_ms"),
-        _number("poll, ms", "poll_period_ms", 2),
-        _number("lost polls, %", "loss", 0, 100.0),
+        KEY,
+        number("naive, ms", "naive_lag_s", 1, _MS),
+        number("= feedback age", "feedback_age_s", 1, _MS),
+        number("+ command hold", "command_hold_s", 1, _MS),
+        _ranged(f"+ servo lag {_LEVEL}", "lag_s", 1, _MS),
+        _ranged(f"of it dead time {_LEVEL}", "dead_time_s", 1, _MS),
+        number("and dynamics", "dynamics_s", 1, _MS),
+        number("poll, ms", "poll_period_s", 2, _MS),
+        number("lost polls, %", "loss", 0, 100.0),
     )
     return Table("lag_budget", "Lag budget", columns, tuple(rows))
 
 
 def estimator_table(results: Mapping[str, JointCalibrationResult]) -> Table:
-    """What each delay estimator says, the usual ones first; a column per joint."""
+    """The lag by every estimator, the usual ones first; a column per joint."""
     names = list(dict.fromkeys(name for r in results.values() for name in r.budget.estimators))
     rows = tuple(
         {"estimator": name}
-        | {
-            f"{joint}_lag_ms": 1e3 * r.budget.estimators.get(name, math.nan)
-            for joint, r in results.items()
-        }
+        | {f"{j}_lag_s": r.budget.estimators.get(name, math.nan) for j, r in results.items()}
         for name in names
     )
     columns = (
-        Column("lag in ms by", lambda row: row["estimator"], "words"),
-        *(_number(joint, f"{joint}_lag_ms") for joint in results),
+        text("lag in ms by", "estimator"),
+        *(number(joint, f"{joint}_lag_s", 1, _MS) for joint in results),
     )
-    return Table("estimators", "The same delay, by other estimators", columns, rows)
+    return Table("estimators", "The same lag, by other estimators", columns, rows)
 
 
 def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """Gain, phase and lag per tone."""
     rows = [
-        {
-            "joint": joint,
-            "trial": f.trial,
-            "frequency_hz": f.frequency_hz,
-            "gain": f.gain,
-            "phase_deg": f.phase_deg,
-            **_interval(
-                "lag_ms", Interval(*(1e3 * x for x in (f.lag.value, f.lag.low, f.lag.high)))
-            ),
-            "naive_lag_ms": 1e3 * f.naive_lag_s,
-            "naive_gain": f.naive_gain,
-        }
+        {"joint": joint} | flat(plain(f))
         for joint, result in results.items()
         for f in sorted(result.budget.by_frequency, key=lambda f: f.frequency_hz)
     ]
     columns = (
-        _KEY,
-        _number("Hz", "frequency_hz", 2),
-        _number("gain", "gain", 2),
-        _number("phase, °", "phase_deg", 0),
-        _ranged(f"lag, ms {_LEVEL}", "lag_ms"),
-        _number("naive gain", "naive_gain", 2),
-        _number("naive lag, ms", "naive_lag_ms"),
+        KEY,
+        number("Hz", "frequency_hz", 2),
+        number("gain", "gain", 2),
+        number("phase, °", "phase_deg", 0),
+        _ranged(f"lag, ms {_LEVEL}", "lag", 1, _MS),
+        number("naive gain", "naive_gain", 2),
+        number("naive lag, ms", "naive_lag_s", 1, _MS),
     )
     return Table("by_frequency", "Frequency by frequency", columns, tuple(rows))
 
 
 def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
-    """The fitted transfer functions, number by number."""
+    """Parameters of the fitted transfer functions."""
     rows = [
-        {
-            "joint": joint,
-            "transfer_function": fit.name,
-            "parameter": name,
-            **_interval("value", p),
-            "chi2_per_dof": fit.chi2_per_dof,
-        }
+        {"joint": joint, "transfer_function": fit.name, "parameter": name}
+        | flat(plain(p))
+        | {"chi2_per_dof": fit.chi2_per_dof}
         for joint, response in responses.items()
         for fit in response.fits
         for name, p in fit.parameters.items()
     ]
     columns = (
-        _KEY,
-        _text("form", "transfer_function"),
-        Column("number", lambda row: _readable(row["parameter"], ""), "words"),
-        Column(
-            f"value {_LEVEL}",
-            lambda row: _value_cell(row["value"], row["value_low"], row["value_high"]),
-        ),
+        KEY,
+        text("form", "transfer_function"),
+        Column("parameter", lambda row: _readable(row["parameter"], ""), "words"),
+        Column(f"value {_LEVEL}", _value_cell),
         Column("unit", lambda row: unit_of(row["parameter"]), "words"),
-        _number("misfit, χ²/dof", "chi2_per_dof"),
+        number("misfit, χ²/dof", "chi2_per_dof"),
     )
     return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))
 
 
-def ladder_table(results: Mapping[str, JointCalibrationResult]) -> Table:
-    """Every model of the ladder and every preset, scored the same way."""
+def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+    """Candidate models and presets, scored the same way."""
     rows = []
     for joint, result in results.items():
-        for name, fitted in result.rungs.items():
-            kind = "chosen" if name == result.chosen else "fitted"
-            rows.append(_scored(joint, name, kind, len(fitted.values), fitted.scores))
-        for name, scores in result.presets.items():
-            rows.append(_scored(joint, name, "preset", None, scores))
+        fitted = {n: ("fitted", len(r.values), r.scores) for n, r in result.rungs.items()}
+        presets = {n: ("preset", None, scores) for n, scores in result.presets.items()}
+        for name, (kind, count, scores) in (fitted | presets).items():
+            chosen = name == result.chosen
+            numbers = plain(scores).items()
+            rows.append(
+                {"joint": joint, "model": name, "kind": "chosen" if chosen else kind}
+                | {"is_chosen": chosen, "parameter_count": count}
+                | {key: number for key, number in numbers if not isinstance(number, dict)}
+            )
     columns = (
-        _KEY,
+        KEY,
         Column("model", _model_cell, "words"),
-        _number("numbers fitted", "parameter_count", 0),
-        _number("fresh, mrad", "rmse_fresh_mrad"),
-        _number("unseen frequency, mrad", "rmse_leave_one_frequency_out_mrad"),
-        _number("held, mrad", "rmse_held_mrad"),
-        _number("one step, mrad", "rmse_one_step_mrad"),
-        _number("fit, %", "fit_percent"),
-        _number("naive, mrad (misleads)", "rmse_naive_mrad"),
+        number("parameters fitted", "parameter_count", 0),
+        number("fresh, mrad", "fresh", 1, 1e3),
+        number("unseen frequency, mrad", "leave_one_out", 1, 1e3),
+        number("held, mrad", "held", 1, 1e3),
+        number("one step, mrad", "one_step", 1, 1e3),
+        number("fit, %", "fit_percent"),
+        number("raw, mrad (misleads)", "naive", 1, 1e3),
     )
-    return Table("ladder", "Models, simplest first", columns, tuple(rows), "is_chosen")
-
-
-def _scored(joint: str, model: str, kind: str, count: int | None, s: Scores) -> Row:
-    return {
-        "joint": joint,
-        "model": model,
-        "kind": kind,
-        "is_chosen": kind == "chosen",
-        "parameter_count": count,
-        "rmse_fresh_mrad": 1e3 * s.fresh,
-        "rmse_leave_one_frequency_out_mrad": 1e3 * s.leave_one_out,
-        "rmse_held_mrad": 1e3 * s.held,
-        "rmse_one_step_mrad": 1e3 * s.one_step,
-        "fit_percent": s.fit_percent,
-        "rmse_naive_mrad": 1e3 * s.naive,
-    }
+    title = "Candidate models, simplest first"
+    return Table("candidate_models", title, columns, tuple(rows), "is_chosen")
 
 
 def _model_cell(row: Row) -> str:
@@ -189,12 +153,12 @@ def _model_cell(row: Row) -> str:
 
 
 def model_name(name: str) -> str:
-    """A rung of the ladder or a preset, in words."""
+    """A candidate model or a preset, in words."""
     return MODEL_NAMES.get(name, f"preset “{name}”")
 
 
 def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
-    """Every number of the calibration with its interval and whether it was identified."""
+    """Parameters of the calibration with their intervals and whether the data identified them."""
     rows = []
     for joint in joints:
         known = calibration.joint(joint)
@@ -204,29 +168,19 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
             "feedback": known.feedback,
         }
         for part, values in parts.items():
-            for name in type(values).model_fields:
-                q = getattr(values, name)
-                if isinstance(q, Quantity):
-                    rows.append(
-                        {
-                            "joint": joint,
-                            "part": part,
-                            "parameter": name,
-                            "unit": unit_of(name),
-                            "value": q.value,
-                            "low": q.low,
-                            "high": q.high,
-                            "identified": q.identified,
-                            "why": q.why or "",
-                        }
-                    )
+            rows += [
+                {"joint": joint, "part": part, "parameter": name, "unit": unit_of(name)}
+                | plain(quantity)
+                for name, quantity in values
+                if isinstance(quantity, Quantity)
+            ]
     columns = (
-        _KEY,
-        Column("number", lambda row: _readable(row["parameter"], row["part"]), "words"),
-        Column(f"value {_LEVEL}", lambda row: _value_cell(row["value"], row["low"], row["high"])),
-        _text("unit", "unit"),
-        _text("identified", "identified"),
-        Column("why", lambda row: row["why"], "prose"),
+        KEY,
+        Column("parameter", lambda row: _readable(row["parameter"], row["part"]), "words"),
+        Column(f"value {_LEVEL}", _value_cell),
+        text("unit", "unit"),
+        text("identified", "identified"),
+        Column("why", lambda row: row["why"] or "", "prose"),
     )
     return Table("parameters", "Parameters", columns, tuple(rows))
 
@@ -240,7 +194,8 @@ def _readable(name: str, part: str) -> str:
     return name.replace("_", " ") + (" / armature" if part == "ratios to armature" else "")
 
 
-def _value_cell(value: float, low: float | None, high: float | None) -> str:
+def _value_cell(row: Row) -> str:
+    value, low, high = row["value"], row["low"], row["high"]
     if low is None or high is None or low == high:
         return _significant(value)
     return f"{_significant(value)} ({_significant(low)} … {_significant(high)})"
@@ -256,68 +211,55 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
     joints : sequence of str
         Which joints to show.
     """
-    rows = []
-    for recording, examination in examinations:
-        for joint, j in examination.joints.items():
-            if joint in joints:
-                rows.append(
-                    {
-                        "recording": recording,
-                        "joint": joint,
-                        "verdict": j.verdict,
-                        "loop_period_ms": j.loop_period_ms,
-                        "jitter_ms": j.jitter_ms,
-                        "fresh_fraction": j.fresh_fraction,
-                        "poll_period_ms": j.poll_period_ms,
-                        "loss": j.loss,
-                        "quantum_rad": j.quantum_rad,
-                        "offset_rad": j.offset_rad,
-                        "reasons": " ".join(j.reasons),
-                    }
-                )
-    columns = (
-        _KEY,
-        _text("verdict", "verdict"),
-        _number("loop, ms", "loop_period_ms", 2),
-        _number("jitter, ms", "jitter_ms", 2),
-        _number("fresh rows, %", "fresh_fraction", 0, 100.0),
-        _number("poll, ms", "poll_period_ms", 2),
-        _number("lost polls, %", "loss", 0, 100.0),
-        _number("count, mrad", "quantum_rad", 3, 1e3),
-        _number("offset, mrad", "offset_rad", 1, 1e3),
-        _text("recording", "recording"),
+    rows = tuple(
+        {"recording": recording, "joint": joint}
+        | flat(plain(found))
+        | {"reasons": " ".join(found.reasons)}
+        for recording, examination in examinations
+        for joint, found in examination.joints.items()
+        if joint in joints
     )
-    return Table("doctor", "The recordings' health", columns, tuple(rows))
+    columns = (
+        KEY,
+        text("verdict", "verdict"),
+        number("loop, ms", "loop_period_ms", 2),
+        number("jitter, ms", "jitter_ms", 2),
+        number("fresh rows, %", "fresh_fraction", 0, 100.0),
+        number("poll, ms", "poll_period_ms", 2),
+        number("lost polls, %", "loss", 0, 100.0),
+        number("quantisation step, mrad", "quantum_rad", 3, 1e3),
+        number("offset, mrad", "offset_rad", 1, 1e3),
+        text("recording", "recording"),
+    )
+    return Table("doctor", "The recordings' health", columns, rows)
 
 
 # ------------------------------------------------------------------------------ how to show
 
 
-def _text(heading: str, key: str) -> Column:
+def text(heading: str, key: str) -> Column:
+    """Column of words."""
     return Column(heading, lambda row: str(row[key]), "words")
 
 
-def _number(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:
+def number(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:
+    """Column of numbers, times `factor`."""
     return Column(heading, lambda row: _digits(row[key], digits, factor))
 
 
-def _ranged(heading: str, key: str, digits: int = 1) -> Column:
+def _ranged(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:
     def show(row: Row) -> str:
-        low, high = _digits(row[f"{key}_low"], digits), _digits(row[f"{key}_high"], digits)
-        return f"{_digits(row[key], digits)} ({low} … {high})"
+        numbers = (row[k] for k in (key, f"{key}_low", f"{key}_high"))
+        return "{} ({} … {})".format(*(_digits(x, digits, factor) for x in numbers))
 
     return Column(heading, show)
-
-
-def _interval(name: str, interval: Interval) -> Row:
-    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
 def _digits(value: float | None, digits: int, factor: float = 1.0) -> str:
     if value is None or not math.isfinite(value):
         return "–"
-    text = f"{value * factor:.{digits}f}"
-    return text.replace("-", "−") if float(text) != 0 else text.lstrip("-")
+    shown = f"{value * factor:.{digits}f}"
+    return shown.replace("-", "−") if float(shown) != 0 else shown.lstrip("-")
 
 
 def _significant(value: float) -> str:

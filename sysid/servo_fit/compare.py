@@ -27,13 +27,11 @@ from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.result import ServoFit
-from pupper_sysid.sysid.servo_fit.scores import ModelScores
+from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LINEAR = "linear, fitted here"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +140,8 @@ def compare(
         if band:
             bands[name] = band
         notes += [
-            f"{shown} was fitted to {inputs[h]}: its errors here are too small. Its contract has "
-            "those on unseen data."
+            f"{shown} was fitted to {inputs[h]}: its errors here are too small. Its contract "
+            "holds those on unseen data."
             for h in used
             if h in inputs
         ]

@@ -1,17 +1,16 @@
-"""What a servo model is fitted to: commands by control tick, readings at the time they were taken.
+"""Data for fitting servo models: commands by control tick, readings at the time they were taken.
 
-A servo model steps once per command, so its clock is the tick: position `k` is where the servo is
-when command `k` is sent, having had commands up to `k - 1`. A reading was taken at some time, hence
-at a fractional tick, and models are looked up there (`look_up`), between ticks by a cubic: linear
-interpolation of a 4 Hz motion between ticks 19 ms apart would be off by several mrad.
+A servo model steps once per command, so its clock is the tick: position `k` is that at which
+command `k` is sent, after commands up to `k - 1`. A reading was taken at a fractional tick, where
+models are interpolated by a cubic (`look_up`): linear interpolation of a 4 Hz motion between ticks
+19 ms apart has an error of several mrad.
 
-Which readings count: where the feedback is held (more than a fifth of the rows repeat the one
-before while the servo moves) only fresh ones, each at its own time; otherwise every row as it
-stands in the log.
+Where the feedback is held (more than a fifth of the rows repeat the one before while the servo
+moves), only fresh readings count, each at its own time; otherwise every row as logged.
 
-Trials that follow each other without a pause, like the loops of a playback, are one run: the servo
-did get those commands. Nothing is carried over a pause, and every reading knows its group (its
-loop, or its tone), so that whole groups can be held out.
+Trials that follow each other without a pause, like the loops of a playback, are one run. Nothing is
+carried over a pause. Every reading belongs to a group (its loop, or its tone), so that whole groups
+can be held out.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ from pupper_sysid.sysid.recordings.joints import joint_rng, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 MODES = ("auto", "fresh", "all")
-_HELD_FRACTION = 0.2  # the doctor's own limit: beyond it, rows as they stand mislead
+_HELD_FRACTION = 0.2  # the doctor's limit, beyond which raw rows mislead
 _PAUSE = 1.5  # in ticks; a longer gap ends a run
 _SAME_RATE = 0.05
 
 
 @dataclass(frozen=True)
 class Run:
-    """Rows of one joint without a pause; arrays are over its rows unless said otherwise.
+    """Rows of one joint without a pause; arrays are over its rows unless a shape is given.
 
     Attributes
     ----------
@@ -50,12 +49,11 @@ class Run:
     readings : Readings
         Those that count, over `fresh` entries.
     tick, position_rad : ndarray, shape (fresh,)
-        When each was taken, in ticks, and what it was [rad].
+        Their times, in ticks, and values [rad].
     row_tick, held_tick : ndarray
-        When each row was read, and when the value it shows was taken (NaN if before the run).
+        When each row was read, and when its value was taken (NaN if before the run).
     number, group : ndarray of int
-        Trial number in its recording; index into `ServoData.groups`, -1 for rows that belong to
-        none.
+        Trial number in its recording; index into `ServoData.groups`, -1 for rows of no group.
     elapsed_s : ndarray
         Since the first command of the row's trial.
     """
@@ -77,19 +75,19 @@ class Run:
 
     @property
     def initial_rad(self) -> float:
-        """The command before the first, as far as it is known [rad]."""
+        """The command before the first, or what is known of it [rad]."""
         return self.trial.initial_command_rad
 
     @property
     def reading_elapsed_s(self) -> NDArray[np.float64]:
-        """When each counted reading was taken, since the start of its trial [s]."""
+        """Time of each counted reading since the start of its trial [s]."""
         row = self.readings.rows
         start = self.trial.send_time_s[row] - self.elapsed_s[row]
         return self.readings.time_s - start
 
     @property
     def truncated_rad(self) -> NDArray[np.float64]:
-        """Commands as the bus sent them, in whole counts [rad]."""
+        """Commands as the bus sent them, quantised [rad]."""
         return whole_counts(self.trial)
 
     def trial_data(self, used: NDArray[np.bool_]) -> TrialData:
@@ -112,7 +110,7 @@ class ServoData:
         Time between commands.
     runs : dict of str to tuple of Run
     groups : tuple of str
-        What can be held out: "loop 0", "3 Hz", …
+        Groups to hold out: "loop 0", "3 Hz", …
     modes : dict of str to str
         "fresh" or "all": which readings of the joint count.
     """
@@ -134,7 +132,7 @@ def servo_data(
     recordings : sequence of Recording
     joints : sequence of str
     mode : {"auto", "fresh", "all"}
-        Which readings count; `auto` decides per joint, see the module's text.
+        Which readings count; `auto` decides per joint, as the module's text describes.
     seed : int
         Of the search for the poll.
 
@@ -150,7 +148,7 @@ def servo_data(
     for joint in joints:
         found, modes[joint] = _joint_runs(recordings, joint, mode, period, labels, seed)
         if not sum(len(r.tick) for r in found):
-            raise InputError(f"{joint}: no reading ever changed; there is nothing to learn from.")
+            raise InputError(f"{joint}: no reading changed; a model cannot be fitted.")
         runs[joint] = tuple(found)
     return ServoData(tuple(joints), period, runs, tuple(labels), modes)
 
@@ -158,7 +156,7 @@ def servo_data(
 def look_up_weights(
     tick: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Which ticks a value between ticks is made of, and how much of each (Catmull-Rom cubic).
+    """Ticks and weights of a value between ticks (Catmull-Rom cubic).
 
     Returns
     -------
@@ -263,7 +261,7 @@ _Part = tuple[Trial, Readings, int, float]
 
 
 def _without_pauses(trial: Trial, r: Readings, group: int, period: float) -> list[_Part]:
-    """A trial cut where rows are missing, each part with its group and its trial's start."""
+    """Parts of a trial between missing rows, each with its group and its trial's start."""
     gaps = np.flatnonzero(np.diff(trial.send_time_s) > _PAUSE * period) + 1
     start = float(trial.send_time_s[0])
     parts, rest = [], trial.initial_command_rad

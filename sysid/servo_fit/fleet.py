@@ -1,7 +1,7 @@
 """Fit servo models to the recordings of many robots at once.
 
-One recording is one robot and becomes one model folder. Models that were fitted to the same bytes
-in the same way are kept; a recording that cannot be used does not stop the others.
+One recording is one robot and becomes one model folder. Models that were fitted to the same file
+with the same settings are kept; a recording that cannot be used does not stop the others.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ QUANTITIES = {
     "delayed_pd_mrad": "delayed_pd_rmse_rad",
     "persistence_mrad": "persistence_rmse_rad",
 }
-"""What the table has of each joint, by its name in the model's contract: errors on unseen data."""
+"""Columns of the table and the scores of the model's contract that they show: unseen data."""
 
 
 @dataclass(frozen=True)
 class ServoSettings:
-    """How every recording is fitted; fields are the parameters of `servo_fit.fit.fit_servo`."""
+    """Settings of every fit: parameters of `servo_fit.fit.fit_servo`."""
 
     arch: str = "mlp"
     preset: str = "default"
@@ -62,7 +62,7 @@ def fit_servo_fleet(
 
 
 def _numbers(target: Path) -> dict[str, dict[str, float]]:
-    """What the table has of each joint of a model; NaN where it has no such score."""
+    """Scores of each joint of a model; NaN where it has no such score."""
     found = {}
     for joint, known in load_servo_model(target).contract.joints.items():
         errors = {name: known.scores.get(key) for name, key in QUANTITIES.items()}
@@ -71,7 +71,7 @@ def _numbers(target: Path) -> dict[str, dict[str, float]]:
 
 
 def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
-    """Whether a model was fitted to these bytes in this way."""
+    """Whether a model was fitted to this file with these settings."""
     try:
         made = load_servo_model(target).contract
     except InputError:
@@ -85,7 +85,7 @@ def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
 
 
 def _modes(path: Path, joints: Iterable[str], settings: ServoSettings) -> dict[str, str]:
-    """Which readings of a recording count, by joint."""
+    """Which readings of a recording count, per joint."""
     return servo_data([load(path)], list(joints), settings.readings, settings.seed).modes
 
 

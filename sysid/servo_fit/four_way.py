@@ -1,4 +1,4 @@
-"""The published four-way comparison of servo models, on readings none of them has seen.
+"""The published four-way comparison of servo models, on unseen readings.
 
 The published DelayedPD, one fitted here, an MLP and an LSTM, each from commands alone (free run)
 and one step ahead from the last reading, beside a linear filter and persistence. The
@@ -15,9 +15,10 @@ import numpy as np
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
-from pupper_sysid.sysid.servo_fit.compare import LINEAR, Comparison, calibrated
+from pupper_sysid.sysid.servo_fit.compare import Comparison, calibrated
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
 from pupper_sysid.sysid.servo_fit.result import ServoFit
+from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 PUBLISHED, FITTED = "DelayedPD, published", "DelayedPD, fitted here"
 _TRAIN_SHARE = 2 / 3

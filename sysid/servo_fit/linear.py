@@ -1,10 +1,10 @@
 """The linear baseline: a servo as a filter of its last commands, fitted robustly.
 
 position = bias + Σ fir[k] · command[t - k], by ridge regression under Huber's loss (iteratively
-re-weighted least squares), so that a fall or a late poll does not tilt it. Old commands must earn
-their place: beforehand, a coefficient's size fades with the age of its command by `FADE_S` (the
-diagonal kernel of regularised FIR identification; Chen, Ohlsson and Ljung, Automatica 2012), which
-spares the choice of a filter length. How much ridge is decided by held-out groups.
+re-weighted least squares), so that outliers, such as a fall or a delayed poll, have little weight.
+The prior size of a coefficient decays with the age of its command by `FADE_S` (the diagonal kernel
+of regularised FIR identification; Chen, Ohlsson and Ljung, Automatica 2012), so that no filter
+length has to be chosen. The ridge is chosen by held-out groups.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pupper_sysid.sysid.servo_fit.windows import Samples
 
 HISTORY_S = 0.4
-"""Commands a model looks back on [s]: a servo answers after 40 ms and swings for up to 200 more."""
+"""Memory of a model [s]: a servo responds after 40 ms and oscillates for up to 200 ms more."""
 
 FADE_S = 0.1
 RIDGES = (1e-4, 1e-3, 1e-2)
@@ -55,7 +55,7 @@ def taps(period_s: float) -> int:
 
 
 def fading(count: int, period_s: float) -> NDArray[np.float64]:
-    """How large the coefficients of the last `count` commands may be, newest first."""
+    """Prior size of the coefficients of the last `count` commands, newest first."""
     return np.exp(-np.arange(count) * period_s / FADE_S)
 
 
@@ -84,7 +84,7 @@ def fit_linear(
     for j in range(joints):
         for n, left_out in enumerate(sets):
             use = learns_from(data, left_out)[j]
-            if not use.any():  # of a joint with no other group: the mean, which is zero
+            if not use.any():  # a joint with no other group: the mean, which is zero
                 residual[j, :, :, n] = data.target[j]
                 continue
             a = np.column_stack([x[j][use], np.ones(int(use.sum()))])
@@ -97,7 +97,7 @@ def fit_linear(
 
 
 def learns_from(data: Samples, left_out: frozenset[int]) -> NDArray[np.bool_]:
-    """Readings a fit that leaves out some groups may see; none too close to a boundary."""
+    """Mask of the readings of a fit that leaves out some groups; none close to a boundary."""
     if not left_out:
         return data.used
     return data.used & (data.group >= 0) & ~np.isin(data.group, list(left_out))

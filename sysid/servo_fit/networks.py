@@ -1,9 +1,9 @@
-"""Fit linear filters, MLPs and LSTMs of all joints, and decide by held-out groups which to keep.
+"""Fit linear filters, MLPs and LSTMs of all joints; choose hyper-parameters by held-out groups.
 
-A fit gives one model for the whole training part and one per held-out group: the latter have never
-seen their group, so their errors on it are honest, both for choosing (ridge, weight decay,
-length of training) and for saying how sure the model is. With `nested`, even the weight decay and
-the length of training of a group's model were chosen without that group.
+A fit gives one model for the whole training part and one per held-out group. The errors of the
+latter on their own group choose the ridge, the weight decay and the length of training, and give
+the predictive band. With `nested`, the hyper-parameters of a group's model are chosen without that
+group, too.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class NetworkFit:
     model : CommandNetwork or RecurrentNetwork
         Fitted to the whole training part.
     held_out : dict of int to model
-        Per group, the model that has not seen it.
+        Per group, the model fitted without it.
     choices : dict of str to float
-        What was decided by held-out groups.
+        Hyper-parameters chosen by held-out groups.
     interrupted : bool
-        Whether the user ended training; the best so far was kept.
+        Whether Ctrl-C ended the training; the best so far was kept.
     """
 
     model: Learned
@@ -48,7 +48,7 @@ class NetworkFit:
 
 
 def past_ticks(period_s: float) -> int:
-    """How many commands before a window the models of this module need."""
+    """Commands before a window that the models of this module need."""
     return max(taps(period_s), round(_LSTM_MEMORY_S / period_s))
 
 
@@ -73,7 +73,7 @@ def fit_network(
         With `past_ticks(period_s)` commands before each window.
     seed : int
     nested : bool
-        Make each held-out model's choices without its group, too.
+        Choose the hyper-parameters of each held-out model without its group, too.
     progress : callable, optional
         Called with steps done and steps in all.
     """
@@ -87,7 +87,7 @@ def fit_network(
         return NetworkFit(built[0], dict(zip(groups, built[1:], strict=True)), choices, False)
 
     recipe = MLP if kind == "mlp" else LSTM
-    # what each purpose may look at: the final model all groups, a group's own model the others
+    # groups that choose a model: for the final one all, for a group's own model the others
     purposes: dict[int | None, list[tuple[int, int]]] = {
         None: [(n, g) for n, s in enumerate(sets) for g in s if len(s) == 1]
     }
@@ -143,10 +143,10 @@ def fit_network(
 
 
 def _choose(judged: list[NDArray]) -> tuple[int, int]:
-    """Which comparison and which decay to keep: of those that are as good, the least regularised.
+    """Checkpoint and decay to keep: of those that are as good, the least regularised.
 
-    A fold's networks have less data than the final ones and often have to extrapolate; both ask
-    for more regularisation than the final fit needs.
+    Networks of a fold have less data than the final ones and often extrapolate, and so need more
+    regularisation than the final fit.
     """
     table = np.stack(judged)
     best = np.argwhere(table <= np.nanmin(table) + _AS_GOOD)
@@ -188,7 +188,7 @@ def _build(
     n: int,
     weights: dict[str, NDArray],
 ) -> Learned:
-    """The model that runs, from training set `n`; members of an MLP become one wide layer."""
+    """Model of training set `n`; members of an MLP become one wide layer."""
     parameters: dict[str, NDArray] = {
         **data.normalisation, "fir": linear.fir[:, n], "fir_bias": linear.bias[:, n],
         "bound": linear.scale[:, n],

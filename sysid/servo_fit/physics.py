@@ -1,7 +1,7 @@
 """DelayedPD and sparse equations, fitted to the same part of the data as the networks.
 
-Both run freely from rest under the commands and are compared with the part's readings at their own
-times (`sysid.identify.output_error`). The result is arrays per joint, ready for a servo model file.
+Both are fitted in free run from rest to the part's readings at their own times
+(`sysid.identify.output_error`). The result is arrays per joint, ready for a servo model file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pupper_sysid.sysid.identify.search import PREFERRED, fit_problems
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen
 
-_MANY = 10  # problems; fewer are started from more places, since few tones have many local optima
+_MANY = 10  # problems; fewer get more starts, since few tones have many local optima
 
 
 def delayed_pd_fits(
@@ -113,22 +113,22 @@ def sindy_model(values: dict[str, NDArray[np.float64]], period_s: float) -> AtCo
 
 
 def part_trials(data: ServoData, joint: str, part: Part) -> tuple[TrialData, ...]:
-    """Runs of a joint on the clock of physics, each with only the part's readings."""
+    """Runs of a joint on the clock of physics, with only the part's readings."""
     found = [(run, chosen(run, part)) for run in data.runs[joint]]
     return tuple(run.trial_data(use) for run, use in found if use.any())
 
 
 def noise_scale(data: ServoData, joint: str) -> float:
-    """Size of an unremarkable residual [rad]: a few counts, or what the reading scatters by."""
+    """Scale of ordinary residuals [rad]: two quantisation steps, or the scatter of readings."""
     step = quantum([run.trial for run in data.runs[joint]])
     # two counts, as measured on the real servos (facts of the recordings); 12 mrad if unknown
     return 2.0 * step if step > 0 else 0.012
 
 
 def _truncation_shift(data: ServoData, joint: str) -> float:
-    """Mean of what the bus's truncation adds to a command [rad].
+    """Mean of quantised minus unquantised commands [rad].
 
-    The fit saw commands as whole counts; the model that runs is given them as they are.
+    The fit uses commands as whole counts; the model that runs gets them unquantised.
     """
     runs = data.runs[joint]
     return float(np.mean(np.concatenate([r.truncated_rad - r.command_rad for r in runs])))

@@ -1,13 +1,12 @@
-"""The servo networks of the paper, trained as it says, to see what that gives.
+"""The servo networks of the paper, trained as published.
 
 "Reinforcement Learning on Cost-Constrained Quadrupedal Hardware" (Mini Pupper 2), section on servo
-models and its released code: per joint, displacements from the standing pose in plain radians;
-the MLP sees the last 5 commands and the last position (6 → 32 → 32 → 1, ReLU), the LSTM (of which
-no code was released: 32 units are assumed) the newest command and the last position. Both learn
-the next position one step ahead from measured ones, by mean squared error and Adam, and then have
-to run
-on their own predictions. The released code keeps the weights that do best on the test loop; here
-training simply ends, so that nothing is selected on it.
+models and its released code: per joint, displacements from the standing pose in plain radians. The
+MLP has the last 5 commands and the last position as inputs (6 → 32 → 32 → 1, ReLU), the LSTM (no
+code was released: 32 units are assumed) the newest command and the last position. Both learn the
+next position one step ahead from measured ones, by mean squared error and Adam; in use they run on
+their own predictions. The released code keeps the weights that are best on the test loop; here
+training ends after a fixed number of epochs, so that nothing is selected on it.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ def _mlp(
             parts.append(np.column_stack([seen, position[t + 1]]))
         rows.append(np.concatenate(parts))
     count = max(len(r) for r in rows)
-    # joints with fewer rows see some of theirs twice per epoch
+    # joints with fewer rows repeat some of them in an epoch
     table = torch.from_numpy(np.stack([np.resize(r, (count, r.shape[1])) for r in rows])).float()
     x, y = table[..., :-1], table[..., -1:]
     sizes = (_COMMANDS + 1, _UNITS, _UNITS, 1)

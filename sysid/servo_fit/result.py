@@ -39,7 +39,7 @@ class FitScores(Scores):
     persistence_rmse_rad : float
         The last reading as the prediction of the next [rad].
     repeatability_rad : float
-        How well the robot repeats itself; NaN if no command was repeated.
+        RMS difference of repetitions over √2 [rad]; NaN if no command was repeated.
     band_noise_rad, band_timing_s : float
         Standard deviation of the error at speed v: sqrt(noise² + (timing · v)²).
     """
@@ -200,7 +200,7 @@ def verdict(
     if np.isfinite(repeatability_rad):
         above = scores[arch].mean.rmse_free_run_rad - repeatability_rad
         text += (
-            f" The robot repeats itself to {1e3 * repeatability_rad:.1f} mrad; the model is "
-            f"{1e3 * above:.1f} mrad above that."
+            f" The robot's repeatability is {1e3 * repeatability_rad:.1f} mrad; the model is "
+            f"{1e3 * above:.1f} mrad above it."
         )
     return text

@@ -24,6 +24,9 @@ from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
 from pupper_sysid.sysid.servo_fit.data import ServoData, look_up
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen, chosen_rows
 
+LINEAR = "linear, fitted here"
+"""Name of the linear filter that stands beside compared models."""
+
 _BLOCK_S = 0.5
 _DRAWS = 1000
 

@@ -1,9 +1,9 @@
 """Train the networks of all joints, all held-out folds and all candidates in one computation.
 
 Every network corrects a linear filter (`sysid.servo_fit.linear`) fitted to the same readings, and
-is scored at the readings' own times in free run: it sees commands only, so its one-step and its
-free-run errors are the same thing and cannot come apart. Candidates differ in weight decay and in
-how long they were trained; which is kept is decided by groups that were held out.
+is scored at the readings' own times in free run. Its inputs are commands only, so its one-step and
+free-run errors are equal. Candidates differ in weight decay and in the length of training; the
+choice is made by held-out groups.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _ROWS_PER_STEP = 4096
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a kind of network is trained.
+    """Hyper-parameters of a kind of network.
 
     Attributes
     ----------
@@ -34,13 +34,13 @@ class Recipe:
     members : int
         Networks that are averaged.
     decays : tuple of float
-        Weight decays to choose from, against the sum of squared errors: as in a posterior, twice
-        the data need half the decay per reading, so a choice made on folds fits the whole.
+        Weight decays to choose from, relative to the sum of squared errors: as in a posterior,
+        twice the data need half the decay per reading, so a choice made on folds fits the whole.
     steps : int
         Optimiser steps, with a learning rate that falls to zero as a cosine.
     check_every, patience : int
-        Candidates are compared this often, and training stops when nothing improved for this
-        many comparisons.
+        Steps between comparisons of the candidates; training stops after `patience` comparisons
+        without improvement.
     """
 
     units: int
@@ -58,7 +58,7 @@ LSTM = Recipe(16, 2, (0.1, 1.0), 200, 5e-3, 50, 3)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """All networks at one moment of training.
+    """All networks at one step of training.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ def train(
     watch: Callable[[Checkpoint], bool],
     progress: Callable[[int], None] | None = None,
 ) -> bool:
-    """Train until `watch` says stop, the steps are used up, or the user presses Ctrl-C.
+    """Train until `watch` returns True, the steps are used up, or Ctrl-C.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def train(
             bend = _BEND * part["spread"][:, :, None, None, None, None]
             loss = bend**2 * (torch.sqrt(1 + (error_of(part) / bend) ** 2) - 1) * 2
             counted = part["learns"][:, :, None, None]
-            # the mean over the readings a set may see, then the sum over independent networks
+            # mean over the readings of a set, then sum over independent networks
             total = (loss * counted).sum((-1, -2)) / counted.sum((-1, -2)).clamp(min=1)
             size = sum((w**2).flatten(4).sum(-1) for k, w in weights.items() if "weight" in k)
             (total + decay * size).sum().backward()
@@ -232,7 +232,7 @@ def _mlp_forward(
     history = command[..., past - taps :].unfold(-1, taps, 1).flip(-1)  # newest first
     windows, outputs = history.shape[1:3]
     x = (history * fade).reshape(joints, windows * outputs, taps)
-    # all networks of a joint see the same commands: one wide product serves them all
+    # all networks of a joint have the same inputs: one wide product serves them all
     wide = w["weight_0"].permute(0, 4, 1, 2, 3, 5).reshape(joints, taps, -1)
     h = torch.relu(torch.baddbmm(w["bias_0"].reshape(joints, 1, -1), x, wide))
     h = h.reshape(joints, windows * outputs, -1, units)

@@ -1,8 +1,8 @@
 """Arrays for fitting: windows of commands and the readings in them, all joints side by side.
 
 A window covers `WINDOW` ticks and is preceded by as many commands as a model remembers (`past`), so
-windows can be shuffled and computed in parallel, and none reaches over a pause. Joints with fewer
-windows or readings than others are padded; `used` says what counts.
+windows can be shuffled and computed in parallel, and none extends over a pause. Joints with fewer
+windows or readings than others are padded; `used` marks what counts.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _STRETCHES = 3
 _MEMORY_S = 0.5
 
 Part = Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], NDArray[np.bool_]]
-"""What belongs to a part (training, test), by trial number, time in the trial [s] and group."""
+"""Mask of a part (training, test), from trial number, time in the trial [s] and group."""
 
 
 def everything(
     number: NDArray[np.int64], elapsed_s: NDArray[np.float64], group: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """The part that has all there is."""
+    """The part that is all data."""
     return np.ones(len(number), bool)
 
 
@@ -44,13 +44,13 @@ def without(group: int) -> Part:
 
 
 def chosen(run: Run, part: Part) -> NDArray[np.bool_]:
-    """Which counted readings of a run belong to a part, shape (fresh,)."""
+    """Mask of the counted readings of a run that belong to a part, shape (fresh,)."""
     row = run.readings.rows
     return part(run.number[row], run.reading_elapsed_s, run.group[row])
 
 
 def chosen_rows(run: Run, part: Part) -> NDArray[np.bool_]:
-    """Which rows of a run belong to a part, shape (rows,)."""
+    """Mask of the rows of a run that belong to a part, shape (rows,)."""
     return part(run.number, run.elapsed_s, run.group)
 
 
@@ -86,7 +86,7 @@ class Samples:
 
     @property
     def windows(self) -> int:
-        """How many there are, padding included."""
+        """Number of windows, padding included."""
         return self.command.shape[1]
 
     def at_readings(self, taps: int) -> NDArray[np.float64]:
@@ -111,8 +111,8 @@ class Samples:
 def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
     """Data whose part has groups to hold out, and a note if they had to be made.
 
-    Where the part has one group only, it is cut into stretches. The first rows after a boundary
-    belong to no stretch: a servo would remember the one before.
+    A part of one group is cut into stretches. The first rows after a boundary belong to no stretch,
+    because the servo's motion there depends on the stretch before.
     """
     present = {
         int(g)
@@ -136,7 +136,7 @@ def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
     group = data.groups[next(iter(present))] if present else "nothing"
     return replace(data, runs=runs, groups=names), (
         f"There is one group to learn from ({group}), so models are chosen by holding out "
-        "stretches of it. Record more loops or tones to know how they generalise."
+        "stretches of it. Record more loops or tones to test how they generalise."
     )
 
 
@@ -209,13 +209,12 @@ def _check(joint: str, command: NDArray, position: NDArray) -> None:
     if len(position) < _FEWEST:
         raise InputError(
             f"{joint}: only {len(position)} readings to learn from; even a linear model needs "
-            f"{_FEWEST}. "
-            "Record longer, or train on more of it."
+            f"{_FEWEST}. Record longer, or train on more of it."
         )
     if np.std(command) < 1e-3:
         raise InputError(
-            f"{joint}: its commands hardly change (by {1e3 * np.ptp(command):.1f} mrad), so they "
-            "say nothing about how it moves. Leave it out of `joints`, or record a sweep."
+            f"{joint}: its commands hardly change (by {1e3 * np.ptp(command):.1f} mrad), so no "
+            "model can be fitted. Leave it out of `joints`, or record a sweep."
         )
 
 
@@ -248,7 +247,7 @@ def _windows(run: Run, use: NDArray[np.bool_], past: int) -> tuple[NDArray, ...]
 
 
 def training_sets(groups: Sequence[int], nested: bool) -> list[frozenset[int]]:
-    """Which groups each fit leaves out: none, each, and, if nested, every pair."""
+    """Groups that each fit leaves out: none, each, and, if nested, every pair."""
     sets = [frozenset(), *(frozenset({g}) for g in groups)]
     if nested:
         sets += [frozenset({a, b}) for n, a in enumerate(groups) for b in groups[n + 1 :]]

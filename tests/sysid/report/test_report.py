@@ -212,24 +212,24 @@ def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
 
 def test_the_finding_says_what_the_naive_lag_is_made_of(page):
     assert (
-        "of the naive 81 ms, 28 ms is stale feedback, 10 ms command hold, 44 ms the servo: "
+        "of the naive 81 ms, 28 ms is feedback age, 10 ms command hold, 44 ms the servo: "
         "24 ms dead time + 20 ms dynamics." in page.text
     )
 
 
 def test_the_parts_of_the_lag_add_up_to_the_naive_lag():
     p = lag_parts(result_of())
-    total = p.command_hold_ms + p.dead_time_ms.value + p.dynamics_ms + p.feedback_age_ms
-    assert total == pytest.approx(p.naive_ms.value)
+    total = p.command_hold_s + p.dead_time_s.value + p.dynamics_s + p.feedback_age_s
+    assert total == pytest.approx(p.naive_lag_s.value)
 
 
 def test_lag_budget_csv_has_the_numbers_of_the_result(written):
     (row,) = rows_of(written, "lag_budget")
     assert row["joint"] == "LF_thigh"
-    assert float(row["naive_lag_ms"]) == pytest.approx(81.0)
-    assert float(row["feedback_age_ms"]) == pytest.approx(27.5)
-    assert float(row["dead_time_ms_low"]) == pytest.approx(20.5)
-    assert float(row["dynamics_ms"]) == pytest.approx(20.0)
+    assert float(row["naive_lag_s"]) == pytest.approx(0.081)
+    assert float(row["feedback_age_s"]) == pytest.approx(0.0275)
+    assert float(row["dead_time_s_low"]) == pytest.approx(0.0205)
+    assert float(row["dynamics_s"]) == pytest.approx(0.020)
     # 20.5 to 27.5 ms in steps of 2 ms, rounded outward
     assert (row["delay_steps_min"], row["delay_steps_max"]) == ("10", "14")
 
@@ -242,16 +242,16 @@ def test_frequency_csv_has_one_row_per_tone(written):
 
 def test_transfer_function_csv_has_every_fitted_number(written):
     rows = {r["parameter"]: r for r in rows_of(written, "transfer_functions")}
-    assert float(rows["dead_time_s"]["value_high"]) == pytest.approx(0.11)
+    assert float(rows["dead_time_s"]["high"]) == pytest.approx(0.11)
     assert float(rows["gain"]["chi2_per_dof"]) == 1.5
 
 
-def test_ladder_csv_scores_models_and_presets_and_marks_the_chosen_one(written):
-    rows = {r["model"]: r for r in rows_of(written, "ladder")}
+def test_model_csv_scores_candidates_and_presets_and_marks_the_chosen_one(written):
+    rows = {r["model"]: r for r in rows_of(written, "candidate_models")}
     assert list(rows) == [*(r.name for r in LADDER), "paper"]
     assert [m for m, r in rows.items() if r["is_chosen"] == "True"] == ["delayed_pd"]
-    assert float(rows["paper"]["rmse_fresh_mrad"]) == pytest.approx(150.0)
-    assert float(rows["delayed_pd"]["rmse_naive_mrad"]) == pytest.approx(120.0)
+    assert float(rows["paper"]["fresh"]) == pytest.approx(0.150)
+    assert float(rows["delayed_pd"]["naive"]) == pytest.approx(0.120)
 
 
 def test_the_page_says_whom_the_naive_score_would_have_chosen(page):
@@ -271,12 +271,12 @@ def test_parameter_csv_carries_intervals_and_identifiability(written):
 
 def test_nothing_is_overwritten_without_force(tmp_path):
     first = write(tmp_path)
-    victim = next(p for p in first.tables if p.stem == "ladder")
+    victim = next(p for p in first.tables if p.stem == "candidate_models")
     victim.write_text("mine")
     for path in (first.path, *first.figures, *first.drawings, *first.tables):
         if path != victim:
             path.unlink()
-    with pytest.raises(InputError, match=r"ladder\.csv exists already.*force=True"):
+    with pytest.raises(InputError, match=r"candidate_models\.csv exists already.*force=True"):
         write(tmp_path)
     assert victim.read_text() == "mine"
     assert not first.path.exists(), "a refused report leaves no half of one behind"
@@ -291,8 +291,8 @@ def test_advice_asks_for_steps_only_if_a_limit_was_not_reached():
     with_limit = advice(
         {"LF_thigh": result_of(rungs={**result_of().rungs, "delayed_pd": open_limit})}
     )
-    assert not any("--kind steps" in s for s in without)
-    assert any("limit of its speed" in s and "--kind steps" in s for s in with_limit)
+    assert not any("Record steps" in s for s in without)
+    assert any("limit of its speed" in s and "Record steps" in s for s in with_limit)
 
 
 def test_advice_names_joints_with_the_same_gap_in_one_sentence():
@@ -303,7 +303,7 @@ def test_advice_names_joints_with_the_same_gap_in_one_sentence():
 
 
 def test_advice_names_the_joints_that_nothing_is_known_of():
-    (missing,) = [s for s in advice({"LF_thigh": result_of()}) if "Nothing is known" in s]
+    (missing,) = [s for s in advice({"LF_thigh": result_of()}) if "Not recorded yet" in s]
     assert "LF_hip" in missing and "LF_thigh" not in missing
 
 
@@ -422,7 +422,7 @@ def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path)
     found = Findings(recordings=recordings, results=results, calibration=calibration)
     made = found.write(tmp_path)
     (row,) = rows_of(made, "lag_budget")
-    assert row["poll_period_ms"] == row["loss"] == ""
+    assert row["poll_period_s"] == row["loss"] == ""
     assert not re.search(r">\s*-?(nan|inf|None)\s*<", made.path.read_text(encoding="utf-8"))
 
 
