@@ -1,4 +1,4 @@
-"""What programs that run policies share: which policy is meant, with which servos, and where."""
+"""The policy, servos and task that the arguments of a program mean."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
 
 
 def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str | None, bool]:
-    """What the policy at `path` was trained with, and whether it is that to the last bit.
+    """The actuator of the policy's training, and whether its hash is the contract's.
 
-    A file is looked for from here, then from the policy's folder and those above it: a run keeps
-    the name that it was given where it began. Of several, the one with the contract's hash is
-    meant. None if there is none.
+    A file is searched from here, then from the policy's folder and those above it, since a run
+    keeps the name given at its beginning; of several, the one with the contract's hash is taken.
+    None if there is none.
     """
     name = run.actuator if run else policy.contract.actuator
     if name in (*PRESETS, IDEAL):
@@ -86,17 +86,17 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
     return (str((same or found)[0]) if found else None), bool(same)
 
 
-def chosen_actuator(path: Path, policy: Policy, run: Run | None, told: str | None) -> str:
-    """What to run the policy at `path` with: what --actuator says, else what it was trained with.
+def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | None) -> str:
+    """The actuator for the policy at `path`: the `given` one, else that of its training.
 
     Raises
     ------
     InputError
-        If there is no such thing.
+        If it is not here.
     """
-    if told is not None:
-        check_actuator(told)
-        return told
+    if given is not None:
+        check_actuator(given)
+        return given
     found, same = trained_actuator(path, policy, run)
     if found is None:
         file, name = (RUN_FILE, run.actuator) if run else (_CONTRACT, policy.contract.actuator)
@@ -108,14 +108,14 @@ def chosen_actuator(path: Path, policy: Policy, run: Run | None, told: str | Non
         warn(
             [
                 f"{found} is not the file with which {path} was trained: it was changed, or only "
-                "has the same name. Give the right one with --actuator, or this one, to mean it."
+                "has the same name. Give the right one, or this one, with --actuator."
             ]
         )
     return found
 
 
 def _near(name: str, path: Path) -> list[Path]:
-    """What has this name, seen from here, from `path` or from a folder above that."""
+    """Paths of this name from here, from `path` or from a folder above that."""
     folder = path.resolve()
     return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
 
@@ -123,7 +123,7 @@ def _near(name: str, path: Path) -> list[Path]:
 def simulator(
     path: Path, policy: Policy, run: Run | None, actuator: str | None, feedback: str | None
 ) -> tuple[Walking, ServoRanges]:
-    """Task and servos to run the policy at `path` in: its own, unless told otherwise."""
+    """Task and servos for the policy at `path`: those of its training, unless others are given."""
     from pupper_sysid.policies.network.policy_file import refuse_other_observation
 
     contract = policy.contract

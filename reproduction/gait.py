@@ -206,8 +206,8 @@ def ground(policies: Policies) -> Finding:
 
 
 @claim(
-    "C1", "It walks forward, backward, sideways and turns as told", "shown, not measured",
-    "Speed along the command over the speed asked for (0 of a robot that fell), six directions, "
+    "C1", "It walks forward, backward, sideways and turns as commanded", "shown, not measured",
+    "Speed along the command over the commanded speed (0 of a robot that fell), six directions, "
     "worst and mean.",
 )  # fmt: skip
 def directions(policies: Policies) -> Finding:
@@ -241,7 +241,7 @@ def arc(policies: Policies) -> Finding:
 @claim(
     "D1", "At 25 Hz the policy walks at half the gait frequency",
     "5.3 Hz trained, 2.8 Hz at 25 Hz",
-    "The policy of 50 Hz asked 25 times a second, closed loop.",
+    "The policy of 50 Hz at 25 Hz, closed loop.",
 )  # fmt: skip
 def half_rate(policies: Policies) -> Finding:
     """D1."""

@@ -33,9 +33,9 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
-The robot stands up, is measured at rest for a second, walks, and sits down. Ctrl-C ends it there,
-a fault leaves it limp. Every input and output is in walks/<name>/walk.csv, which --replay repeats
-bit for bit; walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
+The robot stands up, rests for a second, walks, and sits down; Ctrl-C ends the walk, a fault leaves
+it limp. walks/<name>/walk.csv holds every input and output, and --replay repeats it bit for bit;
+walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
 
 Example: pupper-deploy runs/<name> --command 0.15 0 0 --seconds 20
 """
@@ -45,7 +45,7 @@ PLAYBACK_LOOPS, PLAYBACK_HZ = 3, 50.0
 
 @dataclass(frozen=True)
 class Deploy:
-    """What to run, and on what."""
+    """A policy, a robot, and the settings between them."""
 
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """A run (`runs/<name>`) or a policy folder."""
@@ -56,13 +56,13 @@ class Deploy:
     joint_map: str | None = None
     """Joint map of the bus: a file of `calibrate-joints` or a preset."""
     stack: Literal["auto", "closed-loop", "lstm-servo", "mlp-observer"] = "auto"
-    """`closed-loop`: the policy sees the servos' readings; `lstm-servo`: a servo model's
-    prediction; `mlp-observer`: that of a simulated PD; `auto`: what it was trained with."""
+    """Joint observation. `closed-loop`: the servos' readings; `lstm-servo`: a servo model's
+    prediction; `mlp-observer`: that of a simulated PD; `auto`: as in the training."""
     servo: Path | None = None
     """Servo model's folder, for `lstm-servo`."""
     actuator: str | None = None
-    """Calibration of this robot, for `mlp-observer`, and to be compared with the one the policy was
-    trained with before the start; by default that one."""
+    """Calibration of this robot, for `mlp-observer` and for a comparison with the policy's training
+    before the start; by default that of the training."""
     observer: ObserverKind | None = None
     """Instead of the stack's."""
     lowpass_hz: float | None = None
@@ -81,7 +81,7 @@ class Deploy:
     keyboard: bool = False
     """Drive: w/s forward, a/d sideways, q/e turn, space stands, x ends."""
     seconds: float = 20.0
-    """How long to walk."""
+    """Duration of the walk."""
     playback: Path | None = None
     """Instead of a policy: play the commands of this CSV three times and record the servos, for
     `pupper-sysid fit-servo`."""
@@ -135,18 +135,18 @@ def _run(options: Deploy) -> None:
         )
         if stack.observer == "readings" and options.actuator is None:
             err.print(
-                "The policy is shown the servos' own readings. Whether they move as in its "
-                "training can be told with a calibration of this robot: --actuator."
+                "The policy observes the servos' own readings. Give a calibration of this robot "
+                "with --actuator to compare its servos with those of the training."
             )
         elif not known:
             warn(
                 [
-                    "the actuator with which the policy was trained is not here, so whether the "
-                    "observer moves like it was not checked."
+                    "the actuator with which the policy was trained is not here, so the observer "
+                    "was not compared with it."
                 ]
             )
         else:
-            _say_match(parts.match)
+            _show_match(parts.match)
         header = parts.header | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
             "bus": {"name": bus.name} | bus.metadata,
@@ -155,7 +155,7 @@ def _run(options: Deploy) -> None:
 
 
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
-    """The stack, with what the user changed of it."""
+    """The stack, with the user's changes."""
     name = suited(contract) if options.stack == "auto" else options.stack
     stack = STACKS[name]
     if options.observer:
@@ -169,8 +169,8 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
         warn(
             [
-                f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its time "
-                f"runs {stack.rate_hz / own:.2f} times as fast, its gait too."
+                f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its gait "
+                f"is {stack.rate_hz / own:.2f} times as fast."
             ]
         )
     return name, stack
@@ -210,13 +210,13 @@ def _replay(path: Path, policy: Any) -> None:
     ended = walk.ended or "it was cut short"
     if differs is not None:
         raise InputError(
-            f"{path}: tick {differs} of {len(walk.senses)} gives another action than it gave then. "
+            f"{path}: tick {differs} of {len(walk.senses)} gives another action than in the log. "
             "The policy and all settings are the same; the libraries or the processor are not."
         )
     out.print(f"{len(walk.senses)} ticks repeated, every action equal bit for bit ({ended}).")
 
 
-def _say_match(match: Any) -> None:
+def _show_match(match: Any) -> None:
     if match.fits:
         err.print(match.sentence())
         return
@@ -233,14 +233,14 @@ def _walk(
     options: Deploy, bus: GuardedBus, imu: Imu, controller: Any, header: dict[str, Any],
     folder: Path, truth: Any,
 ) -> None:  # fmt: skip
-    """Walk, log, and say how it went."""
+    """Walk, log, and show the result."""
     from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.commands import constant, script
     from pupper_sysid.policies.deploy.deployment import deploy
     from pupper_sysid.policies.deploy.emulated_walk import ERRORS, WalkScore
     from pupper_sysid.sysid.recordings.files import RecordingWriter
 
-    told = script(options.script) if options.script else constant(options.command)
+    commands = script(options.script) if options.script else constant(options.command)
     score = WalkScore(bus, truth) if truth else None
     log, table = folder / "walk.csv", folder / "recording.csv"
     about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
@@ -251,14 +251,23 @@ def _walk(
         watchers: list[Any] = [score] if score else []
         if options.keyboard:
             driver = open_things.enter_context(Driver().driving())
-            told, watchers = driver, [*watchers, driver.watch]
+            commands, watchers = driver, [*watchers, driver.watch]
         rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
-            bus, imu, controller, told, options.seconds, log, header, rows, watchers, options.force
+            bus,
+            imu,
+            controller,
+            commands,
+            options.seconds,
+            log,
+            header,
+            rows,
+            watchers,
+            options.force,
         )
         rows.close({"stop_reason": outcome.stop_reason})
     steps = outcome.steps
-    # only an emulated robot says where it really went
+    # only the true motion of an emulated robot is known
     motion: dict[str, Any] = score.summary() if score else dict.fromkeys(ERRORS)
     found = {
         "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),

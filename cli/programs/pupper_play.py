@@ -34,14 +34,14 @@ _SIZE = (480, 640)
 
 @dataclass(frozen=True)
 class Play:
-    """What to watch, and how."""
+    """A walk, as video or in a window."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """A run (`runs/<name>`) or a policy folder."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
     """Forward and sideways speed [m/s], turn rate [rad/s]."""
     seconds: float = 10.0
-    """How long."""
+    """Duration."""
     video: Path | None = None
     """Write an .mp4 file."""
     viewer: bool = False
@@ -105,7 +105,7 @@ def _run(options: Play) -> None:
     if ended:
         out.print(ended)
     out.print(
-        "asked {:.2f} m/s forward, {:.2f} m/s left, {:.2f} rad/s; mean ".format(*options.command)
+        "command {:.2f} m/s forward, {:.2f} m/s left, {:.2f} rad/s; mean ".format(*options.command)
         + "{:.2f}, {:.2f}, {:.2f}".format(*moved)
         + f"; {np.linalg.norm(away):.2f} m from the start"
     )
@@ -152,7 +152,7 @@ class _Screen:
         try:
             imageio: Any = importlib.import_module("imageio.v2")
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            # a picture per action: at the policy's own rate the video runs as fast as the robot
+            # a picture per action: the video runs as fast as the robot
             self._writer = imageio.get_writer(
                 self._path, fps=1 / self._env.config.control_step_s, codec="libx264",
                 macro_block_size=None,
@@ -163,7 +163,7 @@ class _Screen:
             ) from error
 
     def show(self, span_s: float) -> bool:
-        """One more picture; False when the window was closed."""
+        """Show one more picture; False when the window was closed."""
         if self._viewer is None and self._writer is None:
             return True
         self._data = self._env.robots.batch.get_data(0, self._data)

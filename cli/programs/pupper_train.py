@@ -39,7 +39,7 @@ Preset = Literal["fast", "paper", "release"]
 
 @dataclass(frozen=True)
 class Options:
-    """What to train, and where to put it."""
+    """Settings of a training, and its folder."""
 
     run: Annotated[Run, tyro.conf.arg(name="")] = field(default_factory=Run)
     policy: Kind = "mlp"
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _parse(given: list[str]) -> Options:
-    """Options; --preset and --policy decide what the other flags start from."""
+    """Options; --preset and --policy set the defaults of the others."""
     start = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind))
     return parse(
         Options, given, "pupper-train", DESCRIPTION,
@@ -75,7 +75,7 @@ def _parse(given: list[str]) -> Options:
 
 
 def _choice(given: list[str], flag: str, kind: Any) -> Any:
-    """Value of a flag, or its default: what is wrong with it, tyro will say."""
+    """Value of a flag, or its default if it is wrong, which tyro reports."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument(flag, nargs="?")
     value = vars(parser.parse_known_args(given)[0]).popitem()[1]
@@ -89,7 +89,7 @@ def _run(options: Options, given: list[str]) -> None:
         return
     if options.resume is None:
         check_actuator(run.actuator)
-    # torch and rsl_rl take seconds to import: not before the settings are known to be good
+    # torch and rsl_rl take seconds to import: only after the settings were checked
     warnings.filterwarnings("ignore", category=UserWarning, module="torch")
     from pupper_sysid.policies.train.learner import Ranks
     from pupper_sysid.policies.train.training import train
@@ -128,7 +128,7 @@ def _run(options: Options, given: list[str]) -> None:
 
 
 def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:
-    """New --iterations and --minutes of a run that goes on; anything else would be ignored."""
+    """New --iterations and --minutes of a resumed run; anything else would have no effect."""
     flags = {a.split("=")[0] for a in given if a.startswith("--")}
     other = flags - {"--resume", "--iterations", "--minutes"}
     if other:
@@ -148,7 +148,7 @@ def _name(options: Options) -> str:
 
 @contextlib.contextmanager
 def _bar() -> Iterator:
-    """Progress with what matters and when it ends; one line per ten updates where no terminal."""
+    """Progress bar with the time left; without a terminal one line per ten updates."""
     terminal = err.is_terminal
     with Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"),

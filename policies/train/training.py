@@ -112,9 +112,9 @@ def train(
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run
     session = _Session(folder, settings, resumed, watch)
-    with _interruptible() as asked:
-        session.learn_first_gait(asked)
-        session.improve(asked)
+    with _interruptible() as stop_requested:
+        session.learn_first_gait(stop_requested)
+        session.improve(stop_requested)
         session.save(LAST)
     session.finish()
     return session.learner
@@ -158,11 +158,11 @@ class _Session:
         if self.ranks.rank == 0:
             save_run(self.folder, self.run)
 
-    def learn_first_gait(self, asked: Callable[[], bool]) -> None:
+    def learn_first_gait(self, stop_requested: Callable[[], bool]) -> None:
         """The remaining rounds of imitation."""
         learner, rounds = self.learner, self.run.imitation.iterations
         self.phase_began = time.monotonic()
-        while self.counters["imitated"] < rounds and not self.ranks.any(asked()):
+        while self.counters["imitated"] < rounds and not self.ranks.any(stop_requested()):
             before = learner.networks()
             error = imitate(learner, self.run.imitation, self.counters["imitated"])
             self.refuse_nan(before, [error])
@@ -173,14 +173,14 @@ class _Session:
             if self.counters["imitated"] % _SAVE_EVERY == 0:
                 self.save(LAST)
 
-    def improve(self, asked: Callable[[], bool]) -> None:
+    def improve(self, stop_requested: Callable[[], bool]) -> None:
         """Updates of PPO, until they are done, time is up or a stop is requested."""
         if self.counters["imitated"] < self.run.imitation.iterations:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
         self.phase_began = time.monotonic()
         while learner.iteration < self.run.iterations and not self.ranks.any(
-            asked() or time.monotonic() - self.started >= 60 * self.run.minutes
+            stop_requested() or time.monotonic() - self.started >= 60 * self.run.minutes
         ):
             begun = time.perf_counter()
             learner.rollout(episodes)
@@ -298,18 +298,18 @@ def _fresh_optimiser(learner: Learner) -> None:
 @contextmanager
 def _interruptible() -> Iterator[Callable[[], bool]]:
     """Ctrl-C and termination as a flag that is checked between updates."""
-    asked = False
+    stop_requested = False
 
     def note(number, frame) -> None:
-        nonlocal asked
-        asked = True
+        nonlocal stop_requested
+        stop_requested = True
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
     before = {n: signal.signal(n, note) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield lambda: stop_requested
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -120,7 +120,7 @@ def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys,
         "--name", "swapped",
     )  # fmt: skip
     assert code == 0 and "calibrated.yaml is not the file with which alone was trained" in err
-    assert "was not checked" in err and "moves like the trained" not in err
+    assert "was not compared with it" in err and "moves like the trained" not in err
 
 
 def test_the_shipped_policies_are_tried_from_any_folder(capsys, here):

@@ -278,7 +278,7 @@ def test_a_walk_is_told_in_numbers(capsys, trained):
     arguments = ("--seconds", "0.2", "--command", "0.1", "0", "0.3")
     code, out, _ = run(capsys, pupper_play, trained, *arguments)
     assert code == 0
-    assert "asked 0.10 m/s forward, 0.00 m/s left, 0.30 rad/s" in " ".join(out.split())
+    assert "command 0.10 m/s forward, 0.00 m/s left, 0.30 rad/s" in " ".join(out.split())
 
 
 def test_a_fall_is_told_with_its_time(capsys, trained, monkeypatch):
@@ -305,7 +305,7 @@ def test_where_nothing_can_be_drawn_the_walk_goes_on_without_a_video(
     monkeypatch.setattr(mujoco, "Renderer", no_gl)
     arguments = ("--seconds", "0.2", "--video", here / "walk.mp4")
     code, out, err = run(capsys, pupper_play, trained, *arguments)
-    assert code == 0 and "asked 0.15 m/s" in out
+    assert code == 0 and "command 0.15 m/s" in out
     assert "No frames can be drawn here (RuntimeError: no EGL display)" in err
     assert not (here / "walk.mp4").exists()
 

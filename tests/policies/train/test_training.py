@@ -264,7 +264,7 @@ def test_when_numbers_stop_being_numbers_the_networks_before_are_saved_and_go_on
     tmp_path, monkeypatch, when, where
 ):
     began = spoil(monkeypatch, when, where)
-    with pytest.raises(PupperError, match=f"stopped being numbers after update {when}") as said:
+    with pytest.raises(PupperError, match=f"are not finite after update {when}") as said:
         train(tmp_path, tiny_run())
     assert f"`resume={tmp_path}`" in str(said.value) and "\n" not in str(said.value)
     found = read_checkpoint(tmp_path / LAST)
@@ -278,7 +278,7 @@ def test_when_numbers_stop_being_numbers_the_networks_before_are_saved_and_go_on
 
 def test_imitation_is_guarded_as_well(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "imitate", lambda *_: math.nan)
-    with pytest.raises(PupperError, match="stopped being numbers"):
+    with pytest.raises(PupperError, match="are not finite"):
         train(tmp_path, tiny_run())
     assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 0
 
