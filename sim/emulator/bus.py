@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +126,7 @@ class EmulatedBus:
         """
         self._refuse_closed()
         asked = finite_angles(position_rad, len(self.joint_names), self.name)
-        sent, goal = self._clock.now(), self._truncated(asked)
+        sent, (goal, _) = self._clock.now(), self._quantised(asked, whole=np.trunc)
         for i in np.flatnonzero(goal != self._goal).tolist():
             self._plant.command(i, sent, goal[i])
             if self._keep_log:
@@ -151,7 +151,8 @@ class EmulatedBus:
         fresh = np.flatnonzero(measured > self._measured_s)
         noise = self.robot.spec.reading_noise_rad * self._noise.standard_normal(len(fresh))
         position = np.array([self._plant.angle(i, measured[i]) for i in fresh.tolist()])
-        self._reading[fresh], self._count[fresh] = self._quantised(position + noise, fresh)
+        reported = position + noise + self._offset[fresh]
+        self._reading[fresh], self._count[fresh] = self._quantised(reported, fresh)
         self._measured_s = measured
         if self._keep_log:
             true = np.array([self._plant.angle(i, time_s) for i in range(len(self.joint_names))])
@@ -216,23 +217,17 @@ class EmulatedBus:
         succeeded = self._polls.random(len(self.joint_names)) >= self.robot.spec.loss
         return np.where(succeeded, time_s, self._measured_s)
 
-    def _truncated(self, goal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The command after `int()` of its count, within the servo's travel."""
-        if self._quantum == 0:
-            return goal
-        count = np.trunc(self._centre + self._sign * (goal - self._zero) / self._quantum)
-        count = np.clip(count, 0, 2 * self._centre - 1)
-        return self._zero + self._sign * (count - self._centre) * self._quantum
-
     def _quantised(
-        self, position: NDArray[np.float64], joints: NDArray[np.intp]
+        self,
+        position: NDArray[np.float64],
+        joints: NDArray[np.intp] | slice = slice(None),
+        whole: Callable = np.round,
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Reported angle and count of `position` of `joints`."""
-        sign, zero = self._sign[joints], self._zero[joints]
-        reported = position + self._offset[joints]
+        """Angles of whole counts within the servos' travel, and the counts; -1 without a step."""
         if self._quantum == 0:
-            return reported, np.full(len(joints), -1)
-        count = np.round(self._centre + sign * (reported - zero) / self._quantum)
+            return position, np.full(len(position), -1)
+        sign, zero = self._sign[joints], self._zero[joints]
+        count = whole(self._centre + sign * (position - zero) / self._quantum)
         count = np.clip(count, 0, 2 * self._centre - 1)
         return zero + sign * (count - self._centre) * self._quantum, count.astype(int)
 

@@ -11,6 +11,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import actuator_attributes, free_air_xml, rest_at
+from support.servo_parameters import MEASURED
 
 H = 0.002
 PAPER = DelayedPDParameters(
@@ -21,15 +22,6 @@ PAPER = DelayedPDParameters(
     effort_limit=5.0,
     velocity_limit=10.5,
     dead_time_s=0.076,
-)
-MEASURED = DelayedPDParameters(
-    stiffness=10.3,
-    damping=0.083,
-    friction_loss=0.167,
-    armature=8.08e-4,
-    effort_limit=0.35,
-    velocity_limit=7.6,
-    dead_time_s=0.025,
 )
 TIME = np.arange(1000) * H
 SINE = 0.3 * np.sin(2 * np.pi * 3 * TIME)

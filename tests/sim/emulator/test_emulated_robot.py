@@ -12,11 +12,12 @@ import yaml
 
 from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.sim.emulator.bus import TRUTH_COLUMNS, EmulatedBus
 from pupper_sysid.sim.emulator.free_air_servo import FreeAirServo
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot, random_spec
+from support.servo_parameters import MEASURED
 
 POSE = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
 PERFECT = RobotSpec(
@@ -26,15 +27,6 @@ PERFECT = RobotSpec(
     reading_noise_rad=0.0,
     offset_sd_rad=0.0,
     sleep_overshoot_s=0.0,
-)
-SERVO = DelayedPDParameters(
-    stiffness=10.3,
-    damping=0.083,
-    friction_loss=0.167,
-    armature=8.08e-4,
-    effort_limit=0.35,
-    velocity_limit=7.6,
-    dead_time_s=0.025,
 )
 
 
@@ -62,10 +54,10 @@ def test_servo_moves_as_delayed_pd_when_commands_come_on_physics_steps():
     steps = np.arange(1500)
     commands = 0.785 + np.where(steps % 19 == 0, 0.3 * np.sin(2 * np.pi * 3 * steps * step), np.nan)
     commands = pd.Series(commands).ffill().to_numpy()
-    model = DelayedPD(SERVO, step)
+    model = DelayedPD(MEASURED, step)
     model.reset(np.array(0.785))
     expected = model.rollout(commands)
-    servo = FreeAirServo(SERVO, 0.785, step)
+    servo = FreeAirServo(MEASURED, 0.785, step)
     got = []
     for k in steps:
         servo.command(k * step, commands[k])
@@ -74,9 +66,9 @@ def test_servo_moves_as_delayed_pd_when_commands_come_on_physics_steps():
 
 
 def test_a_command_between_physics_steps_keeps_its_timing():
-    servo = FreeAirServo(SERVO, 0.0, 0.001)
+    servo = FreeAirServo(MEASURED, 0.0, 0.001)
     servo.command(0.0104, 0.3)
-    later = DelayedPD(replace(SERVO, dead_time_s=0.0254), 0.001)
+    later = DelayedPD(replace(MEASURED, dead_time_s=0.0254), 0.001)
     later.reset(np.array(0.0))
     expected = later.rollout(np.where(np.arange(300) >= 10, 0.3, 0.0))
     got = [servo.position_at((k + 1) * 0.001) for k in range(300)]
@@ -86,7 +78,7 @@ def test_a_command_between_physics_steps_keeps_its_timing():
 
 
 def test_position_inside_a_physics_step_lies_on_the_line_between_its_ends():
-    servo = FreeAirServo(SERVO, 0.0, 0.001)
+    servo = FreeAirServo(MEASURED, 0.0, 0.001)
     servo.command(0.0, 0.3)
     left, inside, right = (servo.position_at(t) for t in (0.05, 0.05025, 0.051))
     assert left < right
@@ -94,7 +86,7 @@ def test_position_inside_a_physics_step_lies_on_the_line_between_its_ends():
 
 
 def test_a_servo_that_was_left_alone_for_long_still_answers_on_time():
-    rested, fresh = FreeAirServo(SERVO, 0.1), FreeAirServo(SERVO, 0.1)
+    rested, fresh = FreeAirServo(MEASURED, 0.1), FreeAirServo(MEASURED, 0.1)
     for k in range(40):
         rested.position_at(k * 1.0)
     rested.command(40.0, 0.4)
@@ -109,7 +101,7 @@ def test_a_servo_that_was_left_alone_for_long_still_answers_on_time():
 
 def test_a_delay_too_short_for_the_emulator_is_refused():
     with pytest.raises(InputError, match="dead_time_s"):
-        FreeAirServo(replace(SERVO, dead_time_s=0.0015), 0.0)
+        FreeAirServo(replace(MEASURED, dead_time_s=0.0015), 0.0)
 
 
 def test_readings_are_the_position_at_the_poll_rounded_to_counts_with_the_offset():
