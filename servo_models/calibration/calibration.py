@@ -41,7 +41,13 @@ SCHEMA = "pupper-calibration"
 SCHEMA_VERSION = 2
 PRESETS = ("paper", "release")
 
-_RENAMED = {"delay_s": "dead_time_s", "ladder": "candidate_models"}
+_RENAMED = {
+    "delay_s": "dead_time_s",
+    "ladder": "candidate_models",
+    "naive_lag_s": "raw_lag_s",
+    "rmse_free_run_naive_rad": "rmse_free_run_raw_rad",
+    "rmse_naive_rad": "rmse_raw_rad",
+}
 """Names of version 1 files, and what replaced them."""
 
 UNITS = (

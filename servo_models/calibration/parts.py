@@ -253,7 +253,7 @@ class Lag(Part):
 
     lag_s: Annotated[Quantity | None, _LAG] = None
     """From a command's edge to the motion [s]: the servo's own lag."""
-    naive_lag_s: Annotated[Quantity | None, _LAG] = None
+    raw_lag_s: Annotated[Quantity | None, _LAG] = None
     """Cross-correlation of all rows [s]: lag, feedback age and zero-order hold."""
     fresh_lag_s: Annotated[Quantity | None, _LAG] = None
     """The same on fresh rows only [s]: lag and zero-order hold."""
@@ -264,7 +264,7 @@ class Scores(Part):
 
     rmse_one_step_rad: NotNegative | None = None
     """Root mean square error one loop period ahead [rad]."""
-    rmse_free_run_naive_rad: NotNegative | None = None
+    rmse_free_run_raw_rad: NotNegative | None = None
     """Free-run error on all rows as logged (raw) [rad]."""
     rmse_free_run_fresh_rad: NotNegative | None = None
     """Free-run error on fresh rows [rad]."""
@@ -287,7 +287,7 @@ class CandidateModel(Part):
     """Free-run error on fresh rows [rad]."""
     rmse_held_rad: NotNegative | None = None
     """Free-run error on all rows, the model sampled at the poll instants (held) [rad]."""
-    rmse_naive_rad: NotNegative | None = None
+    rmse_raw_rad: NotNegative | None = None
     """Free-run error on all rows as logged (raw) [rad]."""
     rmse_leave_one_frequency_out_rad: NotNegative | None = None
     """Free-run error on frequencies that were left out of the fit [rad]."""

@@ -118,7 +118,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         feedback=_feedback(budget.lattice, result),
         lag=Lag(
             lag_s=_quantity(budget.lag),
-            naive_lag_s=_quantity(budget.naive),
+            raw_lag_s=_quantity(budget.naive),
             fresh_lag_s=_quantity(budget.fresh),
         ),
         selection=Selection(
@@ -126,7 +126,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         ),
         scores=Scores(
             rmse_one_step_rad=_finite(s.one_step),
-            rmse_free_run_naive_rad=_finite(s.naive),
+            rmse_free_run_raw_rad=_finite(s.naive),
             rmse_free_run_fresh_rad=_finite(s.fresh),
             rmse_free_run_held_rad=_finite(s.held),
             rmse_leave_one_frequency_out_rad=_finite(s.leave_one_out),
@@ -143,7 +143,7 @@ def _candidate(rung: RungResult) -> CandidateModel:
         parameter_count=len(rung.values),
         rmse_fresh_rad=_finite(s.fresh),
         rmse_held_rad=_finite(s.held),
-        rmse_naive_rad=_finite(s.naive),
+        rmse_raw_rad=_finite(s.naive),
         rmse_leave_one_frequency_out_rad=_finite(s.leave_one_out),
         fit_percent=_finite(s.fit_percent),
         parameters=rung.values,

@@ -153,7 +153,11 @@ def test_every_quantity_of_a_calibration_has_a_unit_and_a_description():
 def version_1(path: Path) -> Path:
     """The file at `path` with the keys that it had in version 1."""
     text = path.read_text().replace("schema_version: 2", "schema_version: 1")
-    text = text.replace("dead_time_s:", "delay_s:").replace("candidate_models:", "ladder:")
+    for new, old in (
+        ("dead_time_s:", "delay_s:"), ("candidate_models:", "ladder:"), ("raw_lag_s", "naive_lag_s"),
+        ("free_run_raw_rad", "free_run_naive_rad"), ("rmse_raw_rad", "rmse_naive_rad"),
+    ):  # fmt: skip
+        text = text.replace(new, old)
     path.write_text(text)
     return path
 

@@ -58,7 +58,7 @@ def joint_calibration(stiffness: float = 11.0) -> JointCalibration:
             offset_rad=Quantity(value=-0.1, low=-0.2, high=0.3, identified="yes"),
             mean_age_s=measured(0.0329),
         ),
-        lag=Lag(lag_s=measured(0.041), naive_lag_s=measured(0.081)),
+        lag=Lag(lag_s=measured(0.041), raw_lag_s=measured(0.081)),
         selection=Selection(
             model="delayed_pd",
             candidate_models=(
