@@ -154,8 +154,9 @@ def version_1(path: Path) -> Path:
     """The file at `path` with the keys that it had in version 1."""
     text = path.read_text().replace("schema_version: 2", "schema_version: 1")
     for new, old in (
-        ("dead_time_s:", "delay_s:"), ("candidate_models:", "ladder:"), ("raw_lag_s", "naive_lag_s"),
-        ("free_run_raw_rad", "free_run_naive_rad"), ("rmse_raw_rad", "rmse_naive_rad"),
+        ("dead_time_s:", "delay_s:"), ("candidate_models:", "ladder:"),
+        ("raw_lag_s", "naive_lag_s"), ("rmse_raw_rad", "rmse_naive_rad"),
+        ("rmse_free_run_raw_rad", "rmse_free_run_naive_rad"),
     ):  # fmt: skip
         text = text.replace(new, old)
     path.write_text(text)
