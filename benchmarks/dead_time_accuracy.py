@@ -41,7 +41,7 @@ def measure(seed: int, tones: str) -> Result:
     rng = np.random.default_rng([20261123, seed])
     loss, noise = float(rng.uniform(0.0, 0.5)), float(rng.uniform(0.002, 0.012))
     robot = sweep_random_robot(rng, loss, noise, tones)
-    dead = calibrate([robot.recording], [robot.joint], workers=1)[robot.joint].dead_time
+    dead = calibrate([robot.recording], [robot.joint], workers=1)[robot.joint].dead_time_s
     return Result(loss, robot.dead_time_s(TIME_STEP_S), dead.value, dead.low, dead.high)
 
 

@@ -125,7 +125,7 @@ def main() -> None:
 
 def dead_time_s(recording: Recording) -> float:
     """Dead time of the calibrated model [s]."""
-    return calibrate([recording], seed=0)[JOINT].dead_time.value
+    return calibrate([recording], seed=0)[JOINT].dead_time_s.value
 
 
 if __name__ == "__main__":

@@ -79,15 +79,15 @@ def measure(seed: int) -> Result | None:
     used = tone_weights(tones) > 0
     information = float(np.sum((fresh * speed**2 / (2 * scatter**2))[used]))
     truth = float(np.average(lags, weights=tone_weights(tones)))
-    estimates = {k: v for k, v in budget.estimators.items() if "hold-aware" not in k}
+    estimates = {k: v for k, v in budget.estimators_s.items() if "hold-aware" not in k}
     for name in estimates:  # the others measure from rows: give them the command hold
         estimates[name] -= budget.command_hold_s
     return Result(
         robot.spec.loss, truth, information**-0.5,
         sum(1 / t.lag_variance_s2 for t in np.array(tones)[used]) ** -0.5,
-        budget.lag.low, budget.lag.high,
-        estimates | {"hold-aware (default)": budget.lag.value},
-        abs(lattice.period_s - robot.spec.poll_period_s), lattice.kind,
+        budget.lag_s.low, budget.lag_s.high,
+        estimates | {"hold-aware (default)": budget.lag_s.value},
+        abs(lattice.poll_period_s - robot.spec.poll_period_s), lattice.kind,
     )  # fmt: skip
 
 

@@ -123,7 +123,7 @@ def main() -> None:
         errors, off, apart, inside, held = [], [], [], 0, 0
         for joint in joints:
             result, other = found[joint], without[joint]
-            lag, delay = result.budget.lag, result.dead_time
+            lag, delay = result.lag.lag_s, result.dead_time_s
             truth = true_lag(recording, server, joint, shift)
             servo = server.emulator.bench.robot.servos[JOINT_NAMES.index(joint)].actuator
             own = float(delay_at_step(servo, TIME_STEP_S, PHYSICS_STEP_S)[0])
@@ -132,14 +132,14 @@ def main() -> None:
             inside += lag.low <= truth <= lag.high
             held += delay.low <= own <= delay.high
             off.append(delay.value - own)
-            apart.append(delay.value - other.dead_time.value)
+            apart.append(delay.value - other.dead_time_s.value)
             print(
                 f"| {kind} | {joint} | {1e3 * lag.value:.1f} "
                 f"| {1e3 * lag.low:.1f} … {1e3 * lag.high:.1f} | {1e3 * truth:.1f} "
-                f"| {1e3 * other.budget.lag.value:.1f} | {1e3 * delay.value:.1f} "
-                f"| {1e3 * other.dead_time.value:.1f} | {1e3 * own:.1f} "
-                f"| {1e3 * result.rungs['delayed_pd'].scores.held:.1f} "
-                f"| {1e3 * other.rungs['delayed_pd'].scores.held:.1f} "
+                f"| {1e3 * other.lag.lag_s.value:.1f} | {1e3 * delay.value:.1f} "
+                f"| {1e3 * other.dead_time_s.value:.1f} | {1e3 * own:.1f} "
+                f"| {1e3 * result.candidate_models['delayed_pd'].scores.rmse_held_rad:.1f} "
+                f"| {1e3 * other.candidate_models['delayed_pd'].scores.rmse_held_rad:.1f} "
                 f"| {100 * missing[joint]:.1f} |",
                 flush=True,
             )

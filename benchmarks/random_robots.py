@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,46 @@ from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S, FreeAirServo
-from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot, random_spec
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servo_plant import FreeAirServos
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
 from pupper_sysid.sysid.sweep.recorder import record
+
+
+def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
+    """Draw a spec, for benchmarks over many robots.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    **chosen : float
+        Fields of `RobotSpec` to fix instead of drawing (`loss=0.3`).
+    """
+    base = RobotSpec()
+
+    def around(value: float, spread: float) -> float:
+        return float(value * np.exp(rng.uniform(-spread, spread)))
+
+    drawn = {
+        "dead_time_s": float(rng.uniform(0.010, 0.040)),
+        "stiffness_per_inertia": around(base.stiffness_per_inertia, 0.4),
+        "damping_per_inertia": around(base.damping_per_inertia, 0.3),
+        "friction_per_inertia": around(base.friction_per_inertia, 0.5),
+        "effort_per_inertia": around(base.effort_per_inertia, 0.2),
+        "velocity_limit_rad_s": around(base.velocity_limit_rad_s, 0.15),
+        "poll_period_s": float(rng.uniform(0.020, 0.034)),
+        "loss": float(rng.uniform(0.0, 0.6)),
+        "poll_jitter_s": float(rng.uniform(0.0, 0.0012)),
+        "poll_drift": float(rng.uniform(0.0, 0.003)),
+        # Mini Pupper counts, 300° over 10 bits, 360° over 12 bits
+        "quantum_rad": float(rng.choice([np.pi / 550, np.radians(300) / 1024, 2 * np.pi / 4096])),
+        "reading_noise_rad": float(rng.uniform(0.001, 0.006)),
+        "sleep_overshoot_s": float(rng.uniform(0.0, 0.0005)),
+    }
+    return replace(base, **(drawn | chosen))
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from emulators import in_process
 from pupper_sysid.common.figure_style import save
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.servo_file import physical_model
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report.data_curve import FILE, data_curve_figure, measured
@@ -33,7 +34,7 @@ from pupper_sysid.sysid.report.data_curve import MODELS as CURVES
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.physics import delayed_pd_fits, delayed_pd_model
+from pupper_sysid.sysid.servo_fit.physics import delayed_pd_fits
 from pupper_sysid.sysid.servo_fit.published import fit_published
 from pupper_sysid.sysid.servo_fit.windows import Part, grouped, merged_groups, samples
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S
@@ -83,7 +84,7 @@ def fitted(arch: str, preset: str, data: ServoData, part: Part, seed: int) -> Se
     if preset == "paper":
         return fit_published(arch, data, part, seed)
     if arch == "delayed-pd":
-        return delayed_pd_model(delayed_pd_fits(data, [part], seed)[0], data.period_s)
+        return physical_model("delayed-pd", delayed_pd_fits(data, [part], seed)[0], data.period_s)
     ready = samples(data, part, past_ticks(data.period_s))
     return fit_network(arch, data.joints, data.period_s, ready, seed).model
 

@@ -17,6 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import get_args
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -24,7 +25,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 
-from pupper_sysid.policies.network.hyperparameters import KINDS
+from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.transformer import CONTEXT, CausalAttention
 from pupper_sysid.policies.train.run_file import preset
 from pupper_sysid.policies.train.speed import environment_rates, measure
@@ -94,7 +95,7 @@ def end_to_end(threads: int) -> None:
     )
     print("|---|---|---|---|---|---|---|")
     for sizes in ("fast", "paper"):
-        for kind in KINDS if sizes == "fast" else PAPER:
+        for kind in get_args(Kind) if sizes == "fast" else PAPER:
             run = preset(sizes, kind)
             run = replace(
                 run, actuator=ACTUATOR, threads=threads, environments=512,

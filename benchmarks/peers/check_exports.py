@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.export.mjlab import MJLAB_PD
@@ -32,7 +33,6 @@ from pupper_sysid.sim.export.newton import export_newton
 from pupper_sysid.sim.export.shared import EXPLICIT_PD, delays_at_step
 from pupper_sysid.sim.export.targets import SIMULATORS
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
-from pupper_sysid.sysid.lag.tone import fit_phasor
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -109,7 +109,7 @@ def tone(step_s: float) -> tuple[NDArray, NDArray]:
 def phasors(at: NDArray, moved: NDArray) -> list[complex]:
     """Of each joint's steady motion, shape (steps, joints)."""
     late = at > 1.0
-    return [fit_phasor(at[late], m, TONE_HZ) for m in moved[late].T]
+    return list(fit_sine(2 * np.pi * TONE_HZ * at[late], moved[late]).phasor)
 
 
 def ran(

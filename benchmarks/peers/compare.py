@@ -33,12 +33,13 @@ from numpy.typing import NDArray
 from random_robots import SweptRobot, sweep_random_robot
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.identify.calibrate import calibrate, joint_trials
-from pupper_sysid.sysid.identify.models import rung
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.scores import rms, score
 from pupper_sysid.sysid.identify.search import leave_one_out_folds
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording
 
 HERE = Path(__file__).parent
@@ -107,12 +108,13 @@ def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:
     began = time.perf_counter()
     result = calibrate([case.recording], [case.joint], workers=1)[case.joint]
     seconds = time.perf_counter() - began
-    pd, dead = result.rungs["delayed_pd"], result.dead_time
-    values = np.array([pd.values[p] for p in rung("delayed_pd").names])
-    track = positions(rung("delayed_pd"), [(values[None], result.trials)])[0][:, 0]
+    pd, dead = result.candidate_models["delayed_pd"], result.dead_time_s
+    values = np.array([pd.values[p] for p in candidate_model("delayed_pd").names])
+    track = positions(candidate_model("delayed_pd"), [(values[None], result.trials)])[0][:, 0]
     true = case.dead_time_s(TIME_STEP_S)
     outcome = Outcome(
-        OURS, case.name, pd.scores.naive, pd.scores.held, pd.scores.leave_one_out,
+        OURS, case.name, pd.scores.rmse_raw_rad, pd.scores.rmse_held_rad,
+        pd.scores.rmse_leave_one_frequency_out_rad,
         off_truth(track, case), dead.value - true,
         dead.low <= true <= dead.high if case.motion else None, dead.high - dead.low, seconds,
     )  # fmt: skip
@@ -181,7 +183,8 @@ def theirs(
     true = case.dead_time_s(whole["step_s"])
     off = float("nan") if whole["dead_time_s"] is None else whole["dead_time_s"] - true
     return Outcome(
-        method, case.name, scores.naive, scores.held, scores.leave_one_out,
+        method, case.name, scores.rmse_raw_rad, scores.rmse_held_rad,
+        scores.rmse_leave_one_frequency_out_rad,
         off_truth(tracks[0], case), off,
         bool(span[0] <= true <= span[1]) if span and case.motion else None,
         span[1] - span[0] if span else float("nan"), sum(a["seconds"] for a in answers),
