@@ -8,10 +8,10 @@ good reading of each joint is the recovery.
 
     .venv/bin/python benchmarks/fault_campaign.py
 
-"frozen" servos lie to the protocol itself: their value is an honest answer of a servo that does not
-move, which no bus can see; the safety guard does (`tests/hardware/safety/test_guard.py`). Corrupted Feetech frames
-are bursts over one or two bytes. Their checksum has 8 bits, so what slips through is bounded by
-the plausibility check behind it, not excluded.
+"frozen" servos answer correctly with a position that does not change, which no bus can detect; the
+safety guard does (`tests/hardware/safety/test_guard.py`). Corrupted Feetech frames are bursts over
+one or two bytes. Their checksum has 8 bits, so what passes it is bounded by the plausibility check
+behind it, not excluded.
 """
 
 from __future__ import annotations
