@@ -315,9 +315,10 @@ def test_trouble_ends_in_a_stop_that_says_what_it_is(trouble, says):
         setattr(bus, name, value)
     with pytest.raises(SafetyStop, match=says):
         drive(guard, 3.0, swing)
+    commands = len(bus.written)
     guard.close()
     # torque off, and no way back for a robot that may be jammed
-    assert bus.log[-2:] == ["torque False", "close"]
+    assert bus.log[-2:] == ["torque False", "close"] and len(bus.written) == commands
 
 
 def test_a_joint_that_is_held_away_from_its_goal_stops_the_robot():
@@ -412,6 +413,57 @@ def test_parking_stops_returns_to_where_the_robot_was_found_and_lets_go():
     assert guard.now() - before == pytest.approx(0.3 * np.pi / 2, abs=0.05)
 
 
+def test_the_way_back_is_as_gentle_as_the_limits_say():
+    bus = PlainBus()
+    guard = ready(bus, GuardLimits(gentle_rad_s=0.5))
+    drive(guard, 1.25, swing)
+    before = guard.now()
+    guard.park()
+    # the fastest point of a raised cosine is π/2 times its mean speed
+    assert guard.now() - before == pytest.approx(0.5 * np.pi * 0.3 / 0.5, abs=0.05)
+
+
+def test_a_robot_that_goes_limp_is_not_moved_home_first():
+    bus = PlainBus()
+    guard = ready(bus)
+    drive(guard, 1.25, swing)
+    commands = len(bus.written)
+    guard.limp()
+    assert len(bus.written) == commands and bus.log[-1] == "torque False"
+
+
+def test_a_driver_that_has_lost_its_watchdog_leaves_the_robot_limp_where_it_is():
+    class Ending(RecordingWatchdog):
+        ended = False
+
+        def beat(self):
+            if self.ended:
+                raise SafetyStop("the watchdog process has ended")
+
+    bus = PlainBus()
+    watchdog = Ending(bus)
+    guard = GuardedBus(bus, watchdog=watchdog)
+    guard.torque(True)
+    guard.write(np.zeros(2))
+    drive(guard, 1.25, swing)
+    watchdog.ended = True
+    with pytest.raises(SafetyStop, match="has ended"):
+        guard.read()
+    commands = len(bus.written)
+    guard.close()
+    assert len(bus.written) == commands and "torque False" in bus.log
+
+
+def test_missing_readings_are_counted_joint_by_joint():
+    bus = PlainBus()
+    guard = ready(bus)
+    assert guard.report.summary() == {"clipped": 0, "slowed": 0, "unsent": 0, "missing": 0}
+    for silent in ([True, False], [True, True]):
+        bus.silent = np.array(silent)
+        guard.read()
+    assert guard.report.missing == 3
+
+
 def test_parking_a_bus_that_is_lost_is_over_soon_and_still_asks_for_torque_off():
     bus = PlainBus()
     guard = ready(bus)
@@ -420,7 +472,8 @@ def test_parking_a_bus_that_is_lost_is_over_soon_and_still_asks_for_torque_off()
     bus.torque = lambda on: bus.log.append("asked") or False
     before = guard.now()
     guard.close()
-    assert guard.now() - before < 3.5
+    # ten tries, 20 ms apart
+    assert 0.2 <= guard.now() - before < 3.5
     assert bus.log.count("asked") == 10 and bus.log[-1] == "close"
 
 
