@@ -182,11 +182,6 @@ def phases(signal: Signal, step_s: float, frequency_hz: float) -> Array:
     return np.where(moves & moves[0], _wrapped(-np.angle(product) / (2 * np.pi)), np.nan)
 
 
-def duty(contact: NDArray[np.bool_]) -> Array:
-    """Share of time that feet stand, (steps, …) to (…)."""
-    return np.mean(contact, axis=0)
-
-
 def diagonal_coordination(contact: NDArray[np.bool_]) -> float:
     """Coordination of diagonal feet: φ, mean over the two pairs.
 
@@ -323,7 +318,7 @@ def _describe_one(
     found: dict[str, object] = {
         "frequency": astuple(rate),
         "null_r2": float("nan"),
-        "duty": duty(contact),
+        "duty": contact.mean(axis=0),
         "diagonal": diagonal_coordination(contact),
         "jitter": jitter(action),
         "fast_share": fast_share(action, step_s, rate.value),

@@ -11,13 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, KINDS
 from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.policies.deploy.observers import Observer, SyntheticPD
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+
+Array = NDArray[np.float64]
 
 FREQUENCIES_HZ = np.arange(2, 25) / 4
 """Frequencies of the comparison, up to the band of a gait [Hz]."""
@@ -36,58 +38,27 @@ _WINDOW_S = 4.0
 _STILL = 1e-9  # a gain below it has no phase
 
 
-def response(
-    observer: Observer, frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float
-) -> NDArray[np.complex128]:
-    """Frequency response of an observer to its targets, without readings.
-
-    Sines about the default pose, all frequencies on a leading axis. After a settling time, each
-    response is fitted by least squares over a whole number of cycles. A target is held for its
-    control period and the estimate is of the period's end, so the lag includes half a period of
-    zero-order hold, as on the robot.
-
-    Parameters
-    ----------
-    observer : Observer
-        Its state changes: reset it before use.
-    frequencies_hz : array_like, shape (frequencies,)
-        Below half the control rate.
-    amplitude_rad : float
-    period_s : float
-        Control period [s].
-
-    Returns
-    -------
-    ndarray of complex, shape (frequencies, 12)
-        Swing of a joint over that of its target; the angle is the phase.
-
-    Raises
-    ------
-    InputError
-        If a frequency or the amplitude is out of range, or the observer has another period.
-    """
-    targets = _sines(frequencies_hz, amplitude_rad, period_s)
-    positions = _drive(observer, targets, np.full_like(targets, np.nan), period_s)
-    return _phasors(positions, frequencies_hz, period_s) / amplitude_rad
-
-
 @dataclass(frozen=True)
 class Match:
-    """An observer's frequency response beside that of the trained actuator."""
+    """Frequency responses of an observer and of the trained actuator to their targets.
 
-    frequencies_hz: NDArray[np.float64]
+    Each is the swing of a joint over that of its target, shape (frequencies, 12); the angle is the
+    phase. A target is held for its control period and the estimate is of the period's end, so the
+    lag includes half a period of zero-order hold, as on the robot.
+    """
+
+    frequencies_hz: Array
     """Shape (frequencies,)."""
     observer: NDArray[np.complex128]
-    """See `response`; shape (frequencies, 12)."""
     actuator: NDArray[np.complex128]
 
     @property
-    def gain_ratio(self) -> NDArray[np.float64]:
+    def gain_ratio(self) -> Array:
         """Gain of the observer over that of the actuator, shape (frequencies, 12)."""
         return np.abs(self.observer) / np.abs(self.actuator)
 
     @property
-    def phase_difference_deg(self) -> NDArray[np.float64]:
+    def phase_difference_deg(self) -> Array:
         """Phase of the observer minus the actuator's, shape (frequencies, 12); later is negative.
 
         Unwrapped from the lowest frequency up, so that a long delay is not mistaken for an advance.
@@ -228,18 +199,13 @@ def compare(
     return Match(FREQUENCIES_HZ.copy(), estimated, trained)
 
 
-def _sines(frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float) -> NDArray[np.float64]:
+def _sines(frequencies: Array, amplitude_rad: float, period_s: float) -> Array:
     """Targets [rad], shape (steps, frequencies, 12), at the start of each control period."""
-    frequencies = np.asarray(frequencies_hz, float)
-    if frequencies.ndim != 1 or not len(frequencies):
-        raise InputError("A frequency response needs a list of frequencies.")
     if not (np.all(frequencies > 0) and np.all(frequencies * period_s < 0.5)):
         raise InputError(
             f"The frequencies are {frequencies.min():g} … {frequencies.max():g} Hz; a controller "
             f"with a period of {period_s:g} s can only command between 0 and {0.5 / period_s:g} Hz."
         )
-    if not amplitude_rad > 0:
-        raise InputError(f"The amplitude is {amplitude_rad:g} rad; it must be positive.")
     span = _SETTLE_S + max(_WINDOW_S, 2 / frequencies.min())
     time = period_s * np.arange(int(np.ceil(span / period_s)))
     swing = amplitude_rad * np.sin(2 * np.pi * time[:, None] * frequencies)
@@ -248,10 +214,10 @@ def _sines(frequencies_hz: ArrayLike, amplitude_rad: float, period_s: float) -> 
 
 def _drive(
     observer: Observer,
-    targets: NDArray[np.float64],
-    readings: NDArray[np.float64],
+    targets: Array,
+    readings: Array,
     period_s: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Positions [rad] at the end of each control period, shape (steps, frequencies, 12)."""
     if abs(observer.period_s - period_s) > 1e-9:
         raise InputError(
@@ -262,21 +228,19 @@ def _drive(
     return np.stack([observer.step(t, r).position for t, r in zip(targets, readings, strict=True)])
 
 
-def _phasors(
-    positions: NDArray[np.float64], frequencies_hz: ArrayLike, period_s: float
-) -> NDArray[np.complex128]:
+def _phasors(positions: Array, frequencies: Array, period_s: float) -> NDArray[np.complex128]:
     """Swing of each joint as a multiple of sin(2πft), shape (frequencies, 12) [rad]."""
     steps = len(positions)
     time = period_s * np.arange(1, steps + 1)
     window = steps * period_s - _SETTLE_S
     found = []
-    for i, f in enumerate(np.asarray(frequencies_hz, float)):
+    for i, f in enumerate(frequencies):
         cycles = np.floor(window * f + 1e-9)
         last = slice(steps - round(cycles / f / period_s), None)
         found.append(1j * fit_sine(2 * np.pi * f * time[last], positions[last, i]).phasor)
     return np.array(found)
 
 
-def _largest(values: NDArray[np.float64]) -> tuple[int, int]:
+def _largest(values: Array) -> tuple[int, int]:
     i, j = np.unravel_index(np.argmax(values), values.shape)
     return int(i), int(j)

@@ -344,7 +344,7 @@ def test_a_script_that_is_none_is_refused(tmp_path, text, says):
 
 @pytest.mark.parametrize("command", [(9.0, 0, 0), (0, float("nan"), 0)])
 def test_a_command_no_robot_can_follow_is_refused(command):
-    with pytest.raises(InputError, match="--command"):
+    with pytest.raises(InputError, match="`command`"):
         constant(command)
 
 

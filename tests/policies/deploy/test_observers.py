@@ -10,7 +10,6 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.deploy.observer_match import response
 from pupper_sysid.policies.deploy.observers import (
     HeldEncoder,
     Observer,
@@ -20,6 +19,7 @@ from pupper_sysid.policies.deploy.observers import (
 )
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from support.observer_response import response
 
 P = 0.02
 CALIBRATED = DelayedPDParameters(
