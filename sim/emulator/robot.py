@@ -2,8 +2,7 @@
 
 `RobotSpec` is a kind of robot: the mean servo, its spread from joint to joint, the feedback's
 errors, the host's timing. `draw_robot` draws one robot of it, whose numbers are the truth that an
-identification should find; `random_spec` varies the mean servo and the feedback too, for benchmarks
-over many robots. `sim.emulator.bus` makes them move.
+identification should find. `sim.emulator.bus` makes them move.
 
 The defaults are published measurements of one Mini Pupper 2: pooled fit of three joints, poll
 statistics of twelve recordings.
@@ -11,7 +10,7 @@ statistics of twelve recordings.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
@@ -194,44 +193,3 @@ def directly_read(joint_map: JointMap) -> RobotSpec:
     """Spec of servos on a serial line: every reading is fresh, none is lost."""
     quantum = float(1 / joint_map.counts_per_rad().max())
     return RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=quantum)
-
-
-def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
-    """Draw a spec, for benchmarks over many robots.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    **chosen : float
-        Fields of `RobotSpec` to fix instead of drawing (`loss=0.3`).
-
-    Raises
-    ------
-    InputError
-        If a name is no field of `RobotSpec`.
-    """
-    unknown = sorted(set(chosen) - {f.name for f in fields(RobotSpec)})
-    if unknown:
-        raise InputError(f"RobotSpec has no field {unknown[0]}.")
-    base = RobotSpec()
-
-    def around(value: float, spread: float) -> float:
-        return float(value * np.exp(rng.uniform(-spread, spread)))
-
-    drawn = {
-        "dead_time_s": float(rng.uniform(0.010, 0.040)),
-        "stiffness_per_inertia": around(base.stiffness_per_inertia, 0.4),
-        "damping_per_inertia": around(base.damping_per_inertia, 0.3),
-        "friction_per_inertia": around(base.friction_per_inertia, 0.5),
-        "effort_per_inertia": around(base.effort_per_inertia, 0.2),
-        "velocity_limit_rad_s": around(base.velocity_limit_rad_s, 0.15),
-        "poll_period_s": float(rng.uniform(0.020, 0.034)),
-        "loss": float(rng.uniform(0.0, 0.6)),
-        "poll_jitter_s": float(rng.uniform(0.0, 0.0012)),
-        "poll_drift": float(rng.uniform(0.0, 0.003)),
-        # Mini Pupper counts, 300° over 10 bits, 360° over 12 bits
-        "quantum_rad": float(rng.choice([np.pi / 550, np.radians(300) / 1024, 2 * np.pi / 4096])),
-        "reading_noise_rad": float(rng.uniform(0.001, 0.006)),
-        "sleep_overshoot_s": float(rng.uniform(0.0, 0.0005)),
-    }
-    return replace(base, **(drawn | chosen))

@@ -3,8 +3,8 @@
 Newton's `DriveNeuralMLP` reads an ONNX file that maps position error and velocity to an effort,
 with its contract as metadata. A calibrated PD is exactly such a network with a single layer. Delay
 and effort limit are components of their own there (`delay_steps`, `ClampingMaxEffort`), armature
-and dry friction belong to the joint. Learned servo models cannot be exported: they say where a
-servo will be, and Newton asks for its effort.
+and dry friction belong to the joint. Learned servo models cannot be exported: they predict a
+servo's position, and Newton needs its effort.
 
 Names are those of Newton 1.8.0; `benchmarks/peers/check_exports.py` holds them against the release.
 """

@@ -97,10 +97,10 @@ def _model(path: Path):
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        said = " ".join(str(error).split())
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"{path} cannot be read as a robot: {said}. Give an MJCF or URDF that MuJoCo's viewer "
-            "opens, with its meshes beside it."
+            f"{path} cannot be read as a robot: {reason}. Give an MJCF or URDF that MuJoCo's "
+            "viewer opens, with its meshes beside it."
         ) from None
 
 

@@ -19,11 +19,11 @@ def standing(model: Any) -> Any:
     """The default pose, at rest, commanded there for long."""
     data = mujoco.MjData(model)
     data.qpos[7:] = default_pose()
-    told = default_pose()
+    held = default_pose()
     if model.ntendon:
-        told[2::3] += told[1::3]
+        held[2::3] += held[1::3]
     for i in range(model.nu):
-        hold(model, data, i, told[i])
+        hold(model, data, i, held[i])
     mujoco.mj_forward(model, data)
     return data
 
@@ -67,7 +67,7 @@ def error_in_air(
 
 
 def lags_in_air(model: Any, control_step_s: float) -> np.ndarray:
-    """Lag [s] of each servo behind a tone of 2 Hz that is told every `control_step_s`."""
+    """Lag [s] of each servo behind a tone of 2 Hz commanded every `control_step_s`."""
     _weightless(model)
     data = standing(model)
     in_free_space(model, data)

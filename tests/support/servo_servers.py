@@ -26,7 +26,7 @@ LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy
 
 
 class StillBench(ServoBench):
-    """Servos that stand at the counts they are given, and write down what they are told."""
+    """Servos that stand at the counts they are given, and keep their commands."""
 
     def __init__(self, layout: str):
         rng = np.random.default_rng(0)
@@ -54,7 +54,7 @@ class StillBench(ServoBench):
 
 
 class Listening(FeetechEmulator):
-    """Servos that keep what they heard and said."""
+    """Servos that keep what they received and sent."""
 
     def __init__(self, *args, **keywords):
         super().__init__(*args, **keywords)
@@ -72,7 +72,7 @@ class Listening(FeetechEmulator):
 
 
 class Scripted(FeetechEmulator):
-    """A line that says what a test wants: `answer(request)` gives pieces with their delays."""
+    """A line with the answers of a test: `answer(request)` gives pieces with their delays."""
 
     def __init__(self, answer: Callable[[Frame], list[tuple[float, bytes]]]):
         self.answers = answer
@@ -88,7 +88,7 @@ class Scripted(FeetechEmulator):
 
 
 class ScriptedProxy(ProxyEmulator):
-    """A proxy that says what a test wants; None is silence."""
+    """A proxy with the answers of a test; None is silence."""
 
     def __init__(self, answers: Callable[[bytes], bytes | None]):
         self.answers = answers
@@ -111,7 +111,7 @@ class ScriptedProxy(ProxyEmulator):
 
 
 def exact_spec() -> RobotSpec:
-    """A robot whose encoders tell the truth of the very moment."""
+    """A robot with exact, fresh readings."""
     return RobotSpec(
         poll_period_s=0.0, loss=0.0, quantum_rad=0.0, reading_noise_rad=0.0, offset_sd_rad=0.0
     )

@@ -1,4 +1,4 @@
-"""The emulated robot is wrong in the ways it says, by as much as it says, and repeats itself."""
+"""The emulated robot has the errors of its specification, by their size, and is repeatable."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.sim.emulator.bus import TRUTH_COLUMNS, EmulatedBus
 from pupper_sysid.sim.emulator.free_air_servo import FreeAirServo
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
-from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot, random_spec
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from support.servo_parameters import MEASURED
 
 POSE = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
@@ -234,16 +234,6 @@ def test_the_mean_servo_is_the_published_one():
     assert {s.effort_limit for s in servos} == {0.35}
 
 
-def test_random_specs_span_their_range_and_keep_what_was_chosen():
-    specs = [random_spec(np.random.default_rng(i), loss=0.3) for i in range(60)]
-    assert {s.loss for s in specs} == {0.3}
-    assert len({s.quantum_rad for s in specs}) == 3
-    delays = np.array([s.dead_time_s for s in specs])
-    assert delays.min() < 0.014 and delays.max() > 0.036
-    with pytest.raises(InputError, match="losses"):
-        random_spec(np.random.default_rng(0), losses=0.1)
-
-
 @pytest.mark.parametrize(
     ("name", "value"), [("loss", 1.0), ("loss", -0.1), ("dead_time_s", np.nan)]
 )
@@ -267,7 +257,7 @@ def test_a_limp_robot_ignores_goals_and_holds_its_pose_when_switched_on_again():
 
 
 @pytest.mark.parametrize("goal", [np.full(12, np.nan), np.zeros(3)])
-def test_impossible_goals_and_a_closed_bus_are_refused(goal):
+def test_impossible_commands_and_a_closed_bus_are_refused(goal):
     bus = make_bus(PERFECT)
     with pytest.raises(BusError, match="12 finite angles"):
         bus.write(goal)

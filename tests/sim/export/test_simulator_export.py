@@ -121,7 +121,7 @@ def test_readings_of_the_mjcf_export_are_held_for_a_poll_and_of_the_measured_age
     rest_at(model, data, [0.0] * len(names))
     times, read = [], []
     for k in range(3000):
-        # nothing else moves it: a ramp of 1 rad/s says how old a reading is
+        # nothing else moves it: on a ramp of 1 rad/s a reading's age is its error
         data.qpos[:], data.qvel[:] = k * TIME_STEP_S, 0.0
         mujoco.mj_forward(model, data)
         mujoco.mj_step(model, data)

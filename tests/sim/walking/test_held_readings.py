@@ -1,4 +1,4 @@
-"""Readings of many robots are as old, coarse and off as the measured feedback says."""
+"""Readings of many robots are as stale, quantised and biased as the measured feedback."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JITTER_S = 0.0008 * np.sqrt(3)  # half width of a uniform jitter of 0.8 ms stand
 
 
 class Bus:
-    """`HeldReadings` whose robots move at one constant speed, so that a reading tells its time."""
+    """`HeldReadings` whose robots move at one constant speed, so that a reading gives its time."""
 
     def __init__(self, feedback: HeldFeedback, environments=200, servos=12, speed=1.0, seed=0):
         self.readings = HeldReadings(
@@ -55,7 +55,7 @@ def test_the_mean_age_is_the_feedbacks(period, loss):
     # and is another one after a successful poll or two
     independent = bus.shape[0] * bus.shape[1] * 60 * SPAN / (3 * (period / (1 - loss) + SPAN))
     error = 4 * spread / np.sqrt(independent)
-    assert error < 0.05 * feedback.mean_age_s + 1e-4, "too few readings to tell"
+    assert error < 0.05 * feedback.mean_age_s + 1e-4, "too few readings"
     assert np.mean(ages) == pytest.approx(feedback.mean_age_s, abs=error)
 
 

@@ -112,11 +112,11 @@ def time_out(env: PupperEnv, ids) -> None:
     env.episode_step[ids] = env.config.episode_steps - 1
 
 
-def spoil(env: PupperEnv, ids) -> None:
+def make_nan(env: PupperEnv, ids) -> None:
     env.robots.batch.bind("qvel")[ids, 7] = np.nan
 
 
-ENDS = {"fall": throw, "time-out": time_out, "NaN": spoil}
+ENDS = {"fall": throw, "time-out": time_out, "NaN": make_nan}
 
 
 # --------------------------------------------------------------------------------- the open loop
@@ -198,7 +198,7 @@ def test_a_servo_model_speaks_of_servos_not_of_joints():
     for _ in range(40):
         env.step(np.tile([0.0, 0.2, 0.0], (1, 4)))
     moved = (env.robots.joints - default_pose())[0].reshape(4, 3)
-    # the thighs' servos do not move; the calves' were told to hold the calf against them
+    # the thighs' servos do not move; the calves' command was to hold the calf against them
     np.testing.assert_allclose(moved, np.tile([0.0, 0.0, 0.1], (4, 1)), atol=0.01)
 
 
@@ -426,11 +426,11 @@ def test_after_a_reset_nothing_moves_until_the_delay_is_over(end):
         end(env, slice(None))
         assert env.step(still(env) + 1.0).done.all()
     start = env.robots.batch.bind("qpos")[:, 7:].copy()
-    told = env.robots.to_servo(start)
-    np.testing.assert_array_equal(env.robots.batch.bind("ctrl"), told)
+    held = env.robots.to_servo(start)
+    np.testing.assert_array_equal(env.robots.batch.bind("ctrl"), held)
     lines = env.robots.batch.bind("history").reshape(4, 12, -1)
     values = (lines.shape[2] - 2) // 2
-    np.testing.assert_array_equal(lines[:, :, -values:], np.repeat(told[..., None], values, 2))
+    np.testing.assert_array_equal(lines[:, :, -values:], np.repeat(held[..., None], values, 2))
     lift(env)
     for _ in range(3):
         env.step(still(env) + 0.5)
@@ -475,7 +475,7 @@ def test_an_action_moves_the_target_by_its_scale_within_the_joint_limits():
 def test_a_simulation_that_becomes_nan_ends_without_reward_and_starts_anew():
     env = make(MEASURED)
     walk_about(env, 3)
-    spoil(env, [1, 3])
+    make_nan(env, [1, 3])
     result = env.step(still(env))
     np.testing.assert_array_equal(result.done, [False, True, False, True])
     assert not result.timed_out.any()

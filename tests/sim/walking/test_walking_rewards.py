@@ -135,7 +135,7 @@ def test_differences_of_times_beyond_the_longest_do_not_count_more():
 def test_a_robot_that_stands_as_told_earns_no_gait_reward():
     trot = {"air_s": (0.1, 0, 0, 0.1), "contact_s": (0, 0.1, 0.1, 0)}
     assert wr.gait(step(**trot), P)[0] == 0.0
-    # but one that moves faster than the threshold without being told does
+    # but one that moves faster than the threshold without a command does
     moving = step(**trot, linear_velocity=(0.0, 0.16, 0.0))
     assert wr.gait(moving, replace(P, gait_threshold=0.1))[0] == pytest.approx(1.0)
 

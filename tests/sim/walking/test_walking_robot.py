@@ -1,4 +1,4 @@
-"""The robot that walks: it stands, obeys on time, tells where it is, and passes the guard."""
+"""The robot that walks stands, executes commands on time, reports its state, passes the guard."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_command_between_physics_steps_keeps_its_timing():
     np.testing.assert_allclose(later, earlier, atol=4e-4)
 
 
-def test_each_servo_obeys_its_own_command():
+def test_each_servo_executes_its_own_command():
     robot = make_robot()
     robot.command(THIGH, 0.0, POSE[THIGH] + 0.1)
     robot.command(3, 0.0003, 0.15)
@@ -208,7 +208,7 @@ def test_a_robot_pushed_onto_its_back_says_so():
     assert robot.trunk(3.0).upright < -0.9
     last = robot.imu(3.0)
     assert last is not None and last.acceleration_m_s2[2] < -9.5
-    # it rolls over its left side, and hits the ground harder than the chip can tell
+    # it rolls over its left side, and hits the ground harder than the chip can measure
     roll = np.array([s.rate_rad_s[0] for s in reads if s])
     assert roll.min() < -3 and abs(roll.min()) > roll.max()
     assert any(s.clipped for s in reads if s)
@@ -293,7 +293,7 @@ def test_the_guard_lets_a_trotting_robot_walk_for_twenty_seconds():
     assert trunk.position_m[0] > 0.85 * 0.15 * 20.0
     assert min(upright) > 0.98
     mean = np.mean([s.acceleration_m_s2 for s in force if s], axis=0)
-    # who neither flies nor falls has felt g on average
+    # without flight or fall the mean specific force is g
     np.testing.assert_allclose(mean, [0.0, 0.0, 9.81], atol=0.5)
     guard.park()
     assert guard.report.missing == 0 and guard.report.unsent == 0
