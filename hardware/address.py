@@ -31,20 +31,14 @@ def bus_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class BusAddress:
-    """Address of a bus.
-
-    Attributes
-    ----------
-    kind : {"esp32", "feetech"}
-    where : str
-        Socket or serial device.
-    baud : int or None
-        None: to be detected.
-    """
+    """Address of a bus."""
 
     kind: str
+    """esp32 or feetech."""
     where: str
+    """Socket or serial device."""
     baud: int | None = None
+    """None: to be detected."""
 
 
 def parse_address(text: str) -> BusAddress:

@@ -139,12 +139,12 @@ def middle_pose_in_words(file: JointMapFile, joints: tuple[str, ...]) -> str:
         mine = {n: d for n, d in degrees.items() if n in JOINT_NAMES and n.endswith(kind)}
         for angle in sorted(set(mine.values())):
             same = [n for n, d in mine.items() if d == angle]
-            who = f"every {kind}" if len(same) == len(mine) else ", ".join(same)
+            which = f"every {kind}" if len(same) == len(mine) else ", ".join(same)
             side = positive if angle > 0 else negative
             serial_calf = kind == "calf" and file.linkage == "none"
             zero = "in line with its thigh" if serial_calf else "straight down"
             how = f"{abs(angle)} degrees from {zero}, {side}" if angle else zero
-            lines.append(f"  {who}: {how}")
+            lines.append(f"  {which}: {how}")
     if file.linkage != "none" and {45, -45} <= set(degrees.values()):
         lines.append("The knees are at a right angle then, the feet below the hips.")
     lines.append("Every servo's horn is then in the middle of its range.")
@@ -213,28 +213,18 @@ def known_scale_near(measured: float, counts: int) -> str | None:
 
 @dataclass(frozen=True)
 class Measured:
-    """Result of a calibration by hand.
-
-    Attributes
-    ----------
-    offset_counts : mapping of joint to int
-        For all calibrated joints.
-    limits_counts : mapping of joint to (int, int)
-        For those moved through their range; the others keep the starting map's, shifted by the
-        offset.
-    scale_joint : str or None
-        Joint on which the scale was measured.
-    counts_per_rad : float or None
-        Scale measured there.
-    use_scale : bool
-        Use the measured scale for all joints; else each keeps that of the starting map.
-    """
+    """Result of a calibration by hand."""
 
     offset_counts: Mapping[str, int]
+    """For all calibrated joints."""
     limits_counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    """For joints moved through their range; the others keep the starting map's, shifted."""
     scale_joint: str | None = None
+    """Joint on which the scale was measured."""
     counts_per_rad: float | None = None
+    """Scale measured there."""
     use_scale: bool = False
+    """Use the measured scale for all joints; else each keeps that of the starting map."""
 
 
 def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
@@ -249,21 +239,23 @@ def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
     data["name"] = f"{start.name.partition(', calibrated ')[0]}, calibrated {date}"
     data["source"] = f"{start.source.partition(_MARK)[0].rstrip('. ')}.{_MARK} {date}."
     for joint, entry in data["joints"].items():
-        said: list[str] = []
+        origin: list[str] = []
         if joint in measured.offset_counts:
-            said = _place(entry, joint, start, measured)
+            origin = _place(entry, joint, start, measured)
         if measured.scale_joint and measured.counts_per_rad:
             on = f"measured on {measured.scale_joint}"
             if measured.use_scale:
                 entry["counts_per_rad"] = float(measured.counts_per_rad)
-                said.append(f"counts_per_rad {on}")
-            elif said:
-                said.append(f"counts_per_rad of {start.name} ({on}: {measured.counts_per_rad:.1f})")
+                origin.append(f"counts_per_rad {on}")
+            elif origin:
+                origin.append(
+                    f"counts_per_rad of {start.name} ({on}: {measured.counts_per_rad:.1f})"
+                )
         if joint in measured.offset_counts:
-            entry["source"] = f"calibrate-joints {date}, {', '.join(said)}"
-        elif said:
+            entry["source"] = f"calibrate-joints {date}, {', '.join(origin)}"
+        elif origin:
             before = entry["source"].partition("; calibrate-joints ")[0]
-            entry["source"] = f"{before}; calibrate-joints {date}, {', '.join(said)}"
+            entry["source"] = f"{before}; calibrate-joints {date}, {', '.join(origin)}"
     return joint_map_from(data, "the new joint map")
 
 

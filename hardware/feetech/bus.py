@@ -292,20 +292,9 @@ class FeetechBus(HostClock):
 def open_line(
     device: str, baud: int | None, ids: Sequence[int]
 ) -> tuple[FeetechLine, dict[int, int | Series]]:
-    """Open a line, at the first baud rate at which a servo answers.
+    """Open a line at the first of the baud rates at which a servo answers.
 
-    Parameters
-    ----------
-    device : str
-    baud : int or None
-        None: the rates of `AUTO_BAUDS` are tried.
-    ids : sequence of int
-
-    Returns
-    -------
-    line : FeetechLine
-    found : dict of int to Series or int
-        Those of `ids` that answer, with their series or unknown model number.
+    Returns it with those of `ids` that answer, and their series or unknown model number.
 
     Raises
     ------

@@ -20,20 +20,13 @@ _HIGHEST_LENGTH = 252
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame with a correct checksum.
-
-    Attributes
-    ----------
-    id : int
-    code : int
-        Instruction of a request, error byte of a reply.
-    data : bytes
-        Parameters.
-    """
+    """A frame with a correct checksum."""
 
     id: int
     code: int
+    """Instruction of a request, error byte of a reply."""
     data: bytes
+    """Parameters."""
 
     def encode(self) -> bytes:
         """The frame on the wire.

@@ -58,14 +58,7 @@ _ATTEMPTS = 4
 
 @dataclass(frozen=True)
 class Reply:
-    """Reply of a servo.
-
-    Attributes
-    ----------
-    frame : Frame
-    before_s, after_s : float
-        `time.monotonic()` around its own part of the exchange.
-    """
+    """Reply of a servo, with `time.monotonic()` around its own part of the exchange."""
 
     frame: Frame
     before_s: float
@@ -131,12 +124,7 @@ class FeetechLine:
         return servo in sent
 
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
-        """Write to several servos at once, unacknowledged.
-
-        Returns
-        -------
-        float
-            `time.monotonic()` of sending; NaN if it failed.
+        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed.
 
         Raises
         ------

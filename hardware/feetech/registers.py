@@ -26,19 +26,13 @@ _SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
 
 @dataclass(frozen=True)
 class Register:
-    """An entry of a memory table.
-
-    Attributes
-    ----------
-    address, size : int
-        Decimal address; 1 or 2 bytes.
-    sign_bit : int or None
-        Sign bit of a value stored as sign and magnitude.
-    """
+    """An entry of a memory table."""
 
     address: int
     size: int = 1
+    """Bytes, 1 or 2."""
     sign_bit: int | None = None
+    """Of a value stored as sign and magnitude."""
 
 
 _COMMON = {
@@ -77,26 +71,15 @@ _COMMON = {
 
 @dataclass(frozen=True)
 class Series:
-    """One family of servos.
-
-    Attributes
-    ----------
-    name : str
-    model : int
-        Model number.
-    big_endian : bool
-        Byte order inside a two-byte register.
-    counts : int
-        Of the encoder's whole range.
-    has_sync_read : bool
-    lock_address : int
-    registers : dict of str to Register
-    """
+    """One family of servos."""
 
     name: str
     model: int
+    """Model number."""
     big_endian: bool
+    """Byte order inside a two-byte register."""
     counts: int
+    """Of the encoder's whole range."""
     has_sync_read: bool
     lock_address: int
     registers: dict[str, Register]
@@ -164,15 +147,7 @@ SERIES = {series.model: series for series in (SCS0009, STS3215)}
 
 
 def series_of_model_bytes(raw: bytes) -> Series | None:
-    """Series with the model number `raw` (2 bytes, in its own byte order); None if unknown.
-
-    Examples
-    --------
-    >>> series_of_model_bytes(bytes([0x09, 0x03])).name
-    'STS3215'
-    >>> series_of_model_bytes(bytes([0x05, 0x04])).name
-    'SCS0009'
-    """
+    """Series with the model number `raw` (2 bytes, in its own byte order); None if unknown."""
     return next((s for s in SERIES.values() if raw == s.word(s.model)), None)
 
 

@@ -13,55 +13,29 @@ from pupper_sysid.hardware.feetech.registers import HIGHEST_ID, Series, error_wo
 
 @dataclass(frozen=True)
 class ServoReport:
-    """State and settings of one servo; None where its model is unknown or a read failed.
-
-    Attributes
-    ----------
-    id : int
-    model : str
-        Name, or "unknown (number)".
-    firmware : str or None
-    voltage_v, temperature_c : float or None
-    count : int or None
-        Present position.
-    limits : tuple of int or None
-        Angle limits in its EEPROM [counts].
-    gains : tuple of int or None
-        P, D, I.
-    return_delay_us : int or None
-    errors : str
-        Error bits in words.
-    """
+    """State and settings of one servo; None where its model is unknown or a read failed."""
 
     id: int
     model: str
+    """Name, or "unknown (number)"."""
     errors: str
+    """Error bits in words."""
     firmware: str | None = None
     voltage_v: float | None = None
     temperature_c: float | None = None
     count: int | None = None
+    """Present position."""
     limits: tuple[int, int] | None = None
+    """Angle limits in its EEPROM [counts]."""
     gains: tuple[int, int, int] | None = None
+    """P, D, I."""
     return_delay_us: int | None = None
 
 
 def scan_line(
     device: str, baud: int | None, advance: Callable[[str], None] = lambda what: None
 ) -> tuple[int, list[ServoReport]]:
-    """Servos on a line, and their baud rate.
-
-    Parameters
-    ----------
-    device : str
-    baud : int or None
-        None: the first of `AUTO_BAUDS` at which a servo answers.
-    advance : callable
-        Called with each rate tried, in words.
-
-    Returns
-    -------
-    baud : int
-    servos : list of ServoReport
+    """Baud rate and servos of a line; `advance` is called with each rate tried, in words.
 
     Raises
     ------

@@ -78,8 +78,8 @@ class CalibrateJoints:
                 f"--scale-joint {self.scale_joint}: it is not among the joints that are "
                 f"calibrated ({', '.join(names)})."
             )
-        asked = None if self.joints == "all" else names
-        bus = open_bus(address, given.per_servo() if given else None, asked)
+        wanted = None if self.joints == "all" else names
+        bus = open_bus(address, given.per_servo() if given else None, wanted)
         try:
             start = given or load_joint_map(bus.metadata["joint_map"])
             # a line need not have all servos

@@ -208,6 +208,13 @@ def test_a_driver_without_its_watchdog_does_not_go_on():
     lost.close()
 
 
+def test_the_watchdog_process_starts_without_the_heavy_libraries():
+    heavy = "{'torch', 'matplotlib', 'pandas', 'scipy', 'mujoco', 'control', 'numba'}"
+    code = f"import sys, {watchdog_process.__name__}; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "set()\n", done.stderr
+
+
 def test_files_in_the_users_folder_do_not_stand_in_for_the_watchdogs_modules(tmp_path, monkeypatch):
     for name in ("json.py", "common.py"):
         (tmp_path / name).write_text("raise SystemExit\n")
