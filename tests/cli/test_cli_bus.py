@@ -190,3 +190,11 @@ def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
     assert "IMU at i." in out and "monitor --bus feetech:s" in out and "Ctrl-C" in out
     assert "sweep" not in out, "a sweep is for legs in free air"
     assert "Traceback" not in err and not list(tmp_path.glob("[is]"))
+
+
+def test_a_sweep_of_the_older_word_for_the_emulated_bus_is_recorded_under_the_new_one(capsys):
+    code, _, err = run(
+        capsys, "sweep", *SHORT, "--joints", "LF_hip", "--bus", "sim", "--out", "a.csv", "--truth"
+    )
+    assert code == 0, err
+    assert load(Path("a.csv")).metadata["sweep"]["bus"] == "emulated"

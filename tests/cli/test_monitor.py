@@ -11,6 +11,7 @@ import pytest
 from pupper_sysid.cli.commands.robot.monitor import Watched
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.frames import FrameReader
 from pupper_sysid.hardware.feetech.registers import PING, SYNC_READ
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
@@ -19,6 +20,12 @@ from support.command_line import run
 from support.servo_servers import StillBench, bench_of, on_a_port, on_a_socket, still_servos
 
 _READ = 2
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """The servos share this process and a busy machine."""
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.02)
 
 
 @pytest.fixture(autouse=True)
@@ -164,3 +171,9 @@ def test_ctrl_c_ends_it_as_it_should(capsys, monkeypatch):
 def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, says):
     code, out, err = run(capsys, "monitor", *arguments)
     assert code == 2 and says in err and out == ""
+
+
+def test_the_older_word_for_the_emulated_bus_is_taken_and_answered_with_the_new_one(capsys):
+    code, out, err = run(capsys, "monitor", "--bus", "sim", "--json")
+    assert code == 0, err
+    assert json.loads(out)["bus"] == "emulated"
