@@ -256,7 +256,6 @@ def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
         if "weight_hidden" in parameters:
             return RecurrentNetwork(joints, step, parameters, contract.feedback, contract.warm_up)
         return CommandNetwork(joints, step, parameters, contract.feedback)
-    count = substeps(step)
     values = {k: np.asarray(v, float) for k, v in parameters.items()}
     for name, value in values.items():
         if value.shape != (len(joints),):
@@ -267,11 +266,28 @@ def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
             )
     if (values["dead_time_s"] > _LONGEST_DELAY_S).any():
         raise InputError(f"dead_time_s is more than {_LONGEST_DELAY_S:g} s. Fit again.")
-    offset = values.pop("offset_rad")
-    if contract.arch == "delayed-pd":
-        return AtControlRate(DelayedPD(DelayedPDParameters(**values), step / count), count, offset)
-    delay = values.pop("dead_time_s")
-    return AtControlRate(SparseEquation(values, delay, offset, step / count), count)
+    return physical_model(contract.arch, values, step)
+
+
+def physical_model(
+    arch: str, parameters: Mapping[str, NDArray], time_step_s: float
+) -> AtControlRate:
+    """DelayedPD ("delayed-pd") or sparse equation ("sindy"), one step per command.
+
+    Parameters
+    ----------
+    arch : {"delayed-pd", "sindy"}
+    parameters : mapping of str to ndarray, shape (joints,)
+        As in the model's file.
+    time_step_s : float
+        Time between commands [s].
+    """
+    values, count = dict(parameters), substeps(time_step_s)
+    offset, step = values.pop("offset_rad"), time_step_s / count
+    if arch == "delayed-pd":
+        return AtControlRate(DelayedPD(DelayedPDParameters(**values), step), count, offset)
+    dead_time = values.pop("dead_time_s")
+    return AtControlRate(SparseEquation(values, dead_time, offset, step), count)
 
 
 def _build(contract: Contract, parameters: Mapping[str, NDArray], folder: Path) -> Model:

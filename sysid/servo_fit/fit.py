@@ -18,16 +18,12 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.servo_file import physical_model
 from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, chosen_joints
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.physics import (
-    delayed_pd_fits,
-    delayed_pd_model,
-    sindy_fits,
-    sindy_model,
-)
+from pupper_sysid.sysid.servo_fit.physics import delayed_pd_fits, sindy_fits
 from pupper_sysid.sysid.servo_fit.published import fit_published
 from pupper_sysid.sysid.servo_fit.result import FitScores, ServoFit, verdict
 from pupper_sysid.sysid.servo_fit.scores import ModelScores
@@ -186,7 +182,7 @@ def fit_servo(
     if arch != "delayed-pd":
         say("DelayedPD", 0.0)
         found = _physics("delayed-pd", data, folds, seed)
-        physics = [delayed_pd_model(v, data.period_s) for v in found]
+        physics = [physical_model("delayed-pd", v, data.period_s) for v in found]
     if ours.interrupted:
         notes.append("Training was stopped early; the best so far was kept.")
     few = ours.weights_per_joint
@@ -283,11 +279,10 @@ def _fit(
     say: Callable[[str, float], None],
 ) -> _Fitted:
     if arch in ("delayed-pd", "sindy"):
-        build = delayed_pd_model if arch == "delayed-pd" else sindy_model
         same = split.test is not None  # the one fold is the whole training part
         parts = folds if same else [(whole, whole), *folds]
         values = _physics(arch, data, parts, seed)
-        models: list[ServoModel] = [build(v, data.period_s) for v in values]
+        models: list[ServoModel] = [physical_model(arch, v, data.period_s) for v in values]
         return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0)
     if preset == "paper":
         found = [

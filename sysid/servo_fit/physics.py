@@ -11,16 +11,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
+from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
-from pupper_sysid.sysid.identify.models import rung
+from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.output_error import Problem, TrialData
 from pupper_sysid.sysid.identify.search import PREFERRED, fit_problems
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen
 
+_NAMES = (
+    "dead_time_s", "stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit",
+)  # fmt: skip
 _MANY = 10  # problems; fewer get more starts, since few tones have many local optima
 
 
@@ -34,7 +35,7 @@ def delayed_pd_fits(
     list of dict of str to ndarray, shape (joints,)
         Fields of `DelayedPDParameters` for an armature of 1, and `offset_rad`.
     """
-    model = rung(PREFERRED)
+    model = candidate_model(PREFERRED)
     problems, shifts = [], []
     for part in parts:
         for joint in data.joints:
@@ -50,26 +51,10 @@ def delayed_pd_fits(
         own = slice(n * len(data.joints), (n + 1) * len(data.joints))
         v = np.array([f.values for f in best[own]]).T
         found.append(
-            {
-                "dead_time_s": v[0],
-                "stiffness": v[1],
-                "damping": v[2],
-                "friction_loss": v[3],
-                "effort_limit": v[4],
-                "velocity_limit": v[5],
-                "armature": np.ones_like(v[0]),
-                "offset_rad": v[6] + np.array(shifts[own]),
-            }
+            dict(zip(_NAMES, v, strict=False))
+            | {"armature": np.ones_like(v[0]), "offset_rad": v[6] + np.array(shifts[own])}
         )
     return found
-
-
-def delayed_pd_model(values: dict[str, NDArray[np.float64]], period_s: float) -> AtControlRate:
-    """The model of `delayed_pd_fits`, one step per command."""
-    count = substeps(period_s)
-    own = {k: v for k, v in values.items() if k != "offset_rad"}
-    model = DelayedPD(DelayedPDParameters(**own), period_s / count)
-    return AtControlRate(model, count, values["offset_rad"])
 
 
 def sindy_fits(
@@ -100,16 +85,6 @@ def sindy_fits(
         )
         found.append(values)
     return found
-
-
-def sindy_model(values: dict[str, NDArray[np.float64]], period_s: float) -> AtControlRate:
-    """The model of `sindy_fits`, one step per command."""
-    count = substeps(period_s)
-    own = {k: v for k, v in values.items() if k in COEFFICIENTS}
-    step = period_s / count
-    return AtControlRate(
-        SparseEquation(own, values["dead_time_s"], values["offset_rad"], step), count
-    )
 
 
 def part_trials(data: ServoData, joint: str, part: Part) -> tuple[TrialData, ...]:

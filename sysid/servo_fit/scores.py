@@ -120,7 +120,12 @@ def tracks(model: ServoModel, data: ServoData) -> Tracks:
     """Free run of `model`, whose last axis is the joints of `data`, over every run."""
     commands, start, _ = _stacked(data)
     model.reset(start)
-    out = np.concatenate([start[None], np.asarray(model.rollout(commands), float)])
+    return _by_run(data, start, model.rollout(commands))
+
+
+def _by_run(data: ServoData, start: NDArray, positions: ArrayLike) -> Tracks:
+    """Positions (steps, runs, joints) after each command, as tracks from `start`."""
+    out = np.concatenate([start[None], np.asarray(positions, float)])
     return {
         joint: [out[: len(r.command_rad) + 1, e, n] for e, r in enumerate(data.runs[joint])]
         for n, joint in enumerate(data.joints)
@@ -131,7 +136,9 @@ def errors(model: ServoModel, found: Tracks, data: ServoData, part: Part) -> dic
     """Errors of a model on a part of the data, given its free run from `tracks`."""
     ahead = None
     if isinstance(model, CommandNetwork | RecurrentNetwork) and model.feedback:
-        ahead = _one_step_tracks(model, data)
+        commands, start, position = _stacked(data)
+        model.reset(start)
+        ahead = _by_run(data, start, model.one_step(commands, position))
     made = {}
     for joint in data.joints:
         parts = []
@@ -144,41 +151,36 @@ def errors(model: ServoModel, found: Tracks, data: ServoData, part: Part) -> dic
             else:
                 step = look_up(ahead[joint][n], np.round(run.tick)) - run.position_rad
             speed = np.gradient(track) / data.period_s
-            seconds = run.reading_elapsed_s
-            alone = run.trial.joint if _alone(data) else ""
-            names = [
-                (alone, int(t), int(s / _BLOCK_S))
-                for t, s in zip(run.number[run.readings.rows], seconds, strict=True)
-            ]
+            alone = joint if _alone(data) else ""
+            times = zip(run.number[run.readings.rows], run.reading_elapsed_s, use, strict=True)
             held = look_up(track, run.held_tick) - run.trial.position_rad
             raw = look_up(track, run.row_tick) - run.trial.position_rad
             parts.append(
-                (error[use], step[use], look_up(speed, run.tick)[use],
-                 [b for b, u in zip(names, use, strict=True) if u],
-                 held[rows & np.isfinite(held)], raw[rows & np.isfinite(raw)])
-            )  # fmt: skip
-        e, s, v, b, h, r = zip(*parts, strict=True)
-        one = np.concatenate(s)
-        made[joint] = Errors(
-            np.concatenate(e), one[np.isfinite(one)], np.abs(np.concatenate(v)),
-            [x for y in b for x in y], np.concatenate(h), np.concatenate(r),
-        )  # fmt: skip
+                Errors(
+                    free_run=error[use],
+                    one_step=step[use & np.isfinite(step)],
+                    speed=np.abs(look_up(speed, run.tick)[use]),
+                    block=[(alone, int(t), int(s / _BLOCK_S)) for t, s, used in times if used],
+                    held=held[rows & np.isfinite(held)],
+                    raw=raw[rows & np.isfinite(raw)],
+                )
+            )
+        made[joint] = _joined(parts)
     return made
 
 
 def pooled(parts: Sequence[dict[str, Errors]]) -> dict[str, Errors]:
     """Errors on several parts, each from a model that has not seen it, as one."""
-    return {
-        joint: Errors(
-            free_run=np.concatenate([p[joint].free_run for p in parts]),
-            one_step=np.concatenate([p[joint].one_step for p in parts]),
-            speed=np.concatenate([p[joint].speed for p in parts]),
-            block=[b for p in parts for b in p[joint].block],
-            held=np.concatenate([p[joint].held for p in parts]),
-            raw=np.concatenate([p[joint].raw for p in parts]),
-        )
-        for joint in parts[0]
+    return {joint: _joined([part[joint] for part in parts]) for joint in parts[0]}
+
+
+def _joined(parts: Sequence[Errors]) -> Errors:
+    """Errors one after the other."""
+    arrays = {
+        name: np.concatenate([getattr(p, name) for p in parts])
+        for name in ("free_run", "one_step", "speed", "held", "raw")
     }
+    return Errors(**arrays, block=[b for p in parts for b in p.block])
 
 
 def rms(values: ArrayLike) -> float:
@@ -272,7 +274,7 @@ def band(found: Errors) -> Band:
     squares = np.minimum(squares, 25 * 2.198 * np.median(squares))
     weight = 1.0 / np.maximum(squares.mean() + 0 * speed, 1e-12)
     a = np.column_stack([np.ones_like(speed), speed**2]) * weight[:, None]
-    from scipy.optimize import nnls
+    from scipy.optimize import nnls  # slow to import
 
     noise, timing = nnls(a, squares * weight)[0]
     return float(np.sqrt(noise)), float(np.sqrt(timing))
@@ -307,13 +309,3 @@ def _stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
             position[:rows, e, n] = np.nan_to_num(seen[here], nan=run.initial_rad)
             position[rows:, e, n] = position[rows - 1, e, n]
     return commands, start, position
-
-
-def _one_step_tracks(model: CommandNetwork | RecurrentNetwork, data: ServoData) -> Tracks:
-    commands, start, position = _stacked(data)
-    model.reset(start)
-    out = np.concatenate([start[None], model.one_step(commands, position).astype(float)])
-    return {
-        joint: [out[: len(r.command_rad) + 1, e, n] for e, r in enumerate(data.runs[joint])]
-        for n, joint in enumerate(data.joints)
-    }
