@@ -153,6 +153,37 @@ def test_speed_is_gained_at_the_acceleration_limit_and_lost_at_once():
     np.testing.assert_allclose([g[0] for g in bus.written[1:6]], [0.04, 0.12, 0.24, 0.3, 0.3])
 
 
+def test_a_reversal_stops_at_once_and_gains_speed_backwards_at_the_limit():
+    bus = PlainBus()
+    guard = ready(bus, GuardLimits(speed_rad_s=100.0, acceleration_rad_s2=100.0))
+    drive(guard, 0.06, lambda t: np.array([1.0, 0.0]))
+    turned = bus.goal[0]
+    drive(guard, 0.04, lambda t: np.array([-1.0, 0.0]))
+    # 2 rad/s after the first tick of 20 ms, 4 after the second, whatever the speed was before
+    np.testing.assert_allclose([g[0] - turned for g in bus.written[-2:]], [-0.04, -0.12])
+
+
+def test_speed_is_gained_anew_after_a_rest():
+    bus = PlainBus()
+    guard = ready(bus, GuardLimits(acceleration_rad_s2=10.0))
+    drive(guard, 0.5, lambda t: np.array([1.5, 0.0]))
+    rested = bus.goal[0]
+    guard.sleep_until(guard.now() + 0.5)
+    guard.write(np.array([1.9, 0.0]))
+    # the longest tick counts, 60 ms: 0.6 rad/s, whatever the speed was before the rest
+    assert bus.goal[0] - rested == pytest.approx(0.6 * 0.06)
+
+
+def test_a_first_command_before_every_joint_was_read_is_refused():
+    bus = PlainBus()
+    bus.silent = np.array([False, True])
+    guard = GuardedBus(bus)
+    guard.read()
+    with pytest.raises(SafetyStop, match=r"no position reading from LF_calf yet\."):
+        guard.write(np.zeros(2))
+    assert bus.written == []
+
+
 def test_the_goal_does_not_jump_after_a_pause():
     bus = PlainBus()
     guard = ready(bus)
