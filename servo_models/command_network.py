@@ -16,7 +16,7 @@ servo models; then errors can build up over time, and `bound` is infinite.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,9 +40,8 @@ class CommandNetwork(JointArrays):
     time_step_s : float
         Time between commands [s].
     parameters : mapping of str to ndarray
-        `command_center`, `command_scale`, `position_center`, `position_scale`, `bound`,
-        `fir_bias`, each (joints,); `fir` (joints, taps), newest command first; and, with a network,
-        `weight_0` (joints, inputs, units), `bias_0` (joints, units), `weight_1`, … to one output.
+        Those of `JointArrays` and, with a network, `weight_0` (joints, inputs, units), `bias_0`
+        (joints, units), `weight_1`, … to one output.
     feedback : bool
         Whether the network's last input is the position predicted last.
 
@@ -52,36 +51,24 @@ class CommandNetwork(JointArrays):
         If shapes do not fit each other, or a number is not finite.
     """
 
-    def __init__(
-        self,
-        joints: Sequence[str],
-        time_step_s: float,
-        parameters: Parameters,
-        feedback: bool = False,
-    ):
-        super().__init__(joints, time_step_s, parameters)
-        self.feedback = feedback
-        self.taps = self._shape("fir", 2)[1]
-        self._depth = sum(name.startswith("weight_") for name in parameters)
-        width = self.taps + feedback
+    def _prepare(self) -> None:
+        self._depth = sum(name.startswith("weight_") for name in self.parameters)
+        width = self.taps + self.feedback
         for layer in range(self._depth):
             units = self._shape(f"weight_{layer}", 3)[2]
             self._need(f"weight_{layer}", (width, units))
             self._need(f"bias_{layer}", (units,))
             width = units
-        if (self._depth and width != 1) or (feedback and not self._depth):
+        if (self._depth and width != 1) or (self.feedback and not self._depth):
             raise InputError(f"A servo network must end in one output; this one has {width}.")
-        self._need("fir_bias", ())
-        self._need("bound", ())
         # relu(h + b) = max(h, -b) + b: the one pass over a layer; b moves on to the next bias
         self._layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
-        carried = np.zeros((len(self.joints), self.taps + feedback), np.float32)
+        carried = np.zeros((len(self.joints), self.taps + self.feedback), np.float32)
         for n in range(self._depth):
             weight = self.parameters[f"weight_{n}"]
             bias = self.parameters[f"bias_{n}"] + np.matmul(carried[:, None], weight)[:, 0]
             self._layers.append((np.ascontiguousarray(np.swapaxes(weight, 1, 2)), -bias[..., None]))
             carried = bias
-        self.reset(np.zeros(len(self.joints)))
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""

@@ -32,7 +32,11 @@ class JointArrays(ABC):
     joints : sequence of str
     time_step_s : float
     parameters : mapping of str to ndarray
-        Each with the joints on its first axis; `bound` may be infinite, all else is finite.
+        Each with the joints on its first axis: `command_center`, `command_scale`,
+        `position_center`, `position_scale`, `bound`, `fir_bias`, each (joints,); `fir` (joints,
+        taps), newest command first; and those of the subclass. All but `bound` are finite.
+    feedback : bool
+        Whether the network's last input is the position predicted last.
 
     Raises
     ------
@@ -45,6 +49,7 @@ class JointArrays(ABC):
         joints: Sequence[str],
         time_step_s: float,
         parameters: Mapping[str, NDArray[np.floating]],
+        feedback: bool = False,
     ):
         refuse_time_step("A servo model", time_step_s)
         self.joints = tuple(joints)
@@ -61,13 +66,22 @@ class JointArrays(ABC):
                     f"A servo model's {name} holds NaN or infinite numbers: its training failed "
                     "or the file was damaged. Fit it again."
                 )
-        for name in ("command_center", "command_scale", "position_center", "position_scale"):
+        scales = ("command_scale", "position_scale", "bound")
+        for name in (*scales, "command_center", "position_center", "fir_bias"):
             self._need(name, ())
-        for name in ("command_scale", "position_scale", "bound"):
-            if name in self.parameters and not (self.parameters[name] > 0).all():
+        for name in scales:
+            if not (self.parameters[name] > 0).all():
                 raise InputError(f"A servo model's {name} must be positive. Fit it again.")
+        self.feedback = feedback
+        self.taps = self._shape("fir", 2)[1]
         self._environments: tuple[int, ...] = ()
         self._last = np.zeros((len(self.joints), 1), np.float32)  # normalised position
+        self._prepare()
+        self.reset(np.zeros(len(self.joints)))
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Check the subclass's parameters, and derive from them what steps need."""
 
     @abstractmethod
     def step(self, command: ArrayLike) -> NDArray[np.float32]:

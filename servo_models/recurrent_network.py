@@ -29,7 +29,7 @@ class RecurrentNetwork(JointArrays):
     joints : sequence of str
     time_step_s : float
     parameters : mapping of str to ndarray
-        As for `CommandNetwork`, and with members m, inputs n and hidden units h:
+        Those of `JointArrays` and, with members m, inputs n and hidden units h:
         `weight_input` (joints, m, n, 4 h), `weight_hidden` (joints, m, h, 4 h), `bias`
         (joints, m, 4 h) for the gates i, f, g, o; `weight_out` (joints, m, h), `bias_out`
         (joints, m).
@@ -52,19 +52,17 @@ class RecurrentNetwork(JointArrays):
         feedback: bool = False,
         warm_up: int = 16,
     ):
-        super().__init__(joints, time_step_s, parameters)
-        self.feedback, self.warm_up = feedback, warm_up
-        self.taps = self._shape("fir", 2)[1]
+        self.warm_up = warm_up
+        super().__init__(joints, time_step_s, parameters, feedback)
+
+    def _prepare(self) -> None:
         _, members, hidden, gates = self._shape("weight_hidden", 4)
         self._need("weight_hidden", (members, gates // 4, gates))
-        self._need("weight_input", (members, 1 + feedback, gates))
+        self._need("weight_input", (members, 1 + self.feedback, gates))
         self._need("bias", (members, gates))
         self._need("weight_out", (members, hidden))
         self._need("bias_out", (members,))
-        for name in ("fir_bias", "bound"):
-            self._need(name, ())
         self._memory = (members, hidden)
-        self.reset(np.zeros(len(self.joints)))
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""

@@ -262,7 +262,7 @@ def test_other_joints_and_time_steps_of_zero_are_refused(make):
     model = make()
     with pytest.raises(InputError, match="last axis must be the joints"):
         model.reset(np.zeros(3))
-    with pytest.raises(InputError, match="time step"):
+    with pytest.raises(InputError, match="time_step_s"):
         type(model)(JOINTS, 0.0, model.parameters)
     with pytest.raises(InputError, match="3 joints"):
         type(model)((*JOINTS, "LB_hip"), P, model.parameters)
