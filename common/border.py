@@ -159,9 +159,7 @@ def parse_json(text: str, name: str, remedy: str = "") -> Any:
 # --------------------------------------------------------------------------- schema and version
 
 
-def refuse_other_version(
-    path: Path | str, found: Any, known: int, oldest: int = 1, remedy: str = ""
-) -> None:
+def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int = 1) -> None:
     """Refuse a file of a version that this code does not read.
 
     Parameters
@@ -171,8 +169,6 @@ def refuse_other_version(
         `schema_version` as the file gives it.
     known, oldest : int
         The newest and the oldest version that are read.
-    remedy : str
-        What to do about a number that is no version, as a sentence.
 
     Raises
     ------
@@ -186,8 +182,8 @@ def refuse_other_version(
         )
     if type(found) is not int or found < oldest:
         raise InputError(
-            f"{path}: schema_version is {_short(found)}; this version reads {known}. "
-            f"{remedy or 'Put the file back as it was written.'}"
+            f"{path}: schema_version is {_short(found)}; this version reads {known}. Put the file "
+            "back as it was written."
         )
 
 

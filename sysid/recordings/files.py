@@ -33,7 +33,7 @@ from pupper_sysid.sysid.recordings.table import (
 
 FOLDER = Path("recordings")
 
-_ADVICE = "; what is there can be continued with `pupper-sysid sweep --resume`"
+_ADVICE = "; what is there can be continued with `resume`"
 _LARGEST_BYTES = 500e6
 
 
@@ -90,7 +90,9 @@ def read_bytes(path: Path) -> bytes:
     """Content of a recording file; an unreadable, empty or huge file is refused."""
     if not path.exists():
         raise InputError(f"{path} does not exist. Check the name, or run a sweep first.")
-    data = border.read_bytes(path, _LARGEST_BYTES, "Split it by joint.")
+    if path.is_file() and path.stat().st_size > _LARGEST_BYTES:
+        raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB; split it by joint.")
+    data = border.read_bytes(path, _LARGEST_BYTES)
     if not data.strip():
         raise InputError(f"{path} is empty: the recording never started. Record it again.")
     return data
