@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -10,6 +12,7 @@ import pytest
 import tyro
 
 from pupper_sysid.cli.flags import remember, spell
+from support.package import FOLDERS, ROOT
 
 
 @dataclass
@@ -65,3 +68,31 @@ def test_arguments_become_the_options_of_the_running_command(text, expected):
 
 def test_without_a_command_a_message_stays_as_the_library_wrote_it():
     assert spell("`force=True`") == "`force=True`"
+
+
+def options_in_strings(path):
+    """Options in the strings of a module, but for docstrings and whole lines to type."""
+    tree = ast.parse(path.read_text())
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            command = re.search(r"pupper-|pip install", node.value)
+            if id(node) not in docstrings and not command:
+                yield from re.findall(r"(?<![\w-])--[a-z][a-z-]+", node.value)
+
+
+def test_no_message_of_the_library_names_an_option():
+    library = (ROOT / room for room in FOLDERS.values() if room != "cli")
+    found = {
+        path.relative_to(ROOT).as_posix(): options
+        for folder in library
+        for path in folder.rglob("*.py")
+        if (options := list(options_in_strings(path)))
+    }
+    assert found == {}
+
+
+def test_an_option_in_a_message_would_be_found(tmp_path):
+    path = tmp_path / "module.py"
+    path.write_text('"""Doc --string."""\nraise ValueError(f"--jobs is {jobs}; `--out x` is not")\n')
+    assert list(options_in_strings(path)) == ["--jobs", "--out"]
