@@ -2,18 +2,22 @@
 
 Every public function of the library returns a frozen dataclass derived from `Result`. Its fields
 are the keys of its JSON object; there is no second list of names. Fields that are not plain data
-(trials for a picture, a fitted model) are declared with `internal()` and left out.
+(trials for a picture, a fitted model) are declared with `internal()` and left out; properties that
+belong to the data are declared with `derived`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import field, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _INTERNAL = {"internal": True}
 
@@ -23,12 +27,74 @@ def internal(**keywords: Any) -> Any:
     return field(metadata=_INTERNAL, repr=False, **keywords)
 
 
+class derived(property):
+    """A property that is part of the result's plain data, after the fields."""
+
+
 class Result:
     """Base of result dataclasses."""
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain data: dicts, lists, text, finite numbers and None."""
         return plain(self)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Table of the numbers and texts; an interval has the columns x, x_low and x_high."""
+        import pandas as pd
+
+        return pd.DataFrame(self.rows())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of `to_frame`; by default a single one."""
+        return [flat(self.to_dict())]
+
+
+Each = TypeVar("Each", bound=Result)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointResults(Result, Mapping[str, Each]):
+    """Results by joint: a mapping, and one table and one JSON object of all.
+
+    Attributes
+    ----------
+    joints : dict of str to Result
+    """
+
+    joints: dict[str, Each]
+
+    def __getitem__(self, joint: str) -> Each:
+        return self.joints[joint]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.joints)
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def __str__(self) -> str:
+        return "\n".join(f"{joint}: {result}" for joint, result in self.joints.items())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of all joints, with the joint's name in the first column."""
+        return [{"joint": j} | row for j, result in self.joints.items() for row in result.rows()]
+
+
+def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """One level of plain data: nested keys are joined by `_`, lists are left out.
+
+    Examples
+    --------
+    >>> flat({"lag_s": {"value": 0.04, "low": 0.03, "high": 0.05}, "scores": {"fit_percent": 98.0}})
+    {'lag_s': 0.04, 'lag_s_low': 0.03, 'lag_s_high': 0.05, 'scores_fit_percent': 98.0}
+    """
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{key}_")
+        elif not isinstance(value, list):
+            found[prefix[:-1] if key == "value" and prefix else f"{prefix}{key}"] = value
+    return found
 
 
 def plain(value: Any) -> Any:
@@ -40,11 +106,13 @@ def plain(value: Any) -> Any:
     >>> plain({"lag_s": Interval(0.04, 0.03, math.nan), "trials": (1, 2)})
     {'lag_s': {'value': 0.04, 'low': 0.03, 'high': None}, 'trials': [1, 2]}
     """
-    if is_dataclass(value) and not isinstance(value, type):
-        shown = (f for f in fields(value) if not f.metadata.get("internal"))
-        return {f.name: plain(getattr(value, f.name)) for f in shown}
     if hasattr(value, "model_dump"):
         return plain(value.model_dump(mode="json", by_alias=True))
+    if is_dataclass(value) and not isinstance(value, type):
+        names = [f.name for f in fields(value) if not f.metadata.get("internal")]
+        for kind in reversed(type(value).__mro__):
+            names += [name for name, entry in vars(kind).items() if isinstance(entry, derived)]
+        return {name: plain(getattr(value, name)) for name in names}
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple | set | frozenset):

@@ -124,11 +124,11 @@ def block_bootstrap(
     solution = np.linalg.solve(gram.sum(0), moment.sum(0))
     if len(gram) < fewest:
         runs = np.array_split(np.arange(len(value)), fewest)
-        block = np.repeat(np.arange(fewest), [len(run) for run in runs])
-        gram, moment = _normal_equations(design, value, block)
+        gram = np.stack([design[run].T @ design[run] for run in runs])
+        moment = np.stack([design[run].T @ value[run] for run in runs])
     weights = rng.exponential(size=(draws, len(gram)))
     drawn = np.linalg.solve(np.tensordot(weights, gram, axes=1), (weights @ moment)[..., None])
-    return BlockFit(solution, drawn[..., 0], len(gram))
+    return BlockFit(solution, np.asarray(drawn[..., 0], np.float64), len(gram))
 
 
 def _normal_equations(design: NDArray, value: NDArray, block: NDArray) -> tuple[NDArray, NDArray]:

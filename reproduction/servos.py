@@ -9,7 +9,8 @@ import numpy as np
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.doctor.examination import JointExamination, examine
-from pupper_sysid.sysid.identify.calibrate import DeadTime, dead_times
+from pupper_sysid.sysid.identify.dead_time import lag
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit.compare import Comparison
 from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
@@ -20,7 +21,7 @@ from reproduction.claims import Claim, Finding, NotTestable, claim, holds
 class ServoEvidence:
     """Measurements of a robot's recordings."""
 
-    lag: dict[str, DeadTime] = field(default_factory=dict)
+    lag: dict[str, LagBudget] = field(default_factory=dict)
     """Per joint, from sweeps."""
     health: dict[str, JointExamination] = field(default_factory=dict)
     """Of the joints of sweeps."""
@@ -43,11 +44,12 @@ def gather(
     others = [r for r, tone in zip(recordings, tones, strict=True) if not tone]
     for recording in sweeps:
         found.health |= {
-            f"{recording.name} {name}": one for name, one in examine(recording, rng).joints.items()
+            f"{recording.name} {name}": one
+            for name, one in examine(recording, seed=rng).joints.items()
         }
     if sweeps:
         progress("lag of the sweeps")
-        found.lag = dead_times(sweeps, None, seed)
+        found.lag = dict(lag(sweeps, seed=seed, workers=2))
         found.sweep = max(sweeps, key=lambda r: len(r.table))
     if others:
         found.played = max(others, key=lambda r: (len(r.joints), len(r.table)))
@@ -67,17 +69,18 @@ def judge(evidence: ServoEvidence) -> list[Claim]:
 )  # fmt: skip
 def constant_lag(found: ServoEvidence) -> Finding:
     """A1."""
-    budgets = [d.budget for d in _sweeps(found).values()]
+    budgets = list(_sweeps(found).values())
     naive, fresh, servo = (
-        1e3 * np.mean([getattr(b, k).value for b in budgets]) for k in ("naive", "fresh", "lag")
+        1e3 * np.mean([getattr(b, k).value for b in budgets])
+        for k in ("naive_lag_s", "fresh_lag_s", "lag_s")
     )
-    by_rate = [1e3 * f.lag.value for b in budgets for f in b.by_frequency]
-    dead = 1e3 * np.mean([d.dead_time.value for d in found.lag.values()])
+    by_rate = [1e3 * f.lag_s.value for b in budgets for f in b.by_frequency]
+    dead = 1e3 * np.mean([b.dead_time_s.value for b in budgets if b.dead_time_s])
     ours = (
         f"{naive:.0f} ms in all rows, {fresh:.0f} ms in fresh ones, {servo:.0f} ms the servo's own "
         f"({dead:.0f} ms of it dead time); {min(by_rate):.0f} to {max(by_rate):.0f} ms by frequency"
     )
-    low, high = min(b.lag.low for b in budgets), max(b.lag.high for b in budgets)
+    low, high = min(b.lag_s.low for b in budgets), max(b.lag_s.high for b in budgets)
     bounds = {"servo": Interval(float(servo), 1e3 * low, 1e3 * high)}
     stale = float(1 - servo / naive)
     return Finding(
@@ -92,7 +95,7 @@ def constant_lag(found: ServoEvidence) -> Finding:
 )  # fmt: skip
 def above_three_hertz(found: ServoEvidence) -> Finding:
     """A2."""
-    tones = [f for d in found.lag.values() for f in d.budget.by_frequency]
+    tones = [f for d in found.lag.values() for f in d.by_frequency]
     high = [f for f in tones if f.frequency_hz > 3.0]
     if not high:
         raise NotTestable("Give sweeps above 3 Hz with --recordings.")
@@ -113,7 +116,7 @@ def above_three_hertz(found: ServoEvidence) -> Finding:
 )  # fmt: skip
 def reading_noise(found: ServoEvidence) -> Finding:
     """A3."""
-    noise = float(np.mean([d.budget.noise_rad for d in _sweeps(found).values()]))
+    noise = float(np.mean([d.noise_rad for d in _sweeps(found).values()]))
     fresh = float(np.mean([h.fresh_fraction for h in found.health.values()]))
     return Finding(
         f"σ {1e3 * noise:.1f} mrad in fresh readings; {100 * (1 - fresh):.0f} % of rows are old",
@@ -185,7 +188,7 @@ def enough_data(found: ServoEvidence) -> Finding:
     )  # fmt: skip
 
 
-def _sweeps(found: ServoEvidence) -> dict[str, DeadTime]:
+def _sweeps(found: ServoEvidence) -> dict[str, LagBudget]:
     if not found.lag:
         raise NotTestable("Give sweeps with --recordings.")
     return found.lag

@@ -1,7 +1,7 @@
-"""What can be wrong with the two signals of a joint: checks of one kind each, for the doctor.
+"""Checks of a joint's command and position signals, for the doctor.
 
-A check looks at command and position and returns findings: a verdict and a sentence that says what
-to do. `unusable` holds those that make every number wrong, `doubtful` those that ask for care.
+A finding is a verdict and a sentence that says what to do. `unusable` has the faults that make
+every number wrong, `doubtful` those that ask for care.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 USE, CARE, REFUSE = "use", "use with care", "do not use"
 
 _DEGREES = 180 / np.pi
-_COARSEST_RAD = 0.05  # no servo counts in steps of three degrees
+_COARSEST_RAD = 0.05  # no servo has a quantisation step of three degrees
 _LARGEST_RAD = 3.3  # no joint of a legged robot turns further from zero
 _FASTEST_RAD_S = 40.0  # twice what a good servo of this size does
 _SLOW_HZ = 2.5  # below it a lag of 0.2 s is less than half a period
@@ -36,7 +36,7 @@ class Finding:
 
 
 def unusable(joint: str, trials: Sequence[Trial], step: float) -> list[Finding]:
-    """Faults after which no number of this joint can be right; the first one found.
+    """The first fault found that makes every number of this joint wrong.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def unusable(joint: str, trials: Sequence[Trial], step: float) -> list[Finding]:
     trials : sequence of Trial
         All of this joint, three rows or more each.
     step : float
-        Size of a count [rad].
+        Quantisation step [rad].
     """
     command = np.concatenate([t.command_rad for t in trials])
     position = np.concatenate([t.position_rad for t in trials])
@@ -54,8 +54,8 @@ def unusable(joint: str, trials: Sequence[Trial], step: float) -> list[Finding]:
         text = ("there is no reading at all: check the servo's plug, id and power, then record "
                 "again.")  # fmt: skip
     elif np.ptp(command) < 1e-3:
-        text = ("the command never changes: this joint was not swept. Sweep it with "
-                f"`pupper-sysid sweep --joints {joint}`.")  # fmt: skip
+        text = (f"the command never changes: {joint} was not swept. Record it with "
+                "`pupper-sysid sweep`.")  # fmt: skip
     elif np.ptp(position) < max(3 * step, 5e-3):
         text = ("the command moves and the reading does not: torque off, wrong servo id, or a "
                 "servo that no longer answers. Power it again and look at it move.")  # fmt: skip
@@ -68,11 +68,11 @@ def unusable(joint: str, trials: Sequence[Trial], step: float) -> list[Finding]:
 
 
 def doubtful(trials: Sequence[Trial], step: float) -> list[Finding]:
-    """Faults that a careful reader can live with."""
+    """Faults that leave the recording usable with care."""
     found = []
     ratio = amplitude_ratio(trials)
     if ratio < 0.3 or ratio > 3:
-        found.append(Finding(CARE, f"the joint moves {ratio:.2f} times as far as it is told: check "
+        found.append(Finding(CARE, f"the joint moves {ratio:.2f} times as far as commanded: check "
                                    "the scale (counts per radian) and mechanical stops, or "
                                    "record slower tones."))  # fmt: skip
     # friction flattens the tops of a slow tone; a stop does it in every trial, or by more

@@ -1,25 +1,24 @@
-"""Is this log usable? Look at a recording as an engineer would, before anything is fitted to it.
+"""Examination of a recording before anything is fitted to it: `examine`.
 
 Every joint gets a verdict, "use", "use with care" or "do not use", with reasons in sentences that
-say what to do about them. Stale feedback alone never spoils a log: the other commands date each
-fresh reading, which is what the "with care" of a held log asks for.
-
-`examine` looks, `to_json` writes the object of `doctor --json`. The checks of the signals
-themselves (units, swapped columns, clipping) are in `sysid.doctor.checks`.
+say what to do. Stale feedback alone never makes a recording unusable: the other commands date each
+fresh reading. The checks of the signals themselves (units, swapped columns, clipping) are in
+`sysid.doctor.checks`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.results import JointResults, Result, internal
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import CARE, REFUSE, USE, Finding
 from pupper_sysid.sysid.feedback.poll_lattice import (
@@ -29,12 +28,21 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     moving_rows,
     quantum,
 )
-from pupper_sysid.sysid.identify.calibrate import joint_rng, joint_trials
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.recordings.recording import Recording, Trial
+from pupper_sysid.sysid.recordings.joints import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    joint_trials,
+)
+from pupper_sysid.sysid.recordings.recording import Trial
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MUCH_LOSS = 0.2
-_MUCH_HOLD = 0.2  # of the lag that a spreadsheet would find
+_MUCH_HOLD = 0.2  # of the naive lag
 _UNEVEN = 0.2  # of the loop period
 _LEAST_ROWS = 3  # of a trial: fewer have no rate of change
 _LEAST_FRESH = 16
@@ -42,25 +50,25 @@ _USUAL_SPEED_RAD_S = 7.5  # a Mini Pupper 2's servo, unloaded
 _FEW_MISSING = 0.02
 
 
-@dataclass(frozen=True)
-class JointExamination:
-    """What was found about one joint. Numbers are NaN where the log does not say.
+@dataclass(frozen=True, kw_only=True)
+class JointExamination(Result):
+    """Examination of one joint. Numbers that the recording does not give are NaN.
 
     Attributes
     ----------
     verdict : {"use", "use with care", "do not use"}
     reasons : tuple of str
         Sentences; each says what to do, or what to record instead.
-    loop_period_ms, jitter_ms : float
+    loop_period_s, jitter_s : float
         Median time between commands, and standard deviation about their mean.
     fresh_fraction : float
         Share of rows whose value differs from the one before.
-    poll_period_ms, loss, z_score, hit_rate : float
+    poll_period_s, loss, z_score, hit_rate : float
         See `sysid.feedback.poll_lattice.PollLattice`.
     hold_share : float
-        Share of the naive lag that is the age of the feedback.
+        Share of the naive lag that is feedback age.
     quantum_rad : float
-        Size of a count; 0 if the readings have none.
+        Quantisation step; 0 if there is none.
     offset_rad : float
         Mean of the fresh readings minus mean of the command, over the tones if there are any.
     missing_fraction : float
@@ -76,10 +84,10 @@ class JointExamination:
 
     verdict: str
     reasons: tuple[str, ...]
-    loop_period_ms: float = math.nan
-    jitter_ms: float = math.nan
+    loop_period_s: float = math.nan
+    jitter_s: float = math.nan
     fresh_fraction: float = math.nan
-    poll_period_ms: float = math.nan
+    poll_period_s: float = math.nan
     loss: float = math.nan
     z_score: float = math.nan
     hit_rate: float = math.nan
@@ -92,16 +100,20 @@ class JointExamination:
     peak_command_rad_s: float = math.nan
     speed_share: float = math.nan
     hold_histogram: tuple[int, ...] = ()
+    feedback: PollLattice | None = internal(default=None)
+
+    def __str__(self) -> str:
+        return "\n".join([self.verdict, *(f"  - {reason}" for reason in self.reasons)])
 
 
-@dataclass(frozen=True)
-class Examination:
-    """What was found about a recording.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Examination(JointResults[JointExamination]):
+    """Examination of a recording, by joint.
 
     Attributes
     ----------
     recording : str
-        Its name.
+        Its name; of several, all names.
     warnings : tuple of str
         What was repaired when it was read, e.g. repeated time stamps.
     joints : dict of str to JointExamination
@@ -109,42 +121,52 @@ class Examination:
 
     recording: str
     warnings: tuple[str, ...]
-    joints: dict[str, JointExamination]
+
+    def plot(self) -> Figure:
+        """For how many rows each reading stayed the same; joints that can be used."""
+        from pupper_sysid.sysid.report.figure_data import hold_runs
+        from pupper_sysid.sysid.report.figures import hold_histogram_figure
+
+        return hold_histogram_figure(
+            {
+                joint: hold_runs([j.hold_histogram], [j.loop_period_s], j.feedback)
+                for joint, j in self.items()
+                if j.feedback
+            }
+        )
 
 
-def examine(recording: Recording, rng: np.random.Generator | int = 0) -> Examination:
-    """Examine every joint of `recording`.
+def examine(
+    recordings: Recordings, joints: Joints = None, seed: int | np.random.Generator = 0
+) -> Examination:
+    """Examine every joint of a recording.
 
     Parameters
     ----------
-    recording : Recording
-    rng : numpy.random.Generator or int
-        Shuffles rows for the poll's z-score; a seed gives each joint a generator of its own.
+    recordings : Recording or sequence of Recording
+        Trials of one joint are pooled.
+    joints : str or sequence of str, optional
+        Which joints; by default all that were recorded.
+    seed : int or numpy.random.Generator
+        Shuffles rows for the poll's z-score.
+
+    Raises
+    ------
+    InputError
+        If a joint is not recorded.
     """
-    bus = recording.metadata.get("bus") or {}
-    limit = float(bus.get("speed_limit_rad_s") or _USUAL_SPEED_RAD_S)
-    found = {}
-    for joint in recording.joints:
-        own = joint_rng(rng, joint) if isinstance(rng, int) else rng
-        found[joint] = _examine_joint(joint, joint_trials([recording], joint), limit, own)
-    return Examination(recording.name, recording.warnings, found)
-
-
-def to_json(examination: Examination) -> dict[str, Any]:
-    """Object of `doctor --json`; a number the log does not give is None."""
-    joints = {}
-    for name, joint in examination.joints.items():
-        joints[name] = {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in asdict(joint).items()
-        }
-        for key in ("reasons", "hold_histogram"):
-            joints[name][key] = list(joints[name][key])
-    return {
-        "recording": examination.recording,
-        "warnings": list(examination.warnings),
-        "joints": joints,
-    }
+    given = as_sequence(recordings)
+    rng = np.random.default_rng(seed)
+    limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
+    limit = max(float(each or _USUAL_SPEED_RAD_S) for each in limits)
+    return Examination(
+        recording=", ".join(r.name for r in given),
+        warnings=tuple(w for r in given for w in r.warnings),
+        joints={
+            joint: _examine_joint(joint, joint_trials(given, joint), limit, rng)
+            for joint in chosen_joints(given, joints)
+        },
+    )
 
 
 def hold_histogram(trials: Sequence[Trial]) -> tuple[int, ...]:
@@ -165,7 +187,7 @@ def _examine_joint(
     trials = [t for t in recorded if len(t.send_time_s) >= _LEAST_ROWS]
     if not trials:
         text = f"no trial has {_LEAST_ROWS} rows: the recording was cut short. Record it again."
-        return JointExamination(REFUSE, (text,))
+        return JointExamination(verdict=REFUSE, reasons=(text,))
     gaps = np.concatenate([np.diff(t.send_time_s) for t in trials])
     loop = float(np.median(gaps))
     seen = np.concatenate([np.isfinite(t.position_rad) for t in trials])
@@ -176,30 +198,29 @@ def _examine_joint(
         *_missing(float(1 - seen.mean()), len(recorded) - len(trials)),
         *_timing(gaps, loop, disorder),
     ]
-    spoilt = checks.unusable(joint, trials, step)
-    if not spoilt and fresh < _LEAST_FRESH:
-        spoilt = [Finding(REFUSE, f"only {fresh} readings differ from the one before, too few to "
+    unusable = checks.unusable(joint, trials, step)
+    if not unusable and fresh < _LEAST_FRESH:
+        unusable = [Finding(REFUSE, f"only {fresh} readings differ from the one before, too few to "
                                   "measure anything. Record for longer, with a larger "
                                   "amplitude.")]  # fmt: skip
-    nan = math.nan
-    lattice = PollLattice("unresolved", nan, nan, nan, nan, nan, nan, fresh / len(seen))
-    hold_share = nan
+    lattice = PollLattice(kind="unresolved", fresh_fraction=fresh / len(seen))
+    hold_share = math.nan
     speed = checks.peak_speed(trials)
-    if not spoilt:
+    if not unusable:
         lattice = find_poll_lattice(trials, rng)
         hold_share = _hold_share(joint, trials, lattice, rng)
         findings += _held(lattice, hold_share)
         findings += _coverage(trials, speed, limit_rad_s)
         findings += checks.doubtful(trials, step)
-    findings = sorted([*spoilt, *findings], key=lambda f: (REFUSE, CARE, USE).index(f.verdict))
+    findings = sorted([*unusable, *findings], key=lambda f: (REFUSE, CARE, USE).index(f.verdict))
     return JointExamination(
         verdict=findings[0].verdict if findings else USE,
         reasons=tuple(f.text for f in findings)
         or ("nothing wrong was found: timing is even, readings are new, motion covers its range.",),
-        loop_period_ms=1e3 * loop,
-        jitter_ms=1e3 * float(np.std(gaps)),
+        loop_period_s=loop,
+        jitter_s=float(np.std(gaps)),
         fresh_fraction=lattice.fresh_fraction,
-        poll_period_ms=1e3 * lattice.period_s,
+        poll_period_s=lattice.poll_period_s,
         loss=lattice.loss,
         z_score=lattice.z_score,
         hit_rate=lattice.hit_rate,
@@ -212,6 +233,7 @@ def _examine_joint(
         peak_command_rad_s=speed,
         speed_share=speed / limit_rad_s,
         hold_histogram=hold_histogram(trials),
+        feedback=None if unusable else lattice,
     )
 
 
@@ -254,9 +276,10 @@ def _hold_share(
 ) -> float:
     try:
         budget = lag_budget(joint, trials, rng, lattice)
-    except InputError:  # too few fresh readings: said elsewhere
+    except InputError:  # too few fresh readings: reported elsewhere
         return math.nan
-    return budget.feedback_age_s / budget.naive.value if budget.naive.value > 0 else math.nan
+    naive = budget.naive_lag_s.value
+    return budget.feedback_age_s / naive if naive > 0 else math.nan
 
 
 def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
@@ -267,7 +290,7 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
                               "reading, and no poll period explains when; fresh readings are dated "
                               "to the middle between two reads. Record at least four tones of "
                               "3 s, with a loop faster than the poll.")]  # fmt: skip
-    text = f"the bus reads this servo every {1e3 * lattice.period_s:.2f} ms"
+    text = f"the bus reads this servo every {1e3 * lattice.poll_period_s:.2f} ms"
     if math.isfinite(lattice.loss):
         text += (
             f" and {100 * lattice.loss:.0f} % of the reads fail silently, so a reading is "
@@ -276,8 +299,8 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
     if math.isfinite(hold_share):
         text += f", {100 * hold_share:.0f} % of the lag that all rows show"
     text += (
-        ". The log is usable: `delay`, `bode` and `calibrate` date each fresh reading to the poll "
-        "that made it; do not compute lag, gain or error from all rows."
+        ". The recording is usable: `delay`, `bode` and `calibrate` date each fresh reading to the "
+        "poll that measured it; do not compute lag, gain or error from all rows."
     )
     care = lattice.loss > _MUCH_LOSS or hold_share > _MUCH_HOLD
     return [Finding(CARE if care else USE, text)]
@@ -289,8 +312,8 @@ def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Findi
     frequencies = sorted({round(t.frequency_hz, 2) for t in tones})
     if len(frequencies) == 1 and len(tones) == len(trials):
         found.append(Finding(CARE, f"one frequency only ({frequencies[0]:g} Hz): the lag is known "
-                                   "up to whole periods and no model can be tested. Record several "
-                                   "with `sweep --freqs 1-10`."))  # fmt: skip
+                                   "up to whole periods and no model can be tested. Record tones "
+                                   "of 1 to 10 Hz."))  # fmt: skip
     short = [t for t in tones if (t.send_time_s[-1] - t.send_time_s[0]) * t.frequency_hz < 2]
     if short:
         found.append(Finding(CARE, f"{len(short)} of {len(tones)} tones last less than two periods "
@@ -299,5 +322,5 @@ def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Findi
     if speed < 0.9 * limit:
         found.append(Finding(USE, f"speed limit not excited: commands reach {speed:.1f} of about "
                                   f"{limit:.1f} rad/s ({100 * speed / limit:.0f} %), so the limit "
-                                  "cannot be seen. Add `sweep --kind steps`."))  # fmt: skip
+                                  "cannot be identified. Record steps as well."))  # fmt: skip
     return found

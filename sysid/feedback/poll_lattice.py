@@ -1,19 +1,18 @@
-"""When was this reading really taken? Find the bus's poll instants from the readings alone.
+"""Measurement time of each reading: the bus's poll instants, found from the readings alone.
 
 A polled bus refreshes each servo's position at instants on a lattice `phase + n * period`; a read
-in between returns the old value, and a failed poll leaves it for another period. So a row whose
-value *changed* says: a poll succeeded between the previous read and this one. Enough such
-intervals pin the lattice down to a fraction of a millisecond, and every changed ("fresh") row can
-then be given the time at which it was measured, which is what makes the lag of the servo visible
-behind the age of the feedback.
+in between returns the old value, and a failed poll leaves it for another period. A row whose value
+changed therefore brackets a successful poll between the previous read and this one. Enough such
+intervals determine the lattice to a fraction of a millisecond, and every changed ("fresh") row can
+be dated to the poll that measured it, which separates the servo's lag from the feedback age.
 
-`find_poll_lattice` cuts trials into stretches, has `sysid.feedback.poll_search` look for a common
-period and each stretch's phase, and counts the polls that failed; `readings` dates the fresh rows
-by them.
+`find_poll_lattice` cuts trials into stretches, searches them for a common period and each stretch's
+phase (`sysid.feedback.poll_search`), and counts the failed polls; `readings` dates fresh rows.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,6 +20,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.results import Result, derived, internal
 from pupper_sysid.sysid.feedback.poll_search import (
     BLUR_S,
     BLURS_S,
@@ -44,21 +44,21 @@ _SHUFFLES = 12
 _FEWEST_SHUFFLES, _CLEAR = 4, 20.0
 
 
-@dataclass(frozen=True)
-class PollLattice:
-    """The poll of one joint, as far as its readings show it.
+@dataclass(frozen=True, kw_only=True)
+class PollLattice(Result):
+    """The poll of one joint's feedback, as far as its readings show it; NaN where unknown.
 
     Attributes
     ----------
     kind : {"lattice", "unresolved", "every read"}
         A lattice was found; readings are held but no lattice is significant; or no reading is
-        ever held, so each is taken as measured when it was read.
-    period_s, period_sd_s : float
-        Time between polls and its standard error; NaN unless `kind` is "lattice".
+        ever held, so each is dated to its read.
+    poll_period_s, poll_period_sd_s : float
+        Time between polls and its standard error.
     loss, loss_sd : float
-        Probability that a poll fails, and its standard error; NaN without a lattice.
+        Probability that a poll fails, and its standard error.
     z_score : float
-        Score against shuffled rows, in their standard deviations; NaN if there was no search.
+        Score against shuffled rows, in their standard deviations.
     hit_rate : float
         Share of changed rows with a lattice instant between the previous read and this one.
     fresh_fraction : float
@@ -68,19 +68,19 @@ class PollLattice:
     """
 
     kind: str
-    period_s: float
-    period_sd_s: float
-    loss: float
-    loss_sd: float
-    z_score: float
-    hit_rate: float
+    poll_period_s: float = math.nan
+    poll_period_sd_s: float = math.nan
+    loss: float = math.nan
+    loss_sd: float = math.nan
+    z_score: float = math.nan
+    hit_rate: float = math.nan
     fresh_fraction: float
-    phases: tuple[Phase, ...] = ()
+    phases: tuple[Phase, ...] = internal(default=())
 
-    @property
+    @derived
     def mean_age_s(self) -> float:
-        """Mean age of a reading implied by period and loss [s]; NaN without a lattice."""
-        return self.period_s * (0.5 + self.loss / (1 - self.loss))
+        """Mean age of a reading implied by period and loss [s]."""
+        return self.poll_period_s * (0.5 + self.loss / (1 - self.loss))
 
 
 @dataclass(frozen=True)
@@ -164,11 +164,10 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     rows = sum(len(t.read_time_s) for t in trials)
     fresh = sum(len(fresh_rows(t)) for t in trials)
     fraction = fresh / max(rows, 1)
-    nan = float("nan")
-    nothing = PollLattice("unresolved", nan, nan, nan, nan, nan, nan, fraction)
+    nothing = PollLattice(kind="unresolved", fresh_fraction=fraction)
     loop = _loop_period(trials)
     moving, moving_fresh = _moving_fresh(trials)
-    # a servo that sticks repeats itself, too: who was asked settles it better than what was said
+    # the readings of a servo that sticks repeat as well: what answered the read decides first
     direct = bool(trials) and all(t.direct for t in trials)
     if direct or (moving and moving_fresh / moving >= _ALL_FRESH):
         return replace(nothing, kind="every read")
@@ -193,7 +192,7 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
     loss, _ = _loss(trials, phases)
     if np.isfinite(loss):
-        # second pass: rows that did not change speak too, and the blur is what fits best
+        # second pass: rows that did not change count, too, and the blur is what fits best
         loss = float(np.clip(loss, 0.02, 0.98))
         blur = best_blur(informative, period, loss)
         phases = tuple(refine(s, period, blur, loss) for s in stretches)
@@ -205,17 +204,17 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     hits = [contains(s, p) for s, p in zip(stretches, phases, strict=True)]
     hit_rate = float(np.mean(np.concatenate(hits)))
     loss, loss_sd = _loss(trials, phases)
-    found = hit_rate >= 0.9 and z_score >= _SIGNIFICANT
-    return PollLattice(
-        "lattice" if found else "unresolved",
-        period if found else float("nan"),
-        spread / np.sqrt(max(effective - 1, 1)) if found else float("nan"),
-        loss if found else float("nan"),
-        loss_sd if found else float("nan"),
-        z_score,
-        hit_rate,
-        fraction,
-        phases if found else (),
+    nothing = replace(nothing, z_score=z_score, hit_rate=hit_rate)
+    if hit_rate < 0.9 or z_score < _SIGNIFICANT:
+        return nothing
+    return replace(
+        nothing,
+        kind="lattice",
+        poll_period_s=period,
+        poll_period_sd_s=spread / np.sqrt(max(effective - 1, 1)),
+        loss=loss,
+        loss_sd=loss_sd,
+        phases=phases,
     )
 
 

@@ -1,4 +1,4 @@
-"""Turn what calibration found into the `Calibration` that simulators read, caveats included.
+"""Convert the fits of calibration to the `Calibration` that simulators read.
 
 Free-air positions give ratios to the armature. One torque sets the scale: the stall torque, which
 is the effort limit; so armature = stall torque / (effort limit per inertia), and the rest follows.
@@ -6,7 +6,7 @@ is the effort limit; so armature = stall torque / (effort limit per inertia), an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -34,16 +34,13 @@ from pupper_sysid.servo_models.calibration.parts import (
     Selection,
 )
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, RungResult
-from pupper_sysid.sysid.identify.search import PREFERRED
+from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
-
-_Z90 = 1.645
 
 
 def to_calibration(
-    results: dict[str, JointCalibrationResult],
+    results: Mapping[str, JointCalibrationResult],
     recordings: Sequence[Recording],
     seed: int,
     stall_torque_nm: float = STALL_TORQUE_NM,
@@ -55,10 +52,10 @@ def to_calibration(
     ----------
     results : dict of joint to JointCalibrationResult
     recordings : sequence of Recording
-        What they were computed from; names and hashes go into the file.
+        Their sources; names and hashes go into the file.
     seed : int
     stall_torque_nm : float
-        Torque anchor [N·m]: what the servo pulls at zero speed.
+        Torque anchor [N·m]: the servo's torque at zero speed.
     source : str
         Where the anchor comes from.
     """
@@ -84,17 +81,17 @@ def to_calibration(
 
 
 def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCalibration:
-    pd, budget = result.rungs[PREFERRED], result.budget
+    pd, lag = result.delayed_pd, result.lag
     low, high = result.delay_steps
     armature = stall / pd.values["effort_rad_s2"]
-    ratio = {
+    names = {
         "stiffness": "stiffness_per_s2",
         "damping": "damping_per_s",
         "friction_loss": "friction_rad_s2",
         "effort_limit": "effort_rad_s2",
     }
-    ratios = {ours: _ratio(pd, theirs, 1.0) for ours, theirs in ratio.items()}
-    torque = {ours: _ratio(pd, theirs, armature, "ratio only") for ours, theirs in ratio.items()}
+    ratios = {ours: _ratio(pd, fitted, 1.0) for ours, fitted in names.items()}
+    torque = {ours: _ratio(pd, fitted, armature, "ratio only") for ours, fitted in names.items()}
     actuator = Actuator(
         model="delayed_pd",
         stiffness_nm_per_rad=torque["stiffness"],
@@ -105,56 +102,57 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             value=stall, identified="no", why="the anchor itself: taken as known, see scale"
         ),
         velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
-        dead_time_s=_quantity(result.dead_time),
+        dead_time_s=_quantity(result.dead_time_s),
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
         ratios_to_armature=RatiosToArmature(**ratios),
         scale=Scale(anchor="stall torque", value_nm=stall, source=source),
     )
-    s, chosen = pd.scores, result.rungs[result.chosen]
+    s = pd.scores
     return JointCalibration(
         actuator=actuator,
-        feedback=_feedback(budget.lattice, result),
+        feedback=_feedback(lag, pd.parameters["offset_rad"]),
         lag=Lag(
-            lag_s=_quantity(budget.lag),
-            raw_lag_s=_quantity(budget.naive),
-            fresh_lag_s=_quantity(budget.fresh),
+            lag_s=_quantity(lag.lag_s),
+            raw_lag_s=_quantity(lag.naive_lag_s),
+            fresh_lag_s=_quantity(lag.fresh_lag_s),
         ),
         selection=Selection(
-            model=chosen.name, candidate_models=tuple(_candidate(r) for r in result.rungs.values())
+            model=result.model,
+            candidate_models=tuple(_candidate(f) for f in result.candidate_models.values()),
         ),
         scores=Scores(
-            rmse_one_step_rad=_finite(s.one_step),
-            rmse_free_run_raw_rad=_finite(s.naive),
-            rmse_free_run_fresh_rad=_finite(s.fresh),
-            rmse_free_run_held_rad=_finite(s.held),
-            rmse_leave_one_frequency_out_rad=_finite(s.leave_one_out),
+            rmse_one_step_rad=_finite(s.rmse_one_step_rad),
+            rmse_free_run_raw_rad=_finite(s.rmse_raw_rad),
+            rmse_free_run_fresh_rad=_finite(s.rmse_fresh_rad),
+            rmse_free_run_held_rad=_finite(s.rmse_held_rad),
+            rmse_leave_one_frequency_out_rad=_finite(s.rmse_leave_one_frequency_out_rad),
             fit_percent=_finite(s.fit_percent),
         ),
         warnings=result.warnings,
     )
 
 
-def _candidate(rung: RungResult) -> CandidateModel:
-    s = rung.scores
+def _candidate(fit: CandidateFit) -> CandidateModel:
+    s = fit.scores
     return CandidateModel(
-        model=rung.name,
-        parameter_count=len(rung.values),
-        rmse_fresh_rad=_finite(s.fresh),
-        rmse_held_rad=_finite(s.held),
-        rmse_raw_rad=_finite(s.naive),
-        rmse_leave_one_frequency_out_rad=_finite(s.leave_one_out),
+        model=fit.model,
+        parameter_count=len(fit.parameters),
+        rmse_fresh_rad=_finite(s.rmse_fresh_rad),
+        rmse_held_rad=_finite(s.rmse_held_rad),
+        rmse_raw_rad=_finite(s.rmse_raw_rad),
+        rmse_leave_one_frequency_out_rad=_finite(s.rmse_leave_one_frequency_out_rad),
         fit_percent=_finite(s.fit_percent),
-        parameters=rung.values,
+        parameters=fit.values,
     )
 
 
 def _ratio(
-    pd: RungResult, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
+    pd: CandidateFit, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
 ) -> Quantity:
     """A fitted number times `factor`, with its interval and whether the data settled it."""
-    interval, why = pd.intervals[name], pd.undecided.get(name)
+    interval, why = pd.parameters[name], pd.undecided.get(name)
     return Quantity(
         value=interval.value * factor,
         low=interval.low * factor,
@@ -164,8 +162,8 @@ def _ratio(
     )
 
 
-def _anchored(pd: RungResult, stall: float) -> Quantity:
-    effort, why = pd.intervals["effort_rad_s2"], pd.undecided.get("effort_rad_s2")
+def _anchored(pd: CandidateFit, stall: float) -> Quantity:
+    effort, why = pd.parameters["effort_rad_s2"], pd.undecided.get("effort_rad_s2")
     return Quantity(
         value=stall / effort.value,
         low=stall / effort.high,
@@ -175,30 +173,38 @@ def _anchored(pd: RungResult, stall: float) -> Quantity:
     )
 
 
-def _feedback(lattice: PollLattice, result: JointCalibrationResult) -> Feedback:
-    offset, step = result.offset_rad, result.quantum_rad
+def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
+    lattice, step = lag.feedback, lag.quantum_rad
     quantum = Quantity(value=step, low=step, high=step, identified="yes")
     if step == 0:
         quantum = Quantity(value=0.0, identified="no", why="readings show no common step")
     if lattice.kind == "lattice":
-        period = _spread(lattice.period_s, lattice.period_sd_s)
+        z90 = 1.645
+        spread = z90 * lattice.poll_period_sd_s
+        period = _quantity(
+            Interval(
+                lattice.poll_period_s,
+                max(lattice.poll_period_s - spread, 0.0),
+                lattice.poll_period_s + spread,
+            )
+        )
         # the age grows with the loss; the period's share of its uncertainty is nothing beside it
-        losses = np.clip(lattice.loss + _Z90 * lattice.loss_sd * np.array([-1.0, 1.0]), 0, 0.99)
-        low, high = lattice.period_s * (0.5 + losses / (1 - losses))
+        losses = np.clip(lattice.loss + z90 * lattice.loss_sd * np.array([-1.0, 1.0]), 0, 0.99)
+        low, high = lattice.poll_period_s * (0.5 + losses / (1 - losses))
         loss = _quantity(Interval(lattice.loss, *map(float, losses)))
         age = _quantity(Interval(lattice.mean_age_s, float(low), float(high)))
     else:
-        found = result.budget.feedback_age_s
         why = (
             "every reading was new: no poll slower than the loop"
             if lattice.kind == "every read"
             else "readings are held, but no poll period is significant"
         )
-        period = Quantity(value=0.0, identified="no", why=why)
-        loss = Quantity(value=0.0, identified="no", why=why)
-        age = Quantity(value=max(found, 0.0), identified="yes", why="from naive minus fresh lag")
+        period = loss = Quantity(value=0.0, identified="no", why=why)
+        age = Quantity(
+            value=max(lag.feedback_age_s, 0.0), identified="yes", why="from naive minus fresh lag"
+        )
     return Feedback(
-        poll_period_s=period, loss=loss, quantum_rad=quantum, offset_rad=_quantity(offset),
+        poll_period_s=period, loss=loss, quantum_rad=quantum, offset_rad=_quantity(offset_rad),
         mean_age_s=age,
     )  # fmt: skip
 
@@ -211,10 +217,6 @@ def _quantity(interval: Interval) -> Quantity:
         high=max(interval.high, interval.value),
         identified="yes",
     )
-
-
-def _spread(value: float, sd: float) -> Quantity:
-    return _quantity(Interval(value, max(value - _Z90 * sd, 0.0), value + _Z90 * sd))
 
 
 def _finite(number: float) -> float | None:

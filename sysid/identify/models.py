@@ -1,8 +1,8 @@
-"""The ladder of servo models that calibration climbs, from a pure delay to a servo with backlash.
+"""Candidate servo models of calibration, from a pure delay to a servo with backlash.
 
-Every rung is a function from parameters and commands to positions, vectorised over any number of
-simulations, plus what is known of its parameters beforehand. All work per unit of inertia (free-air
-positions say no more) and relative to the position at which the servo rested.
+A candidate is a function from parameters and commands to positions, vectorised over any number of
+simulations, with bounds and priors of its parameters. All are per unit of inertia (positions in
+free air identify no more) and relative to the rest position.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Rung:
-    """A model of the ladder.
+class CandidateModel:
+    """A servo model to fit.
 
     Attributes
     ----------
     name : str
     parameters : tuple of Parameter
-        The delay [s] is the first and the offset [rad] the last, on every rung.
+        The dead time [s] is the first and the offset [rad] the last, in every model.
     simulate : callable
         `(values, track) -> None`: `values` (parameters, simulations) without delay and offset;
         `track` (steps, simulations) holds delayed commands relative to rest and is overwritten
@@ -150,20 +150,27 @@ _EFFORT = Parameter("effort_rad_s2", 450.0, 30.0, 8000.0, 0.6)
 _SPEED = Parameter("velocity_limit_rad_s", 8.3, 1.5, 30.0, 0.3)
 _PD = (_DELAY, _STIFFNESS, _DAMPING, _FRICTION, _EFFORT, _SPEED)
 
-LADDER: tuple[Rung, ...] = (
-    Rung("pure_delay", (_DELAY, _GAIN, _OFFSET), _pure_delay),
-    Rung("fopdt", (_DELAY, _GAIN, Parameter("time_constant_s", 0.02, 0.0005, 0.5), _OFFSET),
-         _first_order),
-    Rung("sopdt", (_DELAY, _GAIN, Parameter("natural_frequency_rad_s", 90.0, 8.0, 600.0),
-                   Parameter("damping_ratio", 0.8, 0.1, 4.0), _OFFSET), _second_order),
-    Rung("dc_servo", (_DELAY, _STIFFNESS, _FRICTION, _EFFORT,
-                      Parameter("no_load_speed_rad_s", 9.0, 1.5, 40.0, 0.4), _OFFSET), _dc_servo),
-    Rung("delayed_pd", (*_PD, _OFFSET), _delayed_pd),
-    Rung("delayed_pd_backlash", (*_PD, Parameter("backlash_rad", 0.01, 0.0005, 0.15, 1.0), _OFFSET),
-         _delayed_pd_backlash),
-)  # fmt: skip
+_TIME_CONSTANT = Parameter("time_constant_s", 0.02, 0.0005, 0.5)
+_NATURAL_FREQUENCY = Parameter("natural_frequency_rad_s", 90.0, 8.0, 600.0)
+_DAMPING_RATIO = Parameter("damping_ratio", 0.8, 0.1, 4.0)
+_NO_LOAD_SPEED = Parameter("no_load_speed_rad_s", 9.0, 1.5, 40.0, 0.4)
+_BACKLASH = Parameter("backlash_rad", 0.01, 0.0005, 0.15, 1.0)
+
+CANDIDATE_MODELS = (
+    CandidateModel("pure_delay", (_DELAY, _GAIN, _OFFSET), _pure_delay),
+    CandidateModel("fopdt", (_DELAY, _GAIN, _TIME_CONSTANT, _OFFSET), _first_order),
+    CandidateModel(
+        "sopdt", (_DELAY, _GAIN, _NATURAL_FREQUENCY, _DAMPING_RATIO, _OFFSET), _second_order
+    ),
+    CandidateModel(
+        "dc_servo", (_DELAY, _STIFFNESS, _FRICTION, _EFFORT, _NO_LOAD_SPEED, _OFFSET), _dc_servo
+    ),
+    CandidateModel("delayed_pd", (*_PD, _OFFSET), _delayed_pd),
+    CandidateModel("delayed_pd_backlash", (*_PD, _BACKLASH, _OFFSET), _delayed_pd_backlash),
+)
+"""All candidates, simplest first."""
 
 
-def rung(name: str) -> Rung:
-    """The rung called `name`."""
-    return next(r for r in LADDER if r.name == name)
+def candidate_model(name: str) -> CandidateModel:
+    """The candidate called `name`."""
+    return next(m for m in CANDIDATE_MODELS if m.name == name)

@@ -20,7 +20,7 @@ from scipy.optimize import differential_evolution
 from pupper_sysid.servo_models.delay_line import fractional_shift
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.identify.models import Rung
+from pupper_sysid.sysid.identify.models import CandidateModel
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _PAD = 64  # steps of rest before each trial: the longest delay of the ladder, 0.12 s
@@ -139,13 +139,13 @@ class Fit:
 
 
 def positions(
-    rung: Rung, groups: Sequence[tuple[NDArray, Sequence[TrialData]]]
+    model: CandidateModel, groups: Sequence[tuple[NDArray, Sequence[TrialData]]]
 ) -> list[NDArray[np.float64]]:
     """Simulate every parameter vector of a group on every trial of that group, all in one go.
 
     Parameters
     ----------
-    rung : Rung
+    model : CandidateModel
     groups : sequence of (values, trials)
         `values` has shape (candidates, parameters).
 
@@ -160,7 +160,7 @@ def positions(
     ends = np.cumsum(widths)
     # Small steps cost a call each, whatever their width: one wide simulation serves all groups.
     track = np.zeros((steps + 1, ends[-1]))
-    parameters = np.empty((len(rung.parameters) - 2, ends[-1]))
+    parameters = np.empty((len(model.parameters) - 2, ends[-1]))
     for (values, trials), end, width in zip(groups, ends, widths, strict=True):
         commands = np.zeros((_PAD + steps, len(trials)))
         for n, trial in enumerate(trials):
@@ -171,13 +171,20 @@ def positions(
         track[1:, end - width : end] = fractional_shift(commands, steps, delay, column)
         parameters[:, end - width : end] = np.repeat(values[:, 1:-1].T, len(trials), axis=1)
     for i in range(0, ends[-1], _BATCH):
-        rung.simulate(parameters[:, i : i + _BATCH], track[1:, i : i + _BATCH])
+        model.simulate(parameters[:, i : i + _BATCH], track[1:, i : i + _BATCH])
     out = []
     for (values, trials), end, width in zip(groups, ends, widths, strict=True):
         own = track[:, end - width : end].reshape(steps + 1, len(values), len(trials))
         own += values[:, -1, None]
         out.append(own)
     return out
+
+
+def free_run(
+    model: CandidateModel, values: NDArray, trials: Sequence[TrialData]
+) -> NDArray[np.float64]:
+    """One simulation of each trial, shape (steps + 1, trials): see `positions`."""
+    return positions(model, [(values[None], trials)])[0][:, 0]
 
 
 def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:
@@ -189,7 +196,7 @@ def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class _Space:
-    """A rung's fitted coordinates: their bounds and prior, arrays of shape (parameters,)."""
+    """A model's fitted coordinates: their bounds and prior, arrays of shape (parameters,)."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -197,8 +204,8 @@ class _Space:
     precision: NDArray[np.float64]
 
     @classmethod
-    def of(cls, rung: Rung) -> _Space:
-        par = rung.parameters
+    def of(cls, model: CandidateModel) -> _Space:
+        par = model.parameters
         low, high, centre = (
             np.array([float(p.encode(getattr(p, name))) for p in par])
             for name in ("low", "high", "nominal")
@@ -212,7 +219,7 @@ class _Space:
 
 
 def fit(
-    rung: Rung,
+    model: CandidateModel,
     problems: Sequence[Problem],
     starts: NDArray,
     iterations: int = 40,
@@ -222,7 +229,7 @@ def fit(
 
     Parameters
     ----------
-    rung : Rung
+    model : CandidateModel
     problems : sequence of Problem
     starts : ndarray, shape (problems, parameters)
         Values to start from.
@@ -235,14 +242,14 @@ def fit(
     -------
     list of Fit, one per problem
     """
-    par, space = rung.parameters, _Space.of(rung)
+    par, space = model.parameters, _Space.of(model)
     k, low, high = len(par), space.low, space.high
     scale = np.where([p.logarithmic for p in par], 1.0, 0.01)
     z = np.array([[float(p.encode(v)) for p, v in zip(par, row, strict=True)] for row in starts])
     free = np.ones((len(problems), k), bool)
     for i, problem in enumerate(problems):
         for name, value in problem.frozen.items():
-            j = rung.names.index(name)
+            j = model.names.index(name)
             free[i, j], z[i, j] = False, float(par[j].encode(value))
     z = np.where(free, np.clip(z, low, high), z)
 
@@ -251,7 +258,7 @@ def fit(
         step = difference * scale
         # the offset, last, moves every residual alike: no simulation needed for its column
         cloud = points[:, None, :] + np.concatenate([np.zeros((1, k)), np.diag(step)[:-1]])
-        residuals = _residuals(rung, [problems[i] for i in index], cloud)
+        residuals = _residuals(model, [problems[i] for i in index], cloud)
         costs, gradients, curvatures = [], [], []
         for n, i in enumerate(index):
             r = residuals[n] / problems[i].noise_rad
@@ -307,7 +314,11 @@ def fit(
 
 
 def evolve(
-    rung: Rung, problem: Problem, starts: NDArray, rng: np.random.Generator, generations: int
+    model: CandidateModel,
+    problem: Problem,
+    starts: NDArray,
+    rng: np.random.Generator,
+    generations: int,
 ) -> Fit:
     """The best of a population that starts at `starts` and evolves, fitted to the end.
 
@@ -316,17 +327,17 @@ def evolve(
 
     Parameters
     ----------
-    rung : Rung
+    model : CandidateModel
     problem : Problem
         Without frozen parameters.
     starts : ndarray, shape (population, parameters)
     rng : numpy.random.Generator
     generations : int
     """
-    par, space = rung.parameters, _Space.of(rung)
+    par, space = model.parameters, _Space.of(model)
 
     def cost(points: NDArray) -> NDArray:  # (parameters, candidates)
-        r = _residuals(rung, [problem], points.T[None])[0] / problem.noise_rad
+        r = _residuals(model, [problem], points.T[None])[0] / problem.noise_rad
         return space.cost(r, points.T)
 
     population: Any = np.clip(  # SciPy's annotations know names of methods only
@@ -339,11 +350,15 @@ def evolve(
         vectorized=True, updating="deferred",
     )  # fmt: skip
     values = np.array([float(p.decode(x)) for p, x in zip(par, found.x, strict=True)])
-    return fit(rung, [problem], values[None])[0]
+    return fit(model, [problem], values[None])[0]
 
 
 def global_starts(
-    rung: Rung, problems: Sequence[Problem], rng: np.random.Generator, candidates: int, keep: int
+    model: CandidateModel,
+    problems: Sequence[Problem],
+    rng: np.random.Generator,
+    candidates: int,
+    keep: int,
 ) -> NDArray[np.float64]:
     """The `keep` best of `candidates` quasi-random parameter vectors, per problem.
 
@@ -355,7 +370,7 @@ def global_starts(
     -------
     ndarray, shape (problems, keep, parameters)
     """
-    par = rung.parameters
+    par = model.parameters
     from scipy.stats import qmc  # half a second to import
 
     unit = qmc.Sobol(len(par), rng=rng).random(candidates)
@@ -374,7 +389,7 @@ def global_starts(
     values[:, 0] = par[0].low
     later = np.arange(0.0, (par[0].high - par[0].low) / TIME_STEP_S, _DELAY_GRID)
     every = {id(problem.trials): problem.trials for problem in problems}
-    tracks = positions(rung, [(values, trials) for trials in every.values()])
+    tracks = positions(model, [(values, trials) for trials in every.values()])
     errors = {
         key: [_errors_if_later(track[:, :, n], t, later) for n, t in enumerate(trials)]
         for (key, trials), track in zip(every.items(), tracks, strict=True)
@@ -407,9 +422,11 @@ def _errors_if_later(track: NDArray, trial: TrialData, later: NDArray) -> NDArra
     return looked.transpose(0, 2, 1) - trial.sample_rad
 
 
-def _residuals(rung: Rung, problems: Sequence[Problem], points: NDArray) -> list[NDArray]:
+def _residuals(
+    model: CandidateModel, problems: Sequence[Problem], points: NDArray
+) -> list[NDArray]:
     """Model minus fresh reading of each problem's used trials, (candidates, samples) each."""
-    values = np.stack([p.decode(points[..., j]) for j, p in enumerate(rung.parameters)], axis=-1)
+    values = np.stack([p.decode(points[..., j]) for j, p in enumerate(model.parameters)], axis=-1)
     groups: dict[tuple[int, tuple[bool, ...]], list[int]] = {}
     for i, problem in enumerate(problems):  # fits to the same trials are one simulation
         groups.setdefault((id(problem.trials), problem.use), []).append(i)
@@ -418,7 +435,7 @@ def _residuals(rung: Rung, problems: Sequence[Problem], points: NDArray) -> list
         for key, members in groups.items()
     }
     tracks = positions(
-        rung, [(values[m].reshape(-1, values.shape[-1]), used[key]) for key, m in groups.items()]
+        model, [(values[m].reshape(-1, values.shape[-1]), used[key]) for key, m in groups.items()]
     )
     found: dict[int, NDArray] = {}
     for (key, members), track in zip(groups.items(), tracks, strict=True):

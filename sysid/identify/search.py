@@ -1,16 +1,15 @@
-"""Fit one rung of the ladder to one joint: from global starts, per held-out frequency, in profile.
+"""Fit one candidate model to one joint: global starts, left-out frequencies, likelihood profile.
 
 A servo's cost has many local optima (delay trades against damping, friction against effort), so
-every fit here is the same search, `fit_problems`: many seeded candidates are simulated once, the
-best are improved a little, and the best of those are fitted to the end. `fit_with_folds` runs it
-for all trials and again for each left-out frequency, so that a model can be judged on motion it
-has not seen; the fit of DelayedPD to all trials, whose numbers are exported, evolves a population
-besides. `dead_time_profile` holds the delay elsewhere and fits the rest anew: how fast the
-cost rises says how well the dead time is known. It counts samples by what they tell
-(`integrated_autocorrelation_time`), because the residuals of a real servo are not white.
+every fit is the same search, `fit_problems`: many seeded starts are simulated once, the best are
+improved a little, and the best of those are fitted to convergence. `fit_with_folds` runs it for all
+trials and for each left-out frequency, to score a model on unseen motion; the fit of DelayedPD to
+all trials, whose numbers are exported, evolves a population besides. `dead_time_profile` fits the
+other parameters at fixed dead times; the rise of the cost gives the interval, counted in effective
+samples (`integrated_autocorrelation_time`) because residuals of a real servo are not white.
 
-`sysid.identify.calibrate` chooses among the rungs by these fits; `sysid.identify.sparse_equations`
-and `sysid.servo_fit.physics` fit their models with the same search.
+`sysid.identify.joint_fit`, `sysid.identify.sparse_equations` and `sysid.servo_fit.physics` fit
+their models with it.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from scipy.special import gammaincinv, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.identify.models import Rung
+from pupper_sysid.sysid.identify.models import CandidateModel
 from pupper_sysid.sysid.identify.output_error import (
     DIFFERENCE,
     Fit,
@@ -32,17 +31,17 @@ from pupper_sysid.sysid.identify.output_error import (
     TrialData,
     evolve,
     fit,
+    free_run,
     global_starts,
     look_up,
-    positions,
 )
 
 PREFERRED = "delayed_pd"
-"""The rung that simulators and training run."""
+"""The model that simulators and training run."""
 
 STEPPING_SD_S = 0.5 * TIME_STEP_S
-"""How far off a dead time is, however many the readings, because the servo itself does not move in
-the model's steps: standard deviation over random emulated servos, which are stepped twice as finely
+"""Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
+standard deviation over random emulated servos with half that step
 (`benchmarks/dead_time_accuracy.py`)."""
 
 _MOST_FOLDS = 6
@@ -75,7 +74,7 @@ def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ..
 
 
 def fit_with_folds(
-    model: Rung,
+    model: CandidateModel,
     data: tuple[TrialData, ...],
     folds: dict[float, tuple[bool, ...]],
     noise: float,
@@ -90,7 +89,7 @@ def fit_with_folds(
 
     Parameters
     ----------
-    model : Rung
+    model : CandidateModel
     data : tuple of TrialData
     folds : dict of float to tuple of bool
         From `leave_one_out_folds`; may be empty.
@@ -98,7 +97,7 @@ def fit_with_folds(
         Size of residuals beyond which one counts as an outlier [rad].
     rng : numpy.random.Generator
     lower : dict of str to list of Fit
-        Results for lower rungs, by name; a rung nested in `PREFERRED` starts from them.
+        Fits of simpler models, by name; a model that contains `PREFERRED` starts from its fits.
     more_starts : ndarray, shape (1 + folds, starts, parameters), optional
         Join the global starts.
 
@@ -109,11 +108,11 @@ def fit_with_folds(
     Raises
     ------
     KeyError
-        If the rung is nested in `PREFERRED` and `lower` lacks that.
+        If the model contains `PREFERRED` and `lower` lacks it.
     """
     everything = Problem(data, (True,) * len(data), noise, {})
     problems = [everything, *(replace(everything, use=use) for use in folds.values())]
-    if model.name == f"{PREFERRED}_backlash":  # nested in DelayedPD: start from its solutions
+    if model.name == f"{PREFERRED}_backlash":  # contains DelayedPD: start from its solutions
         starts = [
             [np.insert(f.values, -1, gap) for gap in (0.002, 0.008, 0.025)]
             for f in lower[PREFERRED]
@@ -122,7 +121,7 @@ def fit_with_folds(
     # few tones leave many local optima: start from more places
     keep, final = (24, 4) if len(problems) <= 5 else (8, 3)
     fits = fit_problems(model, problems, rng, keep, final, more_starts)
-    if model.name == PREFERRED:  # its numbers are what people use: no dent will do
+    if model.name == PREFERRED:  # its numbers are exported: no local optimum will do
         crowd = global_starts(model, [everything], rng, _CANDIDATES, _POPULATION)[0]
         crowd[-1] = fits[0].values
         fits[0] = min(
@@ -132,7 +131,7 @@ def fit_with_folds(
 
 
 def fit_problems(
-    model: Rung,
+    model: CandidateModel,
     problems: Sequence[Problem],
     rng: np.random.Generator,
     keep: int,
@@ -143,7 +142,7 @@ def fit_problems(
 
     Parameters
     ----------
-    model : Rung
+    model : CandidateModel
     problems : sequence of Problem
     rng : numpy.random.Generator
         Draws the candidates, the same for every problem.
@@ -169,13 +168,13 @@ def fit_problems(
 
 
 def best_of(
-    model: Rung, problems: Sequence[Problem], starts: NDArray, iterations: int
+    model: CandidateModel, problems: Sequence[Problem], starts: NDArray, iterations: int
 ) -> list[Fit]:
     """The best fit to each problem from starts of its own.
 
     Parameters
     ----------
-    model : Rung
+    model : CandidateModel
     problems : sequence of Problem
     starts : ndarray, shape (problems, starts, parameters)
     iterations : int
@@ -191,7 +190,7 @@ def best_of(
 
 
 def _fit_all(
-    model: Rung,
+    model: CandidateModel,
     problems: Sequence[Problem],
     starts: NDArray,
     iterations: int,
@@ -205,13 +204,13 @@ def _fit_all(
 
 
 def dead_time_profile(
-    model: Rung, data: tuple[TrialData, ...], noise: float, best: Fit
+    model: CandidateModel, data: tuple[TrialData, ...], noise: float, best: Fit
 ) -> tuple[Interval, Fit]:
     """Dead time with its profile-likelihood interval, and the best fit met on the way.
 
     Parameters
     ----------
-    model : Rung
+    model : CandidateModel
         Its first parameter is `dead_time_s`.
     data : tuple of TrialData
     noise : float
@@ -238,7 +237,7 @@ def dead_time_profile(
         delays = delays[(delays >= model.parameters[0].low) & (delays <= model.parameters[0].high)]
         problems = [replace(everything, frozen={"dead_time_s": float(d)}) for d in delays]
         fits = fit(model, problems, np.tile(best.values, (len(delays), 1)), 10)
-        # neighbours know better ways: pass each point's solution on, outward and back
+        # a neighbour's solution may be a better start: pass each on, outward and back
         for shift in (1, -1):
             moved = fit(model, problems, np.roll([f.values for f in fits], shift, axis=0), 4)
             fits = [min(pair, key=lambda f: f.cost) for pair in zip(fits, moved, strict=True)]
@@ -272,21 +271,47 @@ def _crossings(
     return min(ends[0], float(centre)), max(ends[1], float(centre))
 
 
-def fresh_residuals(model: Rung, values: NDArray, data: Sequence[TrialData]) -> list[NDArray]:
+def fresh_residuals(
+    model: CandidateModel, values: NDArray, data: Sequence[TrialData]
+) -> list[NDArray]:
     """Free run minus fresh readings of each trial, each of shape (samples,) [rad].
 
     Parameters
     ----------
-    model : Rung
+    model : CandidateModel
     values : ndarray, shape (parameters,)
     data : sequence of TrialData
     """
-    track = positions(model, [(values[None], data)])[0][:, 0]
+    track = free_run(model, values, data)
     return [look_up(track[:, n], t.sample_step) - t.sample_rad for n, t in enumerate(data)]
 
 
+def held_out_residuals(
+    model: CandidateModel,
+    fits: Sequence[Fit],
+    folds: dict[float, tuple[bool, ...]],
+    data: Sequence[TrialData],
+) -> dict[float, NDArray]:
+    """Residuals on each left-out frequency [rad], from the fit that has not seen it.
+
+    Parameters
+    ----------
+    model : CandidateModel
+    fits : sequence of Fit
+        One per fold.
+    folds : dict of float to tuple of bool
+        From `leave_one_out_folds`.
+    data : sequence of TrialData
+    """
+    found = {}
+    for (name, use), fold in zip(folds.items(), fits, strict=True):
+        left = [d for d, used in zip(data, use, strict=True) if not used]
+        found[name] = np.concatenate(fresh_residuals(model, fold.values, left))
+    return found
+
+
 def integrated_autocorrelation_time(residuals: Sequence[NDArray]) -> float:
-    """How many nominal samples carry the information of one, given their autocorrelation.
+    """Nominal samples per independent one, from their autocorrelation.
 
     1 + 2 Σ ρ(k) over the lags k at which the autocorrelation ρ stands out of its own noise.
 

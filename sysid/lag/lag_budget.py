@@ -1,37 +1,39 @@
-"""How late is this servo, and whose fault is it: the bus's, the sensor's, or its own?
+"""Lag budget of one joint: how much is feedback age, command hold and servo.
 
-The naive lag between a command's row and the position's row is a sum:
-
-    naive lag = age of the feedback + half a loop of command hold + servo lag
+    naive lag = feedback age + command hold (half a loop) + servo lag
     servo lag = dead time + dynamics
 
-This module measures the left side and the first two terms of the right; the dead time needs a
-model and comes from `sysid.identify.calibrate`. Estimators, each on all rows and on fresh rows:
+`lag_budget` measures the naive lag and its three parts; the dead time needs a model
+(`sysid.identify.joint_fit`). Estimators, each on all rows and on fresh rows:
 
-* integer cross-correlation, the usual script: only whole loop periods can come out;
+* integer cross-correlation, which resolves whole loop periods only;
 * sub-sample cross-correlation, bounded to one period of the tone;
 * sine phase per trial; and the phase slope over all tones, where a lag common to all frequencies
   has no whole-period ambiguity below half a second.
 
-The default, "hold-aware", is the phase slope of fresh rows at the times they were measured,
-against the command as it was held. Intervals are from a bootstrap over periods.
+The default, "hold-aware", is the phase slope of fresh rows at their measurement times, against the
+zero-order-held command. Intervals are from a bootstrap over periods.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.results import Result, derived, flat
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
     find_poll_lattice,
+    quantum,
     readings,
 )
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
@@ -46,53 +48,97 @@ _FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the dela
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrequencyLag:
-    """Response of the joint to one tone."""
+    """Response of the joint to one tone.
+
+    Attributes
+    ----------
+    frequency_hz : float
+    gain, phase_deg : float
+        Of fresh readings against the held command.
+    lag_s : Interval
+    naive_lag_s, naive_gain : float
+        Of all rows at their own times.
+    trial : int
+    """
 
     frequency_hz: float
     gain: float
     phase_deg: float
-    lag: Interval
+    lag_s: Interval
     naive_lag_s: float
     naive_gain: float
     trial: int
 
 
-@dataclass(frozen=True)
-class LagBudget:
-    """Where one joint's lag comes from. Times in seconds.
+@dataclass(frozen=True, kw_only=True)
+class LagBudget(Result):
+    """Parts of one joint's lag.
 
     Attributes
     ----------
-    naive : Interval
-        Command row to position row, all rows.
-    fresh : Interval
-        Command row to fresh rows at the times they were measured.
-    lag : Interval
-        Command edge to the motion the host sees: the servo's own lag.
+    joint : str
+    naive_lag_s : Interval
+        From a command's row to the position's row, all rows.
+    fresh_lag_s : Interval
+        The same of fresh rows at their measurement times.
+    lag_s : Interval
+        From a command's edge to the measured motion: the servo's own lag.
     feedback_age_s, command_hold_s : float
-        What the bus adds: `naive - fresh` and `fresh - lag`.
+        What the bus adds: `naive_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`.
+    dead_time_s : Interval or None
+        Part of `lag_s` before the servo moves; None if no model was fitted.
+    feedback : PollLattice
+    quantum_rad : float
+        Quantisation step of the readings; 0 if there is none.
+    offset_rad : float
+        Reading minus position, from the fitted model.
     by_frequency : tuple of FrequencyLag
         Empty if the recording has no tones.
-    estimators : dict of str to float
-        All estimators by name [s], for comparison; NaN where one does not apply.
-    lattice : PollLattice
+    estimators_s : dict of str to float
+        Lag by every estimator; NaN where one does not apply.
     noise_rad : float
         RMS of fresh readings about their tones; NaN if there are none.
+    warnings : tuple of str
     """
 
     joint: str
-    naive: Interval
-    fresh: Interval
-    lag: Interval
+    naive_lag_s: Interval
+    fresh_lag_s: Interval
+    lag_s: Interval
     feedback_age_s: float
     command_hold_s: float
+    dead_time_s: Interval | None = None
+    feedback: PollLattice
+    quantum_rad: float
+    offset_rad: float = math.nan
     by_frequency: tuple[FrequencyLag, ...]
-    estimators: dict[str, float]
-    lattice: PollLattice
+    estimators_s: dict[str, float]
     noise_rad: float
     warnings: tuple[str, ...]
+
+    @derived
+    def dynamics_s(self) -> float:
+        """Part of the servo's lag that is not dead time [s]."""
+        return self.lag_s.value - (self.dead_time_s.value if self.dead_time_s else math.nan)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A single row, without the estimators."""
+        return [flat(replace(self, estimators_s={}).to_dict())]
+
+    def __str__(self) -> str:
+        parts = f"{1e3 * self.lag_s.value:.0f} ms the servo"
+        if self.dead_time_s:
+            parts += (
+                f": {1e3 * self.dead_time_s.value:.0f} ms dead time + "
+                f"{1e3 * self.dynamics_s:.0f} ms dynamics"
+            )
+        age = f"{1e3 * self.feedback_age_s:.0f} ms" if abs(self.feedback_age_s) >= 1e-3 else "none"
+        return (
+            f"of the naive {1e3 * self.naive_lag_s.value:.0f} ms, {age} is feedback age, "
+            f"{1e3 * self.command_hold_s:.0f} ms command hold, {parts}."
+        )
 
 
 def lag_budget(
@@ -123,8 +169,8 @@ def lag_budget(
     if sum(len(r.rows) for r in read) < 16:
         raise InputError(
             f"{joint}: only {sum(len(r.rows) for r in read)} readings differ from the one before, "
-            "too few to measure a lag. Was the joint moving and its torque on? "
-            "`pupper-sysid doctor` says more."
+            "too few to measure a lag. Was the joint moving and its torque on? See "
+            "`pupper-sysid doctor`."
         )
     tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
     tones = [t for t in tones if t is not None]
@@ -133,8 +179,8 @@ def lag_budget(
         moved = max(abs(t.response) for t in tones)
         if moved < _MOVES:
             raise InputError(
-                f"{joint}: it moved by {100 * moved:.0f} % of what it was told at best, so there "
-                "is no lag to measure. Was its torque on, and does it turn freely?"
+                f"{joint}: it moved by at most {100 * moved:.0f} % of its command, so there is no "
+                "lag to measure. Was its torque on, and does it turn freely?"
             )
         naive = _slope(tones, "naive_rows")
         fresh = _slope(tones, "fresh_rows")
@@ -143,8 +189,8 @@ def lag_budget(
         if lost:
             listed = ", ".join(f"{t.frequency_hz:.3g}" for t in lost)
             warnings.append(
-                f"{joint}: at {listed} Hz it moves less than half as far as told, so these tones "
-                "are left out of the lag; record them with a smaller amplitude."
+                f"{joint}: at {listed} Hz it moves less than half as far as commanded, so these "
+                "tones are left out of the lag; record them with a smaller amplitude."
             )
         if len({round(t.frequency_hz, 2) for t in tones}) == 1:
             warnings.append(
@@ -154,32 +200,39 @@ def lag_budget(
     else:
         naive, fresh, lag = _shifts(trials, read, rng)
         warnings.append(
-            f"{joint}: no tones in this recording, so the lag is one time shift over everything it "
-            "did. Record a sweep for a lag per frequency."
+            f"{joint}: no tones in this recording, so the lag is one time shift of all its "
+            "motion. Record a sweep for a lag per frequency."
         )
-    by_frequency = tuple(map(_at_frequency, tones, _servo_lags(tones)))
+    frequency = np.array([t.frequency_hz for t in tones])
+    lags = tone_lags(np.array([t.response for t in tones]), frequency) if tones else []
+    by_frequency = tuple(_at_frequency(t, float(own)) for t, own in zip(tones, lags, strict=True))
+    doubt = max(t.read_time_doubt_s for t in trials)
     if lattice.kind == "unresolved":
-        # all readings may be as old as a read that was answered at once, or one loop older
+        # every reading may be as old as a read that was answered at once, or one loop older
         loop = float(np.median(np.concatenate([np.diff(t.read_time_s) for t in trials])))
-        fresh, lag = fresh.widened(loop / 2), lag.widened(loop / 2)
-        by_frequency = tuple(replace(f, lag=f.lag.widened(loop / 2)) for f in by_frequency)
+        doubt += loop / 2
         warnings.append(
             f"{joint}: readings are held, but their poll period could not be found; fresh readings "
-            "are dated to the middle between two reads, which may put all lags off by half a loop "
+            "are dated to the middle between two reads, which may bias all lags by half a loop "
             f"({1e3 * loop / 2:.0f} ms). A longer sweep would settle it."
         )
-    doubt = max(t.read_time_doubt_s for t in trials)
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
-    by_frequency = tuple(replace(f, lag=f.lag.widened(doubt)) for f in by_frequency)
     return LagBudget(
-        joint, naive, fresh, lag,
-        naive.value - fresh.value, fresh.value - lag.value,
-        by_frequency,
-        _estimators(trials, read, tones, lag.value),
-        lattice,
-        float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else float("nan"),
-        tuple(warnings),
-    )  # fmt: skip
+        joint=joint,
+        naive_lag_s=naive,
+        fresh_lag_s=fresh,
+        lag_s=lag,
+        feedback_age_s=naive.value - fresh.value,
+        command_hold_s=fresh.value - lag.value,
+        feedback=lattice,
+        quantum_rad=quantum(trials),
+        by_frequency=tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency),
+        estimators_s=_estimators(trials, read, tones, lag.value),
+        noise_rad=float(np.sqrt(np.mean([t.residual_rad**2 for t in tones])))
+        if tones
+        else math.nan,
+        warnings=tuple(warnings),
+    )
 
 
 # --------------------------------------------------------------------------- phase slope
@@ -204,10 +257,10 @@ def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
 
 
 def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
-    """Share of each tone in the joint's lag: inverse variance, nothing where it cannot follow.
+    """Weight of each tone in the joint's lag: inverse variance, 0 where the servo cannot follow.
 
-    A servo that moves less than half as far as it does at its best is cut short by its torque or
-    speed limit; when its motion comes then is no delay.
+    Below half of the largest gain the torque or speed limit clips the motion, and its phase is no
+    delay.
     """
     gain = np.array([abs(t.response) for t in tones])
     weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
@@ -243,7 +296,7 @@ def tone_lags(response: NDArray, frequency_hz: NDArray) -> NDArray[np.float64]:
 def _common_lag(response: NDArray, frequency: NDArray) -> float:
     """The lag on which all phases agree best."""
     spacing = np.diff(np.unique(frequency))
-    # two trials of one tone differ by what their fits are off, and say nothing more
+    # two trials of one tone differ by the error of their fits only
     spacing = spacing[spacing > _ONE_TONE_HZ]
     # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
     repeat = 1.0 / (spacing.min() if len(spacing) else frequency[0])
@@ -258,21 +311,19 @@ def _lag_near(response, frequency, centre):
     return centre - turned / (2 * np.pi * frequency)
 
 
-def _servo_lags(tones: Sequence[ToneResponse]) -> list[float]:
-    if not tones:
-        return []
-    frequency = np.array([t.frequency_hz for t in tones])
-    return tone_lags(np.array([t.response for t in tones]), frequency).tolist()
-
-
 def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
     f, response = tone.frequency_hz, tone.response
     draws = _lag_near(tone.response_draws, f, lag)
     naive = tone.naive / tone.command_rows
     return FrequencyLag(
-        f, abs(response), -360.0 * f * lag, Interval.of_draws(lag, draws),
-        float(_lag_near(naive, f, lag + _USUAL_AGE_S)), abs(naive), tone.trial,
-    )  # fmt: skip
+        frequency_hz=f,
+        gain=abs(response),
+        phase_deg=-360.0 * f * lag,
+        lag_s=Interval.of_draws(lag, draws),
+        naive_lag_s=float(_lag_near(naive, f, lag + _USUAL_AGE_S)),
+        naive_gain=abs(naive),
+        trial=tone.trial,
+    )
 
 
 # ------------------------------------------------------------------- time shift, any excitation
@@ -372,7 +423,7 @@ def _longest(trial: Trial) -> float:
 
 
 def _integer(trial: Trial, rows: NDArray | None) -> float:
-    """Lag in whole loop periods at which raw correlation peaks: the usual script [s]."""
+    """Lag in whole loop periods at which raw correlation peaks [s]."""
     c = trial.command_rad - trial.command_rad.mean()
     loop = float(np.median(np.diff(trial.send_time_s)))
     shifts = np.arange(0, max(2, int(_longest(trial) / loop)))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import PREFERRED
 
 _FEW_FREQUENCIES = 4
@@ -63,10 +63,10 @@ def advice(
 
 def _gaps(result: JointCalibrationResult) -> list[str]:
     """Sentences for one joint, without its name."""
-    pd, lattice = result.rungs[PREFERRED], result.budget.lattice
+    pd, lattice = result.candidate_models[PREFERRED], result.lag.feedback
     tones = sorted({round(t.frequency_hz, 2) for t in result.trials if t.frequency_hz > 0})
     fresh = sum(len(t.sample_step) for t in result.trials)
-    width = 1e3 * (result.dead_time.high - result.dead_time.low)
+    width = 1e3 * (result.dead_time_s.high - result.dead_time_s.low)
     found = []
     limits = {"velocity_limit_rad_s": "speed", "effort_rad_s2": "torque"}
     if unknown := [name for key, name in limits.items() if key in pd.undecided]:
@@ -106,6 +106,6 @@ def _gaps(result: JointCalibrationResult) -> list[str]:
             "readings are held, but the bus's poll period could not be found. Record a longer "
             f"sweep ({_LONG_S:g} s or more) at full amplitude."
         )
-    if not np.isfinite(pd.scores.leave_one_out) and tones:
+    if not np.isfinite(pd.scores.rmse_leave_one_frequency_out_rad) and tones:
         found.append("no frequency could be left out, so the model was not tested on new motion.")
     return found

@@ -1,68 +1,29 @@
 """Data of the report's figures.
 
-`lag_parts` splits one joint's lag into the parts of the lag budget; `tracks` is the free run of a
-fitted model beside commands and readings; `hold_runs` counts for how many rows readings stay the
-same, beside the prediction of the poll lattice.
+`tracks` is the free run of a fitted model beside commands and readings; `hold_runs` counts for how
+many rows readings stay the same, beside the prediction of the poll lattice.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
-from pupper_sysid.sysid.identify.models import rung
-from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.output_error import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.search import PREFERRED
-
-if TYPE_CHECKING:  # the second brings python-control, which is not needed here
-    from pupper_sysid.sysid.doctor.examination import JointExamination
-    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
 LONGEST_RUN = 12
 """Hold runs of this many rows and more share the last bar."""
-
-
-@dataclass(frozen=True)
-class LagParts:
-    """The lag budget of one joint [s], in the order in which the parts happen.
-
-    naive = command hold + dead time + dynamics + feedback age
-    """
-
-    naive_lag_s: Interval
-    feedback_age_s: float
-    command_hold_s: float
-    lag_s: Interval
-    dead_time_s: Interval
-    dynamics_s: float
-
-    def sentence(self) -> str:
-        """The finding in words."""
-        age = f"{1e3 * self.feedback_age_s:.0f} ms" if abs(self.feedback_age_s) >= 1e-3 else "none"
-        return (
-            f"of the naive {1e3 * self.naive_lag_s.value:.0f} ms, {age} is feedback age, "
-            f"{1e3 * self.command_hold_s:.0f} ms command hold, {1e3 * self.lag_s.value:.0f} ms the "
-            f"servo: {1e3 * self.dead_time_s.value:.0f} ms dead time + "
-            f"{1e3 * self.dynamics_s:.0f} ms dynamics."
-        )
-
-
-def lag_parts(result: JointCalibrationResult) -> LagParts:
-    """The parts of a joint's lag."""
-    budget = result.budget
-    return LagParts(
-        budget.naive, budget.feedback_age_s, budget.command_hold_s, budget.lag, result.dead_time,
-        budget.lag.value - result.dead_time.value,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -110,9 +71,9 @@ def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track
     """
     if not result.trials:
         return []
-    fitted = rung(model)
-    values = np.array([[result.rungs[model].values[name] for name in fitted.names]])
-    simulated = positions(fitted, [(values, result.trials)])[0][:, 0]
+    fitted = candidate_model(model)
+    values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
+    simulated = free_run(fitted, values, result.trials)
     return [_track(trial, simulated[:, n]) for n, trial in enumerate(result.trials)]
 
 
@@ -189,25 +150,27 @@ class HoldRuns:
     expected: NDArray[np.float64] | None
 
 
-def hold_runs(examined: Sequence[JointExamination], lattice: PollLattice) -> HoldRuns:
+def hold_runs(
+    histograms: Sequence[tuple[int, ...]], loop_periods_s: Sequence[float], lattice: PollLattice
+) -> HoldRuns:
     """Hold runs of one joint, counted by the doctor and predicted by its poll lattice.
 
     Parameters
     ----------
-    examined : sequence of JointExamination
-        One per recording; their counts are added.
+    histograms : sequence of tuple of int
+        Runs of 1, 2, … rows in each recording; they are added.
+    loop_periods_s : sequence of float
+        Of each recording.
     lattice : PollLattice
     """
     count = np.zeros(LONGEST_RUN, dtype=np.int64)
-    for found in examined:
-        length = np.clip(np.arange(len(found.hold_histogram)), 0, LONGEST_RUN - 1)
-        np.add.at(count, length, np.array(found.hold_histogram, dtype=np.int64))
+    for histogram in histograms:
+        length = np.clip(np.arange(len(histogram)), 0, LONGEST_RUN - 1)
+        np.add.at(count, length, np.array(histogram, dtype=np.int64))
     if lattice.kind != "lattice" or not count.any():
         return HoldRuns(lattice, count, None)
-    loop = float(np.median([found.loop_period_ms for found in examined]))
-    return HoldRuns(
-        lattice, count, count.sum() * _expected(1e3 * lattice.period_s / loop, lattice.loss)
-    )
+    rows = lattice.poll_period_s / float(np.median(loop_periods_s))
+    return HoldRuns(lattice, count, count.sum() * _expected(rows, lattice.loss))
 
 
 def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:

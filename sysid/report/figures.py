@@ -7,7 +7,6 @@ Curves differ from each other in more than colour.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,36 +29,34 @@ from pupper_sysid.common.figure_style import (
     axes_column,
     styled,
 )
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.report.figure_data import (
     LONGEST_RUN,
     HoldRuns,
-    LagParts,
     Track,
-    lag_parts,
     response_errors,
     some_tracks,
     tracks,
     window,
 )
 
-if TYPE_CHECKING:  # it brings python-control, which is not needed to draw
-    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
-
 
 @styled
-def lag_budget_figure(results: Mapping[str, JointCalibrationResult]) -> Figure:
+def lag_budget_figure(budgets: Mapping[str, LagBudget]) -> Figure:
     """One stacked bar per joint: the parts of the time from a command's row to its position's row.
 
     Parameters
     ----------
-    results : dict of joint to JointCalibrationResult
+    budgets : dict of joint to LagBudget
+        With their dead times.
     """
-    figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(results))
-    ends = [_lag_bar(axes, row, lag_parts(r)) for row, r in enumerate(results.values())]
-    axes.set_yticks(range(len(results)), list(results))
-    axes.set_ylim(len(results) - 0.4, -0.6)
+    figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(budgets))
+    ends = [_lag_bar(axes, row, budget) for row, budget in enumerate(budgets.values())]
+    axes.set_yticks(range(len(budgets)), list(budgets))
+    axes.set_ylim(len(budgets) - 0.4, -0.6)
     axes.set_xlim(0, max(ends) * 1.14)
     axes.set_xlabel("time after the command's row [ms]")
     axes.grid(axis="y", visible=False)
@@ -85,9 +82,10 @@ _LAG_KINDS = (
 )
 
 
-def _lag_bar(axes: Axes, row: int, part: LagParts) -> float:
+def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
     """Draw one joint's bar; returns where it ends [ms]."""
     naive, dead_time = 1e3 * part.naive_lag_s.value, part.dead_time_s
+    assert dead_time is not None
     lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.feedback_age_s)
     left = 0.0
     for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
@@ -178,7 +176,7 @@ def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
                 length, runs.expected, "D", color=INK, ms=5, label="predicted by poll and loss"
             )
             title = (
-                f"{joint}: a poll every {1e3 * lattice.period_s:.2f} ms, "
+                f"{joint}: a poll every {1e3 * lattice.poll_period_s:.2f} ms, "
                 f"{100 * lattice.loss:.0f} % of them lost"
             )
         axes.set_title(title)
@@ -220,7 +218,7 @@ def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
             frequency, 20 * np.log10(np.abs(response.naive_response)), color=colour, marker=mark,
             ms=6, mfc="none", ls="",
         )  # fmt: skip
-        for fit in response.fits[-1:]:
+        for fit in list(response.transfer_functions.values())[-1:]:
             fine = np.geomspace(frequency[0], frequency[-1], 200)
             fitted = fit.evaluate(fine)
             gain.plot(fine, 20 * np.log10(np.abs(fitted)), color=colour, lw=1.2)
@@ -264,7 +262,7 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     def gathered(name: str) -> NDArray:
         return np.concatenate([getattr(t, name) for t in found])
 
-    age = 1e3 * result.budget.feedback_age_s
+    age = 1e3 * result.lag.feedback_age_s
     over_speed.plot(
         gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
         label=f"all rows at their own time (dashed: speed × {age:.0f} ms)",

@@ -16,8 +16,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, versions
 from pupper_sysid.common.page import Picture, Section, Table, WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, calibrate
-from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import PREFERRED
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
@@ -30,13 +30,12 @@ from pupper_sysid.sysid.recordings.joints import (
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures, tables
 from pupper_sysid.sysid.report.advice import advice
-from pupper_sysid.sysid.report.figure_data import hold_runs, lag_parts, tracks
-from pupper_sysid.sysid.report.servo_section import servo_section
+from pupper_sysid.sysid.report.figure_data import hold_runs, tracks
 from pupper_sysid.sysid.report.tables import MODEL_NAMES
 
 if TYPE_CHECKING:  # they bring libraries that a page does not need
     from pupper_sysid.sysid.doctor.examination import Examination
-    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+    from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
     from pupper_sysid.sysid.servo_fit.compare import Comparison
     from pupper_sysid.sysid.servo_fit.result import ServoFit
 
@@ -125,28 +124,10 @@ def write_report(
         If one of the files exists and `force` is not given (nothing has been written then), if one
         cannot be written, or if the calibration was made from other recordings.
     """
-    refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
-    found = find(
-        recordings, joints=joints, calibration=calibration, models=models, seed=seed,
-        workers=workers, progress=progress,
-    )  # fmt: skip
-    return found.write(Path(folder), force)
-
-
-def find(
-    recordings: Recordings,
-    *,
-    joints: Joints = None,
-    calibration: Calibration | None = None,
-    models: Sequence[str | Path | Calibration | ServoFit] = (),
-    seed: int = 0,
-    workers: int = 1,
-    progress: Callable[[str, float], None] | None = None,
-) -> Findings:
-    """The findings of a report; parameters and errors as for `write_report`."""
     from pupper_sysid.sysid.doctor.examination import examine
-    from pupper_sysid.sysid.lag.frequency_response import frequency_response
+    from pupper_sysid.sysid.lag.joint_response import joint_response
 
+    refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
     if calibration is not None:
         _refuse_foreign(calibration, recordings, names)
@@ -159,26 +140,26 @@ def find(
         if progress:
             progress(what, done / steps)
 
-    results = calibrate(recordings, names, seed, preset_parameters(), workers, advance)
+    results = calibrate(recordings, names, seed, workers=workers, progress=advance)
     examinations, responses = [], {}
     for recording in recordings:
-        examinations.append((recording.name, examine(recording, seed)))
+        examinations.append((recording.name, examine(recording, seed=seed)))
         advance(recording.name)
     for joint, result in results.items():
-        if result.budget.by_frequency:
+        if result.lag.by_frequency:
             trials, rng = joint_trials(recordings, joint), joint_rng(seed, joint)
-            responses[joint] = frequency_response(joint, trials, rng, result.budget.lattice)
+            responses[joint] = joint_response(joint, trials, rng, result.lag.feedback)
         advance(joint)
     comparison = None
     if models:
         from pupper_sysid.sysid.servo_fit.compare import compare  # brings torch
 
         comparison = compare(recordings, models, names, seed=seed)
-    return Findings(
+    found = Findings(
         recordings=recordings, results=results, examinations=examinations, responses=responses,
-        calibration=calibration or to_calibration(results, recordings, seed),
-        comparison=comparison,
+        calibration=calibration or results.calibration, comparison=comparison,
     )  # fmt: skip
+    return found.write(Path(folder), force)
 
 
 def _refuse_foreign(
@@ -203,6 +184,8 @@ def sections(found: Findings) -> list[Section]:
     overlays, residuals = _free_runs(results)
     made += [overlays, _holds(found), _bode(found), _models(results), _parameters(found), residuals]
     if found.comparison:
+        from pupper_sysid.sysid.report.servo_section import servo_section
+
         made.append(servo_section(found.comparison))
     next_steps = advice(results, found.examinations)
     made += [
@@ -219,7 +202,7 @@ def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
     return Section(
         "found",
         "What was found",
-        findings=[(joint, lag_parts(r).sentence()) for joint, r in results.items()],
+        findings=[(joint, str(r.lag)) for joint, r in results.items()],
         notes=[
             "Naive lag: from a command's row to the position's row, as a cross-correlation of the "
             "log measures it. Only the servo's own part belongs to a simulated actuator; stale "
@@ -233,12 +216,12 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
         "lag_budget",
         "Lag budget: the time from sending a command to the row in which its motion is read. The "
         "black line is the naive lag, which is the sum.",
-        figures.lag_budget_figure(results),
+        figures.lag_budget_figure({joint: r.lag for joint, r in results.items()}),
     )
     return Section(
         "lag", "Lag budget", figures=[picture],
         tables=[tables.lag_table(results), tables.estimator_table(results)],
-        notes=[w for r in results.values() for w in r.budget.warnings],
+        notes=[w for r in results.values() for w in r.lag.warnings],
     )  # fmt: skip
 
 
@@ -287,7 +270,11 @@ def _holds(found: Findings) -> Section:
     for joint, result in found.results.items():
         examined = [e.joints[joint] for _, e in found.examinations if joint in e.joints]
         if examined:
-            held[joint] = hold_runs(examined, result.budget.lattice)
+            held[joint] = hold_runs(
+                [e.hold_histogram for e in examined],
+                [e.loop_period_s for e in examined],
+                result.lag.feedback,
+            )
     pictures = []
     if held:
         text = (
@@ -310,7 +297,7 @@ def _bode(found: Findings) -> Section:
     return Section(
         "bode", "Frequency response", figures=pictures, tables=[t for t in made if t.rows],
         findings=[
-            (joint, f"−3 dB bandwidth {response.bandwidth_text()}.")
+            (joint, f"−3 dB bandwidth {response.bandwidth_text}.")
             for joint, response in found.responses.items()
         ],
     )  # fmt: skip
@@ -320,7 +307,7 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
     misled = [
         f"On {joint} it prefers {tables.model_name(best)}."
         for joint, result in results.items()
-        if (best := _best_by_raw_score(result)) != result.chosen
+        if (best := _best_by_raw_score(result)) != result.model
     ]
     return Section(
         "models",
@@ -341,8 +328,8 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
 
 
 def _best_by_raw_score(result: JointCalibrationResult) -> str:
-    scores = {name: r.scores.naive for name, r in result.rungs.items()}
-    scores |= {name: s.naive for name, s in result.presets.items()}
+    scores = {name: r.scores.rmse_raw_rad for name, r in result.candidate_models.items()}
+    scores |= {name: s.rmse_raw_rad for name, s in result.presets.items()}
     return min(scores, key=lambda name: scores[name])
 
 
@@ -357,7 +344,7 @@ def _parameters(found: Findings) -> Section:
             "the armature, and the anchor gives the rest.",
         ],
         tables=[tables.parameter_table(found.calibration, list(found.results))],
-        notes=[w for r in found.results.values() for w in r.warnings if w not in r.budget.warnings],
+        notes=[w for r in found.results.values() for w in r.warnings if w not in r.lag.warnings],
     )
 
 

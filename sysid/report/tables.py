@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.common.results import flat, plain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
-from pupper_sysid.sysid.report.figure_data import lag_parts
-
-if TYPE_CHECKING:  # it brings python-control, which a table does not need
-    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
 MODEL_NAMES = {
     "pure_delay": "pure delay",
@@ -37,19 +34,10 @@ _MS = 1e3
 def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """The lag budget per joint."""
     rows = []
-    for joint, result in results.items():
-        lattice, steps = result.budget.lattice, result.delay_steps
-        rows.append(
-            {"joint": joint}
-            | flat(plain(lag_parts(result)))
-            | {
-                "delay_steps_min": steps[0],
-                "delay_steps_max": steps[1],
-                "poll_period_s": lattice.period_s,
-                "loss": lattice.loss,
-                "mean_age_from_poll_s": lattice.mean_age_s,
-            }
-        )
+    for result in results.values():
+        low, high = result.delay_steps
+        (row,) = result.lag.rows()
+        rows.append(row | {"delay_steps_min": low, "delay_steps_max": high})
     columns = (
         KEY,
         number("naive, ms", "naive_lag_s", 1, _MS),
@@ -58,18 +46,18 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         _ranged(f"+ servo lag {_LEVEL}", "lag_s", 1, _MS),
         _ranged(f"of it dead time {_LEVEL}", "dead_time_s", 1, _MS),
         number("and dynamics", "dynamics_s", 1, _MS),
-        number("poll, ms", "poll_period_s", 2, _MS),
-        number("lost polls, %", "loss", 0, 100.0),
+        number("poll, ms", "feedback_poll_period_s", 2, _MS),
+        number("lost polls, %", "feedback_loss", 0, 100.0),
     )
     return Table("lag_budget", "Lag budget", columns, tuple(rows))
 
 
 def estimator_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """The lag by every estimator, the usual ones first; a column per joint."""
-    names = list(dict.fromkeys(name for r in results.values() for name in r.budget.estimators))
+    names = list(dict.fromkeys(name for r in results.values() for name in r.lag.estimators_s))
     rows = tuple(
         {"estimator": name}
-        | {f"{j}_lag_s": r.budget.estimators.get(name, math.nan) for j, r in results.items()}
+        | {f"{j}_lag_s": r.lag.estimators_s.get(name, math.nan) for j, r in results.items()}
         for name in names
     )
     columns = (
@@ -84,14 +72,14 @@ def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     rows = [
         {"joint": joint} | flat(plain(f))
         for joint, result in results.items()
-        for f in sorted(result.budget.by_frequency, key=lambda f: f.frequency_hz)
+        for f in sorted(result.lag.by_frequency, key=lambda f: f.frequency_hz)
     ]
     columns = (
         KEY,
         number("Hz", "frequency_hz", 2),
         number("gain", "gain", 2),
         number("phase, °", "phase_deg", 0),
-        _ranged(f"lag, ms {_LEVEL}", "lag", 1, _MS),
+        _ranged(f"lag, ms {_LEVEL}", "lag_s", 1, _MS),
         number("naive gain", "naive_gain", 2),
         number("naive lag, ms", "naive_lag_s", 1, _MS),
     )
@@ -105,7 +93,7 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
         | flat(plain(p))
         | {"chi2_per_dof": fit.chi2_per_dof}
         for joint, response in responses.items()
-        for fit in response.fits
+        for fit in response.transfer_functions.values()
         for name, p in fit.parameters.items()
     ]
     columns = (
@@ -123,10 +111,12 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """Candidate models and presets, scored the same way."""
     rows = []
     for joint, result in results.items():
-        fitted = {n: ("fitted", len(r.values), r.scores) for n, r in result.rungs.items()}
+        fitted = {
+            n: ("fitted", len(r.values), r.scores) for n, r in result.candidate_models.items()
+        }
         presets = {n: ("preset", None, scores) for n, scores in result.presets.items()}
         for name, (kind, count, scores) in (fitted | presets).items():
-            chosen = name == result.chosen
+            chosen = name == result.model
             numbers = plain(scores).items()
             rows.append(
                 {"joint": joint, "model": name, "kind": "chosen" if chosen else kind}
@@ -137,12 +127,12 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         KEY,
         Column("model", _model_cell, "words"),
         number("parameters fitted", "parameter_count", 0),
-        number("fresh, mrad", "fresh", 1, 1e3),
-        number("unseen frequency, mrad", "leave_one_out", 1, 1e3),
-        number("held, mrad", "held", 1, 1e3),
-        number("one step, mrad", "one_step", 1, 1e3),
+        number("fresh, mrad", "rmse_fresh_rad", 1, 1e3),
+        number("unseen frequency, mrad", "rmse_leave_one_frequency_out_rad", 1, 1e3),
+        number("held, mrad", "rmse_held_rad", 1, 1e3),
+        number("one step, mrad", "rmse_one_step_rad", 1, 1e3),
         number("fit, %", "fit_percent"),
-        number("raw, mrad (misleads)", "naive", 1, 1e3),
+        number("raw, mrad (misleads)", "rmse_raw_rad", 1, 1e3),
     )
     title = "Candidate models, simplest first"
     return Table("candidate_models", title, columns, tuple(rows), "is_chosen")
@@ -222,10 +212,10 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
     columns = (
         KEY,
         text("verdict", "verdict"),
-        number("loop, ms", "loop_period_ms", 2),
-        number("jitter, ms", "jitter_ms", 2),
+        number("loop, ms", "loop_period_s", 2, _MS),
+        number("jitter, ms", "jitter_s", 2, _MS),
         number("fresh rows, %", "fresh_fraction", 0, 100.0),
-        number("poll, ms", "poll_period_ms", 2),
+        number("poll, ms", "poll_period_s", 2, _MS),
         number("lost polls, %", "loss", 0, 100.0),
         number("quantisation step, mrad", "quantum_rad", 3, 1e3),
         number("offset, mrad", "offset_rad", 1, 1e3),

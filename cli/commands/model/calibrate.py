@@ -1,4 +1,4 @@
-"""`calibrate`: fit the ladder to recordings and write the calibration file."""
+"""`calibrate`: fit servo models to recordings and write the calibration file."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 
 if TYPE_CHECKING:
-    from pupper_sysid.servo_models.calibration.calibration import Calibration
-    from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult
+    from pupper_sysid.sysid.identify.calibrate import CalibrationResult
 
 _SHOWN = {
     "lag_ms": ("lag ms", 1),
@@ -60,8 +59,6 @@ class Calibrate:
     def run(self) -> None:
         """Calibrate, print, write."""
         from pupper_sysid.sysid.identify.calibrate import calibrate
-        from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
-        from pupper_sysid.sysid.report.json_objects import calibrate_json
 
         started = time.perf_counter()
         terminal.need_positive("--stall-torque", self.stall_torque)
@@ -75,16 +72,19 @@ class Calibrate:
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.progress("calibrating", len(joints)) as advance:
-            results = calibrate(
-                recordings, joints, self.seed, preset_parameters(), progress=advance
-            )
-        made = to_calibration(results, recordings, self.seed, self.stall_torque, self._source())
+            made = calibrate(
+                recordings, joints, self.seed, self.stall_torque, self._source(),
+                workers=2, progress=advance,
+            )  # fmt: skip
         made.save(out, force=self.force)
-        elapsed = time.perf_counter() - started
         if self.json:
-            terminal.print_json(calibrate_json(results, made, elapsed))
+            terminal.print_json(made)
         else:
-            self._print(results, made, out, elapsed)
+            self._print(made)
+            terminal.err.print(
+                f"Wrote {out} in {time.perf_counter() - started:.1f} s. Next: pupper-sysid report",
+                soft_wrap=True,
+            )
 
     def _source(self) -> str:
         """Where the torque anchor comes from."""
@@ -107,20 +107,14 @@ class Calibrate:
             fleet, out, time.perf_counter() - started, self.json, "a calibration", _SHOWN
         )
 
-    def _print(
-        self,
-        results: dict[str, JointCalibrationResult],
-        made: Calibration,
-        out: Path,
-        elapsed: float,
-    ) -> None:
+    def _print(self, made: CalibrationResult) -> None:
         shown = terminal.table(
-            "DelayedPD per joint", "joint", "delay ms", "steps @500 Hz", "Kp", "Kd",
+            "DelayedPD per joint", "joint", "dead time ms", "steps @500 Hz", "Kp", "Kd",
             "fric. N·m", "J 1e-4 kg·m²", "speed rad/s", "error mrad", "unseen Hz mrad",
             "paper mrad",
         )  # fmt: skip
-        for name, r in results.items():
-            a, s = made.joint(name).actuator, r.rungs["delayed_pd"].scores
+        for name, r in made.items():
+            a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
             paper = r.presets.get("paper")
             shown.add_row(
                 name, terminal.ms(a.dead_time_s.value), "{}–{}".format(*r.delay_steps),
@@ -128,8 +122,9 @@ class Calibrate:
                 terminal.number(a.damping_nm_s_per_rad.value, 3),
                 terminal.number(a.friction_loss_nm.value, 3),
                 terminal.number(1e4 * a.armature_kg_m2.value, 2),
-                terminal.number(a.velocity_limit_rad_s.value), terminal.ms(s.fresh),
-                terminal.ms(s.leave_one_out), terminal.ms(paper.fresh if paper else None),
+                terminal.number(a.velocity_limit_rad_s.value), terminal.ms(s.rmse_fresh_rad),
+                terminal.ms(s.rmse_leave_one_frequency_out_rad),
+                terminal.ms(paper.rmse_fresh_rad if paper else None),
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print(
@@ -137,15 +132,12 @@ class Calibrate:
             "give only their ratios. Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
-        for r in results.values():
+        for r in made.values():
             terminal.warn(r.warnings)
-        if self.stall_torque == STALL_TORQUE_NM and not set(results) <= set(JOINT_NAMES):
+        if self.stall_torque == STALL_TORQUE_NM and not set(made) <= set(JOINT_NAMES):
             terminal.warn(
                 [
                     f"{self.stall_torque:g} N·m is the stall torque of the Mini Pupper's servo. "
                     "Give --stall-torque from your servo's data sheet: all torques scale with it."
                 ]
             )
-        terminal.err.print(
-            f"Wrote {out} in {elapsed:.1f} s. Next: pupper-sysid report", soft_wrap=True
-        )

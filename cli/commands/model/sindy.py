@@ -13,7 +13,7 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.identify.sparse_equations import EquationResult
+    from pupper_sysid.sysid.identify.sparse_equations import Equations
 
 
 @dataclass(frozen=True)
@@ -34,20 +34,20 @@ class Sindy:
 
     def run(self) -> None:
         """Find the equations and print them."""
-        from pupper_sysid.sysid.identify.sparse_equations import identify, to_json
+        from pupper_sysid.sysid.identify.sparse_equations import sparse_equations
 
         started = time.perf_counter()
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.progress("finding equations", len(joints)) as advance:
-            results = identify(recordings, joints, self.seed, progress=advance)
-        elapsed = time.perf_counter() - started
+            results = sparse_equations(recordings, joints, self.seed, workers=2, progress=advance)
         if self.json:
-            terminal.print_json({**to_json(results), "elapsed_s": elapsed})
-        else:
-            self._print(results, elapsed)
+            terminal.print_json(results)
+            return
+        self._print(results)
+        terminal.err.print(f"Took {time.perf_counter() - started:.1f} s.")
 
-    def _print(self, results: dict[str, EquationResult], elapsed: float) -> None:
+    def _print(self, results: Equations) -> None:
         for name, r in results.items():
             terminal.out.print(Text.assemble((name, "bold"), f": {r.equation}"), soft_wrap=True)
             for line in r.explanation():
@@ -59,9 +59,10 @@ class Sindy:
         )  # fmt: skip
         for name, r in results.items():
             shown.add_row(
-                name, terminal.ms(r.scores.fresh), terminal.ms(r.scores.held),
-                terminal.ms(r.scores.leave_one_out), terminal.ms(r.delayed_pd.fresh),
-                terminal.ms(r.delayed_pd.leave_one_out), str(len(r.candidates)),
+                name, terminal.ms(r.scores.rmse_fresh_rad), terminal.ms(r.scores.rmse_held_rad),
+                terminal.ms(r.scores.rmse_leave_one_frequency_out_rad),
+                terminal.ms(r.delayed_pd.rmse_fresh_rad),
+                terminal.ms(r.delayed_pd.rmse_leave_one_frequency_out_rad), str(len(r.candidates)),
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print(
@@ -71,4 +72,3 @@ class Sindy:
         )
         for r in results.values():
             terminal.warn(r.warnings)
-        terminal.err.print(f"Took {elapsed:.1f} s.")

@@ -1,4 +1,4 @@
-"""`bode`: frequency response per joint."""
+"""`bode`: the frequency response of each joint."""
 
 from __future__ import annotations
 
@@ -32,32 +32,25 @@ class Bode:
     """Seed of the bootstrap."""
 
     def run(self) -> None:
-        """Measure and print."""
-        from pupper_sysid.sysid.identify import calibrate as calibration
-        from pupper_sysid.sysid.lag import frequency_response
+        """Measure, draw and print."""
+        from pupper_sysid.sysid.lag.frequency_response import frequency_response
 
         if self.plot:
             from pupper_sysid.common.figure_style import refuse_picture
 
             refuse_picture(self.plot, self.force)
         recordings = terminal.load_all(self.recordings)
-        found = {}
-        for joint in terminal.pick_joints(recordings, self.joints):
-            trials = calibration.joint_trials(recordings, joint)
-            rng = calibration.joint_rng(self.seed, joint)
-            found[joint] = frequency_response.frequency_response(joint, trials, rng)
+        joints = terminal.pick_joints(recordings, self.joints)
+        found = frequency_response(recordings, joints, self.seed)
         if self.plot:
             from pupper_sysid.common.figure_style import save
-            from pupper_sysid.sysid.report.figures import bode_figure
 
-            save(bode_figure(found), self.plot, self.force)
+            save(found.plot(), self.plot, self.force)
         if self.json:
-            terminal.print_json(
-                {"joints": {j: frequency_response.to_json(r) for j, r in found.items()}}
-            )
+            terminal.print_json(found)
             return
         for joint, response in found.items():
             terminal.out.print(Text(joint, "bold"))
-            terminal.out.print(response.summary(), soft_wrap=True)
+            terminal.out.print(str(response), soft_wrap=True)
         if self.plot:
             terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)

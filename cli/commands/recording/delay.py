@@ -1,4 +1,4 @@
-"""`delay`: lag per joint, split into bus, sensor and servo."""
+"""`delay`: the lag of each joint, and its parts."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import tyro
 from pupper_sysid.cli import terminal
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.lag.lag_budget import LagBudget
+    from pupper_sysid.common.interval import Interval
+    from pupper_sysid.sysid.identify.dead_time import LagBudgets
 
 
 @dataclass(frozen=True)
 class Delay:
-    """Split the lag of each joint into the bus's, the sensor's and the servo's share.
+    """Measure each joint's lag, and split it into bus, sensor and servo.
 
     Example: pupper-sysid delay recordings/sweep.csv --joints LF_thigh
     """
@@ -32,53 +33,55 @@ class Delay:
 
     def run(self) -> None:
         """Measure and print."""
-        from pupper_sysid.sysid.identify import calibrate as calibration
-        from pupper_sysid.sysid.report.json_objects import delay_json
+        from pupper_sysid.sysid.identify.dead_time import lag
 
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.progress("measuring", len(joints)) as advance:
-            found = calibration.dead_times(recordings, joints, self.seed, progress=advance)
+            found = lag(recordings, joints, self.seed, workers=2, progress=advance)
         if self.json:
-            terminal.print_json(delay_json(found))
+            terminal.print_json(found)
             return
         budget = terminal.table(
             "Lag budget, ms: naive = feedback age + command hold + servo lag", "joint", "naive",
             "feedback age", "command hold", "servo lag", "90 % interval", "of it dead time",
             "90 % interval",
         )  # fmt: skip
-        for name, f in found.items():
-            b, dead = f.budget, f.dead_time
+        for name, b in found.items():
+            dead = b.dead_time_s
+            assert dead is not None
             budget.add_row(
-                name, terminal.ms(b.naive.value), terminal.ms(b.feedback_age_s),
-                terminal.ms(b.command_hold_s), terminal.ms(b.lag.value),
-                f"{terminal.ms(b.lag.low)} … {terminal.ms(b.lag.high)}",
-                terminal.ms(dead.value), f"{terminal.ms(dead.low)} … {terminal.ms(dead.high)}",
+                name, terminal.ms(b.naive_lag_s.value), terminal.ms(b.feedback_age_s),
+                terminal.ms(b.command_hold_s), terminal.ms(b.lag_s.value), _ends(b.lag_s),
+                terminal.ms(dead.value), _ends(dead),
             )  # fmt: skip
         terminal.out.print(budget)
-        self._print_frequencies([f.budget for f in found.values()])
-        first = next(iter(found.values())).budget
+        self._print_frequencies(found)
+        first = next(iter(found.values()))
         shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")
-        for name, value in first.estimators.items():
+        for name, value in first.estimators_s.items():
             shown.add_row(name, terminal.ms(value))
         terminal.out.print()
         terminal.out.print(shown)
-        for f in found.values():
-            terminal.warn(f.budget.warnings)
+        for b in found.values():
+            terminal.warn(b.warnings)
 
-    def _print_frequencies(self, budgets: list[LagBudget]) -> None:
+    def _print_frequencies(self, found: LagBudgets) -> None:
         shown = terminal.table(
             "Per frequency, fresh readings", "joint", "Hz", "gain", "phase °", "lag ms",
             "90 % interval", "naive lag ms", "naive gain",
         )  # fmt: skip
-        for b in budgets:
+        for name, b in found.items():
             for f in b.by_frequency:
                 shown.add_row(
-                    b.joint, terminal.number(f.frequency_hz), terminal.number(f.gain),
-                    terminal.number(f.phase_deg, 0), terminal.ms(f.lag.value),
-                    f"{terminal.ms(f.lag.low)} … {terminal.ms(f.lag.high)}",
+                    name, terminal.number(f.frequency_hz), terminal.number(f.gain),
+                    terminal.number(f.phase_deg, 0), terminal.ms(f.lag_s.value), _ends(f.lag_s),
                     terminal.ms(f.naive_lag_s), terminal.number(f.naive_gain),
                 )  # fmt: skip
         if shown.row_count:
             terminal.out.print()
             terminal.out.print(shown)
+
+
+def _ends(interval: Interval) -> str:
+    return f"{terminal.ms(interval.low)} … {terminal.ms(interval.high)}"

@@ -1,4 +1,4 @@
-"""`doctor`: check whether a recording is usable."""
+"""`doctor`: whether a recording is usable."""
 
 from __future__ import annotations
 
@@ -27,28 +27,23 @@ class Doctor:
 
     def run(self) -> None:
         """Examine and print."""
-        import numpy as np
-
-        from pupper_sysid.sysid.doctor import examination as doctor
+        from pupper_sysid.sysid.doctor.examination import examine
 
         (recording,) = terminal.load_all([self.recording] if self.recording else [])
-        found = doctor.examine(recording, np.random.default_rng(self.seed))
+        found = examine(recording, seed=self.seed)
         if self.json:
-            terminal.print_json(doctor.to_json(found))
+            terminal.print_json(found)
             return
         shown = terminal.table(
             recording.name, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
-            "loss", "count mrad", "offset mrad",
+            "loss", "step mrad", "offset mrad",
         )  # fmt: skip
-        for name, j in found.joints.items():
+        for name, j in found.items():
             shown.add_row(
-                name, j.verdict, terminal.number(j.loop_period_ms),
-                terminal.number(j.jitter_ms), terminal.number(100 * j.fresh_fraction, 0),
-                terminal.number(j.poll_period_ms), terminal.number(j.loss),
-                terminal.ms(j.quantum_rad, 3), terminal.ms(j.offset_rad),
+                name, j.verdict, terminal.ms(j.loop_period_s, 2), terminal.ms(j.jitter_s, 2),
+                terminal.number(100 * j.fresh_fraction, 0), terminal.ms(j.poll_period_s, 2),
+                terminal.number(j.loss), terminal.ms(j.quantum_rad, 3), terminal.ms(j.offset_rad),
             )  # fmt: skip
         terminal.out.print(shown)
-        for name, j in found.joints.items():
-            terminal.out.print(Text.assemble("\n", (name, "bold"), f": {j.verdict}"))
-            for reason in j.reasons:
-                terminal.out.print(f"  - {reason}", soft_wrap=True)
+        for name, j in found.items():
+            terminal.out.print(Text.assemble("\n", (name, "bold"), f": {j}"), soft_wrap=True)

@@ -7,10 +7,11 @@ import pytest
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
-from pupper_sysid.sysid.identify.calibrate import _calibrate_joint, _dead_time, _Task, calibrate
-from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
-from pupper_sysid.sysid.identify.models import LADDER, rung
-from pupper_sysid.sysid.identify.output_error import Problem, fit, positions, prepare
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.identify.calibration_file import to_calibration
+from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
+from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
+from pupper_sysid.sysid.identify.output_error import Problem, TrialData, fit, free_run, prepare
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Truncation
 from support.synthetic import LOOP_S, tone_trials
@@ -40,12 +41,12 @@ def servo_trials(rng, frequencies=(1.0, 2.0, 3.0, 4.0)):
 @pytest.fixture(scope="module")
 def result():
     trials = servo_trials(np.random.default_rng(1))
-    return _calibrate_joint(_Task("LF_hip", trials, 0, {}))
+    return fit_joint("LF_hip", trials, 0)
 
 
 def test_delayed_pd_is_recovered_from_lossy_readings(result):
-    pd = result.rungs["delayed_pd"]
-    assert result.chosen == "delayed_pd"
+    pd = result.candidate_models["delayed_pd"]
+    assert result.model == "delayed_pd"
     assert pd.values["dead_time_s"] == pytest.approx(0.025, abs=2e-3)
     assert pd.values["velocity_limit_rad_s"] == pytest.approx(6.5, rel=0.05)
     # the command's lag through a stiff PD is damping / stiffness
@@ -54,33 +55,38 @@ def test_delayed_pd_is_recovered_from_lossy_readings(result):
 
 
 def test_the_truth_is_inside_the_dead_time_interval(result):
-    assert result.dead_time.low <= 0.025 <= result.dead_time.high
+    assert result.dead_time_s.low <= 0.025 <= result.dead_time_s.high
     low, high = result.delay_steps
     assert low <= 12.5 <= high and high - low <= 8
 
 
 def test_the_interval_of_a_fast_servo_ends_at_zero():
     trials = tone_trials(0.002, np.random.default_rng(2), (1.0, 3.0), period_s=0.0)
-    found = _dead_time(_Task("LF_hip", tuple(trials), 0, {})).dead_time
-    assert found.low == 0.0 < found.high
+    found = joint_lag("LF_hip", tuple(trials)).dead_time_s
+    assert found is not None and found.low == 0.0 < found.high
 
 
 def test_the_fit_is_as_good_as_the_readings_allow(result):
-    scores = result.rungs["delayed_pd"].scores
+    scores = result.candidate_models["delayed_pd"].scores
     # a count of 5.7 mrad and polls dated to about 0.5 ms at up to 6.5 rad/s
-    assert scores.fresh < 6e-3 and scores.held < 8e-3
-    assert scores.naive > 5 * scores.fresh  # stale rows: the model is right and looks wrong
-    assert scores.fresh < result.rungs["pure_delay"].scores.fresh
+    assert scores.rmse_fresh_rad < 6e-3 and scores.rmse_held_rad < 8e-3
+    assert (
+        scores.rmse_raw_rad > 5 * scores.rmse_fresh_rad
+    )  # stale rows: the model is right and looks wrong
+    assert scores.rmse_fresh_rad < result.candidate_models["pure_delay"].scores.rmse_fresh_rad
 
 
-def test_simpler_rungs_are_worse_on_tones_they_have_not_seen(result):
-    errors = [result.rungs[r.name].scores.leave_one_out for r in LADDER]
+def test_simpler_models_are_worse_on_tones_they_have_not_seen(result):
+    errors = [
+        result.candidate_models[r.name].scores.rmse_leave_one_frequency_out_rad
+        for r in CANDIDATE_MODELS
+    ]
     assert errors[0] > errors[2] > errors[4]
 
 
 def test_friction_and_speed_limit_only_add_to_delay_and_linear_dynamics(result):
     linear = 0.025 + 100 / 12000  # low-frequency lag of the PD without them
-    assert linear < result.budget.lag.value < linear + 0.015
+    assert linear < result.lag.lag_s.value < linear + 0.015
 
 
 def test_ratios_are_identified_and_torques_only_by_the_anchor(result, tmp_path):
@@ -98,44 +104,59 @@ def test_ratios_are_identified_and_torques_only_by_the_anchor(result, tmp_path):
 def test_a_speed_limit_that_was_never_reached_is_not_claimed():
     rng = np.random.default_rng(2)
     slow = servo_trials(rng, (0.5, 1.0, 1.5))  # 2.8 rad/s at most
-    found = _calibrate_joint(_Task("LF_hip", slow, 0, {}))
-    assert "velocity_limit_rad_s" in found.rungs["delayed_pd"].undecided
+    found = fit_joint("LF_hip", slow, 0)
+    assert "velocity_limit_rad_s" in found.candidate_models["delayed_pd"].undecided
     assert any("speed limit was not excited" in w for w in found.warnings)
 
 
 def test_results_repeat_under_a_seed():
     trials = servo_trials(np.random.default_rng(3), (1.0, 3.0))
-    first, again = (_calibrate_joint(_Task("LF_hip", trials, 5, {})) for _ in range(2))
-    assert first.rungs == again.rungs and first.dead_time == again.dead_time
+    first, again = (fit_joint("LF_hip", trials, 5) for _ in range(2))
+    assert (
+        first.candidate_models == again.candidate_models and first.dead_time_s == again.dead_time_s
+    )
 
 
-def test_the_fit_simulates_what_delayed_pd_simulates():
-    trial = servo_trials(np.random.default_rng(4), (2.0,))[0]
-    data = prepare(trial, readings(trial, find_poll_lattice([trial], np.random.default_rng(0))))
-    values = np.array([0.0273, 12000.0, 100.0, 150.0, 450.0, 6.5, 0.0])
-    track = positions(rung("delayed_pd"), [(values[None], [data])])[0][1:, 0, 0]
-    model = DelayedPD(replace(TRUE, dead_time_s=0.0273))
-    np.testing.assert_allclose(track, model.rollout(data.command), atol=1e-12)
+def test_the_fit_follows_a_step_as_the_equations_of_a_speed_limited_pd_say():
+    kp, kd, friction, speed, dead_time_s = 12000.0, 100.0, 150.0, 6.5, 0.028
+    command = np.ones(100)
+    empty = np.zeros(0)
+    data = TrialData(np.nan, 0.0, command, empty, empty, empty, empty, empty)
+    values = np.array([dead_time_s, kp, kd, friction, 1e9, speed, 0.1])
+    track = free_run(candidate_model("delayed_pd"), values, [data])[:, 0] - 0.1
+    time = TIME_STEP_S * np.arange(len(track))
+    assert np.all(track[time <= dead_time_s - TIME_STEP_S] == 0.0)
+    # the set-point rises at the speed limit, a step of physics ahead of the position; the error is
+    # what damping and friction take
+    late = (time > 0.12) & (time < 0.15)
+    expected = speed * (time[late] - dead_time_s + TIME_STEP_S) - (kd * speed + friction) / kp
+    np.testing.assert_allclose(track[late], expected, atol=0.2 * speed * TIME_STEP_S)
+    assert abs(track[-1] - 1.0) <= friction / kp  # where friction holds it
+    model = DelayedPD(replace(TRUE, dead_time_s=dead_time_s, effort_limit=1e9))
+    np.testing.assert_allclose(track[1:], model.rollout(command), atol=1e-12)
 
 
 def test_commands_are_averaged_over_physics_steps_and_truncated_by_count():
     trial = tone_trials(0.04, np.random.default_rng(5), (1.0,))[0]
     read = readings(trial, find_poll_lattice([trial], np.random.default_rng(0)))
     data = prepare(replace(trial, truncation=Truncation(0.0057, "up")), read)
-    plain = prepare(trial, read)
-    inside = slice(100, 1500)
-    difference = data.command[inside] - plain.command[inside]
-    assert difference.min() >= -1e-9 and difference.max() <= 0.0057 + 1e-9
-    # a command row lasts 9.5 steps: held values appear, in between only their averages
-    assert len(np.unique(np.round(data.command / 0.0057, 6) % 1)) < len(data.command) / 5
-    assert LOOP_S / TIME_STEP_S == pytest.approx(9.5)
+    # the same by sampling: whole counts, rounded up, held until the next row
+    fine = (np.arange(1500 * 200) + 0.5) * TIME_STEP_S / 200
+    row = np.searchsorted(trial.send_time_s - trial.send_time_s[0], fine, side="right") - 1
+    count = np.ceil(trial.command_rad[row] / 0.0057 - 1e-6)
+    sampled = 0.0057 * count.reshape(1500, 200).mean(axis=1)
+    # at most one row begins in a step; it moves by 0.3 · 2π · 1 Hz · 19 ms, a sample is 1 / 200
+    largest = 0.3 * 2 * np.pi * LOOP_S + 0.0057
+    np.testing.assert_allclose(data.command[:1500], sampled, atol=largest / 200)
+    plain = prepare(trial, read).command[:1500]
+    assert np.mean(data.command[:1500] - plain) == pytest.approx(0.0057 / 2, rel=0.2)
 
 
 def test_a_frozen_parameter_stays_where_it_was_put():
     trials = servo_trials(np.random.default_rng(6), (1.0, 2.0))
     lattice = find_poll_lattice(trials, np.random.default_rng(0))
     data = tuple(prepare(t, readings(t, lattice)) for t in trials)
-    model = rung("sopdt")
+    model = candidate_model("sopdt")
     start = np.array([[p.nominal for p in model.parameters]])
     (found,) = fit(model, [Problem(data, (True, True), 0.01, {"dead_time_s": 0.033})], start, 10)
     assert found.values[0] == pytest.approx(0.033)
@@ -144,7 +165,7 @@ def test_a_frozen_parameter_stays_where_it_was_put():
 
 @pytest.fixture(scope="module")
 def real(real_sweeps):
-    return calibrate([load(p) for p in real_sweeps], seed=0, presets=preset_parameters())
+    return calibrate([load(p) for p in real_sweeps], seed=0)
 
 
 @pytest.mark.parametrize(
@@ -153,27 +174,30 @@ def real(real_sweeps):
 )
 def test_the_real_sweeps_reach_the_best_published_figures(real, joint, lag, held, unseen):
     found = real[joint]
-    pd = found.rungs["delayed_pd"].scores
-    lattice = found.budget.lattice
-    assert 1e3 * lattice.period_s == pytest.approx(26.85, abs=0.15)
+    pd = found.candidate_models["delayed_pd"].scores
+    lattice = found.lag.feedback
+    assert 1e3 * lattice.poll_period_s == pytest.approx(26.85, abs=0.15)
     assert lattice.loss == pytest.approx(0.42, abs=0.05)
-    assert found.quantum_rad == pytest.approx(5.712e-3, abs=1e-6)
-    assert 1e3 * found.budget.lag.value == pytest.approx(lag, abs=1.5)
-    assert 1e3 * (found.budget.lag.high - found.budget.lag.low) / 2 <= 1.5
-    assert 0.013 <= found.dead_time.low < found.dead_time.high <= 0.032
-    assert 0.97 <= found.budget.by_frequency[-1].gain <= 1.06
-    assert pd.held <= held
-    assert found.rungs[found.chosen].scores.leave_one_out <= unseen
+    assert found.lag.quantum_rad == pytest.approx(5.712e-3, abs=1e-6)
+    assert 1e3 * found.lag.lag_s.value == pytest.approx(lag, abs=1.5)
+    assert 1e3 * (found.lag.lag_s.high - found.lag.lag_s.low) / 2 <= 1.5
+    assert 0.013 <= found.dead_time_s.low < found.dead_time_s.high <= 0.032
+    assert 0.97 <= found.lag.by_frequency[-1].gain <= 1.06
+    assert pd.rmse_held_rad <= held
+    assert found.candidate_models[found.model].scores.rmse_leave_one_frequency_out_rad <= unseen
 
 
 def test_the_paper_setting_is_ten_times_further_off(real):
-    ours = np.mean([r.rungs["delayed_pd"].scores.held ** 2 for r in real.values()])
-    paper = np.mean([r.presets["paper"].held ** 2 for r in real.values()])
+    ours = np.mean(
+        [r.candidate_models["delayed_pd"].scores.rmse_held_rad ** 2 for r in real.values()]
+    )
+    paper = np.mean([r.presets["paper"].rmse_held_rad ** 2 for r in real.values()])
     assert np.sqrt(paper / ours) >= 10
 
 
 def test_models_fitted_to_1_2_3_hz_predict_4_hz(real):
     left_out = [
-        r.rungs[r.chosen].scores.leave_one_out_by_frequency[4.0] ** 2 for r in real.values()
+        r.candidate_models[r.model].scores.rmse_by_left_out_frequency_rad["4"] ** 2
+        for r in real.values()
     ]
     assert np.sqrt(np.mean(left_out)) <= 28e-3

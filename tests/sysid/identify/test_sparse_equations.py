@@ -16,7 +16,11 @@ from pupper_sysid.servo_models.sparse_equation import (
     explain,
 )
 from pupper_sysid.sysid.identify.output_error import TrialData, positions
-from pupper_sysid.sysid.identify.sparse_equations import equation_rung, fit_equations, identify
+from pupper_sysid.sysid.identify.sparse_equations import (
+    equation_model,
+    fit_equations,
+    sparse_equations,
+)
 from pupper_sysid.sysid.identify.sparse_structure import LINEAR, PULLS, ordered, propose
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
@@ -139,7 +143,7 @@ def test_the_fit_and_the_model_are_one_arithmetic():
     support = tuple(SERVO)
     (data, *_) = trials(linear, np.random.default_rng(0))
     values = np.array([[0.0213, *SERVO.values(), 0.004]])
-    fitted = positions(equation_rung(support), [(values, [data])])[0][1:, 0, 0]
+    fitted = positions(equation_model(support), [(values, [data])])[0][1:, 0, 0]
     model = SparseEquation(SERVO, 0.0213, 0.004).rollout(data.command)
     np.testing.assert_allclose(fitted, model, atol=1e-12)
 
@@ -199,14 +203,15 @@ def test_coulomb_friction_is_found_and_measured(found):
 def test_the_free_run_leaves_only_the_noise(found, joint):
     r = found[joint]
     # about 165 readings: the RMS of pure noise scatters by 1 / sqrt(2 · 165) = 5.5 %
-    assert r.scores.fresh == pytest.approx(NOISE_RAD, rel=0.17)
-    assert r.scores.leave_one_out < 1.3 * NOISE_RAD
+    assert r.scores.rmse_fresh_rad == pytest.approx(NOISE_RAD, rel=0.17)
+    assert r.scores.rmse_leave_one_frequency_out_rad < 1.3 * NOISE_RAD
 
 
 def test_friction_is_there_because_unseen_frequencies_need_it(found):
     r = found["LF_thigh"]
     linear_one = next(c for c in r.candidates if c.terms == LINEAR)
-    assert linear_one.leave_one_out > 3 * r.scores.leave_one_out
+    unseen = r.scores.rmse_leave_one_frequency_out_rad
+    assert linear_one.rmse_leave_one_frequency_out_rad > 3 * unseen
 
 
 def test_regression_proposes_servos_and_among_them_the_linear_one():
@@ -223,9 +228,9 @@ def test_regression_proposes_servos_and_among_them_the_linear_one():
 def test_one_frequency_is_judged_in_sample_and_says_so():
     data = trials(linear, np.random.default_rng(5), frequencies=(2.0,))
     r = fit_equations({"RF_calf": data}, {"RF_calf": NOISE_RAD})["RF_calf"]
-    assert np.isnan(r.scores.leave_one_out) and not r.ranges
+    assert np.isnan(r.scores.rmse_leave_one_frequency_out_rad) and not r.leave_one_out_ranges
     assert any("one frequency only" in w for w in r.warnings)
-    assert r.scores.fresh < 1.2 * NOISE_RAD
+    assert r.scores.rmse_fresh_rad < 1.2 * NOISE_RAD
 
 
 # ------------------------------------------------------------------------------- recordings
@@ -247,10 +252,10 @@ def test_the_command_prints_one_object(capsys, tmp_path):
     (joint,) = json.loads(out)["joints"].values()
     # quantum 5.7 / sqrt(12), reading noise 3, and 0.8 ms of poll jitter and its dating at up to
     # 7 rad/s: 3.4 to 6.5 mrad; the emulated set-point's speed limit is not in the library
-    assert 3e-3 < joint["rmse_fresh_rad"] < 9e-3
-    assert joint["rmse_fresh_rad"] < 2 * joint["delayed_pd"]["rmse_fresh_rad"]
-    for name, term in joint["terms"].items():
-        assert term["value"] > 0 and term["unit"] == COEFFICIENTS[name].unit
+    assert 3e-3 < joint["scores"]["rmse_fresh_rad"] < 9e-3
+    assert joint["scores"]["rmse_fresh_rad"] < 2 * joint["delayed_pd"]["rmse_fresh_rad"]
+    assert set(joint["coefficients"]) <= set(COEFFICIENTS)
+    assert min(joint["coefficients"].values()) > 0
     assert joint["equation"].startswith("q̈ = ") and len(joint["candidates"]) > 3
 
 
@@ -260,8 +265,11 @@ def test_bad_input_is_one_sentence(capsys, tmp_path):
 
 
 def test_a_real_servo_is_followed_better_than_by_regression_on_derivatives(real_sweeps):
-    (r,) = identify([load(real_sweeps[0])], workers=1).values()
+    (r,) = sparse_equations(load(real_sweeps[0])).values()
     # published: 24 mrad for SINDy through a spline with the best delay, in sample
-    assert r.scores.fresh < 0.018 and r.scores.leave_one_out < 0.022
-    assert r.scores.leave_one_out < 1.15 * r.delayed_pd.leave_one_out
+    assert r.scores.rmse_fresh_rad < 0.018 and r.scores.rmse_leave_one_frequency_out_rad < 0.022
+    assert (
+        r.scores.rmse_leave_one_frequency_out_rad
+        < 1.15 * r.delayed_pd.rmse_leave_one_frequency_out_rad
+    )
     assert r.model().time_step_s == TIME_STEP_S

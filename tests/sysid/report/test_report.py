@@ -6,7 +6,6 @@ import csv
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,20 +20,20 @@ from pupper_sysid.common.page import Column, Section, Table, render
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.examination import Examination, JointExamination
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.calibrate import JointCalibrationResult, RungResult
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
-from pupper_sysid.sysid.identify.models import LADDER, rung
+from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
 from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.scores import Scores
-from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse, TransferFunction
+from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
+from pupper_sysid.sysid.lag.transfer_function import TransferFunction
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures
 from pupper_sysid.sysid.report.advice import advice
 from pupper_sysid.sysid.report.figure_data import (
     LONGEST_RUN,
     hold_runs,
-    lag_parts,
     response_errors,
     tracks,
     window,
@@ -44,21 +43,26 @@ from support.browser import looks_right, needs_chromium
 
 HOSTILE = '<script>alert("x")</script>&lt;'
 POLL_S, LOOP_S, AGE_S = 0.030, 0.020, 0.025
-LATTICE = PollLattice("lattice", POLL_S, 1e-5, 0.0, 0.01, 20.0, 1.0, 2 / 3)
+LATTICE = PollLattice(
+    kind="lattice", poll_period_s=POLL_S, poll_period_sd_s=1e-5, loss=0.0, loss_sd=0.01,
+    z_score=20.0, hit_rate=1.0, fresh_fraction=2 / 3,
+)  # fmt: skip
 
 
 def interval(value: float) -> Interval:
     return Interval(value, 0.9 * value, 1.1 * value)
 
 
-def fitted(name: str, scores: Scores, undecided: dict[str, str] | None = None) -> RungResult:
-    values = {p.name: p.nominal for p in rung(name).parameters}
-    return RungResult(
-        name, values, {k: interval(v) for k, v in values.items()}, undecided or {}, scores
+def fitted(name: str, scores: Scores, undecided: dict[str, str] | None = None) -> CandidateFit:
+    return CandidateFit(
+        model=name,
+        parameters={p.name: interval(p.nominal) for p in candidate_model(name).parameters},
+        undecided=undecided or {},
+        scores=scores,
     )
 
 
-def trial_of(model: RungResult, frequency_hz: float) -> TrialData:
+def trial_of(model: CandidateFit, frequency_hz: float) -> TrialData:
     """A trial whose fresh readings are exactly what `model` does; rows show them `AGE_S` late."""
     steps = 1000
     command = 0.2 * np.sin(2 * np.pi * frequency_hz * TIME_STEP_S * np.arange(steps))
@@ -66,7 +70,7 @@ def trial_of(model: RungResult, frequency_hz: float) -> TrialData:
     empty = np.zeros(0)
     bare = TrialData(frequency_hz, 0.5, command, empty, empty, empty, empty, empty)
     values = np.array([list(model.values.values())])
-    track = positions(rung(model.name), [(values, [bare])])[0][:, 0, 0]
+    track = positions(candidate_model(model.model), [(values, [bare])])[0][:, 0, 0]
     measured = row - AGE_S / TIME_STEP_S
     reading = look_up(track, measured)
     return replace(
@@ -76,23 +80,39 @@ def trial_of(model: RungResult, frequency_hz: float) -> TrialData:
 
 
 def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
-    scores = Scores(0.010, 0.011, 0.120, 0.020, 0.015, {1.0: 0.015, 2.0: 0.015}, 95.0)
-    naive_best = replace(scores, fresh=0.150, naive=0.100)
-    rungs = {r.name: fitted(r.name, scores) for r in LADDER}
+    scores = Scores(
+        rmse_fresh_rad=0.010, rmse_held_rad=0.011, rmse_raw_rad=0.120, rmse_one_step_rad=0.020,
+        rmse_leave_one_frequency_out_rad=0.015,
+        rmse_by_left_out_frequency_rad={"1": 0.015, "2": 0.015}, fit_percent=95.0,
+    )  # fmt: skip
+    raw_best = replace(scores, rmse_fresh_rad=0.150, rmse_raw_rad=0.100)
+    candidates = {m.name: fitted(m.name, scores) for m in CANDIDATE_MODELS}
     tones = tuple(
-        FrequencyLag(f, 1.02, -15.0 * f, interval(0.042), 0.080, 0.88, n)
+        FrequencyLag(
+            frequency_hz=f, gain=1.02, phase_deg=-15.0 * f, lag_s=interval(0.042),
+            naive_lag_s=0.080, naive_gain=0.88, trial=n,
+        )
         for n, f in enumerate((1.0, 2.0))
-    )
-    budget = LagBudget(
-        joint, interval(0.081), interval(0.0535), interval(0.044), 0.0275, 0.0095, tones,
-        {"integer cross-correlation, all rows": 0.076, "hold-aware (default)": 0.044}, LATTICE,
-        0.01, ("Only two frequencies.",),
+    )  # fmt: skip
+    lag = LagBudget(
+        joint=joint, naive_lag_s=interval(0.081), fresh_lag_s=interval(0.0535),
+        lag_s=interval(0.044), feedback_age_s=0.0275, command_hold_s=0.0095,
+        dead_time_s=Interval(0.024, 0.0205, 0.0275), feedback=LATTICE, quantum_rad=np.pi / 550,
+        offset_rad=0.01, by_frequency=tones,
+        estimators_s={
+            "integer cross-correlation, all rows": 0.076, "hold-aware (default)": 0.044
+        },
+        noise_rad=0.01, warnings=("Only two frequencies.",),
     )  # fmt: skip
     made = JointCalibrationResult(
-        joint, "delayed_pd", rungs, Interval(0.024, 0.0205, 0.0275), budget, np.pi / 550,
-        Interval(0.01, 0.009, 0.011), {"paper": naive_best},
-        tuple(trial_of(rungs["delayed_pd"], f) for f in (1.0, 2.0)), ("Only two frequencies.",),
-    )  # fmt: skip
+        joint=joint,
+        model="delayed_pd",
+        candidate_models=candidates,
+        lag=lag,
+        presets={"paper": raw_best},
+        warnings=("Only two frequencies.",),
+        trials=tuple(trial_of(candidates["delayed_pd"], f) for f in (1.0, 2.0)),
+    )
     return replace(made, **changes)
 
 
@@ -114,15 +134,15 @@ def recording_of(name: str = "sweep") -> Recording:
 
 def examined_joint() -> JointExamination:
     return JointExamination(
-        verdict="use with care", reasons=("two frequencies only.",), loop_period_ms=20.0,
-        jitter_ms=0.1, fresh_fraction=2 / 3, poll_period_ms=30.0, loss=0.0, z_score=20.0,
+        verdict="use with care", reasons=("two frequencies only.",), loop_period_s=0.02,
+        jitter_s=1e-4, fresh_fraction=2 / 3, poll_period_s=0.03, loss=0.0, z_score=20.0,
         hit_rate=1.0, quantum_rad=0.0057, offset_rad=0.01, missing_fraction=0.0,
         peak_command_rad_s=2.5, hold_histogram=(50, 50),
     )  # fmt: skip
 
 
 def examined(name: str) -> Examination:
-    return Examination(name, (), {"LF_thigh": examined_joint()})
+    return Examination(recording=name, warnings=(), joints={"LF_thigh": examined_joint()})
 
 
 def write(folder, name: str = "sweep", force: bool = False):
@@ -218,9 +238,10 @@ def test_the_finding_says_what_the_naive_lag_is_made_of(page):
 
 
 def test_the_parts_of_the_lag_add_up_to_the_naive_lag():
-    p = lag_parts(result_of())
-    total = p.command_hold_s + p.dead_time_s.value + p.dynamics_s + p.feedback_age_s
-    assert total == pytest.approx(p.naive_lag_s.value)
+    lag = result_of().lag
+    assert lag.dead_time_s is not None
+    total = lag.command_hold_s + lag.dead_time_s.value + lag.dynamics_s + lag.feedback_age_s
+    assert total == pytest.approx(lag.naive_lag_s.value)
 
 
 def test_lag_budget_csv_has_the_numbers_of_the_result(written):
@@ -248,10 +269,10 @@ def test_transfer_function_csv_has_every_fitted_number(written):
 
 def test_model_csv_scores_candidates_and_presets_and_marks_the_chosen_one(written):
     rows = {r["model"]: r for r in rows_of(written, "candidate_models")}
-    assert list(rows) == [*(r.name for r in LADDER), "paper"]
+    assert list(rows) == [*(r.name for r in CANDIDATE_MODELS), "paper"]
     assert [m for m, r in rows.items() if r["is_chosen"] == "True"] == ["delayed_pd"]
-    assert float(rows["paper"]["fresh"]) == pytest.approx(0.150)
-    assert float(rows["delayed_pd"]["naive"]) == pytest.approx(0.120)
+    assert float(rows["paper"]["rmse_fresh_rad"]) == pytest.approx(0.150)
+    assert float(rows["delayed_pd"]["rmse_raw_rad"]) == pytest.approx(0.120)
 
 
 def test_the_page_says_whom_the_naive_score_would_have_chosen(page):
@@ -285,11 +306,15 @@ def test_nothing_is_overwritten_without_force(tmp_path):
 
 
 def test_advice_asks_for_steps_only_if_a_limit_was_not_reached():
-    open_limit = fitted("delayed_pd", result_of().rungs["delayed_pd"].scores,
+    open_limit = fitted("delayed_pd", result_of().candidate_models["delayed_pd"].scores,
                         {"velocity_limit_rad_s": "never reached"})  # fmt: skip
     without = advice({"LF_thigh": result_of()})
     with_limit = advice(
-        {"LF_thigh": result_of(rungs={**result_of().rungs, "delayed_pd": open_limit})}
+        {
+            "LF_thigh": result_of(
+                candidate_models={**result_of().candidate_models, "delayed_pd": open_limit}
+            )
+        }
     )
     assert not any("Record steps" in s for s in without)
     assert any("limit of its speed" in s and "Record steps" in s for s in with_limit)
@@ -324,26 +349,26 @@ def test_a_window_lies_inside_its_trial_and_holds_whole_periods():
 
 
 def test_the_last_bar_of_the_hold_runs_holds_all_longer_ones():
-    found = SimpleNamespace(loop_period_ms=20.0, hold_histogram=(3, 1) + (0,) * LONGEST_RUN + (2,))
-    runs = hold_runs([found, found], LATTICE)
+    histogram = (3, 1) + (0,) * LONGEST_RUN + (2,)
+    runs = hold_runs([histogram, histogram], [LOOP_S, LOOP_S], LATTICE)
     assert runs.count.tolist() == [6, 2] + [0] * (LONGEST_RUN - 3) + [4]
 
 
 def test_predicted_hold_runs_follow_from_poll_and_loss():
     # a poll every 1.5 rows that never fails is seen after 1 row or 2, equally often
-    runs = hold_runs([SimpleNamespace(loop_period_ms=20.0, hold_histogram=(50,))], LATTICE)
+    runs = hold_runs([(50,)], [LOOP_S], LATTICE)
     assert runs.expected == pytest.approx([25.0, 25.0] + [0.0] * (LONGEST_RUN - 2), abs=1e-9)
     # half of the polls lost: gaps of 2, 4, 6 … rows, each half as frequent as the one before
-    halves = replace(LATTICE, period_s=0.040, loss=0.5)
-    runs = hold_runs([SimpleNamespace(loop_period_ms=20.0, hold_histogram=(64,))], halves)
+    halves = replace(LATTICE, poll_period_s=0.040, loss=0.5)
+    runs = hold_runs([(64,)], [LOOP_S], halves)
     assert runs.expected[:6] == pytest.approx([0, 32, 0, 16, 0, 8], abs=1e-6)
 
 
 def test_letters_in_figures_are_nine_points_or_more():
     drawn = [
-        figures.lag_budget_figure({"LF_thigh": result_of()}),
+        figures.lag_budget_figure({"LF_thigh": result_of().lag}),
         figures.overlay_figure(result_of()),
-        figures.hold_histogram_figure({"LF_thigh": hold_runs([examined_joint()], LATTICE)}),
+        figures.hold_histogram_figure({"LF_thigh": hold_runs([(50, 50)], [LOOP_S], LATTICE)}),
         figures.residual_figure(result_of()),
     ]
     for figure in drawn:
@@ -352,7 +377,7 @@ def test_letters_in_figures_are_nine_points_or_more():
 
 
 def test_the_lag_figure_draws_the_parts_end_to_end():
-    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    figure = figures.lag_budget_figure({"LF_thigh": result_of().lag})
     bars = [p for p in figure.axes[0].patches if p.get_width() > 0]
     ends = [(b.get_x(), b.get_x() + b.get_width()) for b in bars]
     assert np.ravel(ends) == pytest.approx([0, 9.5, 9.5, 33.5, 33.5, 53.5, 53.5, 81.0])
@@ -371,13 +396,17 @@ def response_of() -> FrequencyResponse:
         ]
     )
     fit = TransferFunction(
-        "FOPDT",
-        {"gain": interval(0.1), "dead_time_s": interval(0.1), "time_constant_s": interval(1e-3)},
-        1.5,
-    )
+        name="FOPDT",
+        parameters={
+            "gain": interval(0.1), "dead_time_s": interval(0.1), "time_constant_s": interval(1e-3)
+        },
+        chi2_per_dof=1.5,
+    )  # fmt: skip
     return FrequencyResponse(
-        "LF_thigh", frequency, np.full(3, 0.2), turned, 0.5 * turned, covariance, None, (fit,)
-    )
+        joint="LF_thigh", bandwidth_hz=None, transfer_functions={"FOPDT": fit},
+        frequency_hz=frequency, amplitude_rad=np.full(3, 0.2), response=turned,
+        naive_response=0.5 * turned, covariance=covariance,
+    )  # fmt: skip
 
 
 def test_the_bode_figure_shows_gain_in_decibels_and_unwrapped_phase():
@@ -394,13 +423,13 @@ def test_bode_intervals_follow_from_the_covariance():
 
 
 def test_a_figure_is_written_as_its_ending_says(tmp_path):
-    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    figure = figures.lag_budget_figure({"LF_thigh": result_of().lag})
     save(figure, tmp_path / "a.svg")
     drawing = ElementTree.parse(tmp_path / "a.svg").getroot()
     assert drawing.tag == "{http://www.w3.org/2000/svg}svg"
     width, height = (float(drawing.attrib[k].removesuffix("pt")) for k in ("width", "height"))
     assert (width, height) == pytest.approx(72 * figure.get_size_inches())
-    save(figures.lag_budget_figure({"LF_thigh": result_of()}), tmp_path / "b.svg")
+    save(figures.lag_budget_figure({"LF_thigh": result_of().lag}), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     with pytest.raises(InputError, match=r"a\.jpg: pictures are written as \.png or \.svg"):
         save(figure, tmp_path / "a.jpg")
@@ -408,21 +437,21 @@ def test_a_figure_is_written_as_its_ending_says(tmp_path):
 
 def test_saving_a_figure_refuses_to_overwrite(tmp_path):
     path = tmp_path / "figure.png"
-    figure = figures.lag_budget_figure({"LF_thigh": result_of()})
+    figure = figures.lag_budget_figure({"LF_thigh": result_of().lag})
     save(figure, path)
     with pytest.raises(InputError, match="exists already"):
         save(figure, path)
 
 
 def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path):
-    unknown = replace(LATTICE, kind="unresolved", period_s=np.nan, loss=np.nan)
-    budget = replace(result_of().budget, lattice=unknown)
-    results, recordings = {"LF_thigh": result_of(budget=budget)}, [recording_of()]
+    unknown = replace(LATTICE, kind="unresolved", poll_period_s=np.nan, loss=np.nan)
+    budget = replace(result_of().lag, feedback=unknown)
+    results, recordings = {"LF_thigh": result_of(lag=budget)}, [recording_of()]
     calibration = to_calibration(results, recordings, 0)
     found = Findings(recordings=recordings, results=results, calibration=calibration)
     made = found.write(tmp_path)
     (row,) = rows_of(made, "lag_budget")
-    assert row["poll_period_s"] == row["loss"] == ""
+    assert row["feedback_poll_period_s"] == row["feedback_loss"] == ""
     assert not re.search(r">\s*-?(nan|inf|None)\s*<", made.path.read_text(encoding="utf-8"))
 
 
