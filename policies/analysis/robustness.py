@@ -131,7 +131,7 @@ def ablation(
             if kind == "noise" and not walked:
                 found.append(AblationPoint(**row, correlation=NAN))
                 continue
-            closed_loop = outcome(trial.walk(policy, change()))
+            closed_loop: dict[str, Any] = outcome(trial.walk(policy, change()))
             actions, _ = replay(policy, perturbations.applied(change(), plain.observation))
             found.append(
                 AblationPoint(**row, correlation=_agreement(plain, actions), **closed_loop)
