@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.keyboard import terminal_without
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample
@@ -89,14 +90,8 @@ class Driver:
         """
         if not sys.stdin.isatty():
             raise InputError("--keyboard needs a terminal to type in; use --command or --script.")
-        before = termios.tcgetattr(sys.stdin)
-        single = [*before[:3], before[3] & ~(termios.ICANON | termios.ECHO), *before[4:]]
-        termios.tcsetattr(sys.stdin, termios.TCSANOW, single)
-        try:
-            with self._live:
-                yield self
-        finally:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        with terminal_without(termios.ICANON | termios.ECHO, sys.stdin.fileno()), self._live:
+            yield self
 
 
 def _table(tick: Tick, age_s: np.ndarray) -> Table:

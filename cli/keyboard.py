@@ -15,6 +15,18 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 
 
+@contextmanager
+def terminal_without(flags: int, fd: int) -> Iterator[None]:
+    """Local flags of a terminal, such as `termios.ECHO`, off during the block."""
+    before = termios.tcgetattr(fd)
+    changed = [*before[:3], before[3] & ~flags, *before[4:]]
+    termios.tcsetattr(fd, termios.TCSANOW, changed)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
 class Keyboard:
     """Lines typed at the terminal, read without blocking."""
 
@@ -46,13 +58,8 @@ class Keyboard:
             yield
             return
         self.forget()
-        before = termios.tcgetattr(self._fd)
-        quiet = [*before[:3], before[3] & ~termios.ECHO, *before[4:]]
-        termios.tcsetattr(self._fd, termios.TCSANOW, quiet)
-        try:
+        with terminal_without(termios.ECHO, self._fd):
             yield
-        finally:
-            termios.tcsetattr(self._fd, termios.TCSANOW, before)
 
     def line(self) -> str | None:
         """A line if one has been typed.
