@@ -94,5 +94,5 @@ def test_no_message_of_the_library_names_an_option():
 
 def test_an_option_in_a_message_would_be_found(tmp_path):
     path = tmp_path / "module.py"
-    path.write_text('"""Doc --string."""\nraise ValueError(f"--jobs is {jobs}; `--out x` is not")\n')
+    path.write_text('"""A --doc."""\nraise ValueError(f"--jobs is {jobs}; `--out x` is not")\n')
     assert list(options_in_strings(path)) == ["--jobs", "--out"]
