@@ -85,9 +85,9 @@ class Monitor:
                 return
             shown_s = watched.now_s
             if live:
-                live.update(watched.table(self.bus), refresh=True)
+                live.update(watched.table(bus_name(self.bus)), refresh=True)
             else:
-                terminal.out.print(watched.table(self.bus))
+                terminal.out.print(watched.table(bus_name(self.bus)))
 
         with live or nullcontext():
             self._watch(watched, self.seconds or np.inf, show)
