@@ -129,7 +129,7 @@ def _onnx(module, given, names, metadata, batch, opset) -> tuple[bytes, Run]:
         ) from error
     ins, outs = names
     buffer = io.BytesIO()
-    export: Any = torch.onnx.export  # its types know no buffer, its code does
+    export: Any = torch.onnx.export  # its annotations lack buffers
     export(
         module, given["args"], buffer, kwargs=given["kwargs"] or None, input_names=list(ins),
         output_names=list(outs), opset_version=opset, dynamo=False,

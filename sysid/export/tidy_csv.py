@@ -1,9 +1,8 @@
-"""Export: a calibration or a recording as one tidy CSV table, for a spreadsheet or for pandas.
+"""Export of a calibration or a recording as one tidy CSV table, for a spreadsheet or for pandas.
 
-Both tables open with comment lines (`# key: JSON value`) that say where the numbers come from;
+Both tables open with comment lines (`# key: JSON value`) on the origin of the numbers;
 `pandas.read_csv(path, comment="#")` skips them. A calibration becomes one row per joint and
-quantity; a recording, whatever file it was read from, becomes this project's own recording form,
-with absolute angles and increasing times, and so can be used as one.
+quantity; a recording becomes a recording file of this project, from whatever layout it was read.
 """
 
 from __future__ import annotations
@@ -23,16 +22,8 @@ from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.table import comments
 
 CALIBRATION_COLUMNS = (
-    "joint",
-    "part",
-    "quantity",
-    "unit",
-    "value",
-    "low",
-    "high",
-    "identified",
-    "why",
-)
+    "joint", "part", "quantity", "unit", "value", "low", "high", "identified", "why",
+)  # fmt: skip
 
 
 def to_csv(source: Calibration | Recording, path: Path | None = None, force: bool = False) -> str:
@@ -66,7 +57,7 @@ def _calibration(calibration: Calibration) -> str:
     header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
     buffer = io.StringIO()
     buffer.write(comments("pupper-sysid calibration table", header))
-    # text is quoted so that a '#' in a sentence is no comment to whoever reads the table
+    # text is quoted: a '#' in a sentence must not begin a comment
     table = csv.writer(buffer, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
     buffer.write(",".join(CALIBRATION_COLUMNS) + "\n")
     for name, joint in calibration.joints.items():
@@ -87,11 +78,7 @@ def _rows(joint: JointCalibration) -> Iterator[list[Any]]:
     for part, model in parts.items():
         for name, entry in model:
             if isinstance(entry, Quantity):
-                numbers = [_cell(number) for number in (entry.value, entry.low, entry.high)]
-                yield [part, name, unit_of(name), *numbers, entry.identified, entry.why or ""]
+                numbers = [entry.value, entry.low, entry.high]
+                yield [part, name, unit_of(name), *numbers, entry.identified, entry.why]
             elif isinstance(entry, int | float):
                 yield [part, name, unit_of(name), entry, "", "", "", ""]
-
-
-def _cell(number: float | None) -> float | str:
-    return "" if number is None else number

@@ -56,12 +56,12 @@ class Split:
     test: Part | None = None
 
     @classmethod
-    def by_trials(cls, train: Sequence[int], test: Sequence[int]) -> Split:
+    def by_trials(cls, train_loops: Sequence[int], test_loops: Sequence[int]) -> Split:
         """Whole trials (loops of a playback).
 
         Parameters
         ----------
-        train, test : sequence of int
+        train_loops, test_loops : sequence of int
             Numbers of trials.
 
         Raises
@@ -69,16 +69,16 @@ class Split:
         InputError
             If a trial is in both.
         """
-        if both := set(train) & set(test):
+        if both := set(train_loops) & set(test_loops):
             raise InputError(
                 f"Loop {min(both)} is in `train_loops` and in `test_loops`; a model would be "
                 "tested on what it has seen."
             )
-        names = (",".join(map(str, numbers)) for numbers in (train, test))
+        names = (",".join(map(str, numbers)) for numbers in (train_loops, test_loops))
         return cls(
             "trained on loops {}, tested on {}".format(*names),
-            lambda number, elapsed, group: np.isin(number, list(train)),
-            lambda number, elapsed, group: np.isin(number, list(test)),
+            lambda number, elapsed, group: np.isin(number, list(train_loops)),
+            lambda number, elapsed, group: np.isin(number, list(test_loops)),
         )
 
     @classmethod

@@ -83,9 +83,9 @@ class Export:
 
         if self.to not in ("csv", "onnx", "torchscript"):
             raise InputError(
-                f"{folder} is a servo model, which says where a servo will be and not how strong "
-                f"it is; {self.to} needs a calibration (`pupper-sysid calibrate`). A servo model "
-                f"becomes {', '.join(ENDINGS)}."
+                f"{folder} is a servo model, which predicts positions and has no torques; "
+                f"{self.to} needs a calibration (`pupper-sysid calibrate`). A servo model "
+                f"can become {', '.join(ENDINGS)}."
             )
         saved = load_servo_model(folder)
         # not with_suffix: a folder may be called servo-0.5
