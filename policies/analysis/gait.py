@@ -126,27 +126,18 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
         for i, now in walked.items()
     ]  # fmt: skip
     each = {name: np.array([f[name] for f in found]) for name in found[0]}
-    rate, low, high = each["frequency"].T
-    alone = Interval(float(rate[0]), float(low[0]), float(high[0]))
+    rate, null, phase = (each.pop(name) for name in ("frequency_hz", "null_r2", "phase"))
+    action_r2, joint_r2 = (each[f"{x}_r2_by_joint"].mean(axis=1) for x in ("action", "joint"))
     return GaitReport(
         robots=len(walked),
         left_out=rollout.alive.shape[1] - len(walked),
-        frequency_hz=mean_of(rate) if len(walked) > 1 else alone,
-        rhythmic=float((each["action_r2"].mean(axis=1) > each["null_r2"]).mean()),
-        action_r2=mean_of(each["action_r2"].mean(axis=1)),
-        joint_r2=mean_of(each["joint_r2"].mean(axis=1)),
-        null_r2=float(each["null_r2"].mean()),
-        action_r2_by_joint=_means(each["action_r2"]),
-        joint_r2_by_joint=_means(each["joint_r2"]),
-        phase=tuple(_mean_phase(p) for p in each["phase"].T),
-        duty=_means(each["duty"]),
-        diagonal=mean_of(each["diagonal"]),
-        jitter_rad=mean_of(each["jitter"]),
-        fast_share=mean_of(each["fast_share"]),
-        half_range_rad=_means(each["action_half_range"]),
-        deviation_rad=_means(each["action_deviation"]),
-        joint_half_range_rad=_means(each["joint_half_range"]),
-        joint_deviation_rad=_means(each["joint_deviation"]),
+        frequency_hz=mean_of(rate[:, 0]) if len(walked) > 1 else Interval(*rate[0].tolist()),
+        rhythmic=float((action_r2 > null).mean()),
+        action_r2=mean_of(action_r2),
+        joint_r2=mean_of(joint_r2),
+        null_r2=float(null.mean()),
+        phase=tuple(_mean_phase(p) for p in phase.T),
+        **{k: mean_of(v) if v.ndim == 1 else tuple(map(mean_of, v.T)) for k, v in each.items()},
     )
 
 
@@ -316,32 +307,27 @@ def _describe_one(
     moves = bool((action.std(axis=0) > STILL).any())
     rate = frequency(action, step_s) if moves else UNKNOWN
     found: dict[str, object] = {
-        "frequency": astuple(rate),
+        "frequency_hz": astuple(rate),
         "null_r2": float("nan"),
         "duty": contact.mean(axis=0),
         "diagonal": diagonal_coordination(contact),
-        "jitter": jitter(action),
+        "jitter_rad": jitter(action),
         "fast_share": fast_share(action, step_s, rate.value),
         "phase": phases(contact, step_s, rate.value) if moves else np.full(4, np.nan),
     }
     if moves:
         null = null_r2(action, step_s, rng, _NULL_DRAWS).mean(axis=1)
         found["null_r2"] = float(np.quantile(null, _NULL_QUANTILE))
-    for name, signal in (("action", action), ("joint", joints)):
-        found[f"{name}_half_range"], found[f"{name}_deviation"] = amplitude(signal)
+    for name, prefix, signal in (("action", "", action), ("joint", "joint_", joints)):
+        found[f"{prefix}half_range_rad"], found[f"{prefix}deviation_rad"] = amplitude(signal)
         best = sine_frequency(signal, step_s) if signal.std(axis=0).max() > STILL else 1.0
-        found[f"{name}_r2"] = sine_fit_r2(signal, step_s, best)
+        found[f"{name}_r2_by_joint"] = sine_fit_r2(signal, step_s, best)
     return found
 
 
 def _wrapped(cycles: NDArray[np.floating]) -> Array:
     """Shares of a cycle, from -0.25 up to 0.75."""
     return np.asarray((cycles + 0.25) % 1.0 - 0.25, float)
-
-
-def _means(values: Array) -> tuple[Interval, ...]:
-    """`mean_of` each column."""
-    return tuple(mean_of(column) for column in values.T)
 
 
 def _mean_phase(cycles: Array) -> Interval:

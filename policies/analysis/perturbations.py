@@ -6,6 +6,8 @@ sequence for `replay`. Parts are named as in `sim.walking.observation.OBSERVATIO
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,14 +24,12 @@ def delayed(part: slice, steps: int) -> Change:
     """Delay a part by a number of control steps."""
     past: list[Observations] = []
 
-    def change(step: int, observation: Observations) -> Observations:
-        past.append(observation[:, part].copy())
-        if len(past) > steps + 1:
-            past.pop(0)
-        observation[:, part] = past[0]
-        return observation
+    def value(step: int, now: Observations) -> Observations:
+        past.append(now)
+        del past[: -steps - 1]
+        return past[0]
 
-    return change
+    return _altered(part, value)
 
 
 def jittered(part: slice, mean_steps: int, rng: np.random.Generator) -> Change:
@@ -40,50 +40,47 @@ def jittered(part: slice, mean_steps: int, rng: np.random.Generator) -> Change:
     past: list[Observations] = []
     lag = np.zeros(0, int)
 
-    def change(step: int, observation: Observations) -> Observations:
+    def value(step: int, now: Observations) -> Observations:
         nonlocal lag
         if not len(lag):
-            lag = np.full(len(observation), mean_steps)
-        past.insert(0, observation[:, part].copy())
+            lag = np.full(len(now), mean_steps)
+        past.insert(0, now)
         del past[2 * mean_steps + 1 :]
         wanted = rng.integers(0, 2 * mean_steps + 1, len(lag))
         lag = np.minimum(np.minimum(wanted, lag + 1), len(past) - 1)
-        observation[:, part] = np.stack(past)[lag, np.arange(len(lag))]
-        return observation
+        return np.stack(past)[lag, np.arange(len(lag))]
 
-    return change
+    return _altered(part, value)
 
 
 def noisy(part: slice, sigma: NDArray[np.floating], rng: np.random.Generator) -> Change:
     """Add white noise with a standard deviation per number of the part, in its own unit."""
     size = np.asarray(sigma, np.float32)
-
-    def change(step: int, observation: Observations) -> Observations:
-        shape = observation[:, part].shape
-        observation[:, part] += size * rng.standard_normal(shape, np.float32)
-        return observation
-
-    return change
+    return _altered(part, lambda _, now: now + size * rng.standard_normal(now.shape, np.float32))
 
 
 def zeroed(part: slice) -> Change:
     """Set a part to zero."""
-
-    def change(step: int, observation: Observations) -> Observations:
-        observation[:, part] = 0.0
-        return observation
-
-    return change
+    return _altered(part, lambda _, now: np.zeros_like(now))
 
 
 def held(part: slice, steps: int) -> Change:
     """Refresh a part only every `steps` control steps: staleness, as slow polls cause it."""
     kept: list[Observations] = []
 
-    def change(step: int, observation: Observations) -> Observations:
+    def value(step: int, now: Observations) -> Observations:
         if step % steps == 0:
-            kept[:] = [observation[:, part].copy()]
-        observation[:, part] = kept[0]
+            kept[:] = [now]
+        return kept[0]
+
+    return _altered(part, value)
+
+
+def _altered(part: slice, value: Callable[[int, Observations], Observations]) -> Change:
+    """Replace a part by a function of the step and of a copy of the part."""
+
+    def change(step: int, observation: Observations) -> Observations:
+        observation[:, part] = value(step, observation[:, part].copy())
         return observation
 
     return change

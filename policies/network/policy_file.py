@@ -195,12 +195,7 @@ def load_policy(folder: Path) -> Policy:
 
 
 def refuse_other_observation(contract: Contract) -> None:
-    """Refuse a policy of another observation, which would act wrongly without an error.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a policy of another observation, which would act wrongly without an error."""
     expected = [(p.name, p.size) for p in contract.observation]
     given = [(name, size) for name, size, _ in OBSERVATION]
     if expected != given or contract.velocity_steps != VELOCITY_STEPS:
@@ -212,12 +207,7 @@ def refuse_other_observation(contract: Contract) -> None:
 
 
 def refuse_bad(network: PolicyNetwork, name: str) -> None:
-    """The gate: refuse a policy that is not finite, or whose output is constant.
-
-    Raises
-    ------
-    InputError
-    """
+    """The gate: refuse a policy that is not finite, or whose output is constant."""
     if not all(torch.isfinite(p).all() for p in network.state_dict().values()):
         raise InputError(f"Weights of {name} are not numbers. Train it again.")
     generator = torch.Generator().manual_seed(0)

@@ -172,12 +172,7 @@ def save_run(folder: Path, run: Run) -> None:
 
 
 def refuse_taken(folder: Path) -> None:
-    """Raise if the folder holds a run already.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise if the folder holds a run already."""
     if (folder / RUN_FILE).exists():
         raise InputError(
             f"{folder} holds a run already. Go on with it with `resume={folder}`, or give another "
