@@ -151,14 +151,14 @@ def print_tones(folder: Path) -> None:
         if not (HERE / f".venv-{simulator}").exists():
             continue
         delays = delays_at_step(calibration, STEP_S, engine)
-        steps = [round(delays[name].value_s / STEP_S) for name in calibration.joint_names]
+        steps = [round(delays[name].value / STEP_S) for name in calibration.joint_names]
         theirs = ran(simulator, calibration, steps, folder)
         for name, taken, there, here in zip(
             calibration.joint_names, steps, theirs, ours, strict=True
         ):
             turn = 2 * np.pi * TONE_HZ
             lags = [1e3 * (-np.angle(1j * p) % (2 * np.pi)) / turn for p in (there, here)]
-            rounded = 1e3 * (STEP_S * taken - delays[name].value_s)
+            rounded = 1e3 * (STEP_S * taken - delays[name].value)
             print(
                 f"| {simulator} | {name} | {abs(there):.4f} | {abs(here):.4f} | {lags[0]:.1f} "
                 f"| {lags[1]:.1f} | {rounded:+.1f} |"

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.files import refuse_overwrite, write_text
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
-from pupper_sysid.sim.emulator.clocks import Clock, RealClock, VirtualClock
+from pupper_sysid.sim.emulator.clocks import RealClock, VirtualClock
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
 from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
@@ -67,9 +67,7 @@ class EmulatedBus:
         self.joint_names = robot.joint_names
         spec = robot.spec
         polls, self._noise, clock = rng.spawn(3)
-        self._clock: Clock = (
-            RealClock() if real_time else VirtualClock(spec.sleep_overshoot_s, clock)
-        )
+        self._clock = RealClock() if real_time else VirtualClock(spec.sleep_overshoot_s, clock)
         self._plant = plant or FreeAirServos(robot)
         self._schedule = None
         if spec.poll_period_s > 0:

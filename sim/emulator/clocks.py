@@ -7,27 +7,10 @@ a little late, as on a real host; in real time it really sleeps.
 from __future__ import annotations
 
 import time
-from typing import Protocol
 
 import numpy as np
 
 from pupper_sysid.hardware.clock import HostClock
-
-
-class Clock(Protocol):
-    """What a bus needs of time."""
-
-    def now(self) -> float:
-        """Time [s]."""
-        ...
-
-    def sleep_until(self, time_s: float) -> None:
-        """Return when `now()` has reached `time_s`; at once if it has passed."""
-        ...
-
-    def spend(self, duration_s: float) -> None:
-        """Let an exchange with the bus take about `duration_s`."""
-        ...
 
 
 class VirtualClock:

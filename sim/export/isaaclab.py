@@ -7,6 +7,7 @@ Field names are those of Isaac Lab 2.3.2 (3.0 takes them, too);
 from __future__ import annotations
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.sim.export.shared import (
     EXPLICIT_PD,
     NOT_CARRIED,
@@ -31,7 +32,7 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
     groups = []
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        low, high = delays[name].steps(physics_step_s)
+        low, high = whole_steps(delays[name].low, delays[name].high, physics_step_s)
         made = call(
             "DelayedPDActuatorCfg",
             ("joint_names_expr", [name]),

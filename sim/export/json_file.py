@@ -6,6 +6,7 @@ import json
 
 from pupper_sysid.common.files import versions
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, TORQUE_KEYS, delays_at_step, step_note
 
 SCHEMA = "pupper-actuators"
@@ -24,7 +25,7 @@ def to_json(calibration: Calibration, physics_step_s: float) -> str:
     joints = {}
     for name, joint in calibration.joints.items():
         a, f = joint.actuator, joint.feedback
-        low, high = delays[name].steps(physics_step_s)
+        low, high = whole_steps(delays[name].low, delays[name].high, physics_step_s)
         keys = (*TORQUE_KEYS, "velocity_limit_rad_s", "dead_time_s")
         joints[name] = {
             "actuator": {key: getattr(a, key).model_dump(mode="json") for key in keys}

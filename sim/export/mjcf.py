@@ -38,7 +38,7 @@ def to_mjcf(calibration: Calibration, physics_step_s: float) -> str:
     delays = delays_at_step(calibration, physics_step_s)
     defaults, actuators, sensors = [], [], []
     for name, joint in calibration.joints.items():
-        servo = replace(joint.actuator.parameters, dead_time_s=delays[name].value_s)
+        servo = replace(joint.actuator.parameters, dead_time_s=delays[name].value)
         feedback = joint.feedback
         period, age = feedback.poll_period_s.value, feedback.mean_age_s.value
         defaults += [

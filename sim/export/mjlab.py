@@ -7,6 +7,7 @@ released package.
 from __future__ import annotations
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.servo_models.step_size import Engine
 from pupper_sysid.sim.export.shared import (
     NOT_CARRIED,
@@ -33,7 +34,7 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
     groups, bounds = [], []
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        steps = round(delays[name].value_s / physics_step_s)
+        steps = round(delays[name].value / physics_step_s)
         groups.append(
             call(
                 "BuiltinPositionActuatorCfg",
@@ -50,7 +51,7 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
                 ("delay_per_env_phase", False),
             )
         )
-        low, high = delays[name].steps(physics_step_s)
+        low, high = whole_steps(delays[name].low, delays[name].high, physics_step_s)
         bounds.append(f'"{name}": ({low}, {high}),')
     notes = (
         *origin(calibration),

@@ -19,11 +19,12 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator
+from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.sim.export.shared import (
     EXPLICIT_PD,
-    Delay,
     block,
     delays_at_step,
     docstring,
@@ -78,7 +79,7 @@ def export_newton(
     for name in (*(f"{joint}.onnx" for joint in calibration.joint_names), MODULE):
         refuse_overwrite(folder / name, force)
     for name, joint in calibration.joints.items():
-        network = servo_network(joint.actuator, delays[name].value_s, physics_step_s)
+        network = servo_network(joint.actuator, delays[name].value, physics_step_s)
         write_bytes(folder / f"{name}.onnx", network, force)
     write_text(folder / MODULE, _module(calibration, delays, physics_step_s), force)
 
@@ -121,14 +122,14 @@ def servo_network(actuator: Actuator, dead_time_s: float, physics_step_s: float)
     return model.SerializeToString()
 
 
-def _module(calibration: Calibration, delays: dict[str, Delay], physics_step_s: float) -> str:
+def _module(calibration: Calibration, delays: dict[str, Interval], physics_step_s: float) -> str:
     servos = []
     for name, joint in calibration.joints.items():
         actuator, delay = joint.actuator, delays[name]
-        low, high = delay.steps(physics_step_s)
+        low, high = whole_steps(delay.low, delay.high, physics_step_s)
         row: dict[str, Any] = {
             "model": f"{name}.onnx",
-            "delay_steps": round(delay.value_s / physics_step_s),
+            "delay_steps": round(delay.value / physics_step_s),
             "delay_steps_min": low,
             "delay_steps_max": high,
             "effort_limit": actuator.effort_limit_nm.value,

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from textwrap import indent, wrap
 from typing import Any
@@ -19,9 +18,9 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
-from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.servo_models.step_size import MUJOCO, Engine, delay_at_step
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
@@ -40,23 +39,10 @@ KNOWN = {"yes": "measured", "ratio only": "ratio measured, scale assumed", "no":
 _LONGEST_STEP_S = 0.1
 
 
-@dataclass(frozen=True)
-class Delay:
-    """A joint's delay for one physics step: its value and the interval to train with [s]."""
-
-    value_s: float
-    low_s: float
-    high_s: float
-
-    def steps(self, physics_step_s: float) -> tuple[int, int]:
-        """The interval in whole steps, rounded outward."""
-        return whole_steps(self.low_s, self.high_s, physics_step_s)
-
-
 def delays_at_step(
     calibration: Calibration, physics_step_s: float, engine: Engine = MUJOCO
-) -> dict[str, Delay]:
-    """Delay of each joint for another physics step or engine than the calibration's (`step_size`).
+) -> dict[str, Interval]:
+    """Delays [s] of joints for another physics step or engine than the calibration's (`step_size`).
 
     Raises
     ------
@@ -74,16 +60,16 @@ def delays_at_step(
         (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s, engine)
         more = float(fitting) - a.dead_time_s.value
         numbers = (max(t + more, 0.0) for t in (a.dead_time_s.value, *a.dead_time_interval_s))
-        found[name] = Delay(*numbers)
+        found[name] = Interval(*numbers)
     return found
 
 
 def step_note(
-    calibration: Calibration, delays: dict[str, Delay], physics_step_s: float
+    calibration: Calibration, delays: dict[str, Interval], physics_step_s: float
 ) -> Iterator[str]:
     """What was added to the delays for the length of a step, if anything was."""
     added = [
-        1e3 * (delays[name].value_s - joint.actuator.dead_time_s.value)
+        1e3 * (delays[name].value - joint.actuator.dead_time_s.value)
         for name, joint in calibration.joints.items()
     ]
     steps = {1e3 * joint.actuator.physics_step_s for joint in calibration.joints.values()}

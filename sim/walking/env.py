@@ -253,7 +253,8 @@ class PupperEnv:
         found |= {f"readings.{k}": v.copy() for k, v in self._readings.state.items()}
         found |= {name: getattr(self, name).copy() for name in _ARRAYS}
         found["counters"] = np.array([self.nan_resets, self.steps])
-        found["rng"] = json.dumps([self.rng.bit_generator.state, self._readings.rng_state])
+        rngs = (self.rng, self._readings.rng)
+        found["rng"] = json.dumps([rng.bit_generator.state for rng in rngs])
         return found
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -270,7 +271,8 @@ class PupperEnv:
         for name in _ARRAYS:
             getattr(self, name)[:] = state[name]
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
-        self.rng.bit_generator.state, self._readings.rng_state = json.loads(state["rng"])
+        for rng, own in zip((self.rng, self._readings.rng), json.loads(state["rng"]), strict=True):
+            rng.bit_generator.state = own
         self.level = self.config.curriculum.level(self.steps)
 
     # ------------------------------------------------------------------------- one step

@@ -37,6 +37,8 @@ class HeldReadings:
         Readings: angle [rad] and torque [N·m] at the last successful poll.
     age_s : ndarray, shape (environments, servos)
         Age of the readings [s].
+    rng : numpy.random.Generator
+        Draws phases, drift, jitter and lost polls.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class HeldReadings:
         self._loss = np.array([f.loss for f in feedback])
         self._quantum = np.array([f.quantum_rad for f in feedback])
         self._offset = np.array([f.offset_rad for f in feedback])
-        self._step, self._rng = physics_step_s, rng
+        self._step, self.rng = physics_step_s, rng
         shape = (environments, len(feedback))
         self._lattice = np.ones(shape)  # period of each robot's rounds
         self._next = np.zeros(shape)  # time until the next poll
@@ -65,21 +67,12 @@ class HeldReadings:
             "load": self.load, "age_s": self.age_s,
         }  # fmt: skip
 
-    @property
-    def rng_state(self) -> dict:
-        """State of the generator, for an exact copy."""
-        return dict(self._rng.bit_generator.state)
-
-    @rng_state.setter
-    def rng_state(self, state: dict) -> None:
-        self._rng.bit_generator.state = state
-
     def reset(self, ids: NDArray[np.intp], position: NDArray[np.float64]) -> None:
         """Start robots `ids` at rest at `position` [rad], shape (len(ids), servos)."""
         servos = len(self._period)
-        wander = 1.0 + _DRIFT * self._rng.standard_normal((len(ids), 1))
+        wander = 1.0 + _DRIFT * self.rng.standard_normal((len(ids), 1))
         self._lattice[ids] = self._period * wander
-        first = self._rng.random((len(ids), 1)) + np.arange(servos) / servos
+        first = self.rng.random((len(ids), 1)) + np.arange(servos) / servos
         self._next[ids] = self._lattice[ids] * (first % 1.0)
         self.position[ids] = self._reported(position)
         self.load[ids] = 0.0
@@ -106,7 +99,7 @@ class HeldReadings:
             if not due.any():
                 break
             row, servo = np.nonzero(due)
-            chance = self._rng.random((2, len(row)))
+            chance = self.rng.random((2, len(row)))
             succeeded = chance[0] >= self._loss[servo]
             at = self._next[row, servo]
             # a uniform jitter of the same variance stays within bounds

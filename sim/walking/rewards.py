@@ -216,14 +216,12 @@ def gait(s: Step, p: Rewards) -> Array:
     """Product over pairs of feet: 1 if they move together, or in turn, as in a trot."""
     most = p.gait_most**2
     product = np.ones(len(s.command))
-    for a, b in _TOGETHER:
-        gap = np.minimum((s.air_s[:, a] - s.air_s[:, b]) ** 2, most)
-        gap = gap + np.minimum((s.contact_s[:, a] - s.contact_s[:, b]) ** 2, most)
-        product = product * np.exp(-gap / p.gait_sigma)
-    for a, b in _APART:
-        gap = np.minimum((s.air_s[:, a] - s.contact_s[:, b]) ** 2, most)
-        gap = gap + np.minimum((s.contact_s[:, a] - s.air_s[:, b]) ** 2, most)
-        product = product * np.exp(-gap / p.gait_sigma)
+    air, contact = s.air_s, s.contact_s
+    for pairs, first, second in ((_TOGETHER, air, contact), (_APART, contact, air)):
+        for a, b in pairs:
+            gap = np.minimum((air[:, a] - first[:, b]) ** 2, most)
+            gap = gap + np.minimum((contact[:, a] - second[:, b]) ** 2, most)
+            product = product * np.exp(-gap / p.gait_sigma)
     return np.where(s.moving(p.gait_threshold), product, 0.0)
 
 

@@ -90,7 +90,7 @@ def test_an_export_for_longer_steps_lags_as_long_as_the_calibration_says(calibra
     # what the step of 5 ms alone would have done
     more = delays_at_step(calibration, 0.005)
     for name, joint in calibration.joints.items():
-        assert 0.0015 < more[name].value_s - joint.actuator.dead_time_s.value < 0.004
+        assert 0.0015 < more[name].value - joint.actuator.dead_time_s.value < 0.004
 
 
 @pytest.mark.parametrize("engine", [EXPLICIT_PD, MJLAB_PD])
@@ -170,8 +170,8 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
         assert made["joint_names_expr"] == [name]
         assert made["stiffness"] == own.stiffness_nm_per_rad.value
         assert made["armature"] == own.armature_kg_m2.value
-        assert made["min_delay"] * 0.005 <= delays[name].low_s
-        assert delays[name].high_s <= made["max_delay"] * 0.005
+        assert made["min_delay"] * 0.005 <= delays[name].low
+        assert delays[name].high <= made["max_delay"] * 0.005
         assert made["max_delay"] - made["min_delay"] <= 2
     assert space["FEEDBACK"]["LF_hip"]["loss"] == calibration.joint("LF_hip").feedback.loss.value
 
@@ -183,7 +183,7 @@ def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibr
     assert len(space["ACTUATORS"]) == 3
     delays = delays_at_step(calibration, 0.005, MJLAB_PD)
     for made, (name, joint) in zip(space["ACTUATORS"], calibration.joints.items(), strict=True):
-        assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value_s / 0.005)
+        assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value / 0.005)
         assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
         assert made["frictionloss"] == joint.actuator.friction_loss_nm.value
         low, high = space["DELAY_STEPS"][name]

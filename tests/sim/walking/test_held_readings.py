@@ -173,12 +173,12 @@ def test_resetting_some_robots_leaves_the_others_alone():
 def test_a_copied_state_reads_on_as_the_original():
     bus = settled(MEASURED, environments=3)
     saved = {k: v.copy() for k, v in bus.readings.state.items()}
-    random, time = bus.readings.rng_state, bus.time
+    random, time = dict(bus.readings.rng.bit_generator.state), bus.time
     bus.step()
     first = bus.readings.position.copy()
     bus.step()
     for name, value in bus.readings.state.items():
         value[:] = saved[name]
-    bus.readings.rng_state, bus.time = random, time
+    bus.readings.rng.bit_generator.state, bus.time = random, time
     bus.step()
     np.testing.assert_array_equal(bus.readings.position, first)
