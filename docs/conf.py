@@ -8,7 +8,7 @@ import re
 import shutil
 import sys
 import tomllib
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
 from types import GenericAlias
@@ -120,8 +120,9 @@ def _front_door(pages: list[str]) -> str:
     front = import_module("pupper_sysid")
     lines = [*_titled("Python", "="), ".. automodule:: pupper_sysid", ""]
     for name in getattr(front, "__all__", ()):
-        kind = "autoclass" if isinstance(getattr(front, name), type) else "autofunction"
-        lines += [f".. {kind}:: pupper_sysid.{name}", "   :no-index:", ""]
+        item = getattr(front, name)
+        kind = "class" if isinstance(item, type) else "function" if callable(item) else "data"
+        lines += [f".. auto{kind}:: pupper_sysid.{name}", "   :no-index:", ""]
     lines += [*_titled("By folder", "-"), ".. toctree::", "   :maxdepth: 1", ""]
     return "\n".join([*lines, *(f"   {page}" for page in pages), ""])
 
@@ -152,5 +153,8 @@ def setup(app) -> None:
     """Write the generated pages before any page is read."""
     (HERE / "commands.md").write_text(reference())
     write_api_pages()
+    with chdir(HERE.parent):
+        example = import_module("notebook").page(HERE / "examples/example.py", HERE / "figures")
+    (HERE / "example.md").write_text(example)
     app.connect("autodoc-process-docstring", _as_rst, priority=100)  # before numpydoc
     app.connect("autodoc-skip-member", _skip_aliases)
