@@ -360,6 +360,45 @@ def test_a_joint_that_is_held_away_from_its_goal_stops_the_robot():
         drive(guard, 3.0, lambda t: np.array([0.5, 0.0]))
 
 
+def test_a_command_too_recent_to_show_does_not_make_a_servo_frozen():
+    bus = PlainBus()
+    guard = ready(bus)
+    bus.frozen = True  # at rest, its reading does not change either
+    drive(guard, 1.2)
+    drive(guard, 0.25, lambda t: np.array([0.2, 0.0]))
+    bus.frozen = False
+    drive(guard, 1.0, lambda t: np.array([0.2, 0.0]))
+
+
+def test_a_joint_that_is_away_is_given_time_after_its_first_command():
+    bus = PlainBus()
+    guard = ready(bus)
+    read = bus.read
+    bus.read = lambda: replace(read(), position_rad=np.array([0.5, 0.0]))
+    drive(guard, 0.7)
+    with pytest.raises(SafetyStop, match="stays 0.50 rad away"):
+        drive(guard, 0.4)
+
+
+def test_a_joint_whose_command_has_just_moved_is_given_time():
+    bus = PlainBus()
+    guard = ready(bus)
+    drive(guard, 2.0)
+    bus.blocked = True
+    drive(guard, 0.8, lambda t: np.array([0.5, 0.0]))
+    with pytest.raises(SafetyStop, match="stays 0.50 rad away"):
+        drive(guard, 0.5, lambda t: np.array([0.5, 0.0]))
+
+
+def test_a_high_load_is_borne_for_a_while_from_the_start():
+    bus = PlainBus()
+    guard = ready(bus)
+    bus.load = np.array([0.0, -0.95])
+    drive(guard, 1.4, swing)
+    with pytest.raises(SafetyStop, match="LF_calf has worked at 95 % of full duty"):
+        drive(guard, 0.3, swing)
+
+
 def test_a_stuck_calf_servo_is_seen_though_the_angle_of_its_joint_changes_with_the_thigh():
     bus = linked(PlainBus())
     guard = ready(bus)
