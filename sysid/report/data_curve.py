@@ -6,10 +6,8 @@ robot and writes `data/servo_data_curve.csv`, which this module reads and draws.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import resources
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -27,45 +25,21 @@ MODELS = {
 """Title, colour, marker and line of each model of the curve."""
 
 
-@dataclass(frozen=True)
-class DataCurve:
-    """Error in free run against samples.
-
-    Attributes
-    ----------
-    samples : tuple of int
-        Per joint, increasing.
-    error_rad : dict of str to tuple of float
-        By model (a key of `MODELS`), one per number of samples; NaN where it was not run.
-    """
-
-    samples: tuple[int, ...]
-    error_rad: dict[str, tuple[float, ...]]
-
-
-def measured() -> DataCurve:
-    """The curve as measured last."""
+def measured() -> pd.DataFrame:
+    """Error in free run [rad] by samples per joint (rows) and model of `MODELS` (columns)."""
     with (resources.files("pupper_sysid.sysid.report") / "data" / FILE).open() as file:
         table = pd.read_csv(file)
-    by_model = table.pivot(
-        index="samples_per_joint", columns="model", values="rmse_free_run_rad"
-    ).sort_index()
-    return DataCurve(
-        tuple(int(s) for s in by_model.index),
-        {m: tuple(by_model[m]) for m in MODELS if m in by_model},
-    )
+    curve = table.pivot(index="samples_per_joint", columns="model", values="rmse_free_run_rad")
+    return curve.sort_index().reindex(columns=[m for m in MODELS if m in curve])
 
 
 @styled
-def data_curve_figure(curve: DataCurve, own_samples: int | None = None) -> Figure:
+def data_curve_figure(curve: pd.DataFrame, own_samples: int | None = None) -> Figure:
     """Error against samples, a line per model; `own_samples` marks a recording's own number."""
     figure, (axes,) = axes_column(1, 3.6)
-    for model, errors in curve.error_rad.items():
-        title, colour, marker, line = MODELS[model]
-        axes.loglog(
-            curve.samples, 1e3 * np.array(errors), marker=marker, color=colour, ls=line,
-            label=title,
-        )  # fmt: skip
+    for model, errors in curve.items():
+        title, colour, marker, line = MODELS[str(model)]
+        axes.loglog(curve.index, 1e3 * errors, marker=marker, color=colour, ls=line, label=title)
     if own_samples:
         axes.axvline(own_samples, color=FAINT, lw=1.5, zorder=0)
         axes.text(
@@ -74,7 +48,7 @@ def data_curve_figure(curve: DataCurve, own_samples: int | None = None) -> Figur
         )  # fmt: skip
     axes.set_xlabel("samples per joint")
     axes.set_ylabel("error in free run [mrad]")
-    axes.set_xticks(curve.samples, [f"{s:,}" for s in curve.samples])
+    axes.set_xticks(list(curve.index), [f"{samples:,}" for samples in curve.index])
     axes.set_yticks([5, 10, 20, 50, 100], ["5", "10", "20", "50", "100"])
     axes.minorticks_off()
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize=7.5)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from pupper_sysid.common.page import Column, Picture, Section, Table
-from pupper_sysid.sysid.report.data_curve import MODELS, DataCurve, data_curve_figure, measured
+from pupper_sysid.sysid.report.data_curve import MODELS, data_curve_figure, measured
 from pupper_sysid.sysid.report.tables import KEY, number, text
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
@@ -67,13 +68,10 @@ def servo_section(found: Comparison) -> Section:
     )
 
 
-def _curve_table(curve: DataCurve) -> Table:
-    rows = [
-        {"samples_per_joint": n, **{f"{m}_rad": errors[i] for m, errors in curve.error_rad.items()}}
-        for i, n in enumerate(curve.samples)
-    ]
+def _curve_table(curve: pd.DataFrame) -> Table:
+    rows = curve.add_suffix("_rad").reset_index().to_dict("records")
     columns = (
         Column("samples per joint", lambda row: f"{row['samples_per_joint']:,}", "key"),
-        *(number(f"{MODELS[m][0]}, mrad", f"{m}_rad", 1, 1e3) for m in curve.error_rad),
+        *(number(f"{MODELS[m][0]}, mrad", f"{m}_rad", 1, 1e3) for m in map(str, curve)),
     )
     return Table("servo_data_curve", "Error against samples, emulated robot", columns, tuple(rows))
