@@ -8,6 +8,7 @@ along the first axis, for logs of other origin. Signals are joint angles or targ
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +129,9 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
     each = {name: np.array([f[name] for f in found]) for name in found[0]}
     rate, null, phase = (each.pop(name) for name in ("frequency_hz", "null_r2", "phase"))
     action_r2, joint_r2 = (each[f"{x}_r2_by_joint"].mean(axis=1) for x in ("action", "joint"))
+    rest: dict[str, Any] = {
+        name: mean_of(v) if v.ndim == 1 else tuple(map(mean_of, v.T)) for name, v in each.items()
+    }
     return GaitReport(
         robots=len(walked),
         left_out=rollout.alive.shape[1] - len(walked),
@@ -137,7 +141,7 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
         joint_r2=mean_of(joint_r2),
         null_r2=float(null.mean()),
         phase=tuple(_mean_phase(p) for p in phase.T),
-        **{k: mean_of(v) if v.ndim == 1 else tuple(map(mean_of, v.T)) for k, v in each.items()},
+        **rest,
     )
 
 
@@ -302,11 +306,11 @@ def correlation(actions_a: Signal, actions_b: Signal) -> float:
 def _describe_one(
     action: Array, joints: Array, contact: NDArray[np.bool_], step_s: float,
     rng: np.random.Generator,
-) -> dict[str, object]:  # fmt: skip
+) -> dict[str, Any]:  # fmt: skip
     """All measures of one robot, by name."""
     moves = bool((action.std(axis=0) > STILL).any())
     rate = frequency(action, step_s) if moves else UNKNOWN
-    found: dict[str, object] = {
+    found: dict[str, Any] = {
         "frequency_hz": astuple(rate),
         "null_r2": float("nan"),
         "duty": contact.mean(axis=0),
