@@ -48,6 +48,7 @@ def load(path: Path | str) -> Recording:
     Returns
     -------
     Recording
+        Validated, with its repairs in `warnings`.
 
     Raises
     ------

@@ -98,7 +98,7 @@ class Trial:
 class Recording:
     """A validated recording.
 
-    Attributes
+    Parameters
     ----------
     table : pandas.DataFrame
         Columns `table.REQUIRED_COLUMNS`, and those of `table.OPTIONAL_COLUMNS` the bus had.
@@ -107,6 +107,7 @@ class Recording:
     name : str
         Of the file, without folder and ending.
     path : Path or None
+        Of the file, if there is one.
     sha256 : str
         Of the file as it was read, or of the table if there was no file.
     warnings : tuple of str

@@ -120,6 +120,7 @@ def compare(
     Returns
     -------
     Comparison
+        Scores and free runs of the models, and of a linear filter fitted here.
 
     Raises
     ------

@@ -130,9 +130,11 @@ def fit_servo(
     joints : str or sequence of str, optional
         By default all that were recorded.
     arch : {"fir", "mlp", "lstm", "delayed-pd", "sindy"}
+        Kind of model.
     preset : {"default", "paper"}
         `paper` trains an MLP or LSTM as published: from its last position, one step ahead.
     split : Split
+        Parts for training and for testing; by default each group is left out in turn.
     readings : {"auto", "fresh", "all"}
         Which readings count, see `sysid.servo_fit.data`.
     seed : int
@@ -143,6 +145,7 @@ def fit_servo(
     Returns
     -------
     ServoFit
+        The model, fitted to the whole training part, and its scores.
 
     Raises
     ------
