@@ -56,15 +56,22 @@ def whole_steps(low_s: float, high_s: float, time_step_s: float) -> tuple[int, i
 class DelayedPDParameters:
     """Numbers of a DelayedPD servo; floats or arrays that broadcast against each other.
 
-    Attributes
+    Parameters
     ----------
-    stiffness : N·m/rad
-    damping : N·m·s/rad
-    friction_loss : N·m, dry (Coulomb) friction
-    armature : kg·m², all inertia the servo feels, its own included
-    effort_limit : N·m
-    velocity_limit : rad/s, rate limit of the set-point
-    dead_time_s : s, from a command's arrival to its first effect on the torque
+    stiffness : array_like
+        Torque per position error [N·m/rad].
+    damping : array_like
+        Torque per velocity [N·m·s/rad].
+    friction_loss : array_like
+        Dry (Coulomb) friction [N·m].
+    armature : array_like
+        Reflected inertia and load at the joint [kg·m²].
+    effort_limit : array_like
+        Largest torque [N·m].
+    velocity_limit : array_like
+        Largest rate of the set-point [rad/s].
+    dead_time_s : array_like
+        From a command's arrival to its first effect on the torque [s].
     """
 
     stiffness: ArrayLike

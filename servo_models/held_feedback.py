@@ -26,7 +26,7 @@ from pupper_sysid.common.errors import InputError
 class HeldFeedback:
     """Feedback of one joint.
 
-    Attributes
+    Parameters
     ----------
     poll_period_s : float
         Time between polls [s]; 0 if every reading is fresh.

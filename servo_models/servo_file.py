@@ -175,10 +175,16 @@ def load_servo_model(
     Parameters
     ----------
     folder : Path
+        Of the contract and the weights.
     joints : sequence of str, optional
         Joints of the model's batch, in this order; by default all that it has.
     time_step_s : float, optional
         Time between commands in use [s].
+
+    Returns
+    -------
+    SavedModel
+        The model at rest at 0 rad, its arrays and its contract.
 
     Raises
     ------

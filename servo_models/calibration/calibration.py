@@ -81,6 +81,23 @@ class InputFile(Part):
 class Calibration(Part):
     """Measured servos of one robot. Frozen; see the module's text.
 
+    Parameters
+    ----------
+    schema, schema_version : str, int
+        Kind of the file, and version of its format.
+    robot, created, units : str
+        Name of the robot, time of the calibration (UTC, ISO 8601), units of the numbers.
+    inputs : tuple of InputFile
+        Recordings it was made from.
+    seed : int or None
+        Seed of its random numbers.
+    versions : dict of str to str
+        Versions of this project and of the libraries that shape its numbers.
+    notes : tuple of str
+        Notes for the reader.
+    joints : dict of str to JointCalibration
+        The joints, by name.
+
     Raises
     ------
     pydantic.ValidationError
@@ -224,6 +241,11 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
     ----------
     path_or_preset : Path or str
         A YAML file, or one of `PRESETS`. A file that is named like a preset is `./paper`.
+
+    Returns
+    -------
+    Calibration
+        Always of the present version.
 
     Raises
     ------
