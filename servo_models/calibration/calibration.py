@@ -85,14 +85,16 @@ class Calibration(Part):
     ----------
     schema, schema_version : str, int
         Kind of the file, and version of its format.
-    robot, created, units : str
-        Name of the robot, time of the calibration (UTC, ISO 8601), units of the numbers.
+    robot, created : str
+        Name of the robot; time of the calibration (UTC, ISO 8601).
     inputs : tuple of InputFile
         Recordings it was made from.
     seed : int or None
         Seed of its random numbers.
     versions : dict of str to str
         Versions of this project and of the libraries that shape its numbers.
+    units : str
+        Units of the numbers.
     notes : tuple of str
         Notes for the reader.
     joints : dict of str to JointCalibration
