@@ -9,9 +9,11 @@ from pupper_sysid.common.joints import JOINT_NAMES
 # objects whose keys are names of the data
 _BY_NAME = frozenset(
     {"models", "gaits", "orbits", "ablations", "autonomy", "curves", "terrain", "compliance"}
-    | {"parameters", "intervals", "choices", "terms", "transfer_functions", "estimators_s"}
-    | {"estimators_ms", "estimators", "ladder", "candidate_models", "presets"}
+    | {"parameters", "choices", "transfer_functions", "estimators_s"}
+    | {"coefficients", "leave_one_out_ranges", "candidate_models", "presets", "undecided"}
 )
+# objects that another line, or a file, describes
+_ELSEWHERE = {"calibration": ": as in the YAML file", "lag": ": as in delay"}
 _INTERVAL = {"value", "low", "high"}
 _QUANTITY = _INTERVAL | {"identified", "why"}
 
@@ -34,6 +36,8 @@ def _tree(value: Any, key: str = "") -> Any:
             return ": quantity"
         if set(value) == _INTERVAL:
             return ": interval"
+        if key in _ELSEWHERE:
+            return _ELSEWHERE[key]
         entries = {k: _tree(v, k) for k, v in value.items()}
         name = ""
         if entries and set(entries) <= set(JOINT_NAMES):

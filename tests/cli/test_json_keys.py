@@ -1,0 +1,40 @@
+"""The keys of JSON objects are those of docs/formats.md."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from support.command_line import run
+from support.json_keys import key_line
+from support.package import ROOT
+
+ROWS = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", (ROOT / "docs/formats.md").read_text(), re.M)
+DOCUMENTED = {command: keys for commands, keys in ROWS for command in commands.split(", ")}
+SAMPLE = ROOT / "data/samples/sweep.csv"
+COMMANDS = {
+    "sweep": ("--freqs", "4", "--joints", "LF_hip"),
+    "doctor": (SAMPLE,),
+    "delay": (SAMPLE, "--joints", "LF_hip"),
+    "bode": (SAMPLE, "--joints", "LF_hip"),
+    "export": ("paper", "--to", "csv"),
+    "compare": (SAMPLE, "--joints", "LF_hip", "--models", "paper"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_keys_of_an_object_are_the_documented_ones(capsys, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, command, *COMMANDS[command], "--json")
+    assert code == 0, err
+    assert key_line(json.loads(out)) == DOCUMENTED[command]
+
+
+def test_an_objects_keys_in_one_line():
+    found = {
+        "joints": {"LF_hip": {"lag_s": {"value": 1, "low": 0, "high": 2}, "warnings": []}},
+        "rows": [{"a": 1}, {"a": 1, "b": None}],
+    }
+    assert key_line(found) == "joints.<joint>.{lag_s: interval, warnings[]}, rows[].{a, b}"
