@@ -76,7 +76,7 @@ def held(part: slice, steps: int) -> Change:
     return _altered(part, value)
 
 
-def _altered(part: slice, value: Callable[[int, Observations], Observations]) -> Change:
+def _altered(part: slice, value: Callable[[int, Observations], NDArray[np.floating]]) -> Change:
     """Replace a part by a function of the step and of a copy of the part."""
 
     def change(step: int, observation: Observations) -> Observations:
