@@ -117,10 +117,10 @@ def print_fleet(
         cells = [spread(rows[key], digits) for key, (_, digits) in columns.items()]
         shown.add_row(str(joint), str(len(rows)), *cells)
     out.print(shown)
-    for _, row in known.query("unlike != ''").iterrows():
+    for _, row in known.query("outliers != ''").iterrows():
         out.print(
             f"{row['robot']} {row['joint']} is an outlier: "
-            f"{', '.join(str(row['unlike']).split(';'))}.",
+            f"{', '.join(str(row['outliers']).split(';'))}.",
             soft_wrap=True,
         )
     for name, problem in sorted(fleet.problems.items()):

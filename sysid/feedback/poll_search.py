@@ -1,17 +1,14 @@
-"""Where do a poll's instants lie? Search for a lattice that explains when readings changed.
+"""Search for the lattice of poll instants that explains when readings changed.
 
-A stretch of a few seconds says of each changed row between which two reads a poll must have
-succeeded, and of each row that stayed the same, although the servo must have moved, where no poll
-did. A lattice `phase + n * period` is good if its instants lie in many of the former intervals
-and few of the latter. For a trial period T, count for every phase how many changed rows'
-intervals contain an instant; the log-likelihood of the count, against intervals placed at random,
-is the score. Real polls drift by some 0.4 % from stretch to stretch, so stretches share T only
-through a Gaussian of that width (`best_period`). The score means something only beside that of
-rows whose gaps were shuffled (`shuffled`). `best_blur` and `refine` then say, of each stretch,
-how sharp the instants are and where.
-
-Nothing here knows of trials or servos: `sysid.feedback.poll_lattice` cuts recordings into
-stretches.
+In a stretch of a few seconds, each changed row brackets a successful poll between two reads; each
+row that stayed the same although the servo must have moved brackets none. A lattice
+`phase + n * period` is good if its instants lie in many of the former intervals and few of the
+latter. For a trial period T, count for every phase how many changed rows' intervals contain an
+instant; the log-likelihood of the count, against intervals placed at random, is the score. Real
+polls drift by some 0.4 % from stretch to stretch, so stretches share T only through a Gaussian of
+that width (`best_period`). The score is compared with that of rows whose gaps were shuffled
+(`shuffled`). `best_blur` and `refine` then estimate the width and the phase of the instants in each
+stretch.
 """
 
 from __future__ import annotations
@@ -29,7 +26,7 @@ BLURS_S = (0.0012, 0.0025, 0.005)
 """Full widths of the uncertainty of one poll instant, to choose from [s]."""
 
 BLUR_S = BLURS_S[1]
-"""The width to assume before the rows have said which [s]."""
+"""The width before it is estimated [s]."""
 
 _DRIFT = 0.0045  # relative sd of the period between stretches, measured on a Mini Pupper 2
 _BINS = 64
@@ -38,7 +35,7 @@ _PEAKS = 12
 
 @dataclass(frozen=True)
 class Stretch:
-    """What one stretch of one trial says about when polls succeeded.
+    """Evidence on the poll instants from one stretch of one trial.
 
     Attributes
     ----------

@@ -1,15 +1,14 @@
 """Calibrate the recordings of many robots at once, on some cores or on a Dask cluster.
 
-`run_fleet` does the same for whatever else is made of a robot's recording
-(`sysid.servo_fit.fleet`).
+`run_fleet` does the same for any other product of a robot's recording (`sysid.servo_fit.fleet`).
 
     fleet = calibrate_fleet(Path("robots"), Path("fleet"), Settings(seed=0), jobs=2)
     fleet.table                   # one row per robot and joint
 
-One recording is one robot. Each becomes a calibration file of its own, written when it is done, so
-that an interrupted run goes on where it stopped: a file that was made from the same bytes with the
-same settings is kept. A recording that cannot be used does not stop the others; its sentence stands
-in the table. Servos that are unlike their sisters on the other robots are named.
+One recording is one robot. Each gets its own calibration file, written when it is done, so that an
+interrupted run continues: a file made from the same bytes with the same settings is kept. A
+recording that cannot be used does not stop the others; the reason is in the table. Servos far from
+the same joint's on the other robots are marked as outliers.
 """
 
 from __future__ import annotations
@@ -37,10 +36,11 @@ from pupper_sysid.sysid.identify.calibration_file import (
 from pupper_sysid.sysid.recordings.files import load
 
 TABLE = "fleet.csv"
-UNLIKE = 5.0
-"""A servo is named if it is so many robust standard deviations from the median of its sisters."""
+OUTLIER = 5.0
+"""Distance of an outlier from the median of the same joint on all robots, in robust standard
+deviations."""
 FEWEST = 5
-"""Robots that it takes to say what is usual."""
+"""Robots needed to mark outliers."""
 
 QUANTITIES = {
     "lag_ms": lambda joint: _ms(joint.lag.lag_s),
@@ -54,7 +54,7 @@ QUANTITIES = {
     "offset_rad": lambda joint: joint.feedback.offset_rad.value,
     "fit_percent": lambda joint: joint.scores.fit_percent,
 }
-"""What the table has of each joint."""
+"""Columns of the table, from each joint's calibration."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class Settings:
 
 @dataclass
 class Fleet:
-    """What became of the recordings.
+    """Results of a fleet.
 
     Attributes
     ----------
     table : pandas.DataFrame
-        One row per robot and joint: `robot`, `joint`, `QUANTITIES`, `unlike` (names of quantities,
-        with semicolons), `problem` (a sentence; then the numbers are empty).
+        One row per robot and joint: `robot`, `joint`, `QUANTITIES`, `outliers` (names of
+        quantities, with semicolons), `problem` (a sentence; then the numbers are empty).
     kept, made, failed : list of str
         Robots whose calibration was there already, was made, could not be made.
     problems : dict of str to str
@@ -95,7 +95,7 @@ class Fleet:
         Outliers are named, and robots that failed stand at the end with their problem.
         """
         table = pd.DataFrame(rows, columns=["robot", "joint", *quantities])
-        table["unlike"] = _unlike(table, quantities)
+        table["outliers"] = _outliers(table, quantities)
         table["problem"] = ""
         lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(self.problems.items())])
         self.table = pd.concat([table, lost], ignore_index=True) if len(lost) else table
@@ -324,7 +324,7 @@ def _backend(cluster: str | None) -> Iterator[Callable[[int], Parallel]]:
         yield lambda jobs: Parallel(n_jobs=-1)
 
 
-def _unlike(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
+def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
     """Per row the quantities that are far from the same joint's on the other robots."""
     found: list[list[str]] = [[] for _ in range(len(table))]
     for _, rows in table.groupby("joint").groups.items():
@@ -338,7 +338,7 @@ def _unlike(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
             if not spread > 1e-9 * max(abs(middle), 1e-12):
                 continue
             for row, value in zip(rows, values, strict=True):
-                if abs(value - middle) > UNLIKE * spread:
+                if abs(value - middle) > OUTLIER * spread:
                     found[row].append(key)
     return [";".join(names) for names in found]
 

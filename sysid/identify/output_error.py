@@ -1,10 +1,10 @@
-"""Fit a servo model so that, run freely from rest, it ends up where the readings say.
+"""Output-error identification: fit a servo model in free run from rest.
 
-One cost serves the fit, the scores and the tests: the model is simulated under the held, truncated
-commands, looked up at the time each fresh reading was measured, and compared with the reading
-under a soft-L1 loss (a late poll must not steer the fit). Many fits run at once (joints, held-out
-frequencies, starts, points of a likelihood profile): one simulation call per iteration serves them
-all, which is what makes pure NumPy fast enough.
+One cost serves the fit, the scores and the tests: the model is simulated under the zero-order-held,
+truncated commands, looked up at the measurement time of each fresh reading, and compared with it
+under a soft-L1 loss (a late poll must not steer the fit). Many fits run at once (joints, left-out
+frequencies, starts, points of a likelihood profile) with one simulation call per iteration, which
+makes pure NumPy fast enough.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.identify.models import CandidateModel
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_PAD = 64  # steps of rest before each trial: the longest delay of the ladder, 0.12 s
+_PAD = 64  # steps of rest before each trial: the longest delay of the models, 0.12 s
 DIFFERENCE = 0.01  # relative step of the Jacobian; smaller ones drown in friction's stick-slip
 _WIDE_DIFFERENCE = 0.03  # for the covariance: the slope over a likely error, not of one kink
 _DELAY_GRID = 2.0  # steps between the delays tried for a start
@@ -362,9 +362,9 @@ def global_starts(
 ) -> NDArray[np.float64]:
     """The `keep` best of `candidates` quasi-random parameter vectors, per problem.
 
-    The vectors fill the box of fitted coordinates, drawn toward the prior where there is one. Each
-    gets the delay and the offset that suit it best: a servo does the same thing later, so every
-    delay can be read off one simulation, and the most rugged coordinate need not be searched.
+    The vectors fill the box of fitted coordinates, within two standard deviations of the prior
+    where there is one. Each gets its best delay and offset: a delay only shifts the motion in time,
+    so that one simulation serves all delays and the most rugged coordinate is not searched.
 
     Returns
     -------

@@ -14,7 +14,7 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.identify import fleet
-from pupper_sysid.sysid.identify.fleet import QUANTITIES, UNLIKE, _unlike
+from pupper_sysid.sysid.identify.fleet import OUTLIER, QUANTITIES, _outliers
 from pupper_sysid.sysid.servo_fit.fleet import ServoSettings, fit_servo_fleet
 from support.command_line import refused, run
 
@@ -133,17 +133,17 @@ def test_a_dask_cluster_gives_what_one_process_gives(sweeps, tmp_path):
     pd.testing.assert_frame_equal(there.table, here.table)
 
 
-def test_a_servo_unlike_its_sisters_is_named_and_equal_ones_are_not():
+def test_an_outlier_is_named_and_equal_servos_are_not():
     rows = [
         {"robot": f"r{k}", "joint": "LF_hip"} | dict.fromkeys(QUANTITIES, 1.0) for k in range(9)
     ]
     for k, row in enumerate(rows):
         row["lag_ms"] = 40 + 0.1 * k
     # with it the median is 40.5, the median deviation 0.3
-    rows[4]["lag_ms"] = 40.5 + 1.1 * UNLIKE * 1.4826 * 0.3
-    found = _unlike(pd.DataFrame(rows), NAMES)
+    rows[4]["lag_ms"] = 40.5 + 1.1 * OUTLIER * 1.4826 * 0.3
+    found = _outliers(pd.DataFrame(rows), NAMES)
     assert found == ["lag_ms" if k == 4 else "" for k in range(9)]
-    assert _unlike(pd.DataFrame(rows[2:6]), NAMES) == [""] * 4  # too few to say what is usual
+    assert _outliers(pd.DataFrame(rows[2:6]), NAMES) == [""] * 4  # too few to say what is usual
 
 
 def test_what_is_no_fleet_is_refused_in_a_sentence(sweeps, tmp_path, capsys):
@@ -170,5 +170,5 @@ def test_outliers_do_not_depend_on_order():
     rows[7]["loss"] = 50.0
     table = pd.DataFrame(rows)
     turned = table.iloc[::-1].reset_index(drop=True)
-    assert _unlike(table, NAMES) == _unlike(turned, NAMES)[::-1]
-    assert "loss" in _unlike(table, NAMES)[7]
+    assert _outliers(table, NAMES) == _outliers(turned, NAMES)[::-1]
+    assert "loss" in _outliers(table, NAMES)[7]
