@@ -13,7 +13,15 @@ LEVEL = 0.90
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its 90 % interval, all three in the same unit."""
+    """An estimate with its 90 % interval, all three in the same unit.
+
+    Parameters
+    ----------
+    value : float
+        The estimate.
+    low, high : float
+        Ends of the interval.
+    """
 
     value: float
     low: float

@@ -96,7 +96,15 @@ class Contract(_Part):
 
 
 class Policy:
-    """A policy that acts for many robots at once and keeps their states."""
+    """A policy that acts for many robots at once and keeps their states.
+
+    Parameters
+    ----------
+    network : PolicyNetwork
+        From observations to actions.
+    contract : Contract
+        What it was trained for.
+    """
 
     def __init__(self, network: PolicyNetwork, contract: Contract):
         self.network, self.contract = network, contract
@@ -160,6 +168,16 @@ def save_policy(
 
 def load_policy(folder: Path) -> Policy:
     """Read a policy.
+
+    Parameters
+    ----------
+    folder : Path
+        With `contract.json` and `weights.safetensors`.
+
+    Returns
+    -------
+    Policy
+        At rest, for any number of robots.
 
     Raises
     ------

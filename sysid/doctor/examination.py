@@ -150,6 +150,11 @@ def examine(
     seed : int or numpy.random.Generator
         Shuffles rows for the poll's z-score.
 
+    Returns
+    -------
+    Examination
+        Verdict and numbers by joint.
+
     Raises
     ------
     InputError

@@ -91,6 +91,11 @@ def calibrate(
     progress : callable, optional
         Called with a joint's name when it is done.
 
+    Returns
+    -------
+    CalibrationResult
+        Fits by joint, and the calibration.
+
     Raises
     ------
     InputError

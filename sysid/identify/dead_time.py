@@ -49,6 +49,11 @@ def lag(
     progress : callable, optional
         Called with a joint's name when it is done.
 
+    Returns
+    -------
+    LagBudgets
+        Lag budget by joint.
+
     Raises
     ------
     InputError

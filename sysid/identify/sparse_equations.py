@@ -170,6 +170,11 @@ def sparse_equations(
     progress : callable, optional
         Called with a joint's name when it is done.
 
+    Returns
+    -------
+    Equations
+        Equation by joint.
+
     Raises
     ------
     InputError

@@ -52,6 +52,11 @@ def frequency_response(
     progress : callable, optional
         Called with a joint's name when it is done.
 
+    Returns
+    -------
+    FrequencyResponses
+        Response by joint.
+
     Raises
     ------
     InputError
