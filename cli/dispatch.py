@@ -62,8 +62,9 @@ def run_command(
             print(overview(program, description, commands))
             return
         if first.startswith("--tyro-"):  # completion, of all words and their options
-            every = (Annotated[c.load(), tyro.conf.subcommand(w)] for w, c in commands.items())
-            tyro.cli(functools.reduce(operator.or_, every), prog=program, args=left, config=CONFIG)
+            words = (Annotated[c.load(), tyro.conf.subcommand(w)] for w, c in commands.items())
+            every: Any = functools.reduce(operator.or_, words)
+            tyro.cli(every, prog=program, args=left, config=CONFIG)
         chosen = _chosen(first, program, commands)
         kind = chosen.load()
         # a union has no docstring of its own, and Python's would be shown

@@ -35,9 +35,9 @@ from random_robots import SweptRobot, sweep_random_robot
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.identify.models import candidate_model
-from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.scores import rms, score
 from pupper_sysid.sysid.identify.search import leave_one_out_folds
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -110,25 +110,25 @@ def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:
     seconds = time.perf_counter() - began
     pd, dead = result.candidate_models["delayed_pd"], result.dead_time_s
     values = np.array([pd.values[p] for p in candidate_model("delayed_pd").names])
-    track = positions(candidate_model("delayed_pd"), [(values[None], result.trials)])[0][:, 0]
+    tracks = free_run(candidate_model("delayed_pd"), values, result.trials)
     true = case.dead_time_s(TIME_STEP_S)
     outcome = Outcome(
         OURS, case.name, pd.scores.rmse_raw_rad, pd.scores.rmse_held_rad,
         pd.scores.rmse_leave_one_frequency_out_rad,
-        off_truth(track, case), dead.value - true,
+        off_truth(tracks, case), dead.value - true,
         dead.low <= true <= dead.high if case.motion else None, dead.high - dead.low, seconds,
     )  # fmt: skip
     return outcome, result.trials
 
 
-def off_truth(track: NDArray, case: Case) -> float:
-    """RMS distance of a model's positions, shape (steps + 1, trials), to the true motion."""
+def off_truth(tracks: list[NDArray], case: Case) -> float:
+    """RMS distance of a model's positions, shape (steps + 1,) per trial, to the true motion."""
     if case.motion is None:
         return float("nan")
     parts = []
-    for n, true in enumerate(case.motion):
+    for track, true in zip(tracks, case.motion, strict=True):
         length = min(len(track), len(true))
-        parts.append(track[:length, n] - true[:length])
+        parts.append(track[:length] - true[:length])
     return rms(parts)
 
 
@@ -173,8 +173,8 @@ def theirs(
     for (name, use), track in zip(folds.items(), tracks[1:], strict=True):
         held_out[name] = np.concatenate(
             [
-                look_up(track[:, n], one.sample_step) - one.sample_rad
-                for n, (one, used) in enumerate(zip(data, use, strict=True))
+                look_up(position, one.sample_step) - one.sample_rad
+                for position, one, used in zip(track, data, use, strict=True)
                 if not used
             ]
         )
@@ -191,16 +191,12 @@ def theirs(
     )  # fmt: skip
 
 
-def track_of(positions_rad: list[list[float]], data: tuple[TrialData, ...]) -> NDArray:
-    """A peer's positions as the scores want them: relative to rest, as long as the longest."""
-    length = max(len(p) for p in positions_rad)
-    return np.stack(
-        [
-            np.pad(np.array(p) - one.rest_rad, (0, length - len(p)), mode="edge")
-            for p, one in zip(positions_rad, data, strict=True)
-        ],
-        axis=1,
-    )
+def track_of(positions_rad: list[list[float]], data: tuple[TrialData, ...]) -> list[NDArray]:
+    """A peer's positions as the scores want them: relative to rest, to the end of each trial."""
+    return [
+        np.pad(np.array(p) - t.rest_rad, (0, max(0, len(t.command) + 1 - len(p))), mode="edge")
+        for p, t in zip(positions_rad, data, strict=True)
+    ]
 
 
 def code_lines(path: Path) -> int:

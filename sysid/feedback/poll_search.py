@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.sysid.feedback.poll_kernel import log_likelihood, most_hits
+
 OUTLIERS = 0.03
 """Share of changed rows that may contradict the lattice (a late reply, a missed row)."""
 
@@ -145,9 +147,9 @@ def refine(stretch: Stretch, period_s: float, blur_s: float, loss: float | None)
     loss : float or None
         Probability that a poll fails; with None only rows that changed count.
     """
-    log_likelihood, periods, steps, _ = _posterior(stretch, period_s, blur_s, loss, 61, 128)
+    posterior, periods, steps, _ = _posterior(stretch, period_s, blur_s, loss, 61, 128)
     reference = 0.5 * (stretch.start_s + stretch.stop_s)
-    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight = np.exp(posterior - posterior.max())
     weight /= weight.sum()
     best_period = float(np.sum(weight.sum(axis=1) * periods))
     # the phase is an angle: average around the peak, not across the seam
@@ -178,16 +180,7 @@ def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64
     # No blur here: intervals meet end to end, so with one a poll on a common edge would explain
     # every row at periods of two loops. Polls that jitter over an edge count as outliers.
     chance = np.minimum(np.median(end - begin) / periods, 1.0)  # for an interval at random
-    low = begin[None, :] / periods[:, None]
-    length = np.minimum((end - begin)[None, :] / periods[:, None], 1.0)
-    first = np.floor((low % 1.0) * _BINS).astype(np.int64)
-    span = np.round(length * _BINS).astype(np.int64)
-    row = np.arange(len(periods))[:, None] * (2 * _BINS + 1)
-    size = len(periods) * (2 * _BINS + 1)
-    up = np.bincount((row + first).ravel(), minlength=size)
-    down = np.bincount((row + first + span).ravel(), minlength=size)
-    inside = np.cumsum((up - down).reshape(len(periods), -1), axis=1)[:, : 2 * _BINS]
-    hits = (inside[:, :_BINS] + inside[:, _BINS:]).max(axis=1)
+    hits = most_hits(begin, end, periods, _BINS)
     hit = np.log((1 - OUTLIERS) + OUTLIERS * chance) - np.log(chance)
     return hits * hit + (len(begin) - hits) * np.log(OUTLIERS)
 
@@ -230,17 +223,15 @@ def _posterior(
     periods = period * np.exp(np.linspace(-2.5 * _DRIFT, 2.5 * _DRIFT, period_count))
     steps = np.linspace(-0.5, 0.5, phase_count, endpoint=False)
 
-    def inside(begin: NDArray, end: NDArray) -> NDArray[np.float64]:
-        turns = (0.5 * (begin + end) - reference)[None, :] / periods[:, None]
-        away = (turns[:, None, :] - steps[None, :, None] + 0.5) % 1.0 - 0.5
-        distance = np.abs(away) * periods[:, None, None]
-        return np.clip((0.5 * (end - begin) - distance) / blur + 0.5, 0.0, 1.0)
-
     chance = np.minimum((stretch.end - stretch.begin) / period, 1.0)
-    changed = (1 - OUTLIERS) * inside(stretch.begin, stretch.end) + OUTLIERS * chance
-    log_likelihood = np.log(changed).sum(axis=2)
+    total = log_likelihood(
+        stretch.begin - reference, stretch.end - reference, periods, steps, blur, 1 - OUTLIERS,
+        OUTLIERS * chance,
+    )  # fmt: skip
     if loss is not None and len(stretch.same_end):
-        seen = (1 - OUTLIERS) * (1 - loss) * inside(stretch.same_begin, stretch.same_end)
-        log_likelihood += np.log(1 - seen).sum(axis=2)
-    log_likelihood -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
-    return log_likelihood, periods, steps, float(log_likelihood.max() - np.log(chance).sum())
+        total += log_likelihood(
+            stretch.same_begin - reference, stretch.same_end - reference, periods, steps, blur,
+            -(1 - OUTLIERS) * (1 - loss), np.ones(len(stretch.same_end)),
+        )  # fmt: skip
+    total -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
+    return total, periods, steps, float(total.max() - np.log(chance).sum())

@@ -26,7 +26,7 @@ from pupper_sysid.sysid.identify.models import (
     Parameter,
     candidate_model,
 )
-from pupper_sysid.sysid.identify.output_error import Fit, TrialData, free_run, prepare
+from pupper_sysid.sysid.identify.output_error import Fit
 from pupper_sysid.sysid.identify.scores import Scores, rms, score
 from pupper_sysid.sysid.identify.search import (
     PREFERRED,
@@ -37,6 +37,7 @@ from pupper_sysid.sysid.identify.search import (
     integrated_autocorrelation_time,
     leave_one_out_folds,
 )
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.joints import joint_rng
 from pupper_sysid.sysid.recordings.recording import Trial

@@ -64,12 +64,16 @@ class CandidateModel:
     simulate : callable
         `(values, track) -> None`: `values` (parameters, simulations) without delay and offset;
         `track` (steps, simulations) holds delayed commands relative to rest and is overwritten
-        with positions [rad], each step lasting `TIME_STEP_S`.
+        with positions [rad], each step lasting `TIME_STEP_S`. The reference of
+        `sysid.identify.kernel`, which fits run.
+    columns : callable
+        From values (candidates, parameters) without dead time and offset to the kernel's.
     """
 
     name: str
     parameters: tuple[Parameter, ...]
     simulate: Callable[[NDArray, NDArray], None]
+    columns: Callable[[NDArray], NDArray] = np.asarray
 
     @property
     def names(self) -> list[str]:

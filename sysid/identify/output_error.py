@@ -17,86 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
-from pupper_sysid.servo_models.delay_line import fractional_shift
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.identify.models import CandidateModel
-from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.identify.simulation import TrialData, moments_if_later, residuals
 
-_PAD = 64  # steps of rest before each trial: the longest delay of the models, 0.12 s
 DIFFERENCE = 0.01  # relative step of the Jacobian; smaller ones drown in friction's stick-slip
 _WIDE_DIFFERENCE = 0.03  # for the covariance: the slope over a likely error, not of one kink
 _DELAY_GRID = 2.0  # steps between the delays tried for a start
-_BATCH = 3000  # simulations per call: more would leave the processor's cache
-
-
-@dataclass(frozen=True)
-class TrialData:
-    """One trial, ready for simulation.
-
-    Attributes
-    ----------
-    frequency_hz : float
-    rest_rad : float
-        Command before the trial; the simulation is relative to it.
-    command : ndarray, shape (steps,)
-        Held, truncated command averaged over each physics step, relative to rest [rad].
-    sample_step, sample_rad : ndarray, shape (samples,)
-        Fresh readings: time in physics steps from the start, and position relative to rest.
-    held_step, row_step : ndarray, shape (rows,)
-        Per row: when the value it shows was measured, and when it was sent.
-    row_rad : ndarray, shape (rows,)
-        Position of each row relative to rest [rad], NaN where missing.
-    """
-
-    frequency_hz: float
-    rest_rad: float
-    command: NDArray[np.float64]
-    sample_step: NDArray[np.float64]
-    sample_rad: NDArray[np.float64]
-    held_step: NDArray[np.float64]
-    row_step: NDArray[np.float64]
-    row_rad: NDArray[np.float64]
-
-
-_WHOLE_COUNT = {
-    "up": lambda count: np.ceil(count - 1e-6),
-    "down": lambda count: np.floor(count + 1e-6),
-    "nearest": np.rint,
-}
-
-
-def prepare(trial: Trial, reading: Readings) -> TrialData:
-    """Put one trial on the physics clock."""
-    rest, start = trial.initial_command_rad, trial.send_time_s[0]
-    command = whole_counts(trial) - rest
-    stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
-    steps = int(np.ceil(stop / TIME_STEP_S)) + 2
-    edges = TIME_STEP_S * np.arange(steps + 1)
-    sent = np.append(trial.send_time_s - start, edges[-1] + 1.0)
-    area = np.concatenate([[0.0], np.cumsum(command * np.diff(sent))])
-    average = np.diff(np.interp(edges, sent, area)) / TIME_STEP_S
-
-    def to_step(time: NDArray) -> NDArray[np.float64]:
-        return np.clip((time - start) / TIME_STEP_S, 0.0, steps)
-
-    inside = reading.time_s >= start
-    return TrialData(
-        trial.frequency_hz, rest, average,
-        to_step(reading.time_s[inside]), reading.position_rad[inside] - rest,
-        to_step(np.where(np.isfinite(reading.held_time_s), reading.held_time_s, start)),
-        to_step(trial.send_time_s), trial.position_rad - rest,
-    )  # fmt: skip
-
-
-def whole_counts(trial: Trial) -> NDArray[np.float64]:
-    """Commands as the bus sent them [rad]."""
-    cut = trial.truncation
-    if cut.quantum_rad <= 0 or cut.rounding not in _WHOLE_COUNT:
-        return trial.command_rad
-    zero = trial.initial_command_rad if cut.zero_rad is None else cut.zero_rad
-    count = (trial.command_rad - zero) / cut.quantum_rad
-    return _WHOLE_COUNT[cut.rounding](count) * cut.quantum_rad + zero
 
 
 @dataclass(frozen=True)
@@ -136,62 +63,6 @@ class Fit:
     values: NDArray[np.float64]
     cost: float
     covariance: NDArray[np.float64]
-
-
-def positions(
-    model: CandidateModel, groups: Sequence[tuple[NDArray, Sequence[TrialData]]]
-) -> list[NDArray[np.float64]]:
-    """Simulate every parameter vector of a group on every trial of that group, all in one go.
-
-    Parameters
-    ----------
-    model : CandidateModel
-    groups : sequence of (values, trials)
-        `values` has shape (candidates, parameters).
-
-    Returns
-    -------
-    list of ndarray, shape (steps + 1, candidates, trials) each
-        Position relative to rest, the offset included, at step edges [rad]; `steps` is that of
-        the longest trial of all groups.
-    """
-    steps = max(len(t.command) for _, trials in groups for t in trials)
-    widths = [len(values) * len(trials) for values, trials in groups]
-    ends = np.cumsum(widths)
-    # Small steps cost a call each, whatever their width: one wide simulation serves all groups.
-    track = np.zeros((steps + 1, ends[-1]))
-    parameters = np.empty((len(model.parameters) - 2, ends[-1]))
-    for (values, trials), end, width in zip(groups, ends, widths, strict=True):
-        commands = np.zeros((_PAD + steps, len(trials)))
-        for n, trial in enumerate(trials):
-            commands[_PAD : _PAD + len(trial.command), n] = trial.command
-            commands[_PAD + len(trial.command) :, n] = trial.command[-1]
-        delay = np.repeat(values[:, 0] / TIME_STEP_S, len(trials))
-        column = np.tile(np.arange(len(trials)), len(values))
-        track[1:, end - width : end] = fractional_shift(commands, steps, delay, column)
-        parameters[:, end - width : end] = np.repeat(values[:, 1:-1].T, len(trials), axis=1)
-    for i in range(0, ends[-1], _BATCH):
-        model.simulate(parameters[:, i : i + _BATCH], track[1:, i : i + _BATCH])
-    out = []
-    for (values, trials), end, width in zip(groups, ends, widths, strict=True):
-        own = track[:, end - width : end].reshape(steps + 1, len(values), len(trials))
-        own += values[:, -1, None]
-        out.append(own)
-    return out
-
-
-def free_run(
-    model: CandidateModel, values: NDArray, trials: Sequence[TrialData]
-) -> NDArray[np.float64]:
-    """One simulation of each trial, shape (steps + 1, trials): see `positions`."""
-    return positions(model, [(values[None], trials)])[0][:, 0]
-
-
-def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:
-    """Values of `track` (steps, ...) at fractional steps, shape (samples, ...)."""
-    whole = np.minimum(step.astype(int), len(track) - 2)
-    fraction = (step - whole).reshape(-1, *[1] * (track.ndim - 1))
-    return track[whole] + fraction * (track[whole + 1] - track[whole])
 
 
 @dataclass(frozen=True)
@@ -388,38 +259,23 @@ def global_starts(
     values = np.stack([p.decode(c) for p, c in zip(par, cloud.T, strict=True)], axis=-1)
     values[:, 0] = par[0].low
     later = np.arange(0.0, (par[0].high - par[0].low) / TIME_STEP_S, _DELAY_GRID)
-    every = {id(problem.trials): problem.trials for problem in problems}
-    tracks = positions(model, [(values, trials) for trials in every.values()])
-    errors = {
-        key: [_errors_if_later(track[:, :, n], t, later) for n, t in enumerate(trials)]
-        for (key, trials), track in zip(every.items(), tracks, strict=True)
-    }
+    every = {id(trial): trial for problem in problems for trial in problem.trials}
+    moments = {key: np.array(moments_if_later(model, values, t, later)) for key, t in every.items()}
     best = []
     for problem in problems:
-        own = [e for e, use in zip(errors[id(problem.trials)], problem.use, strict=True) if use]
-        count = sum(e.shape[-1] for e in own)
-        mean = sum(e.sum(axis=-1) for e in own) / count
-        spread = sum(np.square(e).sum(axis=-1) for e in own) / count - mean**2
-        at = np.argmin(spread, axis=0)
-        r = np.concatenate([e[at, np.arange(candidates)] for e in own], axis=-1)
+        used = [t for t, use in zip(problem.trials, problem.use, strict=True) if use]
+        count = sum(len(t.sample_step) for t in used)
+        mean, square = np.sum([moments[id(t)] for t in used], axis=0) / count
+        shifted = values.copy()
+        shifted[:, 0] += TIME_STEP_S * later[np.argmin(square - mean**2, axis=0)]
+        r = residuals(model, shifted, used)
         offset = -np.median(r, axis=1)
         robust = np.sqrt(1 + ((r + offset[:, None]) / problem.noise_rad) ** 2).sum(axis=1)
         order = np.argsort(robust)[:keep]
-        chosen = values[order].copy()
-        chosen[:, 0] += TIME_STEP_S * later[at[order]]
+        chosen = shifted[order]
         chosen[:, -1] += offset[order]
         best.append(chosen)
     return np.array(best)
-
-
-def _errors_if_later(track: NDArray, trial: TrialData, later: NDArray) -> NDArray[np.float64]:
-    """Model minus fresh reading if the model had moved `later` steps later.
-
-    `track` has shape (steps, candidates), the result (later, candidates, samples).
-    """
-    moments = np.maximum(trial.sample_step - later[:, None], 0.0)
-    looked = look_up(track, moments.reshape(-1)).reshape(len(later), len(trial.sample_step), -1)
-    return looked.transpose(0, 2, 1) - trial.sample_rad
 
 
 def _residuals(
@@ -430,18 +286,9 @@ def _residuals(
     groups: dict[tuple[int, tuple[bool, ...]], list[int]] = {}
     for i, problem in enumerate(problems):  # fits to the same trials are one simulation
         groups.setdefault((id(problem.trials), problem.use), []).append(i)
-    used = {
-        key: [t for t, use in zip(problems[members[0]].trials, key[1], strict=True) if use]
-        for key, members in groups.items()
-    }
-    tracks = positions(
-        model, [(values[m].reshape(-1, values.shape[-1]), used[key]) for key, m in groups.items()]
-    )
     found: dict[int, NDArray] = {}
-    for (key, members), track in zip(groups.items(), tracks, strict=True):
-        parts = [
-            look_up(track[:, :, n], t.sample_step).T - t.sample_rad for n, t in enumerate(used[key])
-        ]
-        each = np.concatenate(parts, axis=1).reshape(len(members), points.shape[1], -1)
-        found.update(zip(members, each, strict=True))
+    for (_, use), members in groups.items():
+        used = [t for t, u in zip(problems[members[0]].trials, use, strict=True) if u]
+        each = residuals(model, values[members].reshape(-1, values.shape[-1]), used)
+        found.update(zip(members, each.reshape(len(members), points.shape[1], -1), strict=True))
     return [found[i] for i in range(len(problems))]

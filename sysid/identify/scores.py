@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import Result
-from pupper_sysid.sysid.identify.output_error import TrialData, look_up
+from pupper_sysid.sysid.identify.simulation import TrialData, look_up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,26 +46,26 @@ class Scores(Result):
 
 
 def score(
-    track: NDArray[np.float64], data: Sequence[TrialData], held_out: dict[float, NDArray]
+    tracks: Sequence[NDArray[np.float64]], data: Sequence[TrialData], held_out: dict[float, NDArray]
 ) -> Scores:
     """Scores of simulated positions.
 
     Parameters
     ----------
-    track : ndarray, shape (steps + 1, trials)
+    tracks : sequence of ndarray, shape (steps + 1,) each
         Position at step edges, relative to rest [rad].
     data : sequence of TrialData
     held_out : dict of float to ndarray
         Residuals on each left-out frequency, from fits that have not seen it.
     """
     fresh, held, raw, one_step, spread = [], [], [], [], []
-    for n, t in enumerate(data):
-        model = look_up(track[:, n], t.sample_step)
+    for track, t in zip(tracks, data, strict=True):
+        model = look_up(track, t.sample_step)
         fresh.append(model - t.sample_rad)
         one_step.append(np.diff(model) - np.diff(t.sample_rad))
         seen = np.isfinite(t.row_rad)
-        held.append((look_up(track[:, n], t.held_step) - t.row_rad)[seen])
-        raw.append((look_up(track[:, n], t.row_step) - t.row_rad)[seen])
+        held.append((look_up(track, t.held_step) - t.row_rad)[seen])
+        raw.append((look_up(track, t.row_step) - t.row_rad)[seen])
         spread.append(t.sample_rad - t.sample_rad.mean())
     return Scores(
         rmse_fresh_rad=rms(fresh),

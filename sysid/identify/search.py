@@ -28,13 +28,11 @@ from pupper_sysid.sysid.identify.output_error import (
     DIFFERENCE,
     Fit,
     Problem,
-    TrialData,
     evolve,
     fit,
-    free_run,
     global_starts,
-    look_up,
 )
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 
 PREFERRED = "delayed_pd"
 """The model that simulators and training run."""
@@ -283,7 +281,7 @@ def fresh_residuals(
     data : sequence of TrialData
     """
     track = free_run(model, values, data)
-    return [look_up(track[:, n], t.sample_step) - t.sample_rad for n, t in enumerate(data)]
+    return [look_up(p, t.sample_step) - t.sample_rad for p, t in zip(track, data, strict=True)]
 
 
 def held_out_residuals(

@@ -35,7 +35,7 @@ from pupper_sysid.servo_models.sparse_equation import (
 )
 from pupper_sysid.sysid.identify.joint_fit import prepare_joint
 from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
-from pupper_sysid.sysid.identify.output_error import Fit, Problem, TrialData, free_run
+from pupper_sysid.sysid.identify.output_error import Fit, Problem
 from pupper_sysid.sysid.identify.scores import Scores, score
 from pupper_sysid.sysid.identify.search import (
     PREFERRED,
@@ -44,6 +44,7 @@ from pupper_sysid.sysid.identify.search import (
     held_out_residuals,
     leave_one_out_folds,
 )
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run
 from pupper_sysid.sysid.identify.sparse_structure import PULLS, Support, ordered, propose
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
@@ -297,7 +298,14 @@ def equation_model(support: Support) -> CandidateModel:
     parameters = (
         _SHARED["dead_time_s"], *(_PARAMETERS[name] for name in support), _SHARED["offset_rad"]
     )  # fmt: skip
-    return CandidateModel("sparse_equation", parameters, simulate)
+
+    def columns(values: NDArray) -> NDArray:
+        every = np.zeros((len(values), len(COEFFICIENTS)))
+        every[:, list(COEFFICIENTS).index("saturation_error_rad")] = np.inf
+        every[:, [list(COEFFICIENTS).index(name) for name in support]] = values
+        return every
+
+    return CandidateModel("sparse_equation", parameters, simulate, columns)
 
 
 def _starts(model: CandidateModel, pd_values: NDArray) -> list[list[float]]:

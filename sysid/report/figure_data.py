@@ -18,8 +18,8 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
 from pupper_sysid.sysid.identify.models import candidate_model
-from pupper_sysid.sysid.identify.output_error import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.search import PREFERRED
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
 LONGEST_RUN = 12
@@ -74,7 +74,7 @@ def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track
     fitted = candidate_model(model)
     values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
     simulated = free_run(fitted, values, result.trials)
-    return [_track(trial, simulated[:, n]) for n, trial in enumerate(result.trials)]
+    return [_track(*pair) for pair in zip(result.trials, simulated, strict=True)]
 
 
 def _track(trial: TrialData, simulated: NDArray) -> Track:

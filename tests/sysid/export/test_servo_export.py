@@ -188,9 +188,7 @@ def test_a_table_gives_every_number_back(tmp_path: Path, kind: str):
 @pytest.mark.parametrize("kind", ["delayed-pd", "sindy"])
 @pytest.mark.parametrize("to", ["onnx", "torchscript"])
 def test_a_physical_model_becomes_no_network(tmp_path: Path, kind: str, to):
-    with pytest.raises(
-        InputError, match=rf"{kind} model, which integrates.*sysid calibrate"
-    ):
+    with pytest.raises(InputError, match=rf"{kind} model, which integrates.*sysid calibrate"):
         export_servo_model(saved(tmp_path / "a", kind), to, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -11,7 +11,8 @@ from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
 from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
 from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
-from pupper_sysid.sysid.identify.output_error import Problem, TrialData, fit, free_run, prepare
+from pupper_sysid.sysid.identify.output_error import Problem, fit
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Truncation
 from support.synthetic import LOOP_S, tone_trials
@@ -123,7 +124,7 @@ def test_the_fit_follows_a_step_as_the_equations_of_a_speed_limited_pd_say():
     empty = np.zeros(0)
     data = TrialData(np.nan, 0.0, command, empty, empty, empty, empty, empty)
     values = np.array([dead_time_s, kp, kd, friction, 1e9, speed, 0.1])
-    track = free_run(candidate_model("delayed_pd"), values, [data])[:, 0] - 0.1
+    track = free_run(candidate_model("delayed_pd"), values, [data])[0] - 0.1
     time = TIME_STEP_S * np.arange(len(track))
     assert np.all(track[time <= dead_time_s - TIME_STEP_S] == 0.0)
     # the set-point rises at the speed limit, a step of physics ahead of the position; the error is

@@ -15,7 +15,7 @@ from pupper_sysid.servo_models.sparse_equation import (
     equation,
     explain,
 )
-from pupper_sysid.sysid.identify.output_error import TrialData, positions
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run
 from pupper_sysid.sysid.identify.sparse_equations import (
     equation_model,
     fit_equations,
@@ -142,10 +142,10 @@ def test_steps_are_the_rollout_and_absent_terms_are_zeros():
 def test_the_fit_and_the_model_are_one_arithmetic():
     support = tuple(SERVO)
     (data, *_) = trials(linear, np.random.default_rng(0))
-    values = np.array([[0.0213, *SERVO.values(), 0.004]])
-    fitted = positions(equation_model(support), [(values, [data])])[0][1:, 0, 0]
+    values = np.array([0.0213, *SERVO.values(), 0.004])
+    (fitted,) = free_run(equation_model(support), values, [data])
     model = SparseEquation(SERVO, 0.0213, 0.004).rollout(data.command)
-    np.testing.assert_allclose(fitted, model, atol=1e-12)
+    np.testing.assert_allclose(fitted[1:], model, atol=1e-12)
 
 
 def test_what_cannot_be_simulated_is_refused():

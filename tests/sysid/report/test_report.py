@@ -23,8 +23,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
 from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
-from pupper_sysid.sysid.identify.output_error import TrialData, look_up, positions
 from pupper_sysid.sysid.identify.scores import Scores
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction
@@ -69,8 +69,8 @@ def trial_of(model: CandidateFit, frequency_hz: float) -> TrialData:
     row = np.arange(20.0, 980.0, LOOP_S / TIME_STEP_S)
     empty = np.zeros(0)
     bare = TrialData(frequency_hz, 0.5, command, empty, empty, empty, empty, empty)
-    values = np.array([list(model.values.values())])
-    track = positions(candidate_model(model.model), [(values, [bare])])[0][:, 0, 0]
+    values = np.array(list(model.values.values()))
+    (track,) = free_run(candidate_model(model.model), values, [bare])
     measured = row - AGE_S / TIME_STEP_S
     reading = look_up(track, measured)
     return replace(

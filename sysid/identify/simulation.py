@@ -1,0 +1,186 @@
+"""Trials on the physics clock, and free runs of candidate models on them.
+
+`prepare` gives a trial the form that a simulation needs. The functions below simulate any number of
+candidates, which are parameter vectors of one model, from rest under the commands as the servo
+received them; `sysid.identify.kernel` does the arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, TIME_STEP_S
+from pupper_sysid.sysid.feedback.poll_lattice import Readings
+from pupper_sysid.sysid.identify import kernel
+from pupper_sysid.sysid.identify.models import CandidateModel
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_PAD = 64  # steps of rest before each trial: longer than the longest dead time, 0.12 s
+_STEPPING = (_PAD, TIME_STEP_S, -FRICTION_IMPEDANCE)
+
+
+@dataclass(frozen=True)
+class TrialData:
+    """One trial, ready for simulation.
+
+    Attributes
+    ----------
+    frequency_hz : float
+    rest_rad : float
+        Command before the trial; the simulation is relative to it.
+    command : ndarray, shape (steps,)
+        Held, truncated command averaged over each physics step, relative to rest [rad].
+    sample_step, sample_rad : ndarray, shape (samples,)
+        Fresh readings: time in physics steps from the start, and position relative to rest.
+    held_step, row_step : ndarray, shape (rows,)
+        Per row: when the value it shows was measured, and when it was sent.
+    row_rad : ndarray, shape (rows,)
+        Position of each row relative to rest [rad], NaN where missing.
+    """
+
+    frequency_hz: float
+    rest_rad: float
+    command: NDArray[np.float64]
+    sample_step: NDArray[np.float64]
+    sample_rad: NDArray[np.float64]
+    held_step: NDArray[np.float64]
+    row_step: NDArray[np.float64]
+    row_rad: NDArray[np.float64]
+
+
+_WHOLE_COUNT = {
+    "up": lambda count: np.ceil(count - 1e-6),
+    "down": lambda count: np.floor(count + 1e-6),
+    "nearest": np.rint,
+}
+
+
+def prepare(trial: Trial, reading: Readings) -> TrialData:
+    """Put one trial on the physics clock."""
+    rest, start = trial.initial_command_rad, trial.send_time_s[0]
+    command = whole_counts(trial) - rest
+    stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
+    steps = int(np.ceil(stop / TIME_STEP_S)) + 2
+    edges = TIME_STEP_S * np.arange(steps + 1)
+    sent = np.append(trial.send_time_s - start, edges[-1] + 1.0)
+    area = np.concatenate([[0.0], np.cumsum(command * np.diff(sent))])
+    average = np.diff(np.interp(edges, sent, area)) / TIME_STEP_S
+
+    def to_step(time: NDArray) -> NDArray[np.float64]:
+        return np.clip((time - start) / TIME_STEP_S, 0.0, steps)
+
+    inside = reading.time_s >= start
+    return TrialData(
+        trial.frequency_hz, rest, average,
+        to_step(reading.time_s[inside]), reading.position_rad[inside] - rest,
+        to_step(np.where(np.isfinite(reading.held_time_s), reading.held_time_s, start)),
+        to_step(trial.send_time_s), trial.position_rad - rest,
+    )  # fmt: skip
+
+
+def whole_counts(trial: Trial) -> NDArray[np.float64]:
+    """Commands as the bus sent them [rad]."""
+    cut = trial.truncation
+    if cut.quantum_rad <= 0 or cut.rounding not in _WHOLE_COUNT:
+        return trial.command_rad
+    zero = trial.initial_command_rad if cut.zero_rad is None else cut.zero_rad
+    count = (trial.command_rad - zero) / cut.quantum_rad
+    return _WHOLE_COUNT[cut.rounding](count) * cut.quantum_rad + zero
+
+
+def free_run(
+    model: CandidateModel, values: NDArray[np.float64], trials: Sequence[TrialData]
+) -> list[NDArray[np.float64]]:
+    """Simulate one candidate on each trial.
+
+    Parameters
+    ----------
+    model : CandidateModel
+    values : ndarray, shape (parameters,)
+    trials : sequence of TrialData
+
+    Returns
+    -------
+    list of ndarray, shape (steps + 1,) each
+        Position at step edges relative to rest, the offset included [rad].
+    """
+    tracks = []
+    for trial in trials:
+        out = np.empty((len(trial.command) + 1, 1))
+        kernel.positions(*_candidates(model, values[None]), _padded(trial), *_STEPPING, out)
+        tracks.append(out[:, 0] + values[-1])
+    return tracks
+
+
+def residuals(
+    model: CandidateModel, values: NDArray[np.float64], trials: Sequence[TrialData]
+) -> NDArray[np.float64]:
+    """Model minus fresh readings, shape (candidates, samples of all trials) [rad].
+
+    Parameters
+    ----------
+    model : CandidateModel
+    values : ndarray, shape (candidates, parameters)
+    trials : sequence of TrialData
+    """
+    offset = np.ascontiguousarray(values[:, -1])
+    parts = [np.empty((len(values), 0))]
+    for trial in trials:
+        out = np.empty((len(values), len(trial.sample_step)))
+        kernel.residuals(
+            *_candidates(model, values), offset, _padded(trial), trial.sample_step,
+            trial.sample_rad, *_STEPPING, out,
+        )  # fmt: skip
+        parts.append(out)
+    return np.concatenate(parts, axis=1)
+
+
+def moments_if_later(
+    model: CandidateModel,
+    values: NDArray[np.float64],
+    trial: TrialData,
+    later: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums of the residuals and of their squares if every candidate had moved later.
+
+    Parameters
+    ----------
+    model : CandidateModel
+    values : ndarray, shape (candidates, parameters)
+        Their offsets are not added.
+    trial : TrialData
+    later : ndarray, shape (delays,)
+        In physics steps.
+
+    Returns
+    -------
+    total, square : ndarray, shape (delays, candidates)
+        In rad and rad².
+    """
+    total, square = np.zeros((2, len(later), len(values)))
+    kernel.moments_if_later(
+        *_candidates(model, values), _padded(trial), trial.sample_step, trial.sample_rad, later,
+        *_STEPPING, total, square,
+    )  # fmt: skip
+    return total, square
+
+
+def _candidates(model: CandidateModel, values: NDArray) -> tuple[int, NDArray, NDArray]:
+    """What the kernel takes of candidates: the model's number, parameters, dead times in steps."""
+    own = np.ascontiguousarray(model.columns(values[:, 1:-1]))
+    return kernel.KINDS.index(model.name), own, values[:, 0] / TIME_STEP_S
+
+
+def _padded(trial: TrialData) -> NDArray[np.float64]:
+    return np.concatenate([np.zeros(_PAD), trial.command])
+
+
+def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:
+    """Values of `track` (steps, ...) at fractional steps, shape (samples, ...)."""
+    whole = np.minimum(step.astype(int), len(track) - 2)
+    fraction = (step - whole).reshape(-1, *[1] * (track.ndim - 1))
+    return track[whole] + fraction * (track[whole + 1] - track[whole])
