@@ -107,9 +107,7 @@ def refuse_picture(path: Path, force: bool = False) -> None:
         If `path` is neither PNG nor SVG, or exists and `force` is not given.
     """
     if path.suffix.lower() not in (".png", ".svg"):
-        raise InputError(
-            f"{path}: pictures are written as .png or .svg; choose one of them."
-        )
+        raise InputError(f"{path}: pictures are written as .png or .svg; choose one of them.")
     refuse_overwrite(path, force)
 
 

@@ -70,19 +70,19 @@ def judge(evidence: ServoEvidence) -> list[Claim]:
 def constant_lag(found: ServoEvidence) -> Finding:
     """A1."""
     budgets = list(_sweeps(found).values())
-    naive, fresh, servo = (
+    raw, fresh, servo = (
         1e3 * np.mean([getattr(b, k).value for b in budgets])
-        for k in ("naive_lag_s", "fresh_lag_s", "lag_s")
+        for k in ("raw_lag_s", "fresh_lag_s", "lag_s")
     )
     by_rate = [1e3 * f.lag_s.value for b in budgets for f in b.by_frequency]
     dead = 1e3 * np.mean([b.dead_time_s.value for b in budgets if b.dead_time_s])
     ours = (
-        f"{naive:.0f} ms in all rows, {fresh:.0f} ms in fresh ones, {servo:.0f} ms the servo's own "
+        f"{raw:.0f} ms in all rows, {fresh:.0f} ms in fresh ones, {servo:.0f} ms the servo's own "
         f"({dead:.0f} ms of it dead time); {min(by_rate):.0f} to {max(by_rate):.0f} ms by frequency"
     )
     low, high = min(b.lag_s.low for b in budgets), max(b.lag_s.high for b in budgets)
     bounds = {"servo": Interval(float(servo), 1e3 * low, 1e3 * high)}
-    stale = float(1 - servo / naive)
+    stale = float(1 - servo / raw)
     return Finding(
         ours, bounds, holds(stale <= 0.15, True),
         f"It holds as a sum; {100 * stale:.0f} % of it is bus and stale feedback.",
@@ -101,10 +101,10 @@ def above_three_hertz(found: ServoEvidence) -> Finding:
         raise NotTestable("Give sweeps above 3 Hz with --recordings.")
     low = [f.gain for f in tones if f.frequency_hz <= 3.0]
     before, after = float(np.mean(low)), float(np.mean([f.gain for f in high]))
-    naive = float(np.mean([f.naive_gain for f in high]))
+    raw = float(np.mean([f.raw_gain for f in high]))
     lost = 1 - after / before
     return Finding(
-        f"gain {before:.2f} up to 3 Hz, {after:.2f} above (all rows, as the paper: {naive:.2f})",
+        f"gain {before:.2f} up to 3 Hz, {after:.2f} above (all rows, as the paper: {raw:.2f})",
         None, holds(lost >= 0.3, lost >= 0.05),
         f"Lost: {100 * lost:.0f} %; 30 % would hold, 5 % partly.",
     )  # fmt: skip

@@ -25,9 +25,7 @@ def violations(name: str, checks: set[str]) -> list[str]:
     """Sentences of numpydoc's validation of one name, for these checks only."""
     try:
         found = validate(name)
-    except (
-        StopIteration
-    ):  # a module without `def` and `class` is too small for it
+    except StopIteration:  # a module without `def` and `class` is too small for it
         summary = (import_module(name).__doc__ or "").split("\n")[0]
         return [] if summary.endswith(".") else [f"{name}: SS03 {summary}"]
     listed = "\nParameters\n" in inspect.cleandoc(found["docstring"] or "")

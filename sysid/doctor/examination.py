@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MUCH_LOSS = 0.2
-_MUCH_HOLD = 0.2  # of the naive lag
+_MUCH_HOLD = 0.2  # of the raw lag
 _UNEVEN = 0.2  # of the loop period
 _LEAST_ROWS = 3  # of a trial: fewer have no rate of change
 _LEAST_FRESH = 16
@@ -66,7 +66,7 @@ class JointExamination(Result):
     poll_period_s, loss, z_score, hit_rate : float
         See `sysid.feedback.poll_lattice.PollLattice`.
     hold_share : float
-        Share of the naive lag that is feedback age.
+        Share of the raw lag that is feedback age.
     quantum_rad : float
         Quantisation step; 0 if there is none.
     offset_rad : float
@@ -283,8 +283,8 @@ def _hold_share(
         budget = lag_budget(joint, trials, rng, lattice)
     except InputError:  # too few fresh readings: reported elsewhere
         return math.nan
-    naive = budget.naive_lag_s.value
-    return budget.feedback_age_s / naive if naive > 0 else math.nan
+    raw = budget.raw_lag_s.value
+    return budget.feedback_age_s / raw if raw > 0 else math.nan
 
 
 def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:

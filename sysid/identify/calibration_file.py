@@ -115,7 +115,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         feedback=_feedback(lag, pd.parameters["offset_rad"]),
         lag=Lag(
             lag_s=_quantity(lag.lag_s),
-            raw_lag_s=_quantity(lag.naive_lag_s),
+            raw_lag_s=_quantity(lag.raw_lag_s),
             fresh_lag_s=_quantity(lag.fresh_lag_s),
         ),
         selection=Selection(
@@ -201,7 +201,7 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
         )
         period = loss = Quantity(value=0.0, identified="no", why=why)
         age = Quantity(
-            value=max(lag.feedback_age_s, 0.0), identified="yes", why="from naive minus fresh lag"
+            value=max(lag.feedback_age_s, 0.0), identified="yes", why="from raw minus fresh lag"
         )
     return Feedback(
         poll_period_s=period, loss=loss, quantum_rad=quantum, offset_rad=_quantity(offset_rad),

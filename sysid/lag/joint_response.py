@@ -38,7 +38,7 @@ class FrequencyPoint(Result):
         Of the command.
     gain, phase_deg : float
         Describing gain, and phase unwrapped by the lag that all tones share.
-    naive_gain : float
+    raw_gain : float
         Of all rows against their commands.
     covariance : ndarray, shape (2, 2)
         Of the response's real and imaginary parts.
@@ -48,7 +48,7 @@ class FrequencyPoint(Result):
     amplitude_rad: float
     gain: float
     phase_deg: float
-    naive_gain: float
+    raw_gain: float
     covariance: NDArray[np.float64]
 
 
@@ -59,7 +59,7 @@ class FrequencyResponse(Result):
     Attributes
     ----------
     frequency_hz, amplitude_rad : ndarray
-    response, naive_response : ndarray of complex
+    response, raw_response : ndarray of complex
         Of fresh readings against the held command; of all rows against their commands.
     covariance : ndarray, shape (tones, 2, 2)
         Of the response's real and imaginary parts.
@@ -76,7 +76,7 @@ class FrequencyResponse(Result):
     frequency_hz: NDArray[np.float64] = internal()
     amplitude_rad: NDArray[np.float64] = internal()
     response: NDArray[np.complex128] = internal()
-    naive_response: NDArray[np.complex128] = internal()
+    raw_response: NDArray[np.complex128] = internal()
     covariance: NDArray[np.float64] = internal()
 
     @property
@@ -94,11 +94,11 @@ class FrequencyResponse(Result):
         """The tones, by frequency."""
         return tuple(
             FrequencyPoint(
-                frequency_hz=f, amplitude_rad=a, gain=g, phase_deg=p, naive_gain=n, covariance=c
+                frequency_hz=f, amplitude_rad=a, gain=g, phase_deg=p, raw_gain=n, covariance=c
             )
             for f, a, g, p, n, c in zip(
                 self.frequency_hz, self.amplitude_rad, self.gain, self.phase_deg,
-                np.abs(self.naive_response), self.covariance, strict=True,
+                np.abs(self.raw_response), self.covariance, strict=True,
             )
         )  # fmt: skip
 
@@ -124,11 +124,11 @@ class FrequencyResponse(Result):
         return [row for point in self.by_frequency for row in point.rows()]
 
     def __str__(self) -> str:
-        lines = ["    Hz  amplitude rad   gain      dB  phase °  naive gain"]
+        lines = ["    Hz  amplitude rad   gain      dB  phase °  raw gain"]
         for p in self.by_frequency:
             lines.append(
                 f"{p.frequency_hz:6.2f} {p.amplitude_rad:14.3f} {p.gain:6.3f} "
-                f"{20 * np.log10(p.gain):+7.2f} {p.phase_deg:8.1f} {p.naive_gain:11.3f}"
+                f"{20 * np.log10(p.gain):+7.2f} {p.phase_deg:8.1f} {p.raw_gain:11.3f}"
             )
         lines.append(f"  −3 dB bandwidth: {self.bandwidth_text}")
         for name, fit in self.transfer_functions.items():
@@ -186,7 +186,7 @@ def joint_response(
         frequency_hz=np.array([t.frequency_hz for t in tones]),
         amplitude_rad=np.array([abs(t.command_held) for t in tones]),
         response=np.array([t.response for t in tones]),
-        naive_response=np.array([t.naive / t.command_rows for t in tones]),
+        raw_response=np.array([t.raw / t.command_rows for t in tones]),
         covariance=np.stack([np.cov(d.real, d.imag) for d in draws]),
     )
 

@@ -1,9 +1,9 @@
 """Lag budget of one joint: how much is feedback age, command hold and servo.
 
-    naive lag = feedback age + command hold (half a loop) + servo lag
+    raw lag = feedback age + command hold (half a loop) + servo lag
     servo lag = dead time + dynamics
 
-`lag_budget` measures the naive lag and its three parts; the dead time needs a model
+`lag_budget` measures the raw lag and its three parts; the dead time needs a model
 (`sysid.identify.joint_fit`). Estimators, each on all rows and on fresh rows:
 
 * integer cross-correlation, which resolves whole loop periods only;
@@ -45,7 +45,7 @@ _BLOCK_S = 0.5  # of the bootstrap where there are no periods
 _ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
 _MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
 _FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
-_USUAL_AGE_S = 0.03  # of feedback: where to look for the naive lag of a tone
+_USUAL_AGE_S = 0.03  # of feedback: where to look for the raw lag of a tone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class FrequencyLag:
     gain, phase_deg : float
         Of fresh readings against the held command.
     lag_s : Interval
-    naive_lag_s, naive_gain : float
+    raw_lag_s, raw_gain : float
         Of all rows at their own times.
     trial : int
     """
@@ -67,8 +67,8 @@ class FrequencyLag:
     gain: float
     phase_deg: float
     lag_s: Interval
-    naive_lag_s: float
-    naive_gain: float
+    raw_lag_s: float
+    raw_gain: float
     trial: int
 
 
@@ -79,14 +79,14 @@ class LagBudget(Result):
     Attributes
     ----------
     joint : str
-    naive_lag_s : Interval
+    raw_lag_s : Interval
         From a command's row to the position's row, all rows.
     fresh_lag_s : Interval
         The same of fresh rows at their measurement times.
     lag_s : Interval
         From a command's edge to the measured motion: the servo's own lag.
     feedback_age_s, command_hold_s : float
-        What the bus adds: `naive_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`.
+        What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`.
     dead_time_s : Interval or None
         Part of `lag_s` before the servo moves; None if no model was fitted.
     feedback : PollLattice
@@ -104,7 +104,7 @@ class LagBudget(Result):
     """
 
     joint: str
-    naive_lag_s: Interval
+    raw_lag_s: Interval
     fresh_lag_s: Interval
     lag_s: Interval
     feedback_age_s: float
@@ -128,16 +128,16 @@ class LagBudget(Result):
         return [flat(replace(self, estimators_s={}).to_dict())]
 
     def __str__(self) -> str:
-        parts = f"{1e3 * self.lag_s.value:.0f} ms the servo"
+        servo = f"{1e3 * self.lag_s.value:.0f} ms servo"
         if self.dead_time_s:
-            parts += (
-                f": {1e3 * self.dead_time_s.value:.0f} ms dead time + "
-                f"{1e3 * self.dynamics_s:.0f} ms dynamics"
+            servo += (
+                f" ({1e3 * self.dead_time_s.value:.0f} ms dead time + "
+                f"{1e3 * self.dynamics_s:.0f} ms dynamics)"
             )
-        age = f"{1e3 * self.feedback_age_s:.0f} ms" if abs(self.feedback_age_s) >= 1e-3 else "none"
         return (
-            f"of the naive {1e3 * self.naive_lag_s.value:.0f} ms, {age} is feedback age, "
-            f"{1e3 * self.command_hold_s:.0f} ms command hold, {parts}."
+            f"raw lag {1e3 * self.raw_lag_s.value:.0f} ms = "
+            f"{1e3 * self.feedback_age_s:.0f} ms feedback age + "
+            f"{1e3 * self.command_hold_s:.0f} ms command hold + {servo}."
         )
 
 
@@ -182,7 +182,7 @@ def lag_budget(
                 f"{joint}: it moved by at most {100 * moved:.0f} % of its command, so there is no "
                 "lag to measure. Was its torque on, and does it turn freely?"
             )
-        naive = _slope(tones, "naive_rows")
+        raw = _slope(tones, "raw_rows")
         fresh = _slope(tones, "fresh_rows")
         lag = _slope(tones, "fresh_held")
         lost = [t for t, w in zip(tones, tone_weights(tones), strict=True) if w == 0]
@@ -198,7 +198,7 @@ def lag_budget(
                 f"({1e3 / tones[0].frequency_hz:.0f} ms) more would look the same; record several."
             )
     else:
-        naive, fresh, lag = _shifts(trials, read, rng)
+        raw, fresh, lag = _shifts(trials, read, rng)
         warnings.append(
             f"{joint}: no tones in this recording, so the lag is one time shift of all its "
             "motion. Record a sweep for a lag per frequency."
@@ -219,10 +219,10 @@ def lag_budget(
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
     return LagBudget(
         joint=joint,
-        naive_lag_s=naive,
+        raw_lag_s=raw,
         fresh_lag_s=fresh,
         lag_s=lag,
-        feedback_age_s=naive.value - fresh.value,
+        feedback_age_s=raw.value - fresh.value,
         command_hold_s=fresh.value - lag.value,
         feedback=lattice,
         quantum_rad=quantum(trials),
@@ -238,7 +238,7 @@ def lag_budget(
 # --------------------------------------------------------------------------- phase slope
 
 _PAIRS = {
-    "naive_rows": ("naive", "command_rows"),
+    "raw_rows": ("raw", "command_rows"),
     "fresh_rows": ("fresh", "command_rows"),
     "fresh_held": ("fresh", "command_held"),
 }
@@ -314,14 +314,14 @@ def _lag_near(response, frequency, centre):
 def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
     f, response = tone.frequency_hz, tone.response
     draws = _lag_near(tone.response_draws, f, lag)
-    naive = tone.naive / tone.command_rows
+    raw = tone.raw / tone.command_rows
     return FrequencyLag(
         frequency_hz=f,
         gain=abs(response),
         phase_deg=-360.0 * f * lag,
         lag_s=Interval.of_draws(lag, draws),
-        naive_lag_s=float(_lag_near(naive, f, lag + _USUAL_AGE_S)),
-        naive_gain=abs(naive),
+        raw_lag_s=float(_lag_near(raw, f, lag + _USUAL_AGE_S)),
+        raw_gain=abs(raw),
         trial=tone.trial,
     )
 
@@ -347,7 +347,7 @@ def _shifts(
 
 def _shift_sums(trial: Trial, read: Readings, kind: str, lags: NDArray) -> NDArray[np.float64]:
     """Sums behind the correlation of position and shifted command, per block of half a second."""
-    if kind == "naive_rows":
+    if kind == "raw_rows":
         rows = np.flatnonzero(np.isfinite(trial.position_rad))
         time, position = trial.send_time_s[rows], trial.position_rad[rows]
     else:
@@ -398,13 +398,13 @@ def _estimators(
     found = {
         "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
         "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
-        "sub-sample cross-correlation, all rows": [_bounded(t, r, "naive_rows") for t, r in pairs],
+        "sub-sample cross-correlation, all rows": [_bounded(t, r, "raw_rows") for t, r in pairs],
         "sub-sample cross-correlation, fresh rows": [
             _bounded(t, r, "fresh_rows") for t, r in pairs
         ],
     }
     frequency = np.array([t.frequency_hz for t in tones])
-    for kind, name in (("naive_rows", "all rows"), ("fresh_rows", "fresh rows")):
+    for kind, name in (("raw_rows", "all rows"), ("fresh_rows", "fresh rows")):
         output, command = _PAIRS[kind]
         response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
         found[f"sine phase, {name}"] = list(tone_lags(response, frequency)) if tones else []
@@ -412,7 +412,7 @@ def _estimators(
         k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()
     }
     if tones:
-        result["phase slope, all rows"] = _slope(tones, "naive_rows").value
+        result["phase slope, all rows"] = _slope(tones, "raw_rows").value
         result["phase slope, fresh rows"] = _slope(tones, "fresh_rows").value
         result["hold-aware (default)"] = lag
     return result

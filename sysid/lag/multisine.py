@@ -53,13 +53,13 @@ def multisine_responses(
     held = trial.command_rad[np.searchsorted(send, grid, side="right") - 1]
     command_held = _phasors(grid, held, lines)
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
-    naive = _draw(send[rows], trial.position_rad[rows], lines, rng, draws)
+    raw = _draw(send[rows], trial.position_rad[rows], lines, rng, draws)
     measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     return [
         ToneResponse(
             trial.number, float(f), complex(command_rows[k]), complex(command_held[k]),
-            complex(naive[0][k]), complex(measured[0][k]), naive[1][:, k],
+            complex(raw[0][k]), complex(measured[0][k]), raw[1][:, k],
             measured[1][:, k] * np.exp(2j * np.pi * f * shift),
             int(fresh.sum()), measured[2], reading.time_sd_s,
         )

@@ -31,11 +31,11 @@ class ToneResponse:
         Of the command as it was sent, fitted.
     command_rows, command_held : complex
         Command at the rows' send times, and as the bus holds it between them.
-    naive : complex
+    raw : complex
         Position of all rows, each at its row's send time.
     fresh : complex
         Position of fresh rows at the times they were measured.
-    naive_draws, fresh_draws : ndarray of complex, shape (draws,)
+    raw_draws, fresh_draws : ndarray of complex, shape (draws,)
         The same under random weights of the periods.
     fresh_count : int
         Fresh rows in the window.
@@ -49,9 +49,9 @@ class ToneResponse:
     frequency_hz: float
     command_rows: complex
     command_held: complex
-    naive: complex
+    raw: complex
     fresh: complex
-    naive_draws: NDArray[np.complex128]
+    raw_draws: NDArray[np.complex128]
     fresh_draws: NDArray[np.complex128]
     fresh_count: int
     residual_rad: float
@@ -110,7 +110,7 @@ def tone_response(
     def fitted(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
         return _fit(time, value, frequency, start, rng, draws)
 
-    naive, naive_draws, _ = fitted(send[rows], trial.position_rad[rows])
+    raw, raw_draws, _ = fitted(send[rows], trial.position_rad[rows])
     result, fresh_draws, residual = fitted(reading.time_s[fresh], reading.position_rad[fresh])
     grid = np.arange(start, stop, 5e-4)
     row = np.clip(np.searchsorted(send, grid, side="right") - 1, 0, None)
@@ -120,7 +120,7 @@ def tone_response(
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     fresh_draws = fresh_draws * np.exp(2j * np.pi * frequency * shift)
     return ToneResponse(
-        trial.number, frequency, sent, held, naive, result, naive_draws, fresh_draws,
+        trial.number, frequency, sent, held, raw, result, raw_draws, fresh_draws,
         int(fresh.sum()), residual, reading.time_sd_s,
     )  # fmt: skip
 

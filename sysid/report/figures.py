@@ -66,9 +66,9 @@ def lag_budget_figure(budgets: Mapping[str, LagBudget]) -> Figure:
     ]
     whisker = Line2D([], [], color=INK, marker="|", ms=8, markevery=[0, -1], lw=1.5)
     whisker.set_label("90 % interval of the dead time")
-    naive = Line2D([], [], color=INK, lw=2.2, label="naive lag, the sum")
+    raw = Line2D([], [], color=INK, lw=2.2, label="raw lag, the sum")
     figure.legend(
-        handles=[*kinds, naive, whisker], loc="outside upper left", ncols=2, numpoints=2,
+        handles=[*kinds, raw, whisker], loc="outside upper left", ncols=2, numpoints=2,
         columnspacing=1.2,
     )  # fmt: skip
     return figure
@@ -84,7 +84,7 @@ _LAG_KINDS = (
 
 def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
     """Draw one joint's bar; returns where it ends [ms]."""
-    naive, dead_time = 1e3 * part.naive_lag_s.value, part.dead_time_s
+    raw, dead_time = 1e3 * part.raw_lag_s.value, part.dead_time_s
     assert dead_time is not None
     lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.feedback_age_s)
     left = 0.0
@@ -110,9 +110,9 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
             middle, row + 0.17, xerr=[[below], [above]], color=colour, capsize=4, lw=width,
             capthick=width,
         )  # fmt: skip
-    axes.plot([naive, naive], [row - 0.4, row + 0.4], color=INK, lw=2.2)
-    axes.text(naive + 0.015 * max(naive, 1.0), row, f"{naive:.0f}", va="center", weight="bold")
-    return max(naive, left)
+    axes.plot([raw, raw], [row - 0.4, row + 0.4], color=INK, lw=2.2)
+    axes.text(raw + 0.015 * max(raw, 1.0), row, f"{raw:.0f}", va="center", weight="bold")
+    return max(raw, left)
 
 
 @styled
@@ -215,7 +215,7 @@ def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
         gain.errorbar(frequency, decibels, yerr=gain_error, label=joint, **style)
         phase.errorbar(frequency, response.phase_deg, yerr=phase_error, **style)
         gain.plot(
-            frequency, 20 * np.log10(np.abs(response.naive_response)), color=colour, marker=mark,
+            frequency, 20 * np.log10(np.abs(response.raw_response)), color=colour, marker=mark,
             ms=6, mfc="none", ls="",
         )  # fmt: skip
         for fit in list(response.transfer_functions.values())[-1:]:
@@ -236,7 +236,7 @@ def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
     phase.set_ylabel("phase [°]")
     phase.set_xlabel("frequency [Hz]")
     handles, _ = gain.get_legend_handles_labels()
-    hollow = Line2D([], [], color=INK, marker="o", mfc="none", ls="", label="naive: all rows")
+    hollow = Line2D([], [], color=INK, marker="o", mfc="none", ls="", label="raw: all rows")
     line = Line2D([], [], color=INK, lw=1.2, label="fitted")
     figure.legend(handles=[*handles, hollow, line], loc="outside upper left", ncols=3)
     return figure

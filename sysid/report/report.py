@@ -215,7 +215,7 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
     picture = Picture(
         "lag_budget",
         "Lag budget: the time from sending a command to the row in which its motion is read. The "
-        "black line is the naive lag, which is the sum.",
+        "black line is the raw lag, which is the sum.",
         figures.lag_budget_figure({joint: r.lag for joint, r in results.items()}),
     )
     return Section(

@@ -40,7 +40,7 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         rows.append(row | {"delay_steps_min": low, "delay_steps_max": high})
     columns = (
         KEY,
-        number("naive, ms", "naive_lag_s", 1, _MS),
+        number("raw, ms", "raw_lag_s", 1, _MS),
         number("= feedback age", "feedback_age_s", 1, _MS),
         number("+ command hold", "command_hold_s", 1, _MS),
         _ranged(f"+ servo lag {_LEVEL}", "lag_s", 1, _MS),
@@ -80,8 +80,8 @@ def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         number("gain", "gain", 2),
         number("phase, °", "phase_deg", 0),
         _ranged(f"lag, ms {_LEVEL}", "lag_s", 1, _MS),
-        number("naive gain", "naive_gain", 2),
-        number("naive lag, ms", "naive_lag_s", 1, _MS),
+        number("raw gain", "raw_gain", 2),
+        number("raw lag, ms", "raw_lag_s", 1, _MS),
     )
     return Table("by_frequency", "Frequency by frequency", columns, tuple(rows))
 

@@ -35,12 +35,12 @@ def test_delay_json_is_one_object_with_the_documented_keys(capsys):
     joint = json.loads(out)["joints"]["LF_hip"]
     assert code == 0
     assert {
-        "naive_lag_s", "fresh_lag_s", "lag_s", "dead_time_s", "dynamics_s", "feedback_age_s",
+        "raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s", "dynamics_s", "feedback_age_s",
         "command_hold_s", "quantum_rad", "offset_rad", "feedback", "by_frequency", "estimators_s",
     } <= set(joint)  # fmt: skip
     assert {"poll_period_s", "loss", "mean_age_s"} <= set(joint["feedback"])
     assert {"frequency_hz", "gain", "phase_deg", "lag_s"} <= set(joint["by_frequency"][0])
-    lags = [joint[k]["value"] for k in ("naive_lag_s", "fresh_lag_s", "lag_s", "dead_time_s")]
+    lags = [joint[k]["value"] for k in ("raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s")]
     assert lags == sorted(lags, reverse=True)
 
 
@@ -84,7 +84,7 @@ def test_bode_shows_that_the_servo_follows_where_raw_rows_say_it_does_not(capsys
     code, out, _ = run(capsys, "bode", SWEEP, "--joints", "LF_hip", "--json", "--plot", "b.png")
     tones = json.loads(out)["joints"]["LF_hip"]["by_frequency"]
     assert code == 0 and Path("b.png").stat().st_size > 10_000
-    assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["naive_gain"] < 0.75
+    assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["raw_gain"] < 0.75
 
 
 def test_sweep_records_calibrates_and_repeats_under_its_seed(capsys):

@@ -43,7 +43,7 @@ class Delay:
             terminal.print_json(found)
             return
         budget = terminal.table(
-            "Lag budget, ms: naive = feedback age + command hold + servo lag", "joint", "naive",
+            "Lag budget, ms: raw = feedback age + command hold + servo lag", "joint", "raw",
             "feedback age", "command hold", "servo lag", "90 % interval", "of it dead time",
             "90 % interval",
         )  # fmt: skip
@@ -51,7 +51,7 @@ class Delay:
             dead = b.dead_time_s
             assert dead is not None
             budget.add_row(
-                name, terminal.ms(b.naive_lag_s.value), terminal.ms(b.feedback_age_s),
+                name, terminal.ms(b.raw_lag_s.value), terminal.ms(b.feedback_age_s),
                 terminal.ms(b.command_hold_s), terminal.ms(b.lag_s.value), _ends(b.lag_s),
                 terminal.ms(dead.value), _ends(dead),
             )  # fmt: skip
@@ -69,14 +69,14 @@ class Delay:
     def _print_frequencies(self, found: LagBudgets) -> None:
         shown = terminal.table(
             "Per frequency, fresh readings", "joint", "Hz", "gain", "phase °", "lag ms",
-            "90 % interval", "naive lag ms", "naive gain",
+            "90 % interval", "raw lag ms", "raw gain",
         )  # fmt: skip
         for name, b in found.items():
             for f in b.by_frequency:
                 shown.add_row(
                     name, terminal.number(f.frequency_hz), terminal.number(f.gain),
                     terminal.number(f.phase_deg, 0), terminal.ms(f.lag_s.value), _ends(f.lag_s),
-                    terminal.ms(f.naive_lag_s), terminal.number(f.naive_gain),
+                    terminal.ms(f.raw_lag_s), terminal.number(f.raw_gain),
                 )  # fmt: skip
         if shown.row_count:
             terminal.out.print()

@@ -90,12 +90,12 @@ def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
     tones = tuple(
         FrequencyLag(
             frequency_hz=f, gain=1.02, phase_deg=-15.0 * f, lag_s=interval(0.042),
-            naive_lag_s=0.080, naive_gain=0.88, trial=n,
+            raw_lag_s=0.080, raw_gain=0.88, trial=n,
         )
         for n, f in enumerate((1.0, 2.0))
     )  # fmt: skip
     lag = LagBudget(
-        joint=joint, naive_lag_s=interval(0.081), fresh_lag_s=interval(0.0535),
+        joint=joint, raw_lag_s=interval(0.081), fresh_lag_s=interval(0.0535),
         lag_s=interval(0.044), feedback_age_s=0.0275, command_hold_s=0.0095,
         dead_time_s=Interval(0.024, 0.0205, 0.0275), feedback=LATTICE, quantum_rad=np.pi / 550,
         offset_rad=0.01, by_frequency=tones,
@@ -230,24 +230,24 @@ def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
     assert [p.stem for p in written.drawings] == [p.stem for p in written.figures]
 
 
-def test_the_finding_says_what_the_naive_lag_is_made_of(page):
+def test_the_finding_says_what_the_raw_lag_is_made_of(page):
     assert (
-        "of the naive 81 ms, 28 ms is feedback age, 10 ms command hold, 44 ms the servo: "
-        "24 ms dead time + 20 ms dynamics." in page.text
+        "raw lag 81 ms = 28 ms feedback age + 10 ms command hold + 44 ms servo "
+        "(24 ms dead time + 20 ms dynamics)." in page.text
     )
 
 
-def test_the_parts_of_the_lag_add_up_to_the_naive_lag():
+def test_the_parts_of_the_lag_add_up_to_the_raw_lag():
     lag = result_of().lag
     assert lag.dead_time_s is not None
     total = lag.command_hold_s + lag.dead_time_s.value + lag.dynamics_s + lag.feedback_age_s
-    assert total == pytest.approx(lag.naive_lag_s.value)
+    assert total == pytest.approx(lag.raw_lag_s.value)
 
 
 def test_lag_budget_csv_has_the_numbers_of_the_result(written):
     (row,) = rows_of(written, "lag_budget")
     assert row["joint"] == "LF_thigh"
-    assert float(row["naive_lag_s"]) == pytest.approx(0.081)
+    assert float(row["raw_lag_s"]) == pytest.approx(0.081)
     assert float(row["feedback_age_s"]) == pytest.approx(0.0275)
     assert float(row["dead_time_s_low"]) == pytest.approx(0.0205)
     assert float(row["dynamics_s"]) == pytest.approx(0.020)
@@ -275,7 +275,7 @@ def test_model_csv_scores_candidates_and_presets_and_marks_the_chosen_one(writte
     assert float(rows["delayed_pd"]["rmse_raw_rad"]) == pytest.approx(0.120)
 
 
-def test_the_page_says_whom_the_naive_score_would_have_chosen(page):
+def test_the_page_says_whom_the_raw_score_would_have_chosen(page):
     assert "On LF_thigh it prefers preset “paper”." in page.text
 
 
@@ -405,7 +405,7 @@ def response_of() -> FrequencyResponse:
     return FrequencyResponse(
         joint="LF_thigh", bandwidth_hz=None, transfer_functions={"FOPDT": fit},
         frequency_hz=frequency, amplitude_rad=np.full(3, 0.2), response=turned,
-        naive_response=0.5 * turned, covariance=covariance,
+        raw_response=0.5 * turned, covariance=covariance,
     )  # fmt: skip
 
 
