@@ -130,7 +130,7 @@ def test_the_wheel_has_one_top_level_name_and_all_its_files(wheel):
         path.relative_to(ROOT).as_posix()
         for room in FOLDERS.values()
         for path in (ROOT / room).rglob("*")
-        if path.is_file() and path.suffix not in (".py", ".pyc")
+        if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts
     }
     assert any(name.endswith(".j2") for name in data) and any("presets/" in n for n in data)
     modules = {path.relative_to(ROOT).as_posix() for path in FILES.values()}

@@ -66,14 +66,15 @@ class CandidateModel:
         `track` (steps, simulations) holds delayed commands relative to rest and is overwritten
         with positions [rad], each step lasting `TIME_STEP_S`. The reference of
         `sysid.identify.kernel`, which fits run.
-    columns : callable
-        From values (candidates, parameters) without dead time and offset to the kernel's.
+    columns : callable or None
+        From values (candidates, parameters) without dead time and offset to the kernel's; None
+        where they are the same.
     """
 
     name: str
     parameters: tuple[Parameter, ...]
     simulate: Callable[[NDArray, NDArray], None]
-    columns: Callable[[NDArray], NDArray] = np.asarray
+    columns: Callable[[NDArray], NDArray] | None = None
 
     @property
     def names(self) -> list[str]:

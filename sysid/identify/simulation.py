@@ -158,8 +158,10 @@ def moments_if_later(
 
     Returns
     -------
-    total, square : ndarray, shape (delays, candidates)
-        In rad and rad².
+    total : ndarray, shape (delays, candidates)
+        In rad.
+    square : ndarray, shape (delays, candidates)
+        In rad².
     """
     total, square = np.zeros((2, len(later), len(values)))
     kernel.moments_if_later(
@@ -171,8 +173,8 @@ def moments_if_later(
 
 def _candidates(model: CandidateModel, values: NDArray) -> tuple[int, NDArray, NDArray]:
     """What the kernel takes of candidates: the model's number, parameters, dead times in steps."""
-    own = np.ascontiguousarray(model.columns(values[:, 1:-1]))
-    return kernel.KINDS.index(model.name), own, values[:, 0] / TIME_STEP_S
+    own = values[:, 1:-1] if model.columns is None else model.columns(values[:, 1:-1])
+    return kernel.KINDS.index(model.name), np.ascontiguousarray(own), values[:, 0] / TIME_STEP_S
 
 
 def _padded(trial: TrialData) -> NDArray[np.float64]:
