@@ -66,7 +66,7 @@ def to_mjcf(calibration: Calibration, physics_step_s: float) -> str:
         "depend on it, so export again for another one.",
         *step_note(calibration, delays, physics_step_s),
         "Include this file in your model, and give each servo's joint its class, such as class=\""
-        f'servo_{calibration.joint_names[0]}". A position in ctrl is what the servo is told.',
+        f'servo_{calibration.joint_names[0]}". A position in ctrl is the command of the servo.',
         "After a reset fill the delay lines (mj_initCtrlHistory), which MuJoCo sets to zero: a "
         "robot that is not at zero would be thrown there for one delay.",
         "Carried over: delay (to fractions of a step), gains, limits of torque and of the "

@@ -41,7 +41,7 @@ def add_actuators(builder):
     """Add all servos to a `newton.ModelBuilder` that has one robot; call it before replicating.
 
     Joints are found by name, the last part of their labels. Position targets (`joint_target_q`)
-    are what the servos are told. The joints' own drives are switched off.
+    are the commands of the servos. The joints' own drives are switched off.
     """
     folder = Path(__file__).resolve().parent
     labels = [label.split("/")[-1] for label in builder.joint_label]

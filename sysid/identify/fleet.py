@@ -159,7 +159,7 @@ def calibrate_fleet(
     force : bool
         Make calibrations anew that another recording or other settings made.
     progress : callable, optional
-        Told each robot that is done.
+        Called with each robot that is done.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def run_fleet(
 ) -> Fleet:
     """Make what is missing of `targets`, here or on a cluster, and the table of all.
 
-    Problems of single robots are told in it, not raised.
+    Problems of single robots are listed in it, not raised.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Sparse equation of motion per joint (SINDy): `sparse_equations`.
 
 1. *Delay first.* `DelayedPD` is fitted to the fresh readings; shifted by its dead time, commands
-   and readings obey an ordinary differential equation.
+   and readings satisfy an ordinary differential equation.
 2. *Structure by regression.* pysindy proposes which physical terms matter
    (`sysid.identify.sparse_structure`). Its numbers are not used: derivatives of sparse readings
    bias stiffness and delay.
