@@ -137,11 +137,11 @@ def overlay_figure(
         fresh = _inside(track.fresh_time_s, start, stop)
         axes.plot(
             track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
-            label="command, held",
+            label="command (zero-order hold)",
         )  # fmt: skip
         axes.plot(
             track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5,
-            drawstyle="steps-post", label="readings, row by row",
+            drawstyle="steps-post", label="raw readings",
         )  # fmt: skip
         axes.plot(track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2, label="DelayedPD")
         axes.plot(
