@@ -97,3 +97,9 @@ def test_a_result_is_the_json_of_its_command(capsys, recording, command, functio
 def test_a_joint_that_was_not_recorded_is_refused():
     with pytest.raises(ps.InputError, match="RB_calf"):
         ps.lag(ps.load(SWEEP), ["RB_calf"])
+
+
+def test_lag_and_calibration_of_many_tones_find_one_dead_time():
+    recording = ps.load(SWEEP)
+    dead_time = ps.lag(recording, "LF_thigh")["LF_thigh"].dead_time_s
+    assert dead_time == ps.calibrate(recording, "LF_thigh")["LF_thigh"].dead_time_s

@@ -116,8 +116,9 @@ def fit_with_folds(
             for f in lower[PREFERRED]
         ]
         return best_of(model, problems, np.array(starts), 15)
-    # few tones leave many local optima: start from more places
-    keep, final = (24, 4) if len(problems) <= 5 else (8, 3)
+    # Few tones leave many local optima: start from more places. Counted in the data, not in
+    # `folds`, so that a fit without folds finds what the same fit with folds finds.
+    keep, final = (24, 4) if len(leave_one_out_folds(data)) <= 4 else (8, 3)
     fits = fit_problems(model, problems, rng, keep, final, more_starts)
     if model.name == PREFERRED:  # its numbers are exported: no local optimum will do
         crowd = global_starts(model, [everything], rng, _CANDIDATES, _POPULATION)[0]

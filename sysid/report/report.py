@@ -204,7 +204,7 @@ def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
         "What was found",
         findings=[(joint, str(r.lag)) for joint, r in results.items()],
         notes=[
-            "Naive lag: from a command's row to the position's row, as a cross-correlation of the "
+            "Raw lag: from a command's row to the position's row, as a cross-correlation of the "
             "log measures it. Only the servo's own part belongs to a simulated actuator; stale "
             "feedback belongs to the observation.",
         ],

@@ -161,7 +161,7 @@ def fit_servo(
             "Leave it out."
         )
     data = servo_data(recordings, joints, readings, seed)
-    notes: list[str] = []
+    recorded, notes = ", ".join(data.groups), list[str]()
     whole = split.train or everything
     data, note = grouped(data, whole)
     notes += [note] if note else []
@@ -172,7 +172,10 @@ def fit_servo(
     else:
         folds = [(whole, split.test)]
         if not any(chosen(r, split.test).any() for j in joints for r in data.runs[j]):
-            raise InputError(f"There is nothing to test on: {split.name}. Check loops and times.")
+            raise InputError(
+                f"There is nothing to test on: {split.name}. What was recorded: {recorded}. Without "
+                "a split every part is predicted by a model fitted to the others."
+            )
     say = progress or (lambda what, share: None)
     ready = samples(data, whole, past_ticks(data.period_s))
     count = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
