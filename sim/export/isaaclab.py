@@ -56,8 +56,8 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave both "
         "friction lines out with it.",
         "Not carried over: the limit on the set-point's speed (velocity_limit is only "
-        "stored by Isaac Lab, none of its PDs uses it) but for the lag it makes, and parts of a step. The PD "
-        "here is computed once per physics step, before it: keep steps at 5 ms or less.",
+        "stored by Isaac Lab, none of its PDs uses it) but for the lag it makes, and parts of a "
+        "step. The PD here is computed once per physics step, before it: keep steps at 5 ms or less.",
         NOT_CARRIED,
     )
     return torch_module(

@@ -173,8 +173,8 @@ def fit_servo(
         folds = [(whole, split.test)]
         if not any(chosen(r, split.test).any() for j in joints for r in data.runs[j]):
             raise InputError(
-                f"There is nothing to test on: {split.name}. What was recorded: {recorded}. Without "
-                "a split every part is predicted by a model fitted to the others."
+                f"There is nothing to test on: {split.name}. What was recorded: {recorded}. "
+                "Without a split every part is predicted by a model fitted to the others."
             )
     say = progress or (lambda what, share: None)
     ready = samples(data, whole, past_ticks(data.period_s))
