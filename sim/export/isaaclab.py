@@ -57,7 +57,8 @@ def to_isaaclab(calibration: Calibration, physics_step_s: float) -> str:
         "friction lines out with it.",
         "Not carried over: the limit on the set-point's speed (velocity_limit is only "
         "stored by Isaac Lab, none of its PDs uses it) but for the lag it makes, and parts of a "
-        "step. The PD here is computed once per physics step, before it: keep steps at 5 ms or less.",
+        "step. The PD here is computed once per physics step, before it: keep steps at 5 ms or "
+        "less.",
         NOT_CARRIED,
     )
     return torch_module(
