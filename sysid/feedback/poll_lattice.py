@@ -6,8 +6,9 @@ changed therefore brackets a successful poll between the previous read and this 
 intervals determine the lattice to a fraction of a millisecond, and every changed ("fresh") row can
 be dated to the poll that measured it, which separates the servo's lag from the feedback age.
 
-`find_poll_lattice` cuts trials into stretches, searches them for a common period and each stretch's
-phase (`sysid.feedback.poll_search`), and counts the failed polls; `readings` dates fresh rows.
+`find_poll_lattice` first asks whether readings are live (`sysid.feedback.staleness`). If not, it
+cuts trials into stretches, searches them for a common period and each stretch's phase
+(`sysid.feedback.poll_search`), and counts the failed polls; `readings` dates fresh rows.
 """
 
 from __future__ import annotations
@@ -32,12 +33,13 @@ from pupper_sysid.sysid.feedback.poll_search import (
     refine,
     shuffled,
 )
+from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e-4
 _LONGEST_S = 0.12
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
-_ALL_FRESH = 0.97
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SHUFFLES = 12
 # each costs as much as the search: where the first few leave no doubt there are no more
@@ -51,8 +53,8 @@ class PollLattice(Result):
     Attributes
     ----------
     kind : {"lattice", "unresolved", "every read"}
-        A lattice was found; readings are held but no lattice is significant; or no reading is
-        ever held, so each is dated to its read.
+        A lattice was found; none is significant; or readings are live, so each is dated to its
+        read, even where it repeats the one before because the joint stands still.
     poll_period_s, poll_period_sd_s : float
         Time between polls and its standard error.
     loss, loss_sd : float
@@ -128,25 +130,6 @@ def _read_before(trial: Trial) -> NDArray[np.float64]:
     return np.where(last >= 0, trial.read_time_s[last], np.nan)
 
 
-def quantum(trials: Sequence[Trial]) -> float:
-    """Size of one count [rad]: the greatest common divisor of all changes; 0 if there is none."""
-    steps = np.concatenate([np.abs(np.diff(t.position_rad)) for t in trials])
-    steps = np.unique(np.round(steps[np.isfinite(steps) & (steps > 1e-7)], 9))
-    if len(steps) < 3:
-        return 0.0
-    guess = steps[0]
-    for step in steps[1:]:  # Euclid with a tolerance for decimal rounding in the file
-        a, b = max(step, guess), min(step, guess)
-        while b > 2e-5:
-            a, b = b, abs(a - b * np.round(a / b))
-        guess = a
-        if guess < 1e-4:
-            return 0.0
-    counts = np.round(steps / guess)
-    refined = float(np.sum(steps * counts) / np.sum(counts**2))
-    return refined if np.max(np.abs(steps - counts * refined)) < 0.1 * refined else 0.0
-
-
 def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> PollLattice:
     """Period, loss and phases of the poll behind one joint's readings.
 
@@ -166,10 +149,9 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     fraction = fresh / max(rows, 1)
     nothing = PollLattice(kind="unresolved", fresh_fraction=fraction)
     loop = _loop_period(trials)
-    moving, moving_fresh = _moving_fresh(trials)
-    # the readings of a servo that sticks repeat as well: what answered the read decides first
+    # the readings of a joint that stands still repeat as well, and show nothing of the bus
     direct = bool(trials) and all(t.direct for t in trials)
-    if direct or (moving and moving_fresh / moving >= _ALL_FRESH):
+    if direct or staleness(trials).kind == "live":
         return replace(nothing, kind="every read")
     step = max(quantum(trials), 1e-6)
     stretches = [s for t in trials if len(t.read_time_s) > 3 for s in _stretches(t, step)]
@@ -221,8 +203,8 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
 def readings(trial: Trial, lattice: PollLattice) -> Readings:
     """Fresh rows of `trial` with the times at which they were measured.
 
-    With a lattice: its last instant before the read. Held without a lattice: the middle between
-    the previous read and this one. Never held: the time of the read.
+    With a lattice: its last instant before the read. Without one: the middle between the previous
+    read and this one. Live: every row, at the time of its read.
     """
     rows = fresh_rows(trial)
     read = trial.read_time_s
@@ -293,18 +275,6 @@ def _speed(trial: Trial) -> NDArray[np.float64]:
     windows = np.lib.stride_tricks.sliding_window_view(padded, reach + 1)
     # the slowest command in reach: the servo moves even if the lag is unknown
     return windows.min(axis=1)
-
-
-def _moving_fresh(trials: Sequence[Trial]) -> tuple[int, int]:
-    step = quantum(trials) or 1e-6
-    moving = fresh = 0
-    for trial in trials:
-        if len(trial.read_time_s) < 3:
-            continue
-        rows = np.flatnonzero(moving_rows(trial, step) & np.isfinite(trial.position_rad))
-        moving += len(rows)
-        fresh += len(np.intersect1d(rows, fresh_rows(trial)))
-    return moving, fresh
 
 
 def _loss(trials: Sequence[Trial], phases: Sequence[Phase]) -> tuple[float, float]:

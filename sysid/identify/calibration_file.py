@@ -195,7 +195,7 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
         age = _quantity(Interval(lattice.mean_age_s, float(low), float(high)))
     else:
         why = (
-            "every reading was new: no poll slower than the loop"
+            "readings are live: no poll slower than the loop"
             if lattice.kind == "every read"
             else "readings are held, but no poll period is significant"
         )

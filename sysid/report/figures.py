@@ -193,7 +193,7 @@ def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
 
 
 _LATTICE_WORDS = {
-    "every read": "every reading is new",
+    "every read": "live: each read shows the present position",
     "unresolved": "held, but no poll period found",
 }
 

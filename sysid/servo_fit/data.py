@@ -215,7 +215,7 @@ def _joint_runs(
     lattice = find_poll_lattice(trials, joint_rng(seed, joint))
     if mode == "auto":
         held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION
-        mode = "fresh" if held and not all(t.direct for t in trials) else "all"
+        mode = "fresh" if held and lattice.kind != "every read" else "all"
     timed = iter([readings(t, lattice) for t in trials])
     runs = []
     for recording in recordings:

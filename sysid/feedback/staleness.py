@@ -1,0 +1,230 @@
+"""Live or stale: whether a joint's readings are new at each read, from its trials alone.
+
+A reading repeats for two reasons: the bus has no newer value, or the joint does not move. Only the
+first makes readings stale. A repeat in the midst of motion, where the values before and after it
+go on in one direction and the command leads, cannot be friction: `staleness` counts those.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc
+
+from pupper_sysid.common.results import Result
+from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_NEEDED = 30  # episodes
+_FEWEST_STEPS = 8
+_LIVE_REPEATS = 0.005  # share of reads that a direct bus may lose
+_IMPOSSIBLE = 1e-3
+_FEWEST_REPEATS = 3
+_COUNTS = 2.99  # three, less a file's decimals: motion, not the edge of a count
+_OF_FAST_STEPS = 0.02
+_NOISES = 6.0
+_TO_AND_FRO = 0.03  # share of such steps, below which they are chance
+_SMALLEST_OF_NOISE = 0.505  # median smallest of three steps of white noise to and fro
+_IN_A_ROW, _OFTEN = 5, 0.1
+_LEAD = 2.0
+_LONGEST_S = 0.06  # rows farther apart no longer follow the motion
+_HARMLESS_S = 0.004
+
+
+@dataclass(frozen=True, kw_only=True)
+class Staleness(Result):
+    """Whether readings are new at each read.
+
+    Attributes
+    ----------
+    kind : {"live", "stale", "cannot tell"}
+    episodes : int
+        Stretches from one new value to the next in the midst of motion.
+    episodes_with_repeat : int
+        Those in which the older value was read more than once.
+    repeat_share : float
+        Repeated readings among all readings of these episodes; NaN without one.
+    """
+
+    kind: str
+    episodes: int = 0
+    episodes_with_repeat: int = 0
+    repeat_share: float = math.nan
+
+
+_Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def staleness(trials: Sequence[Trial]) -> Staleness:
+    """Decide whether readings are live, from motion and command alone.
+
+    A joint that moves less than a count per row shows no episode at the rows' own rate, so the
+    rule is tried on every second, third, fifth … row as well. There, a poll may hide between two
+    rows: only changes in quick succession then prove readings live.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        All of one joint.
+
+    Returns
+    -------
+    Staleness
+
+    Examples
+    --------
+    >>> time_s = 0.02 * np.arange(200)
+    >>> wave = np.sin(2 * np.pi * time_s)
+    >>> late = np.sin(2 * np.pi * (time_s - 0.05))
+    >>> def trial(position):
+    ...     return Trial("LF_hip", 0, 1.0, time_s, time_s, wave, position, None, 0.0)
+    >>> staleness([trial(late)]).kind, staleness([trial(np.repeat(late[::2], 2))]).kind
+    ('live', 'stale')
+    """
+    rows = [(t.command_rad, t.position_rad) for t in trials if np.isfinite(t.position_rad).any()]
+    if not rows:
+        return Staleness(kind="cannot tell")
+    values = [p[np.isfinite(p)] for _, p in rows]
+    repeated = np.concatenate([np.diff(v) == 0 for v in values])
+    if np.sum(~repeated) < _FEWEST_STEPS:
+        return Staleness(kind="cannot tell")
+    # between the quartiles: a joint with play or friction is on either side, seldom between
+    offset = float(np.mean(np.nanquantile(np.concatenate([p - c for c, p in rows]), (0.25, 0.75))))
+    loop = float(np.median(np.concatenate([np.diff(t.read_time_s) for t in trials])))
+    step = quantum(trials)
+    scatter = _scatter(values)
+    least = max(_COUNTS * step, _NOISES * scatter if scatter > step else 0.0)
+
+    found = _count(rows, offset, least)
+    if len(repeated) >= _NEEDED and not _impossible(int(repeated.sum()), len(repeated)):
+        return _verdict("live", found)  # every row is new, in motion or not
+    every = 1
+    while len(found) < _NEEDED:
+        every = math.ceil(1.5 * every)
+        if not every * loop <= _LONGEST_S:
+            return _verdict("cannot tell", found)
+        found = _count(list(_thinned(rows, every)), offset, least)
+    if _impossible(int(np.sum(found > 0)), len(found)):
+        return _verdict("stale", found)
+    shown = every == 1 or _follows_rows(values) or _shortest(values) * loop <= _HARMLESS_S
+    return _verdict("live" if shown else "cannot tell", found)
+
+
+def _verdict(kind: str, repeats: NDArray[np.int64]) -> Staleness:
+    total = int(repeats.sum())
+    return Staleness(
+        kind=kind,
+        episodes=len(repeats),
+        episodes_with_repeat=int(np.sum(repeats > 0)),
+        repeat_share=total / (total + len(repeats)) if len(repeats) else math.nan,
+    )
+
+
+def _impossible(repeats: int, among: int) -> bool:
+    """Whether a bus that answers each read could not repeat that often."""
+    if repeats < _FEWEST_REPEATS:
+        return False
+    return float(bdtrc(repeats - 1, among, _LIVE_REPEATS)) < _IMPOSSIBLE  # that many or more
+
+
+def _count(rows: Sequence[_Rows], offset: float, least: float) -> NDArray[np.int64]:
+    """Repeats of each episode in the midst of motion, over all stretches of rows."""
+    steps = [np.abs(np.diff(p[np.isfinite(p)])) for _, p in rows]
+    moved = np.concatenate([s[s > 0] for s in steps])
+    if len(moved) < _FEWEST_STEPS:
+        return np.zeros(0, np.int64)
+    least = max(least, _OF_FAST_STEPS * float(np.quantile(moved, 0.95)))
+    return np.concatenate([episodes(c + offset, p, least) for c, p in rows])
+
+
+def episodes(
+    command_rad: NDArray[np.float64], position_rad: NDArray[np.float64], least_rad: float
+) -> NDArray[np.int64]:
+    """Count the repeats of each episode in the midst of motion.
+
+    An episode lasts from the row of one new value to the row of the next.
+
+    Parameters
+    ----------
+    command_rad, position_rad : ndarray, shape (rows,)
+        The command plus the offset of the readings, and the reading; a missing one is NaN.
+    least_rad : float
+        Smallest step, and smallest rate per row beside it, that are motion.
+
+    Returns
+    -------
+    ndarray of int, shape (episodes,)
+        How often the older value was read again.
+    """
+    here = np.flatnonzero(np.isfinite(position_rad))
+    position, command = position_rad[here], command_rad[here]
+    new = np.concatenate([[0], np.flatnonzero(np.diff(position)) + 1])
+    if len(new) < 4:
+        return np.zeros(0, np.int64)
+    # value i lasts `length[i]` rows and is followed by the step `move[i]`
+    move, length = np.diff(position[new]), np.diff(new)
+    rate = np.abs(move) / length
+    near = np.minimum(rate[:-2], rate[2:])
+    sign = np.sign(move)
+    chosen = (sign[:-2] == sign[1:-1]) & (sign[1:-1] == sign[2:])
+    chosen &= (near >= least_rad) & (np.abs(move[1:-1]) >= least_rad)
+    # a stationary joint under a command that does not lead may repeat without the bus's doing
+    error = command - position
+    ahead = np.minimum.reduceat(error, new)[1:-2]
+    behind = np.maximum.reduceat(error, new)[1:-2]
+    chosen &= np.where(sign[1:-1] > 0, ahead, -behind) >= _LEAD * near
+    missing = np.concatenate([[0], np.cumsum(np.diff(here) > 1)])
+    chosen &= missing[new[2:-1]] == missing[np.maximum(new[1:-2] - 1, 0)]
+    return (length[1:-1][chosen] - 1).astype(np.int64)
+
+
+def _thinned(rows: Sequence[_Rows], every: int) -> Iterator[_Rows]:
+    """Every so-many-th row, from the first one on and from one half of that later."""
+    for command, position in rows:
+        for first in range(0, every, max(1, every // 2)):
+            if np.isfinite(position[first::every]).any():
+                yield command[first::every], position[first::every]
+
+
+def _scatter(values: Sequence[NDArray[np.float64]]) -> float:
+    """Standard deviation of live readings' noise [rad], from steps to and fro; 0 if few are.
+
+    Motion turns once and goes on; noise turns at the next row again. Polls too slow for the
+    motion show it to and fro as well, but not in one row after the other.
+    """
+    total, smallest = 0, [np.zeros(0)]
+    for value in (v for v in values if len(v) > 3):
+        step = np.diff(value)
+        total += int(np.sum(step != 0))
+        turn = step[:-1] * step[1:] < 0
+        size = np.lib.stride_tricks.sliding_window_view(np.abs(step), 3).min(axis=1)
+        smallest.append(size[turn[:-1] & turn[1:]])
+    found = np.concatenate(smallest)
+    if len(found) < max(_FEWEST_STEPS, _TO_AND_FRO * total):
+        return 0.0
+    return float(np.median(found) / _SMALLEST_OF_NOISE)
+
+
+def _follows_rows(values: Sequence[NDArray[np.float64]]) -> bool:
+    """Whether many new values come in row after row: polls 1.25 loops apart cannot do that."""
+    changed = [np.diff(v) != 0 for v in values]
+    windows = [np.lib.stride_tricks.sliding_window_view(c, _IN_A_ROW) for c in changed
+               if len(c) >= _IN_A_ROW]  # fmt: skip
+    runs = sum(int(np.sum(w.all(axis=1))) for w in windows)
+    return runs >= max(_NEEDED, _OFTEN * sum(int(np.sum(c)) for c in changed))
+
+
+def _shortest(values: Sequence[NDArray[np.float64]]) -> float:
+    """Rows between changes in one direction that follow fast upon another: the lowest tenth."""
+    gaps = [np.zeros(0)]
+    for value in values:
+        new = np.concatenate([[0], np.flatnonzero(np.diff(value)) + 1])
+        sign, length = np.sign(np.diff(value[new])), np.diff(new)
+        one = (sign[:-2] == sign[1:-1]) & (sign[1:-1] == sign[2:]) if len(sign) > 2 else []
+        gaps.append(length[1:-1][one] if len(sign) > 2 else np.zeros(0))
+    found = np.concatenate(gaps)
+    return float(np.quantile(found, 0.1)) if len(found) else math.inf

@@ -1,0 +1,158 @@
+"""Live, stale or cannot tell: repeats in the midst of motion are the bus's, others are not."""
+
+from __future__ import annotations
+
+import ast
+import csv
+
+import numpy as np
+import pytest
+
+from pupper_sysid.sysid.doctor.examination import examine
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
+from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.staleness import episodes, staleness
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording, Trial
+from support.real_recordings import real_recording
+
+COUNT = 2 * np.pi / 4096
+TIME = 0.02 * np.arange(600)
+WAVE = 0.5 * np.sin(2 * np.pi * 0.7 * TIME)
+
+
+def trial(command, position, time=TIME) -> Trial:
+    return Trial("LF_hip", 0, 0.7, time, time, command, np.asarray(position), None, 0.0)
+
+
+def whole(position):
+    """Readings in counts."""
+    return COUNT * np.round(position / COUNT)
+
+
+def sticking(command, play=0.08):
+    """A joint that follows its command once that leads by `play`, and stays where it is till then.
+
+    It stands at every reversal, as friction makes it.
+    """
+    position = np.empty(len(command))
+    here = command[0]
+    for k, c in enumerate(command):
+        here = float(np.clip(here, c - play, c + play))
+        position[k] = here
+    return position
+
+
+def polled(position, every=3):
+    """Every third value, shown until the next one."""
+    return np.repeat(position[::every], every)[: len(position)]
+
+
+def test_a_joint_that_sticks_at_reversals_is_live_though_many_readings_repeat():
+    stuck = whole(sticking(WAVE))
+    assert np.mean(np.diff(stuck) == 0) > 0.2
+    found = staleness([trial(WAVE, stuck)])
+    assert (found.kind, found.episodes_with_repeat, found.repeat_share) == ("live", 0, 0.0)
+
+
+def test_its_readings_are_all_dated_to_their_reads():
+    stuck = trial(WAVE, whole(sticking(WAVE)))
+    lattice = find_poll_lattice([stuck], np.random.default_rng(0))
+    assert lattice.kind == "every read"
+    found = readings(stuck, lattice)
+    np.testing.assert_array_equal(found.time_s, TIME)
+    assert len(found.rows) == len(TIME)
+
+
+def test_doctor_claims_no_lost_reads_of_a_joint_that_sticks():
+    recording = Recording.from_arrays(
+        TIME, {"LF_hip": WAVE}, {"LF_hip": whole(sticking(WAVE))}, frequency_hz=0.7
+    )
+    found = examine(recording)["LF_hip"]
+    assert found.feedback is not None and found.feedback.kind == "every read"
+    assert not [r for r in found.reasons if "fail" in r or "poll" in r or "new reading" in r]
+
+
+def test_a_servo_polled_every_third_row_is_stale_and_two_of_three_readings_repeat():
+    found = staleness([trial(WAVE, polled(whole(sticking(WAVE))))])
+    assert found.kind == "stale" and found.episodes_with_repeat == found.episodes
+    assert found.repeat_share == pytest.approx(2 / 3)
+
+
+def test_a_constant_reading_tells_nothing():
+    assert staleness([trial(WAVE, np.full(600, 0.3))]).kind == "cannot tell"
+
+
+def test_a_few_rows_tell_nothing():
+    assert staleness([trial(WAVE[:12], WAVE[:12] - 0.1, TIME[:12])]).kind == "cannot tell"
+    assert staleness([]).kind == "cannot tell"
+
+
+def test_missing_readings_are_no_repeats():
+    rng = np.random.default_rng(0)
+    gone = rng.random(600) < 0.1
+    stuck = np.where(gone, np.nan, whole(sticking(WAVE)))
+    assert staleness([trial(WAVE, stuck)]).kind == "live"
+    assert staleness([trial(WAVE, np.full(600, np.nan))]).kind == "cannot tell"
+    held = np.where(gone, np.nan, polled(whole(sticking(WAVE))))
+    assert staleness([trial(WAVE, held)]).kind == "stale"
+
+
+def test_an_offset_between_command_and_reading_changes_nothing():
+    stuck = whole(sticking(WAVE))
+    here, there = staleness([trial(WAVE, stuck)]), staleness([trial(WAVE, stuck + 0.8)])
+    assert (there.kind, there.repeat_share) == (here.kind, here.repeat_share)
+    assert there.episodes == pytest.approx(here.episodes, rel=0.05)
+
+
+def test_a_joint_that_moves_less_than_a_count_per_row_is_not_stale():
+    time = 0.002 * np.arange(6000)
+    command = 0.1 * np.sin(2 * np.pi * 0.5 * time)
+    slow = whole(sticking(command, 0.02))
+    assert np.mean(np.diff(slow) == 0) > 0.5
+    assert staleness([trial(command, slow, time)]).kind in ("live", "cannot tell")
+
+
+def test_episodes_are_counted_by_hand():
+    # steps of 1 each, the value 3 is read twice; the command leads by 5
+    position = np.array([0.0, 1.0, 2.0, 3.0, 3.0, 4.0, 5.0, 6.0])
+    # values 1 to 4 lie between steps in one direction; the rates beside 3 are those of 2 and 4
+    assert episodes(position + 5, position, 0.4).tolist() == [0, 0, 1, 0]
+    # mirrored, it is the same; a command that does not lead proves nothing
+    assert episodes(-position - 5, -position, 0.4).tolist() == [0, 0, 1, 0]
+    assert episodes(position + 0.5, position, 0.4).tolist() == []
+    # steps below the smallest that is motion do not count
+    assert episodes(position + 5, position, 1.5).tolist() == []
+
+
+@pytest.mark.parametrize("decimals", [4, 6, 9])
+def test_the_quantisation_step_is_found_in_a_file_of_few_decimals(decimals):
+    written = np.round(whole(sticking(WAVE)), decimals)
+    assert quantum([trial(WAVE, written)]) == pytest.approx(COUNT, rel=1e-3)
+
+
+def test_continuous_readings_have_no_quantisation_step():
+    assert quantum([trial(WAVE, sticking(WAVE))]) == 0.0
+
+
+def test_the_real_sweeps_of_a_polled_robot_are_stale(real_sweeps):
+    for path in real_sweeps:
+        recording = load(path)
+        for joint in recording.joints:
+            assert staleness(recording.trials(joint)).kind == "stale"
+
+
+def test_a_real_arm_on_a_direct_bus_is_never_stale():
+    columns = {}
+    for name in ("control", "state_motor"):
+        with real_recording(f"sage_so101/frequency_sweep/{name}.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        columns[name] = np.array([ast.literal_eval(r["positions"]) for r in rows])
+    rows = min(len(c) for c in columns.values())
+    time = 0.02006 * np.arange(rows)
+    found = [
+        staleness([trial(columns["control"][:rows, k], columns["state_motor"][:rows, k], time)])
+        for k in range(6)
+    ]
+    assert "stale" not in {f.kind for f in found}
+    assert [f.kind for f in found].count("live") >= 4
