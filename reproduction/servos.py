@@ -12,8 +12,7 @@ from pupper_sysid.sysid.doctor.examination import JointExamination, examine
 from pupper_sysid.sysid.identify.dead_time import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.servo_fit.compare import Comparison
-from pupper_sysid.sysid.servo_fit.four_way import FITTED, PUBLISHED, four_way
+from pupper_sysid.sysid.servo_fit.compare import FITTED, PUBLISHED, Comparison, four_way
 from reproduction.claims import Claim, Finding, NotTestable, claim, holds
 
 

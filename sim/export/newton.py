@@ -143,8 +143,8 @@ def _module(calibration: Calibration, delays: dict[str, Interval], physics_step_
         "interval rounded outward.",
         *step_note(calibration, delays, physics_step_s),
         "Not carried over: the limit on the set-point's speed, parts of a step, and the feedback, "
-        "which is no part of an actuator: readings are old, lost at times, coarse and off. See "
-        "FEEDBACK, and the HeldFeedback that the export to Isaac Lab writes.",
+        "which is no part of an actuator: readings are stale, lost at times, quantised and biased. "
+        "See FEEDBACK, and the HeldFeedback that the export to Isaac Lab writes.",
     )
     return (
         f"{docstring('Servos for Newton.', notes)}\n"
@@ -153,6 +153,6 @@ def _module(calibration: Calibration, delays: dict[str, Interval], physics_step_
         + block("SERVOS", servos)
         + '"""Units: N·m, kg·m², physics steps."""\n\n'
         + feedback_block(calibration)
-        + '"""What makes each joint\'s readings old, coarse and off."""\n\n'
+        + '"""What makes each joint\'s readings stale, quantised and biased."""\n\n'
         + _CODE
     )

@@ -32,7 +32,8 @@ EXPLICIT_PD = Engine(slews=False, implicit=False)
 """Isaac Lab and Newton: torque computed before each step, set-points of unlimited speed."""
 NOT_CARRIED = (
     "The feedback is no part of an actuator, and without it the simulated robot sees more than the "
-    "real one does: its readings are old, lost at times, coarse and off. See FEEDBACK below."
+    "real one does: its readings are stale, lost at times, quantised and biased. See FEEDBACK "
+    "below."
 )
 KNOWN = {"yes": "measured", "ratio only": "ratio measured, scale assumed", "no": "not measured"}
 """How well a number is known, by `Quantity.identified`."""
@@ -159,6 +160,7 @@ def torch_module(
         '"""Physics step that the delays below are counted in [s]."""\n\n'
         f"{actuators}\n"
         f"{feedback_block(calibration)}"
-        '"""What makes each joint\'s readings old, coarse and off; `HeldFeedback` applies it."""\n'
+        '"""What makes each joint\'s readings stale, quantised and biased; `HeldFeedback` applies '
+        'it."""\n'
         f"\n\n{code[code.index('class HeldFeedback') :]}"
     )

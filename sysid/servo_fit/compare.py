@@ -7,7 +7,7 @@ robot's repeatability. A note names models that were fitted to a recording they 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,8 +23,10 @@ from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
 from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, chosen_joints
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.result import ServoFit
 from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
@@ -32,6 +34,10 @@ from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_gro
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+PUBLISHED, FITTED = "DelayedPD, published", "DelayedPD, fitted here"
+_TRAIN_SHARE = 2 / 3  # of a recording without loops, in `four_way`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,3 +218,63 @@ def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores
         for group, model in fit.held_out.items()
     ]
     return scores.tracks(fit.model, data), scores.pooled(parts)
+
+
+def four_way(
+    recording: Recording,
+    joints: Sequence[str],
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> Comparison:
+    """Compare as the paper does: published DelayedPD, one fitted here, an MLP and an LSTM.
+
+    Each runs free and one step ahead, on readings that none was fitted to: the last loop, or the
+    last third of a recording without loops. (The published networks were scored on commands that
+    they had been trained on.)
+
+    Parameters
+    ----------
+    recording : Recording
+    joints : sequence of str
+    seed : int
+    progress : callable, optional
+        Called with what is being done and the share of it that is done.
+
+    Raises
+    ------
+    InputError
+        If the recording cannot support a fit.
+    """
+    split = _split(recording)
+    fits: dict[str, ServoFit] = {
+        arch: fit_servo(recording, joints, arch, split=split, seed=seed, progress=progress)
+        for arch in ("lstm", "mlp")
+    }
+    mlp = fits["mlp"]
+    published = calibrated(load_calibration("paper"), mlp.data.joints, mlp.time_step_s)
+    track = scores.tracks(published, mlp.data)
+    assert split.test is not None
+    errors = scores.errors(published, track, mlp.data, split.test)
+    return Comparison(
+        models={
+            PUBLISHED: scores.ModelScores.of(errors, seed),
+            FITTED: mlp.scored["delayed-pd"],
+            LINEAR: mlp.scored["linear"],
+        }
+        | {arch.upper(): fit.scored[arch] for arch, fit in fits.items()},
+        persistence_rmse_rad={j: s.persistence_rmse_rad for j, s in mlp.joints.items()},
+        repeatability_rad={j: s.repeatability_rad for j, s in mlp.joints.items()},
+        time_step_s=mlp.time_step_s,
+        notes=mlp.notes,
+        data=mlp.data,
+        tracks={PUBLISHED: track} | {arch.upper(): fit.tracks for arch, fit in fits.items()},
+        bands={},
+    )
+
+
+def _split(recording: Recording) -> Split:
+    numbers = sorted(int(n) for n in recording.table["trial"].unique())
+    if len(numbers) > 1:
+        return Split.by_trials(numbers[:-1], numbers[-1:])
+    end = _TRAIN_SHARE * float(np.ptp(recording.table["send_time_s"]))
+    return Split.by_time(end, end)
