@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.doctor.examination import examine
     from pupper_sysid.sysid.identify.calibrate import calibrate
     from pupper_sysid.sysid.identify.dead_time import lag
-    from pupper_sysid.sysid.identify.sparse_equations import sparse_equations
     from pupper_sysid.sysid.lag.frequency_response import frequency_response
     from pupper_sysid.sysid.recordings.files import load
     from pupper_sysid.sysid.recordings.recording import Recording
     from pupper_sysid.sysid.report.report import write_report as report
     from pupper_sysid.sysid.servo_fit.compare import compare
     from pupper_sysid.sysid.servo_fit.fit import fit_servo
+    from pupper_sysid.sysid.sparse.equations import sparse_equations
 
 _MODULES = {
     "load": "sysid.recordings.files",
@@ -46,7 +46,7 @@ _MODULES = {
     "lag": "sysid.identify.dead_time",
     "frequency_response": "sysid.lag.frequency_response",
     "calibrate": "sysid.identify.calibrate",
-    "sparse_equations": "sysid.identify.sparse_equations",
+    "sparse_equations": "sysid.sparse.equations",
     "fit_servo": "sysid.servo_fit.fit",
     "compare": "sysid.servo_fit.compare",
     "report": "sysid.report.report:write_report",

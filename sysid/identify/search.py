@@ -8,7 +8,7 @@ all trials, whose numbers are exported, evolves a population besides. `dead_time
 other parameters at fixed dead times; the rise of the cost gives the interval, counted in effective
 samples (`integrated_autocorrelation_time`) because residuals of a real servo are not white.
 
-`sysid.identify.joint_fit`, `sysid.identify.sparse_equations` and `sysid.servo_fit.physics` fit
+`sysid.identify.joint_fit`, `sysid.sparse.equations` and `sysid.servo_fit.physics` fit
 their models with it.
 """
 

@@ -68,7 +68,7 @@ def sindy_fits(
     list of dict of str to ndarray, shape (joints,)
         Every name of `COEFFICIENTS` that some joint has, `dead_time_s` and `offset_rad`.
     """
-    from pupper_sysid.sysid.identify.sparse_equations import fit_equations
+    from pupper_sysid.sysid.sparse.equations import fit_equations
 
     found = []
     for part in parts:

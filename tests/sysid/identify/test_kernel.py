@@ -16,7 +16,7 @@ from pupper_sysid.sysid.identify.simulation import (
     moments_if_later,
     residuals,
 )
-from pupper_sysid.sysid.identify.sparse_equations import equation_model
+from pupper_sysid.sysid.sparse.equations import equation_model
 
 MODELS = [
     *CANDIDATE_MODELS,

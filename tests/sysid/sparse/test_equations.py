@@ -16,13 +16,13 @@ from pupper_sysid.servo_models.sparse_equation import (
     explain,
 )
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run
-from pupper_sysid.sysid.identify.sparse_equations import (
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.sparse.equations import (
     equation_model,
     fit_equations,
     sparse_equations,
 )
-from pupper_sysid.sysid.identify.sparse_structure import LINEAR, PULLS, ordered, propose
-from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.sparse.structure import LINEAR, PULLS, ordered, propose
 from support.command_line import run
 
 SERVO = {

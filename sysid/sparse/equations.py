@@ -3,7 +3,7 @@
 1. *Delay first.* `DelayedPD` is fitted to the fresh readings; shifted by its dead time, commands
    and readings satisfy an ordinary differential equation.
 2. *Structure by regression.* pysindy proposes which physical terms matter
-   (`sysid.identify.sparse_structure`). Its numbers are not used: derivatives of sparse readings
+   (`sysid.sparse.structure`). Its numbers are not used: derivatives of sparse readings
    bias stiffness and delay.
 3. *Numbers by output error.* Each proposed structure, dead time included, is fitted in free run
    (`sysid.identify.output_error`).
@@ -45,7 +45,6 @@ from pupper_sysid.sysid.identify.search import (
     leave_one_out_folds,
 )
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run
-from pupper_sysid.sysid.identify.sparse_structure import PULLS, Support, ordered, propose
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -53,6 +52,7 @@ from pupper_sysid.sysid.recordings.joints import (
     joint_rng,
     map_joints,
 )
+from pupper_sysid.sysid.sparse.structure import PULLS, Support, ordered, propose
 
 _WITHIN = 1.05  # cross-validation errors this close are a tie: the sparser one wins
 

@@ -5,7 +5,7 @@ sequentially thresholded least squares (S. Brunton, J. Proctor, J. Kutz, "Discov
 equations from data by sparse identification of nonlinear dynamical systems", 2016) says which
 physical terms carry the acceleration, at many thresholds, delays and saturation errors. Only the
 structures are used, not the numbers: derivatives of sparse readings bias stiffness and delay, and
-`sysid.identify.sparse_equations` refines each structure by output error.
+`sysid.sparse.equations` refines each structure by output error.
 """
 
 from __future__ import annotations
