@@ -359,6 +359,8 @@ def _unit_in_words(place: Place) -> str:
 
 def _short(given: Any) -> str:
     text = "null" if given is None else str(given)
+    # control characters of a file must not reach the terminal
+    text = text if text.isprintable() else repr(text)
     return text if len(text) <= 60 else f"{text[:57]}…"
 
 

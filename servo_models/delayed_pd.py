@@ -4,10 +4,13 @@ One servo holds one joint whose inertia is `armature`. A command takes effect af
 its set-point moves at `velocity_limit` at most, and the torque
 
     tau = clip(stiffness * (setpoint - position) - damping * velocity, ±effort_limit)
+          - back_emf * velocity
 
-works against a dry friction of `friction_loss`. This module is the same arithmetic as MuJoCo's
-native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with `armature` and
-`frictionloss`, integrated with `implicitfast`; `tests/servo_models/test_delayed_pd.py` holds the
+works against a dry friction of `friction_loss`. A limit on the speed is one of two things: the
+set-point slews (`velocity_limit`), or the motor's voltage runs out (`back_emf`: with
+`effort_limit / back_emf` the no-load speed); a servo may have both. This module is the same arithmetic as MuJoCo's
+native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with `armature`,
+`frictionloss` and `damping`, integrated with `implicitfast`; `tests/servo_models/test_delayed_pd.py` holds the
 two together:
 
 * dead time: the command of the past, linearly interpolated between time steps. For a command that
@@ -17,10 +20,10 @@ two together:
 * friction: a constraint that removes the whole velocity in one time step if `friction_loss`
   allows it (`sim.robot.servo_mjcf`). MuJoCo's default friction is far softer than
   a servo's gears: it would still creep at 1 rad/s;
-* damping is integrated implicitly, except while the torque is clipped.
+* damping is integrated implicitly, except while the torque is clipped; back-EMF always is.
 
 Free-air positions cannot tell the torques from the inertia: scaling stiffness, damping,
-friction_loss, effort_limit and armature together changes nothing (`per_inertia`).
+friction_loss, effort_limit, back_emf and armature together changes nothing (`per_inertia`).
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""
 
 FRICTION_IMPEDANCE = 0.9999
-_TORQUES = ("stiffness", "damping", "friction_loss", "effort_limit")
+_TORQUES = ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf")
 
 
 def whole_steps(low_s: float, high_s: float, time_step_s: float) -> tuple[int, int]:
@@ -72,6 +75,9 @@ class DelayedPDParameters:
         Largest rate of the set-point [rad/s].
     dead_time_s : array_like
         From a command's arrival to its first effect on the torque [s].
+    back_emf : array_like
+        Torque lost per velocity outside of the effort limit [N·m·s/rad]: back-EMF of the motor,
+        viscous friction of the gears.
     """
 
     stiffness: ArrayLike
@@ -81,6 +87,7 @@ class DelayedPDParameters:
     effort_limit: ArrayLike
     velocity_limit: ArrayLike
     dead_time_s: ArrayLike
+    back_emf: ArrayLike = 0.0
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """The numbers as arrays, by name."""
@@ -164,14 +171,15 @@ def integrate(
     def flat(value):  # one contiguous axis: the fastest shape for the small steps below
         return np.ascontiguousarray(np.broadcast_to(value, batch), dtype=float).reshape(-1)
 
-    kp, kd, friction, effort = (flat(values[name] / values["armature"]) for name in _TORQUES)
+    kp, kd, friction, effort, brake = (flat(values[name] / values["armature"]) for name in _TORQUES)
     positions = np.empty(delayed.shape) if out is None else out
     flat_positions = positions.reshape(len(delayed), -1)  # a view: splitting or merging one axis
     delayed = delayed.reshape(len(delayed), -1)
     low_effort, low_friction, stop = -effort, -friction, -FRICTION_IMPEDANCE
     slew = flat(values["velocity_limit"] * h)
     low_slew = -slew
-    inverse = h / (1.0 + h * kd) if implicit else h
+    inverse, clipped = (h / (1.0 + h * (kd + brake)), h / (1.0 + h * brake)) if implicit else (h, h)
+    brakes = bool(brake.any())
     position, velocity, setpoint = (flat(x).copy() for x in state)
     force, wanted, change = (np.empty_like(position) for _ in range(3))
     # numpy.clip costs five times minimum + maximum on small arrays, hence the pairs below
@@ -187,7 +195,9 @@ def integrate(
         np.minimum(wanted, effort, out=force)
         np.maximum(force, low_effort, out=force)
         # explicit where the torque is clipped: MuJoCo drops the damping's derivative there
-        gain = np.where(force == wanted, inverse, h)
+        gain = np.where(force == wanted, inverse, clipped)
+        if brakes:
+            force -= brake * velocity
         np.multiply(velocity, 1.0 / h, out=change)
         change += force
         change *= stop

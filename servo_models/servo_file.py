@@ -307,7 +307,8 @@ def _check_names(arch: str, found: set[str]) -> None:
     """Refuse missing arrays, and those of another architecture."""
     required, optional = set(_LINEAR), frozenset[str]()
     if arch == "delayed-pd":
-        required = {f.name for f in fields(DelayedPDParameters)} | {"offset_rad"}
+        required = {f.name for f in fields(DelayedPDParameters)} - {"back_emf"} | {"offset_rad"}
+        optional = frozenset({"back_emf"})  # not in older files
     elif arch == "sindy":
         required, optional = {"dead_time_s", "offset_rad"}, frozenset(COEFFICIENTS)
     elif arch == "mlp":

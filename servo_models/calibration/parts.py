@@ -24,6 +24,7 @@ UNIT_OF_NAME = {
     "damping": "1/s",
     "friction_loss": "rad/s²",
     "effort_limit": "rad/s²",
+    "back_emf": "1/s",
     "delay_steps_min": "physics steps",
     "delay_steps_max": "physics steps",
 }
@@ -139,6 +140,11 @@ _OFFSET = AfterValidator(
 )
 
 
+NO_SPEED_LIMIT_RAD_S = 1000.0
+"""Speed limit of a set-point that is not limited."""
+_NO_BACK_EMF = Quantity(value=0.0, identified="no", why="the model has no back-EMF")
+
+
 class RatiosToArmature(Part):
     """The actuator's numbers over its armature, which positions in free air identify."""
 
@@ -150,6 +156,8 @@ class RatiosToArmature(Part):
     """Dry friction over armature [rad/s²]."""
     effort_limit: Annotated[Quantity, _RATIO]
     """Effort limit over armature [rad/s²]: the servo's largest acceleration."""
+    back_emf: Annotated[Quantity, _RATIO] = _NO_BACK_EMF
+    """Back-EMF over armature [1/s]."""
 
 
 class Scale(Part):
@@ -171,6 +179,7 @@ PARAMETER_KEYS = {
     "effort_limit": "effort_limit_nm",
     "velocity_limit": "velocity_limit_rad_s",
     "dead_time_s": "dead_time_s",
+    "back_emf": "back_emf_nm_s_per_rad",
 }
 """Fields of `DelayedPDParameters` and their names in `Actuator`."""
 
@@ -193,9 +202,13 @@ class Actuator(Part):
     velocity_limit_rad_s: Annotated[
         Quantity, AfterValidator(PlausibleRange(0, 1000, "degrees per second"))
     ]
-    """Largest rate of the set-point [rad/s]."""
+    """Largest rate of the set-point [rad/s]; 1000 where it is not limited."""
     dead_time_s: Annotated[Quantity, _TIME]
     """Dead time from a command's arrival to its first effect on the torque [s]."""
+    back_emf_nm_s_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e4))] = (
+        _NO_BACK_EMF
+    )
+    """Torque lost per velocity outside of the effort limit [N·m·s/rad]."""
     delay_steps_min: Annotated[Whole, Field(ge=0)]
     """Smallest dead time to train with, in whole physics steps."""
     delay_steps_max: Annotated[Whole, Field(ge=0)]

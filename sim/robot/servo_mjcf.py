@@ -27,10 +27,10 @@ INTEGRATOR = "implicitfast"
 FRICTION_SOLIMP = (FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
 BATCH_FIELDS = (
     "actuator_biasprm", "actuator_dynprm", "actuator_forcerange", "actuator_delay",
-    "dof_armature", "dof_frictionloss",
+    "dof_armature", "dof_frictionloss", "dof_damping",
 )  # fmt: skip
 """Model fields that `write_servos` writes; with servos on tendons `TENDON_FIELDS`, too."""
-TENDON_FIELDS = ("tendon_armature", "tendon_frictionloss")
+TENDON_FIELDS = ("tendon_armature", "tendon_frictionloss", "tendon_damping")
 
 
 def friction_solref(time_step_s: float) -> tuple[float, float]:
@@ -42,7 +42,7 @@ def friction_solref(time_step_s: float) -> tuple[float, float]:
 
 
 def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
-    """Attributes of the `<joint>` (or tendon) that the servo turns: inertia and dry friction.
+    """Attributes of the `<joint>` (or tendon) that the servo turns: inertia, friction, back-EMF.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dic
         "frictionloss": _number(parameters.friction_loss),
         "solreffriction": " ".join(map(_number, friction_solref(time_step_s))),
         "solimpfriction": " ".join(map(_number, FRICTION_SOLIMP)),
-    }
+    } | ({"damping": _number(parameters.back_emf)} if np.any(parameters.back_emf) else {})
 
 
 def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
@@ -210,6 +210,7 @@ def write_servos(
             own, at = list(places), list(places.values())
             fields[f"{kind}_armature"][ids[:, None], at] = servos["armature"][:, own]
             fields[f"{kind}_frictionloss"][ids[:, None], at] = servos["friction_loss"][:, own]
+            fields[f"{kind}_damping"][ids[:, None], at] = servos["back_emf"][:, own]
 
 
 def empty_delay_lines(model: Any) -> NDArray[np.float64]:

@@ -17,7 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
-from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration, Quantity
+from pupper_sysid.servo_models.calibration.parts import (
+    NO_SPEED_LIMIT_RAD_S,
+    PARAMETER_KEYS,
+    JointCalibration,
+    Quantity,
+)
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.joint_arrays import JointArrays
@@ -25,7 +30,7 @@ from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.servo_models.step_size import delay_at_step
 
 IDEAL = "ideal"
-_NO_LIMIT_NM, _NO_LIMIT_RAD_S = 1e3, 1e3
+_NO_LIMIT_NM = 1e3
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,7 @@ class ServoRanges:
             for f in PARAMETER_KEYS
         }
         scale = rng.uniform(*torque_scale, (count, 1))
-        for f in ("stiffness", "damping", "friction_loss", "armature", "effort_limit"):
+        for f in ("stiffness", "damping", "friction_loss", "armature", "effort_limit", "back_emf"):
             drawn[f] *= scale
         return drawn
 
@@ -175,7 +180,8 @@ def _ideal(source: str) -> ServoRanges:
     """Servos that follow their command, as nearly as a 2 ms step can hold."""
     own = {
         "stiffness": 20.0, "damping": 0.25, "friction_loss": 0.0, "armature": 8e-4,
-        "effort_limit": _NO_LIMIT_NM, "velocity_limit": _NO_LIMIT_RAD_S, "dead_time_s": 0.0,
+        "effort_limit": _NO_LIMIT_NM, "velocity_limit": NO_SPEED_LIMIT_RAD_S, "dead_time_s": 0.0,
+        "back_emf": 0.0,
     }  # fmt: skip
     value = {f: np.full(len(JOINT_NAMES), x) for f, x in own.items()}
     return ServoRanges(source, value, value, value, (HeldFeedback(),) * len(JOINT_NAMES), {})

@@ -33,7 +33,7 @@ def _clip(x, limit):
 
 @njit(fastmath=_SAFE, error_model="numpy")
 def _constants(kind, values, who, h, p):
-    """Constants `p` (7, LANES) of one step of `h` seconds for the candidates `who`."""
+    """Constants `p` (9, LANES) of one step of `h` seconds for the candidates `who`."""
     for i in range(LANES):
         v = values[who[i]]
         p[0, i] = v[0]
@@ -49,8 +49,10 @@ def _constants(kind, values, who, h, p):
         elif kind == 4 or kind == 5:
             p[1, i], p[2, i], p[3, i] = v[1], v[2], v[3]
             p[4, i] = v[4] * h
-            p[5, i] = h / (1.0 + h * v[1])
-            p[6, i] = 0.5 * v[5] if kind == 5 else 0.0
+            p[5, i] = h / (1.0 + h * (v[1] + v[5]))
+            p[6, i] = 0.5 * v[6] if kind == 5 else 0.0
+            p[7, i] = v[5]
+            p[8, i] = h / (1.0 + h * v[5])
         elif kind == 6:
             p[0, i], p[1, i], p[2, i] = v[0] * h, v[1] * h, v[2]
             p[3, i], p[4, i], p[5, i] = 0.5 * h * v[3], v[4] * (0.5 * h), v[5] * h
@@ -59,7 +61,7 @@ def _constants(kind, values, who, h, p):
 @njit(fastmath=_SAFE, error_model="numpy")
 def _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track):
     """Positions of the candidates `who` after each step, into rows 1 … `steps` of `track`."""
-    p = np.zeros((7, LANES))
+    p = np.zeros((9, LANES))
     y, v, s, d = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
     play, part, shift = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES, np.int64)
     _constants(kind, values, who, h, p)
@@ -76,7 +78,8 @@ def _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
                 s[i] += _clip(d[i] - s[i], p[4, i])
                 wanted = (s[i] - y[i]) * p[0, i] - p[1, i] * v[i]
                 force = _clip(wanted, p[3, i])
-                gain = p[5, i] if force == wanted else h
+                gain = p[5, i] if force == wanted else p[8, i]
+                force -= p[7, i] * v[i]
                 force += _clip((v[i] * (1.0 / h) + force) * stop, p[2, i])
                 v[i] += force * gain
                 y[i] += v[i] * h

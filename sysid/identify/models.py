@@ -69,12 +69,15 @@ class CandidateModel:
     columns : callable or None
         From values (candidates, parameters) without dead time and offset to the kernel's; None
         where they are the same.
+    kernel : str or None
+        Name in `sysid.identify.kernel.KINDS`; None where it is the model's.
     """
 
     name: str
     parameters: tuple[Parameter, ...]
     simulate: Callable[[NDArray, NDArray], None]
     columns: Callable[[NDArray], NDArray] | None = None
+    kernel: str | None = None
 
     @property
     def names(self) -> list[str]:
@@ -123,14 +126,25 @@ def _dc_servo(values: NDArray, track: NDArray) -> None:
 
 
 def _delayed_pd(values: NDArray, track: NDArray) -> None:
-    stiffness, damping, friction, effort, speed = values
-    one = np.ones_like(stiffness)
-    parameters = {
-        "stiffness": stiffness, "damping": damping, "friction_loss": friction,
-        "effort_limit": effort, "velocity_limit": speed, "armature": one,
-    }  # fmt: skip
-    rest = np.zeros_like(stiffness)
+    names = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit", "back_emf")
+    own = _without_back_emf(values.T).T if len(values) < len(names) else values
+    rest = np.zeros_like(values[0])
+    parameters = dict(zip(names, own, strict=True)) | {"armature": np.ones_like(rest)}
     integrate(track, (rest, rest, rest), parameters, TIME_STEP_S, out=track)
+
+
+def _without_back_emf(values: NDArray) -> NDArray:
+    return np.insert(values, 5, 0.0, axis=1)
+
+
+def _back_emf_pd(values: NDArray, track: NDArray) -> None:
+    _delayed_pd(_from_no_load_speed(values.T).T, track)
+
+
+def _from_no_load_speed(values: NDArray) -> NDArray:
+    """Stiffness, damping, friction, effort; no set-point slew; back-EMF from the no-load speed."""
+    pd, no_load = values[:, :4], values[:, 4]
+    return np.column_stack([pd, np.full(len(pd), np.inf), pd[:, 3] / no_load])
 
 
 def _delayed_pd_backlash(values: NDArray, track: NDArray) -> None:
@@ -170,8 +184,14 @@ CANDIDATE_MODELS = (
     CandidateModel(
         "dc_servo", (_DELAY, _STIFFNESS, _FRICTION, _EFFORT, _NO_LOAD_SPEED, _OFFSET), _dc_servo
     ),
-    CandidateModel("delayed_pd", (*_PD, _OFFSET), _delayed_pd),
-    CandidateModel("delayed_pd_backlash", (*_PD, _BACKLASH, _OFFSET), _delayed_pd_backlash),
+    CandidateModel("delayed_pd", (*_PD, _OFFSET), _delayed_pd, _without_back_emf),
+    CandidateModel(
+        "delayed_pd_back_emf", (*_PD[:-1], _NO_LOAD_SPEED, _OFFSET), _back_emf_pd,
+        _from_no_load_speed, "delayed_pd",
+    ),
+    CandidateModel(
+        "delayed_pd_backlash", (*_PD, _BACKLASH, _OFFSET), _delayed_pd_backlash, _without_back_emf
+    ),
 )
 """All candidates, simplest first."""
 

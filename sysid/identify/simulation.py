@@ -174,7 +174,7 @@ def moments_if_later(
 def _candidates(model: CandidateModel, values: NDArray) -> tuple[int, NDArray, NDArray]:
     """What the kernel takes of candidates: the model's number, parameters, dead times in steps."""
     own = values[:, 1:-1] if model.columns is None else model.columns(values[:, 1:-1])
-    return kernel.KINDS.index(model.name), np.ascontiguousarray(own), values[:, 0] / TIME_STEP_S
+    return kernel.KINDS.index(model.kernel or model.name), np.ascontiguousarray(own), values[:, 0] / TIME_STEP_S
 
 
 def _padded(trial: TrialData) -> NDArray[np.float64]:

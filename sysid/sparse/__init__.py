@@ -1,1 +1,1 @@
-"""Sparse equations of motion: a servo model read off the data, with a term only where it earns it."""
+"""Sparse equations of motion (SINDy): a term is kept only where it earns its place."""

@@ -55,6 +55,8 @@ SERVOS = {
     "paper": PAPER,
     "torque always saturated": replace(MEASURED, effort_limit=0.19),
     "slow set-point": replace(MEASURED, velocity_limit=2.0),
+    "back-EMF": replace(MEASURED, velocity_limit=np.inf, back_emf=0.35 / 8.0),
+    "back-EMF and a slow set-point": replace(MEASURED, velocity_limit=2.0, back_emf=0.35 / 5.0),
     "no limits": replace(MEASURED, effort_limit=np.inf, velocity_limit=np.inf),
 }
 

@@ -34,7 +34,7 @@ def arrays(kind: str, seed: int = 0) -> Arrays:
             stiffness=rng.uniform(1e3, 4e3, n), damping=rng.uniform(40, 90, n),
             friction_loss=rng.uniform(0, 20, n), armature=np.ones(n),
             effort_limit=np.full(n, np.inf), velocity_limit=rng.uniform(5, 9, n),
-            dead_time_s=rng.uniform(0.01, 0.05, n),
+            dead_time_s=rng.uniform(0.01, 0.05, n), back_emf=np.zeros(n),
         )  # fmt: skip
         return {k: np.asarray(v) for k, v in vars(values).items()} | {
             "offset_rad": 0.01 * rng.normal(size=n)
