@@ -150,6 +150,8 @@ def test_a_missing_or_a_foreign_array_is_refused_by_name(tmp_path: Path, kind: s
     for n, name in enumerate(arrays(kind)):
         if kind == "sindy" and name.startswith(("stiffness", "damping")):
             continue  # a term may be absent from an equation
+        if name == "back_emf":
+            continue  # files of earlier versions lack it
         parameters = arrays(kind)
         removed = parameters.pop(name)
         said = refusal(crafted(tmp_path / str(n), kind, parameters))
