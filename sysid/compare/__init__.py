@@ -1,0 +1,1 @@
+"""Compare models with recordings, and calibrations with the truth of an emulated robot."""

@@ -1,0 +1,330 @@
+"""Compare a calibration with the true parameters of an emulated robot.
+
+`pupper-sysid sweep --truth` writes them beside the recording (`<recording>.truth.yaml`).
+`truth_table` puts each calibrated number with its 90 % interval beside the true one, and says
+whether the interval holds it. Torques are compared as ratios to the armature, because a recording
+in free air determines no more. The true lag is measured on the true servo's motion under the
+recording's own commands, with the weights of the recording's tones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from pupper_sysid.common.border import read_yaml, validated
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.results import Result
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import JointCalibration, Quantity
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.step_size import delay_at_step
+from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
+from pupper_sysid.sysid.identify.calibrate import CalibrationResult
+from pupper_sysid.sysid.identify.simulation import whole_counts
+from pupper_sysid.sysid.lag.lag_budget import lag_budget, tone_lags, tone_weights
+from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.recordings.joints import (
+    Recordings,
+    as_sequence,
+    joint_rng,
+    joint_trials,
+)
+from pupper_sysid.sysid.recordings.recording import Trial
+
+ENDING = ".truth.yaml"
+"""What a recording's name ends in where its true parameters stand, instead of `.csv`."""
+
+_EMULATOR_STEP_S = 0.001
+_GRID_S = 0.001
+_ROUNDING = 1e-6  # of files: a quantisation step has an interval of no width
+
+
+class _Joint(BaseModel):
+    """True parameters of one joint."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    actuator: dict[str, float]
+    """Numbers of the servo: stiffness, damping, friction_loss, armature, dead_time_s, …"""
+    feedback: dict[str, float]
+    """Numbers of its readings: poll_period_s, loss, quantum_rad, offset_rad, mean_age_s."""
+
+
+class _Truth(BaseModel):
+    """A file of true parameters."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    joints: Annotated[dict[str, _Joint], Field(min_length=1)]
+    """Joints by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruthRow(Result):
+    """One quantity of one joint: found and true.
+
+    Attributes
+    ----------
+    joint, quantity : str
+        `stiffness`, `damping`, `friction_loss`, `effort_limit` and `back_emf` are ratios to the
+        armature; the other names end in their unit.
+    found : Interval
+        With its 90 % interval; NaN at ends that the calibration does not give.
+    identified : {"yes", "ratio only", "no"}
+        Whether the calibration calls it determined.
+    truth : float
+    held : bool or None
+        Whether the interval holds the truth; None without an interval.
+    """
+
+    joint: str
+    quantity: str
+    found: Interval
+    identified: str
+    truth: float
+    held: bool | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruthTable(Result):
+    """A calibration beside the truth.
+
+    Attributes
+    ----------
+    quantities : tuple of TruthRow
+        By joint, in the order of the calibration.
+    notes : tuple of str
+    """
+
+    quantities: tuple[TruthRow, ...]
+    notes: tuple[str, ...] = ()
+
+    def __iter__(self) -> Iterator[TruthRow]:
+        return iter(self.quantities)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per joint and quantity."""
+        return [row.rows()[0] for row in self.quantities]
+
+
+_Numbers = Mapping[str, float]
+
+
+def _ratio(name: str) -> Callable[[_Numbers, _Numbers], float]:
+    """Truth of a torque, over the armature."""
+    return lambda actuator, _: actuator.get(name, 0.0) / actuator["armature"]
+
+
+def _of(name: str, part: int) -> Callable[[_Numbers, _Numbers], float]:
+    """Truth of the number `name` of the actuator (0) or the feedback (1)."""
+    return lambda *parts: parts[part].get(name, math.nan)
+
+
+QUANTITIES: dict[
+    str, tuple[Callable[[JointCalibration], Quantity], Callable[[_Numbers, _Numbers], float]]
+] = {
+    "dead_time_s": (lambda j: j.actuator.dead_time_s, _of("dead_time_s", 0)),
+    "stiffness": (lambda j: j.actuator.ratios_to_armature.stiffness, _ratio("stiffness")),
+    "damping": (lambda j: j.actuator.ratios_to_armature.damping, _ratio("damping")),
+    "friction_loss": (
+        lambda j: j.actuator.ratios_to_armature.friction_loss,
+        _ratio("friction_loss"),
+    ),
+    "effort_limit": (lambda j: j.actuator.ratios_to_armature.effort_limit, _ratio("effort_limit")),
+    "back_emf": (lambda j: j.actuator.ratios_to_armature.back_emf, _ratio("back_emf")),
+    "velocity_limit_rad_s": (lambda j: j.actuator.velocity_limit_rad_s, _of("velocity_limit", 0)),
+    "poll_period_s": (lambda j: j.feedback.poll_period_s, _of("poll_period_s", 1)),
+    "loss": (lambda j: j.feedback.loss, _of("loss", 1)),
+    "mean_age_s": (lambda j: j.feedback.mean_age_s, _of("mean_age_s", 1)),
+    "quantum_rad": (lambda j: j.feedback.quantum_rad, _of("quantum_rad", 1)),
+    "offset_rad": (lambda j: j.feedback.offset_rad, _of("offset_rad", 1)),
+}
+"""By name, where the calibration has a quantity and how it follows from the truth's actuator and
+feedback."""
+
+
+def truth_table(
+    calibration: Calibration | CalibrationResult,
+    truth: Mapping[str, Any],
+    recordings: Recordings | None = None,
+    seed: int = 0,
+) -> TruthTable:
+    """Each quantity of a calibration beside the true one.
+
+    Parameters
+    ----------
+    calibration : Calibration or CalibrationResult
+    truth : mapping
+        As `EmulatedRobot.truth()` gives it and `read_truth` reads it.
+    recordings : Recording or sequence of Recording, optional
+        What the calibration was made from: with them the lag is compared, too, because it depends
+        on the commands.
+    seed : int
+        Of the calibration; the search for the poll uses it.
+
+    Returns
+    -------
+    TruthTable
+        Rows of the joints that both have.
+
+    Raises
+    ------
+    InputError
+        If the two have no joint in common.
+    """
+    if isinstance(calibration, CalibrationResult):
+        calibration = calibration.calibration
+    joints = [j for j in calibration.joint_names if j in truth["joints"]]
+    if not joints:
+        raise InputError(
+            f"The calibration has {', '.join(calibration.joint_names)}, the truth "
+            f"{', '.join(truth['joints'])}: no joint in common."
+        )
+    rows: list[TruthRow] = []
+    for joint in joints:
+        found, true = calibration.joint(joint), truth["joints"][joint]
+        actuator, feedback = true["actuator"], true["feedback"]
+        stepped = _in_steps_of(actuator, true, found.actuator.physics_step_s)
+        if recordings is not None and found.lag.lag_s is not None:
+            trials = joint_trials(recordings, joint)
+            rows.append(_row(joint, "lag_s", found.lag.lag_s, true_lag_s(trials, true, seed)))
+        for name, (where, value) in QUANTITIES.items():
+            quantity, known = where(found), value(stepped, feedback)
+            # a part that neither servo has, and a limit that is infinite, are nothing to find
+            if np.isfinite(known) and (known or quantity.value):
+                rows.append(_row(joint, name, quantity, known))
+    return TruthTable(quantities=tuple(rows))
+
+
+def read_truth(recording: Path) -> dict[str, Any]:
+    """True parameters beside the file of an emulated recording.
+
+    Parameters
+    ----------
+    recording : Path
+        The recording's `.csv`, or the `.truth.yaml` itself.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is not valid.
+    """
+    path = recording
+    if not recording.name.endswith(ENDING):
+        path = recording.with_name(recording.name.removesuffix(".csv") + ENDING)
+    if not path.exists():
+        raise InputError(
+            f"{path} does not exist, so the true parameters of {recording.name} are not known. "
+            "Only recordings of an emulated robot have them: `pupper-sysid sweep --truth` writes "
+            "them."
+        )
+    data, lines = read_yaml(path)
+    return validated(_Truth, data, path, lines).model_dump()
+
+
+def true_lag_s(trials: Sequence[Trial], truth: Mapping[str, Any], seed: int = 0) -> float:
+    """Lag of the true servo's motion behind the held command, under the trials' commands [s].
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        All of one joint.
+    truth : mapping
+        Of that joint: `actuator`, and `physics_step_s` if the emulator gives it.
+    seed : int
+        Of the search for the poll, on which the weights of the tones depend.
+    """
+    joint = trials[0].joint
+    rng = joint_rng(seed, joint)
+    lattice = find_poll_lattice(trials, rng.spawn(1)[0])
+    measured, clean, dense = [], [], []
+    for trial in trials:
+        moved = _true_motion(trial, truth)
+        dense.append(moved)
+        own = tone_response(trial, readings(trial, lattice), rng, draws=2)
+        everything = Readings(
+            np.arange(len(moved.read_time_s)), moved.read_time_s, moved.position_rad,
+            moved.read_time_s, 0.0,
+        )  # fmt: skip
+        true = tone_response(trial, everything, rng, draws=2)
+        if own is not None and true is not None:
+            measured.append(own)
+            clean.append(true.response)
+    if not measured:
+        return lag_budget(joint, dense, rng).lag_s.value
+    lags = tone_lags(np.array(clean), np.array([t.frequency_hz for t in measured]))
+    return float(np.average(lags, weights=tone_weights(measured)))
+
+
+def _true_motion(trial: Trial, truth: Mapping[str, Any]) -> Trial:
+    """The trial as a host would log it that reads the true position every millisecond."""
+    step = truth.get("physics_step_s", _EMULATOR_STEP_S)
+    per_row = max(round(_GRID_S / step), 1)
+    start = trial.send_time_s[0]
+    count = int((trial.send_time_s[-1] - start) / step)
+    edges = start + step * np.arange(count + 1)
+    sent = np.append(trial.send_time_s, edges[-1] + 1.0)
+    received = whole_counts(trial)
+    area = np.concatenate([[0.0], np.cumsum(received * np.diff(sent))])
+    average = np.diff(np.interp(edges, sent, area)) / step
+    servo = DelayedPD(_parameters(truth["actuator"]), step)
+    servo.reset(trial.initial_command_rad)
+    position: NDArray[np.float64] = np.asarray(servo.rollout(average), float)
+    time = edges[1:][::per_row]
+    row = np.searchsorted(trial.send_time_s, time, side="right") - 1
+    return Trial(
+        trial.joint, trial.number, trial.frequency_hz, time, time, trial.command_rad[row],
+        position[::per_row], None, trial.initial_command_rad, readings="live",
+    )  # fmt: skip
+
+
+def _parameters(actuator: _Numbers) -> DelayedPDParameters:
+    """The true servo; parameters that the truth's emulator has not are left at their defaults."""
+    known = {f.name for f in fields(DelayedPDParameters)}
+    return DelayedPDParameters(**{k: v for k, v in actuator.items() if k in known})
+
+
+def _in_steps_of(
+    actuator: _Numbers, joint: Mapping[str, Any], physics_step_s: float
+) -> dict[str, float]:
+    """True actuator with the dead time that gives its lag in the calibration's physics steps."""
+    step = joint.get("physics_step_s", _EMULATOR_STEP_S)
+    dead_time = float(delay_at_step(_parameters(actuator), physics_step_s, step)[0])
+    return dict(actuator) | {"dead_time_s": dead_time}
+
+
+def _row(joint: str, name: str, found: Quantity, truth: float) -> TruthRow:
+    low = math.nan if found.low is None else found.low
+    high = math.nan if found.high is None else found.high
+    known = found.low is not None and found.high is not None
+    rounding = _ROUNDING * abs(truth)
+    return TruthRow(
+        joint=joint, quantity=name, found=Interval(found.value, low, high),
+        identified=found.identified, truth=float(truth),
+        held=bool(low - rounding <= truth <= high + rounding) if known else None,
+    )  # fmt: skip
+
+
+def compared_with_truth(
+    recordings: Recordings, truth: Mapping[str, Any], calibration: Calibration, seed: int = 0
+) -> TruthTable:
+    """`truth_table` with the lag where the recordings are the calibration's own, else a note."""
+    made_from = {i.sha256 for i in calibration.inputs}
+    if {r.sha256 for r in as_sequence(recordings)} == made_from:
+        return truth_table(calibration, truth, recordings, seed)
+    table = truth_table(calibration, truth, None, seed)
+    names = ", ".join(i.name for i in calibration.inputs) or "no recording"
+    note = (
+        f"The calibration was made from {names}, so its lag, which depends on the commands, is "
+        "not compared."
+    )
+    return TruthTable(quantities=table.quantities, notes=(note,))
