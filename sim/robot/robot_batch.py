@@ -57,6 +57,8 @@ class RobotBatch:
         0 for all cores.
     servo_model : JointArrays, optional
         See `sim.walking.env.PupperEnv`.
+    extra_dead_time_s : float or ndarray, shape (n,)
+        Added to every dead time of a robot [s].
 
     Attributes
     ----------
@@ -82,6 +84,7 @@ class RobotBatch:
         environments: int,
         threads: int,
         servo_model: JointArrays | None,
+        extra_dead_time_s: float | Array = 0.0,
     ):
         servos = servos.in_steps_of(config.physics_step_s)
         self.config, self.servos, self.ground = config, servos, ground
@@ -89,9 +92,11 @@ class RobotBatch:
         if servo_model is not None:
             self._check_servo_model(servo_model)
             servo_model.reset(np.zeros((environments, len(JOINT_NAMES))))
+        self._extra_s = np.broadcast_to(extra_dead_time_s, environments)
+        longest_s = servos.longest_dead_time_s + float(self._extra_s.max())
         # every buffer holds the longest delay that can be drawn
         longest = {
-            name: replace(own, dead_time_s=np.array(servos.longest_dead_time_s))
+            name: replace(own, dead_time_s=np.array(longest_s))
             for name, own in servos.nominal().items()
         }
         self.model = mujoco.MjModel.from_xml_string(
@@ -99,11 +104,8 @@ class RobotBatch:
         )
         ground.fill(self.model)
         buffer = self.model.actuator_history[:, 0].min() * config.physics_step_s
-        if servos.longest_dead_time_s > buffer:
-            raise InputError(
-                f"A dead time of {servos.longest_dead_time_s} s does not fit the buffer of "
-                f"{buffer} s."
-            )
+        if longest_s > buffer:
+            raise InputError(f"A dead time of {longest_s} s does not fit the buffer of {buffer} s.")
         from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 
         self.batch = Batch(self.model, environments, threads)
@@ -235,7 +237,7 @@ class RobotBatch:
         """Draw servos, friction and payload of some robots; dead times times `delay_share`."""
         random, f = self.config.randomisation, self._fields
         drawn = self.servos.draw(len(ids), random.torque_scale, rng)
-        drawn["dead_time_s"] = drawn["dead_time_s"] * delay_share
+        drawn["dead_time_s"] = (drawn["dead_time_s"] + self._extra_s[ids, None]) * delay_share
         for name, value in drawn.items():
             self.drawn[name][ids] = value
         write_servos(f, ids, drawn, self._dof_of, self._tendon_of)

@@ -25,6 +25,7 @@ from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.held_readings import HeldReadings
 from pupper_sysid.sim.walking.observation import FALLEN_TILT, VELOCITY_STEPS, observed
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.shared_draws import Twins, generator
 
 Array = NDArray[np.float64]
 
@@ -87,6 +88,10 @@ class PupperEnv:
     servo_model : JointArrays, optional
         Stands in for the actuators: a learned model of all twelve joints at the control rate. The
         position it predicts is the command of stiff, immediate servos, moving over the step.
+    extra_dead_time_s : float or ndarray, shape (n,)
+        Added to every dead time of a robot [s].
+    twins : Twins, optional
+        Which robots are the same one; by default all differ.
 
     Attributes
     ----------
@@ -133,19 +138,23 @@ class PupperEnv:
         seed: int = 0,
         threads: int = 0,
         servo_model: JointArrays | None = None,
+        extra_dead_time_s: float | Array = 0.0,
+        twins: Twins | None = None,
     ):
         if environments < 1:
             raise InputError(f"There are {environments} environments; at least 1 is needed.")
         self.config, self.servos, self.environments = config, servos, environments
-        self.rng = np.random.default_rng(seed)
+        self.rng = generator(seed, twins)
         # terrain is the same for every run of a seed, whatever the number of environments
         self.ground = make_ground(config.terrain, np.random.default_rng([seed, 1]))
-        self.robots = RobotBatch(config, servos, self.ground, environments, threads, servo_model)
+        self.robots = RobotBatch(
+            config, servos, self.ground, environments, threads, servo_model, extra_dead_time_s
+        )
         self.default, (self._low, self._high) = default_pose(), limits()
         self.trot = config.trot
         n = environments
         self._readings = HeldReadings(
-            servos.feedback, n, config.physics_step_s, np.random.default_rng([seed, 2])
+            servos.feedback, n, config.physics_step_s, generator([seed, 2], twins)
         )
         self.nan_resets = 0
         self.steps = 0

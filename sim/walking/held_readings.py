@@ -99,7 +99,8 @@ class HeldReadings:
             if not due.any():
                 break
             row, servo = np.nonzero(due)
-            chance = self.rng.random((2, len(row)))
+            # for all servos, due or not, so that twins (`shared_draws`) have the same numbers
+            chance = self.rng.random((len(due), 2, due.shape[1]))[row, :, servo].T
             succeeded = chance[0] >= self._loss[servo]
             at = self._next[row, servo]
             # a uniform jitter of the same variance stays within bounds
