@@ -70,7 +70,8 @@ class ServoBus(Protocol):
     joint_names: tuple[str, ...]
     limits: PositionLimits
     metadata: dict[str, Any]
-    """For the header of a recording: kind, model, quantisation step, rounding."""
+    """For the header of a recording: kind, model, quantisation step, rounding; `readings` is "live"
+    where the servo itself answers each read, "polled" where a read returns the bus's last poll."""
 
     def now(self) -> float:
         """Time of the bus's clock [s]."""
@@ -109,3 +110,10 @@ def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> N
     if angles.shape != (joints,) or not np.isfinite(angles).all():
         raise BusError(f"{bus}: commands must be {joints} finite angles, got {angles}.")
     return angles
+
+
+def header_entries(bus: ServoBus) -> dict[str, Any]:
+    """Entries of a recording's header that describe its bus: `bus`, and `readings` if known."""
+    about = {"name": bus.name} | bus.metadata
+    readings = about.pop("readings", None)
+    return {"bus": about} | ({} if readings is None else {"readings": readings})

@@ -23,6 +23,7 @@ from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
+from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
@@ -147,9 +148,8 @@ def _run(options: Deploy) -> None:
             )
         else:
             _show_match(parts.match)
-        header = parts.header | {
+        header = parts.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
-            "bus": {"name": bus.name} | bus.metadata,
         }  # fmt: skip
         _walk(options, bus, imu, parts.controller, header, folder, truth)
 

@@ -99,6 +99,7 @@ class Esp32Bus(HostClock):
         self.limits = self._map.position_limits()
         self.metadata: dict[str, Any] = {
             "kind": "esp32 proxy",
+            "readings": "polled",
             "socket": str(self.path),
             "speed_limit_rad_s": SPEED_LIMIT_RAD_S,
             "voltage_band_v": list(VOLTAGE_BAND_V),

@@ -276,6 +276,7 @@ class FeetechBus(HostClock):
         ]
         known: dict[str, Any] = {
             "kind": "feetech",
+            "readings": "live",
             "device": device,
             "baud": self.line.baud,
             "echo": self.line.echoes,

@@ -96,6 +96,7 @@ class EmulatedBus:
         self.limits = robot.joint_map.per_servo().position_limits()
         self.metadata: dict[str, Any] = {
             "kind": "emulated",
+            "readings": "polled" if spec.poll_period_s > 0 or spec.loss > 0 else "live",
             "coordinates": "servo",
             "command_quantum_rad": {s.joint: spec.quantum_rad for s in robot.servos},
             "command_rounding": {s.joint: s.command_rounding for s in robot.servos},

@@ -6,9 +6,10 @@ changed therefore brackets a successful poll between the previous read and this 
 intervals determine the lattice to a fraction of a millisecond, and every changed ("fresh") row can
 be dated to the poll that measured it, which separates the servo's lag from the feedback age.
 
-`find_poll_lattice` first asks whether readings are live (`sysid.feedback.staleness`). If not, it
-cuts trials into stretches, searches them for a common period and each stretch's phase
-(`sysid.feedback.poll_search`), and counts the failed polls; `readings` dates fresh rows.
+`find_poll_lattice` first asks whether readings are live: the recording's header says so, or their
+motion shows it (`sysid.feedback.staleness`). If they are not, it cuts trials into stretches,
+searches them for a common period and each stretch's phase (`sysid.feedback.poll_search`), and
+counts the failed polls; `readings` dates fresh rows.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ _STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e
 _LONGEST_S = 0.12
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
+_SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
+_NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
 _SHUFFLES = 12
 # each costs as much as the search: where the first few leave no doubt there are no more
 _FEWEST_SHUFFLES, _CLEAR = 4, 20.0
@@ -55,6 +58,13 @@ class PollLattice(Result):
     kind : {"lattice", "unresolved", "every read"}
         A lattice was found; none is significant; or readings are live, so each is dated to its
         read, even where it repeats the one before because the joint stands still.
+    readings : {"live", "polled", "cannot tell"}
+        Whether the bus returns present positions or those of its last poll: by the recording's
+        header, else by the motion, else by a significant lattice.
+    time_doubt_s : float
+        By how much all readings may have been measured earlier or later than they are dated: half
+        a loop if the lattice is unresolved, else 0. Lag and dead time are in doubt by as much, and
+        neither is identified then.
     poll_period_s, poll_period_sd_s : float
         Time between polls and its standard error.
     loss, loss_sd : float
@@ -70,6 +80,8 @@ class PollLattice(Result):
     """
 
     kind: str
+    readings: str = "cannot tell"
+    time_doubt_s: float = 0.0
     poll_period_s: float = math.nan
     poll_period_sd_s: float = math.nan
     loss: float = math.nan
@@ -113,10 +125,10 @@ class Readings:
 def fresh_rows(trial: Trial) -> NDArray[np.int64]:
     """Indices of the rows whose value differs from the last value before them.
 
-    Where the servo itself answers each read, every row is fresh.
+    Where readings are known to be live, every row is fresh.
     """
     valid = np.flatnonzero(np.isfinite(trial.position_rad))
-    if trial.direct:
+    if trial.readings == "live":
         return valid
     changed = np.flatnonzero(np.diff(trial.position_rad[valid]) != 0) + 1
     return valid[changed]
@@ -147,12 +159,19 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     rows = sum(len(t.read_time_s) for t in trials)
     fresh = sum(len(fresh_rows(t)) for t in trials)
     fraction = fresh / max(rows, 1)
-    nothing = PollLattice(kind="unresolved", fresh_fraction=fraction)
-    loop = _loop_period(trials)
     # the readings of a joint that stands still repeat as well, and show nothing of the bus
-    direct = bool(trials) and all(t.direct for t in trials)
-    if direct or staleness(trials).kind == "live":
-        return replace(nothing, kind="every read")
+    trials = [t for t in trials if t.readings != "live"]
+    told = staleness(trials).kind if trials else "live"
+    declared = any(t.readings == "polled" for t in trials)
+    if told == "live" and not declared:
+        return PollLattice(kind="every read", readings="live", fresh_fraction=fraction)
+    loop = _loop_period(trials)
+    nothing = PollLattice(
+        kind="unresolved", readings="polled" if declared or told == "stale" else "cannot tell",
+        fresh_fraction=fraction, time_doubt_s=loop / 2 if np.isfinite(loop) else 0.0,
+    )  # fmt: skip
+    if told == "live":  # a new value at each read: the poll is faster than the loop
+        return nothing
     step = max(quantum(trials), 1e-6)
     stretches = [s for t in trials if len(t.read_time_s) > 3 for s in _stretches(t, step)]
     if not stretches or not np.isfinite(loop):
@@ -187,11 +206,14 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     hit_rate = float(np.mean(np.concatenate(hits)))
     loss, loss_sd = _loss(trials, phases)
     nothing = replace(nothing, z_score=z_score, hit_rate=hit_rate)
-    if hit_rate < 0.9 or z_score < _SIGNIFICANT:
+    sure = told == "stale" and period > _NEAR_LOOP * loop
+    if hit_rate < 0.9 or z_score < (_SIGNIFICANT if sure else _SIGNIFICANT_ALONE):
         return nothing
     return replace(
         nothing,
         kind="lattice",
+        readings="polled",
+        time_doubt_s=0.0,
         poll_period_s=period,
         poll_period_sd_s=spread / np.sqrt(max(effective - 1, 1)),
         loss=loss,
@@ -209,7 +231,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
     rows = fresh_rows(trial)
     read = trial.read_time_s
     before = _read_before(trial)[rows]
-    if lattice.kind == "every read":
+    if "live" in (lattice.readings, trial.readings):
         rows = np.flatnonzero(np.isfinite(trial.position_rad))
         return Readings(rows, read[rows], trial.position_rad[rows], read.copy(), 0.0)
     time = 0.5 * (before + read[rows])

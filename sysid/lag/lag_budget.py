@@ -208,13 +208,11 @@ def lag_budget(
     by_frequency = tuple(_at_frequency(t, float(own)) for t, own in zip(tones, lags, strict=True))
     doubt = max(t.read_time_doubt_s for t in trials)
     if lattice.kind == "unresolved":
-        # every reading may be as old as a read that was answered at once, or one loop older
-        loop = float(np.median(np.concatenate([np.diff(t.read_time_s) for t in trials])))
-        doubt += loop / 2
+        doubt += lattice.time_doubt_s
         warnings.append(
             f"{joint}: readings are held, but their poll period could not be found; fresh readings "
             "are dated to the middle between two reads, which may bias all lags by half a loop "
-            f"({1e3 * loop / 2:.0f} ms). A longer sweep would settle it."
+            f"({1e3 * lattice.time_doubt_s:.0f} ms). A longer sweep would settle it."
         )
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
     return LagBudget(

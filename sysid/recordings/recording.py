@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -72,8 +72,9 @@ class Trial:
         Raw counts where the bus has them, -1 where missing.
     initial_command_rad : float
         Command in force before the first row.
-    direct : bool
-        Whether the servo itself answered each read, so that no reading can be an old one.
+    readings : {"live", "polled"} or None
+        Whether each read returned the present position or that of the bus's last poll; None where
+        the recording's header does not say.
     truncation : Truncation
         How the bus cut the commands.
     read_time_doubt_s : float
@@ -89,7 +90,7 @@ class Trial:
     position_rad: NDArray[np.float64]
     position_count: NDArray[np.int64] | None
     initial_command_rad: float
-    direct: bool = False
+    readings: Literal["live", "polled"] | None = None
     truncation: Truncation = Truncation()
     read_time_doubt_s: float = 0.0
 
@@ -295,7 +296,6 @@ class Recording:
     def _trials(self) -> dict[str, list[Trial]]:
         rest = self.metadata.get("start_pose_rad") or {}
         bus = self.metadata.get("bus") or {}
-        direct = bus.get("kind") == "feetech"
         quantum = bus.get("command_quantum_rad") or 0.0
         found: dict[str, list[Trial]] = {}
         for _, rows in self.table.groupby(["joint", "trial"], sort=True):
@@ -313,7 +313,7 @@ class Recording:
                     columns["position_rad"],
                     None if count is None else np.nan_to_num(count, nan=-1).astype(np.int64),
                     float(rest.get(joint, columns["command_rad"][0])),
-                    direct,
+                    self.metadata.get("readings"),
                     Truncation(
                         float(
                             (quantum.get(joint) or 0.0) if isinstance(quantum, dict) else quantum

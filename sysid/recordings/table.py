@@ -52,6 +52,7 @@ class Header(BaseModel):
     schema_version: int = 1
     bus: Bus = Bus()
     joints: list[str] = []
+    readings: Literal["live", "polled"] | None = None
     start_pose_rad: dict[str, float] = {}
     read_after_send_s: float | None = None
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, ServoBus
+from pupper_sysid.hardware.bus import BusSample, ServoBus, header_entries
 from pupper_sysid.hardware.loop import FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
@@ -154,15 +154,18 @@ class _Session:
 
     def _header(self, metadata: dict[str, Any]) -> dict[str, Any]:
         moving = {joint for trial in self._plan.trials for joint in trial.joints}
-        return {
-            "bus": {"name": self._bus.name} | dict(self._bus.metadata),
-            "excitation": dict(self._plan.description),
-            "joints": [j for j in self._bus.joint_names if j in moving],
-            "start_pose_rad": dict(
-                zip(self._bus.joint_names, map(float, self._start), strict=True)
-            ),
-            "loop": {"period_s": self._loop.period_s},
-        } | metadata
+        return (
+            header_entries(self._bus)
+            | {
+                "excitation": dict(self._plan.description),
+                "joints": [j for j in self._bus.joint_names if j in moving],
+                "start_pose_rad": dict(
+                    zip(self._bus.joint_names, map(float, self._start), strict=True)
+                ),
+                "loop": {"period_s": self._loop.period_s},
+            }
+            | metadata
+        )
 
     def _trial(self, number: int, trial: TrialPlan, writer: RecordingWriter, done: float) -> int:
         """One trial, recorded; returns its number of rows."""

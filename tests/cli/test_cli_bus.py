@@ -54,6 +54,7 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     recording = load(Path("a.csv"))
     bus = recording.metadata["bus"]
     assert recording.joints == ["LF_thigh"] and bus["baud"] == 1_000_000
+    assert recording.trials("LF_thigh")[0].readings == "live"
     assert bus["servos"]["LF_thigh"]["p"] == 32 and bus["servos"]["LF_thigh"]["return_delay"] == 250
     assert recording.metadata["completed"]["guard"]["clipped"] == 0
     doubt = recording.trials("LF_thigh")[0].read_time_doubt_s

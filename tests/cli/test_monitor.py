@@ -52,7 +52,8 @@ class ScriptedBus:
     name, joint_names = "scripted", ("LF_hip",)
 
     def __init__(self, kind, readings):
-        self.metadata = {"kind": kind, "coordinates": "servo"}
+        live = "live" if kind == "feetech" else "polled"
+        self.metadata = {"kind": kind, "coordinates": "servo", "readings": live}
         self._readings = iter(readings)
         self.time_s = 0.0
 

@@ -115,7 +115,7 @@ class Watched:
 
     def __init__(self, bus: ServoBus):
         self.bus = bus
-        self.answers_now = bus.metadata["kind"] == "feetech"
+        self.answers_now = bus.metadata.get("readings") == "live"
         joints = len(bus.joint_names)
         self.now_s = self._start_s = bus.now()
         self._seen_s = np.full(joints, np.nan)

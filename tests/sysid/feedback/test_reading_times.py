@@ -17,7 +17,7 @@ MIDDLE = READ - 0.01
 
 def times(*phases: Phase) -> np.ndarray:
     """Times of readings that change in every row, on these stretches of a lattice."""
-    trial = Trial("LF_hip", 0, 1.0, READ - 0.001, READ, 0.01 * ROWS, 0.01 * ROWS, None, 0.0, False)
+    trial = Trial("LF_hip", 0, 1.0, READ - 0.001, READ, 0.01 * ROWS, 0.01 * ROWS, None, 0.0)
     found = readings(trial, PollLattice(kind="lattice", fresh_fraction=1.0, phases=phases))
     assert found.rows[-3:].tolist() == [97, 98, 99]
     full = np.full(len(ROWS), np.nan)

@@ -199,6 +199,27 @@ def test_what_numbers_are_made_of_is_checked_in_the_header_s_bus(tmp_path, bus, 
         load(write(tmp_path, rows(), top=top))
 
 
+@pytest.mark.parametrize("readings", ["live", "polled"])
+def test_the_header_says_whether_readings_are_live(tmp_path, readings):
+    top = ("# pupper-sysid recording", f'# readings: "{readings}"')
+    recording = load(write(tmp_path, rows(), top=top))
+    assert {t.readings for t in recording.trials("LF_hip")} == {readings}
+    recording.save(tmp_path / "again.csv")
+    assert load(tmp_path / "again.csv").trials("LF_hip")[0].readings == readings
+
+
+def test_the_kind_of_bus_does_not_say_whether_readings_are_live(tmp_path):
+    top = ("# pupper-sysid recording", '# bus: {"kind": "feetech"}')
+    assert load(write(tmp_path, rows(), top=top)).trials("LF_hip")[0].readings is None
+
+
+@pytest.mark.parametrize("value", ['"direct"', "true", "7"])
+def test_another_word_for_live_is_refused(tmp_path, value):
+    top = ("# pupper-sysid recording", f"# readings: {value}")
+    with pytest.raises(InputError, match="header: readings"):
+        load(write(tmp_path, rows(), top=top))
+
+
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         load(tmp_path / "nothing.csv")

@@ -43,7 +43,7 @@ class ScriptedBus:
     joint_names = JOINT_NAMES
 
     def __init__(self, start: np.ndarray, slow_at: int = -1, fail_at: int = -1, raises=None):
-        self.metadata = {"kind": "scripted"}
+        self.metadata = {"kind": "scripted", "readings": "live"}
         self.limits = PositionLimits(np.full(12, -np.inf), np.full(12, np.inf))
         self.goal, self.time, self.calls = start.astype(float), 0.0, []
         self.written: list[tuple[float, np.ndarray]] = []
@@ -86,7 +86,8 @@ def test_a_recording_holds_every_command_and_reading_of_every_trial(tmp_path):
     recording = load(path)
     assert recording.joints == ["LF_hip", "RB_calf"]
     assert recording.metadata["seed"] == 5
-    assert recording.metadata["bus"]["kind"] == "scripted"
+    assert recording.metadata["bus"] == {"name": "scripted", "kind": "scripted"}
+    assert recording.metadata["readings"] == "live"
     assert recording.metadata["excitation"]["kind"] == "sine"
     assert recording.metadata["start_pose_rad"] == DEFAULT_POSE
     trials = [*recording.trials("LF_hip"), *recording.trials("RB_calf")]
