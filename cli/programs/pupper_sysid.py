@@ -27,6 +27,7 @@ _SUMMARIES = {
         "doctor": "Check whether a recording is usable.",
         "delay": "Split the lag into bus, sensor and servo.",
         "bode": "Measure the frequency response.",
+        "plan": "Plan the sweep that narrows the intervals most.",
     },
     "model": {
         "calibrate": "Fit DelayedPD per joint; write YAML.",

@@ -40,8 +40,10 @@ LOOP_PERIOD_S = 0.019
 POLL_RATE_HZ = 1 / 0.02685
 """Feedback polls of a Mini Pupper 2 [Hz], assumed before a recording."""
 
+LEAST_MARGIN_RAD = 0.03
+"""Smallest margin of a joint in which a measurement is worth it."""
+
 _RATIOS = 12
-_LEAST_MARGIN_RAD = 0.03
 _NUDGE_STEP_HZ = 0.01
 
 
@@ -293,7 +295,7 @@ def _within(
     tight = min((j for j in joints if j in margin), key=lambda j: margin[j], default=None)
     if tight is None or margin[tight] >= amplitude:
         return amplitude
-    if margin[tight] < _LEAST_MARGIN_RAD:
+    if margin[tight] < LEAST_MARGIN_RAD:
         raise InputError(
             f"excitation: {tight} has a margin of {margin[tight]:.3f} rad on either side of its "
             "start pose, too little for a measurement. Check its limits in the joint map."

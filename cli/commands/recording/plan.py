@@ -1,0 +1,195 @@
+"""`plan`: what to record next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import JOINTS_FILE
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_overwrite, sha256
+from pupper_sysid.common.joints import select_joints
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.plan.proposal import SweepPlan
+    from pupper_sysid.sysid.recordings.recording import Recording
+
+_STANDARD_MAP = "mini_pupper_2"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Plan the next sweep: the tones, amplitudes and durations that narrow the intervals most.
+
+    From recordings or a calibration, by simulating their fit; without either, a first sweep for
+    unknown servos. Example: pupper-sysid plan recordings/sweep.csv --out plan.yaml
+    """
+
+    source: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings, pooled per joint, or one calibration; without any, servos are unknown."""
+    out: Path | None = None
+    """Plan file to write, for `sweep --plan`."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    seconds: float | None = None
+    """Recorded time per joint [s]; by default as long as the recordings, else 20 s."""
+    joint_map: str | None = None
+    """Joint map whose limits the excursions keep: a file or a preset. By default the recording's,
+    else joints.yaml if it is here, else the Mini Pupper's."""
+    rate: float | None = None
+    """Control loop [Hz]; by default the recordings', else 52.63 Hz."""
+    force: bool = False
+    """Replace the plan file if it exists."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the fits and of the drawn servos."""
+
+    def run(self) -> None:
+        """Plan, print, write."""
+        if self.out is not None:
+            from pupper_sysid.sysid.plan.plan_file import save_plan
+
+            refuse_overwrite(self.out, self.force)  # before the work, not after it
+        if self.seconds is not None:
+            terminal.need_positive("--seconds", self.seconds)
+        if self.rate is not None:
+            terminal.need_positive("--rate", self.rate)
+        made = self._made()
+        if self.out is not None:
+            save_plan(made, self.out, self.force)
+        if self.json:
+            terminal.print_json(made.to_dict() | {"written": self.out})
+            return
+        show(made)
+        if self.out is not None:
+            terminal.err.print(
+                f"Wrote {self.out}. Next: pupper-sysid sweep --plan {self.out}", soft_wrap=True
+            )
+        else:
+            terminal.err.print("Nothing was written; --out plan.yaml keeps it.")
+
+    def _made(self) -> SweepPlan:
+        if not self.source:
+            return self._first_sweep()
+        if self.source[0].suffix in (".yaml", ".yml"):
+            return self._from_calibration()
+        return self._from_recordings()
+
+    def _first_sweep(self) -> SweepPlan:
+        from pupper_sysid.sysid.plan.candidates import Setup
+        from pupper_sysid.sysid.plan.proposal import SECONDS, plan_first_sweep
+        from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S
+
+        joint_map = self._map(None)
+        joints = select_joints(self.joints, joint_map.joint_names)
+        # the Mini Pupper's proxy polls; a serial line answers each read itself
+        polled = joint_map.frame == "proxy"
+        setup = Setup(
+            loop_period_s=1 / self.rate if self.rate else LOOP_PERIOD_S,
+            quantum_rad=float(1 / joint_map.counts_per_rad().min()),
+            **({} if polled else {"poll_period_s": 0.0, "loss": 0.0}),
+        )
+        return plan_first_sweep(
+            joints, setup=setup, seconds=self.seconds or SECONDS,
+            margins=margins(joint_map), seed=self.seed,
+        )  # fmt: skip
+
+    def _from_calibration(self) -> SweepPlan:
+        from pupper_sysid.servo_models.calibration.calibration import load_calibration
+        from pupper_sysid.sysid.plan.proposal import SECONDS, Source, plan_from_calibration
+        from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S
+
+        if len(self.source) > 1:
+            raise InputError(
+                f"{self.source[0]} and {self.source[1]}: give recordings, or one calibration."
+            )
+        (path,) = self.source
+        calibration = load_calibration(path)
+        joints = select_joints(self.joints, calibration.joint_names)
+        return plan_from_calibration(
+            calibration, Source(name=path.name, sha256=sha256(path)), joints,
+            seconds=self.seconds or SECONDS,
+            loop_period_s=1 / self.rate if self.rate else LOOP_PERIOD_S,
+            margins=_some_margins(self._map(None), joints), seed=self.seed,
+        )  # fmt: skip
+
+    def _from_recordings(self) -> SweepPlan:
+        from pupper_sysid.sysid.plan.proposal import plan_from_recordings
+
+        recordings = terminal.load_all(self.source)
+        joints = terminal.pick_joints(recordings, self.joints)
+        if self.rate is not None:
+            raise InputError("--rate: a plan from recordings keeps their rate; leave it out.")
+        with terminal.progress("fitting", len(joints)) as advance:
+            return plan_from_recordings(
+                recordings, joints, seconds=self.seconds,
+                margins=_some_margins(self._map(recordings[0]), joints), seed=self.seed,
+                workers=2, progress=advance,
+            )  # fmt: skip
+
+    def _map(self, recording: Recording | None) -> JointMap:
+        """The joint map that is named, the recording's, the one in this folder, or the standard."""
+        bus = recording.metadata.get("bus") or {} if recording else {}
+        recorded = bus.get("joint_map")
+        if self.joint_map is None and recorded:
+            try:
+                return load_joint_map(recorded)  # a preset; a file's own name leads nowhere
+            except InputError:
+                pass
+        here = str(JOINTS_FILE) if JOINTS_FILE.exists() else _STANDARD_MAP
+        return load_joint_map(self.joint_map or here)
+
+
+def margins(joint_map: JointMap) -> dict[str, float]:
+    """Largest excursion of each joint to either side of its rest pose [rad]."""
+    own = joint_map.per_servo()
+    margin = own.position_limits().margin(own.rest_pose())
+    return dict(zip(own.joint_names, map(float, margin), strict=True))
+
+
+def _some_margins(joint_map: JointMap, joints: list[str]) -> dict[str, float] | None:
+    """Margins if the map has all joints; None leaves them to the recording."""
+    return margins(joint_map) if set(joints) <= set(joint_map.joint_names) else None
+
+
+def show(plan: SweepPlan) -> None:
+    """Print a plan's trials, what to expect of them, and its notes."""
+    from pupper_sysid.sysid.plan.candidates import trial_seconds
+    from pupper_sysid.sysid.plan.planner import DEAD_TIME
+
+    trials = terminal.table(
+        "Trials to record", "joint", "motion", "Hz", "amplitude rad", "seconds", "for"
+    )
+    for t in plan.trials:
+        trials.add_row(
+            t.joint, t.kind, terminal.number(t.frequency_hz), terminal.number(t.amplitude_rad, 3),
+            terminal.number(trial_seconds(t.duration_s), 1), t.purpose,
+        )  # fmt: skip
+    terminal.out.print(trials)
+    if plan.predictions:
+        expected = terminal.table(
+            "90 % intervals, now and to expect", "joint", "quantity", "value", "now", "after"
+        )
+        for p in plan.predictions:
+            scale, name = 1.0, p.quantity
+            if name == DEAD_TIME:
+                scale, name = 1e3, "dead_time_ms"
+            digits = int(np.clip(2 - np.floor(np.log10(scale * p.now.value + 1e-9)), 0, 4))
+            now, after = (
+                f"{terminal.number(scale * i.low, digits)} … "
+                f"{terminal.number(scale * i.high, digits)}"
+                for i in (p.now, p.after)
+            )
+            value = terminal.number(scale * p.now.value, digits)
+            expected.add_row(p.joint, name, value, now, after)
+        terminal.out.print()
+        terminal.out.print(expected)
+    for note in plan.notes:
+        terminal.out.print(note, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""What to record next: optimal design of a sweep, its plan file, recording until narrow enough."""

@@ -1,0 +1,231 @@
+"""The plan file: the trials of a sweep that `plan` proposes and `sweep --plan` executes, as YAML.
+
+save_plan(proposal, Path("plan.yaml"))
+excitation = executable(load_plan(Path("plan.yaml")), path, margin_rad, start_pose_rad)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256, versions, write_text
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.common.results import plain
+from pupper_sysid.common.strict_yaml import dump
+from pupper_sysid.servo_models.calibration.calibration import utc_now
+from pupper_sysid.servo_models.calibration.parts import Number, Part, Whole
+from pupper_sysid.sysid.plan.planner import PlannedTrial, Prediction
+from pupper_sysid.sysid.plan.proposal import LONGEST_S, Source, SweepPlan
+from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, Plan, plan
+
+SCHEMA = "pupper-sysid plan"
+SCHEMA_VERSION = 1
+
+_MOST_TRIALS = 2000
+_HEADER = """\
+# Plan of a sweep, written by `pupper-sysid plan`; `pupper-sysid sweep --plan` executes it.
+#
+# `trials` may be edited: excursions from the start pose in radians, durations in seconds without
+# the lead-in at rest. `predictions` are the 90 % intervals now and those to expect afterwards.
+"""
+
+
+class SourceEntry(Part):
+    """A file the plan was made from."""
+
+    name: str
+    """File name, without folders."""
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    """SHA-256 of the file, 64 hexadecimal digits."""
+
+
+class TrialEntry(Part):
+    """One trial."""
+
+    joint: str
+    """Joint that moves."""
+    kind: Literal["sine", "square"]
+    """Shape of the motion."""
+    frequency_hz: Annotated[Number, Field(gt=0, le=HIGHEST_HZ)]
+    """Frequency [Hz]."""
+    amplitude_rad: Annotated[Number, Field(gt=0, le=float(np.pi))]
+    """Largest excursion from the start pose [rad]."""
+    duration_s: Annotated[Number, Field(gt=0, le=LONGEST_S)]
+    """Duration without the lead-in [s]."""
+    purpose: str = ""
+    """What it is for."""
+
+    @field_validator("joint")
+    @classmethod
+    def _check_joint(cls, name: str) -> str:
+        if strange := strange_joint([name]):
+            raise ValueError(f"{strange[0]} is no joint; {strange[1].rstrip('.?')}")
+        return name
+
+
+class IntervalEntry(Part):
+    """A value with its 90 % interval."""
+
+    value: Number
+    """The number, in the unit at the end of the quantity's name."""
+    low: Number
+    """Lower end."""
+    high: Number
+    """Upper end."""
+
+
+class PredictionEntry(Part):
+    """Interval of one quantity, now and after the sweep."""
+
+    joint: str
+    """Its joint."""
+    quantity: str
+    """Its name, which ends in the unit."""
+    now: IntervalEntry
+    """Interval at present."""
+    after: IntervalEntry
+    """Interval to expect."""
+
+
+class PlanFile(Part):
+    """The whole file."""
+
+    schema_name: Annotated[Literal["pupper-sysid plan"], Field(alias="schema")]
+    """Kind of the file."""
+    schema_version: Literal[1]
+    """Version of the file's format."""
+    created: str
+    """Time of the plan, in UTC and ISO 8601."""
+    made_from: Annotated[tuple[SourceEntry, ...], Field(strict=False)] = ()
+    """Recordings or calibration it was made from; empty for an unknown servo."""
+    seed: Whole = 0
+    """Seed of its random numbers."""
+    versions: dict[str, str] = Field(default_factory=dict)
+    """Versions of this project and of the libraries that shape its numbers."""
+    loop_period_s: Annotated[Number, Field(gt=0, le=1)]
+    """Time between commands [s]."""
+    poll_rate_hz: Annotated[Number, Field(ge=0, le=1e5)]
+    """Polls of a servo per second; 0 where readings are live."""
+    speed_limit_rad_s: Annotated[Number, Field(gt=0, le=1000)]
+    """Speed limit of the servos [rad/s]."""
+    trials: Annotated[
+        tuple[TrialEntry, ...], Field(strict=False, min_length=1, max_length=_MOST_TRIALS)
+    ]
+    """Trials, in the order of their execution."""
+    predictions: Annotated[tuple[PredictionEntry, ...], Field(strict=False)] = ()
+    """Intervals now and after the sweep."""
+    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """What no trial within the limits can show."""
+
+
+def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:
+    """Write a plan file, in one atomic step.
+
+    Raises
+    ------
+    InputError
+        If the file exists and `force` is not given, or it cannot be written.
+    """
+    data = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "created": utc_now(),
+        "versions": versions(),
+        **plain(proposal),
+    }
+    order = [f.alias or name for name, f in PlanFile.model_fields.items()]
+    write_text(path, f"{_HEADER}\n{dump({name: data[name] for name in order})}", force)
+
+
+def load_plan(path: Path) -> SweepPlan:
+    """Read a plan file.
+
+    Raises
+    ------
+    InputError
+        If anything in it is not valid: one sentence with the file, the place and the fault.
+    """
+    data, lines = read_yaml(path)
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        raise InputError(
+            f"{path} is not a plan: it does not say `schema: {SCHEMA}` at the top. "
+            "Give a file that `pupper-sysid plan` wrote."
+        )
+    refuse_other_version(path, data.get("schema_version"), SCHEMA_VERSION)
+    file = validated(PlanFile, data, path, lines)
+    shared = {f.name for f in fields(SweepPlan)} & set(PlanFile.model_fields)
+    values: dict[str, Any] = {name: getattr(file, name) for name in shared}
+    return SweepPlan(
+        **values
+        | {
+            "made_from": tuple(Source(**s.model_dump()) for s in file.made_from),
+            "trials": tuple(PlannedTrial(**t.model_dump()) for t in file.trials),
+            "predictions": tuple(_prediction(p) for p in file.predictions),
+        }
+    )
+
+
+def executable(
+    proposal: SweepPlan,
+    path: Path,
+    margin_rad: Mapping[str, float],
+    start_pose_rad: Mapping[str, float],
+    speed_limit_rad_s: float,
+) -> Plan:
+    """The plan in the form that the recorder executes, within the limits of a bus.
+
+    Parameters
+    ----------
+    proposal : SweepPlan
+    path : Path
+        Its file; name and hash go into the recording's header.
+    margin_rad : mapping of joint to float
+        Largest excursion of each joint to either side of its start pose.
+    start_pose_rad : mapping of joint to float
+    speed_limit_rad_s : float
+        Of the bus.
+
+    Raises
+    ------
+    InputError
+        If a tone cannot be commanded at the plan's rate, or a joint has no margin.
+    """
+    parts = [
+        plan(
+            t.kind, [t.joint], [t.frequency_hz], t.amplitude_rad, t.duration_s,
+            proposal.loop_period_s, min(proposal.speed_limit_rad_s, speed_limit_rad_s),
+            proposal.poll_rate_hz, margin_rad, start_pose_rad,
+        )
+        for t in proposal.trials
+    ]  # fmt: skip
+    changes = tuple(
+        dict.fromkeys(
+            f"{t.joint}: {w}" for t, p in zip(proposal.trials, parts, strict=True)
+            for w in p.warnings
+        )
+    )  # fmt: skip
+    description = {
+        "kind": "plan",
+        "file": path.name,
+        "sha256": sha256(path),
+        "made_from": plain(proposal.made_from),
+        "lead_in_s": parts[0].description["lead_in_s"],
+        "speed_limit_rad_s": speed_limit_rad_s,
+        "warnings": list(changes),
+    }
+    trials = tuple(t for p in parts for t in p.trials)
+    return Plan(trials, dict(start_pose_rad), description, changes)
+
+
+def _prediction(entry: PredictionEntry) -> Prediction:
+    now, after = (Interval(**e.model_dump()) for e in (entry.now, entry.after))
+    return Prediction(joint=entry.joint, quantity=entry.quantity, now=now, after=after)
