@@ -22,10 +22,13 @@ from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, attributes, joint_attributes, pid_element
 
 Knee = Literal["linkage", "serial"]
+Physics = Literal["training", "evaluation"]
+"""`evaluation`: the whole robot touches the ground, and Newton solves the constraints to their end.
+`training`: only the feet do, and few iterations of PGS are near enough; for half the cost."""
 
 MASS_KG = 0.465
 THIGH_M, CALF_M = 0.050, 0.056
-FOOT_RADIUS_M, FOOT_THICKNESS_M = 0.0085, 0.006
+FOOT_RADIUS_M = 0.0085
 STANDING_HEIGHT_M = 0.0835
 """Height of the trunk's origin above the ground, in the default pose."""
 
@@ -57,11 +60,19 @@ _TRUNK_URDF_KG = 0.125594
 TRUNK_KG = MASS_KG - 4 * (_HIP[0] + _THIGH[0] + _CALF[0])
 
 # trunk's box and the corner at its centre, from the extents of the published meshes
-_TRUNK_BOX, _TRUNK_BOX_AT = (0.0905, 0.030, 0.0266), (-0.0012, 0.0, -0.00015)
-_TRUNK_TOUCH = (0.1, 0.04, 0.04)
+TRUNK_BOX_M, TRUNK_BOX_AT_M = (0.0905, 0.030, 0.0266), (-0.0012, 0.0, -0.00015)
+HIP_BOX_M, HIP_BOX_AT_M = (0.0215, 0.0145, 0.0155), (0.0045, 0.00335, 0.0065)
+"""Half sizes and centre of a left hip's box, in its own frame [m]."""
+THIGH_RADIUS_M = 0.0045
 
-CONTACT_BODIES = ("trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh")))
-"""Bodies that must not touch the ground; sensor `<body>_touch` measures the force [N]."""
+# Newton reaches machine precision in three iterations and ends there, whatever its tolerance; it
+# needs 50 steps of line search (MuJoCo's default), since dry friction is a sharp corner of its
+# cost, and a tolerance that light links do not fall below while they still move. PGS's eight
+# iterations leave 1 mrad/s of a walking robot's joint speeds (in the median; 14 in 1 % of steps).
+_SOLVERS = {
+    "training": 'solver="PGS" iterations="8"',
+    "evaluation": 'solver="Newton" iterations="20" ls_iterations="50" tolerance="1e-15"',
+}
 
 FLAT_GROUND = (
     '<geom name="ground" type="plane" size="0 0 0.05" material="grid" contype="0" conaffinity="1"/>'
@@ -74,6 +85,8 @@ def robot_xml(
     knee: Knee = "linkage",
     ground: str = FLAT_GROUND,
     assets: str = "",
+    physics: Physics = "evaluation",
+    imu: bool = True,
 ) -> str:
     """MJCF of the robot.
 
@@ -89,8 +102,14 @@ def robot_xml(
         MJCF of the ground; its geoms need `conaffinity="1"`.
     assets : str
         MJCF inside `<asset>` that the ground needs.
+    physics : {"training", "evaluation"}
+        The model of training has nothing that it does not simulate: no geoms but feet and ground,
+        no camera and no light.
+    imu : bool
+        Whether it has sensors `gyro` and `accelerometer`; `<leg>_foot_touch` [N] it always has.
     """
-    legs = "".join(_leg(leg, servos, time_step_s, knee) for leg in LEGS)
+    whole = physics == "evaluation"
+    legs = "".join(_leg(leg, servos, time_step_s, knee, whole) for leg in LEGS)
     tendons = ""
     if knee == "linkage":
         tendons = "<tendon>" + "".join(_knee_tendon(leg, servos, time_step_s) for leg in LEGS)
@@ -100,20 +119,23 @@ def robot_xml(
         at = "tendon" if knee == "linkage" and name.endswith("calf") else "joint"
         own = {"name": name, at: name if at == "joint" else f"{name}_servo"}
         actuators.append(pid_element(own, servos[name], time_step_s))
-    sensors = "".join(
-        [f'<touch name="{leg}_foot_touch" site="{leg}_foot"/>' for leg in LEGS]
-        + [f'<touch name="{body}_touch" site="{body}_touch"/>' for body in CONTACT_BODIES]
-        + ['<gyro name="gyro" site="imu"/><accelerometer name="accelerometer" site="imu"/>']
-    )
+    sensors = "".join(f'<touch name="{leg}_foot_touch" site="{leg}_foot"/>' for leg in LEGS)
+    if imu:
+        sensors += '<gyro name="gyro" site="imu"/><accelerometer name="accelerometer" site="imu"/>'
     scale = TRUNK_KG / _TRUNK_URDF_KG
-    # PGS: ten iterations settle the servos' dry friction to 1 mrad/s, where Newton's first ten are
-    # off by hundreds, and cost a little less
     trunk = _inertial(TRUNK_KG, _TRUNK_CENTRE, tuple(scale * x for x in _TRUNK_INERTIA))
-    box, at, touch = map(_numbers, (_TRUNK_BOX, _TRUNK_BOX_AT, _TRUNK_TOUCH))
+    light = shape = ""
+    if whole:
+        light = '<light pos="0 0 3" dir="0 0 -1" directional="true" castshadow="true"/>'
+        shape = (
+            f'<geom name="trunk" type="box" size="{_numbers(TRUNK_BOX_M)}" '
+            f'pos="{_numbers(TRUNK_BOX_AT_M)}" rgba="0.2 0.35 0.6 1"/><camera name="track" '
+            'mode="trackcom" pos="0.1 -0.55 0.22" xyaxes="1 0.2 0 -0.06 0.3 1"/>'
+        )
     return f"""<mujoco model="mini_pupper_2">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{time_step_s!r}" integrator="{INTEGRATOR}" cone="pyramidal"
-    solver="PGS" iterations="10"/>
+    {_SOLVERS[physics]}/>
   <visual><global offwidth="1280" offheight="720"/><headlight ambient="0.4 0.4 0.4"/></visual>
   <asset>
     <texture name="grid" type="2d" builtin="checker" rgb1="0.85 0.87 0.90" rgb2="0.75 0.78 0.82"
@@ -128,15 +150,13 @@ def robot_xml(
     <default class="visual"><geom contype="0" conaffinity="0" group="2" mass="0"/></default>
   </default>
   <worldbody>
-    <light pos="0 0 3" dir="0 0 -1" directional="true" castshadow="true"/>
+    {light}
     {ground}
     <body name="trunk" pos="0 0 {STANDING_HEIGHT_M}">
       <freejoint name="root"/>
       {trunk}
-      <geom name="trunk" type="box" size="{box}" pos="{at}" rgba="0.2 0.35 0.6 1"/>
-      <site name="trunk_touch" type="box" size="{touch}" group="4"/>
       <site name="imu" pos="0 0 0" xyaxes="0 1 0 1 0 0" group="3"/>
-      <camera name="track" mode="trackcom" pos="0.1 -0.55 0.22" xyaxes="1 0.2 0 -0.06 0.3 1"/>
+      {shape}
       {legs}
     </body>
   </worldbody>
@@ -193,7 +213,10 @@ def limits() -> tuple[np.ndarray, np.ndarray]:
 # ---------------------------------------------------------------------------------- pieces
 
 
-def _leg(leg: str, servos: dict[str, DelayedPDParameters], step: float, knee: Knee) -> str:
+def _leg(
+    leg: str, servos: dict[str, DelayedPDParameters], step: float, knee: Knee, whole: bool
+) -> str:
+    """One leg; not `whole` without what is only seen or only touches the ground in a fall."""
     side = SIDE[leg]
     joints = {
         kind: f'<joint name="{leg}_{kind}" type="hinge" axis="{axis}" '
@@ -206,21 +229,27 @@ def _leg(leg: str, servos: dict[str, DelayedPDParameters], step: float, knee: Kn
         + "/>"
         for kind, axis in (("hip", "1 0 0"), ("thigh", "0 1 0"), ("calf", "0 1 0"))
     }
+    x, y, z = HIP_BOX_AT_M
+    hip = thigh = calf = ""
+    if whole:
+        hip = (
+            f'<geom name="{leg}_hip" type="box" size="{_numbers(HIP_BOX_M)}" '
+            f'pos="{x} {side * y} {z}" rgba="0.25 0.25 0.28 1"/>'
+        )
+        thigh = (
+            f'<geom name="{leg}_thigh" type="capsule" size="{THIGH_RADIUS_M}" '
+            f'fromto="0 0 0 0 0 {-THIGH_M}" rgba="0.9 0.55 0.15 1"/>'
+        )
+        calf = f'<geom class="visual" type="capsule" size="0.0015" fromto="0 0 0 0 0 {-CALF_M}"/>'
+    # a cylinder's rim on a plane makes up to eight contacts, a sphere one, in the same place
     return f"""<body name="{leg}_hip" pos="{HIP_X_M[leg]} {side * HIP_Y_M} 0">
-        {joints["hip"]}{_mirrored(_HIP, side)}
-        <geom name="{leg}_hip" type="box" size="0.0215 0.0145 0.0155"
-          pos="0.0045 {side * 0.00335} 0.0065" rgba="0.25 0.25 0.28 1"/>
-        <site name="{leg}_hip_touch" type="sphere" size="0.05" group="4"/>
+        {joints["hip"]}{_mirrored(_HIP, side)}{hip}
         <body name="{leg}_thigh" pos="{THIGH_X_M} {side * THIGH_Y_M} 0">
-          {joints["thigh"]}{_mirrored(_THIGH, side)}
-          <geom name="{leg}_thigh" type="capsule" size="0.0045" fromto="0 0 0 0 0 {-THIGH_M}"
-            rgba="0.9 0.55 0.15 1"/>
-          <site name="{leg}_thigh_touch" type="sphere" size="0.08" group="4"/>
+          {joints["thigh"]}{_mirrored(_THIGH, side)}{thigh}
           <body name="{leg}_calf" pos="0 {side * CALF_Y_M} {-THIGH_M}">
-            {joints["calf"]}{_mirrored(_CALF, side)}
-            <geom class="visual" type="capsule" size="0.0015" fromto="0 0 0 0 0 {-CALF_M}"/>
-            <geom name="{leg}_foot" type="cylinder" size="{FOOT_RADIUS_M} {FOOT_THICKNESS_M / 2}"
-              pos="0 0 {-CALF_M}" zaxis="0 1 0" priority="1" rgba="0.1 0.1 0.1 1"/>
+            {joints["calf"]}{_mirrored(_CALF, side)}{calf}
+            <geom name="{leg}_foot" type="sphere" size="{FOOT_RADIUS_M}" pos="0 0 {-CALF_M}"
+              priority="1" rgba="0.1 0.1 0.1 1"/>
             <site name="{leg}_foot" type="sphere" size="0.013" pos="0 0 {-CALF_M}" group="4"/>
           </body>
         </body>

@@ -18,8 +18,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
 from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.falls import touches_ground
 from pupper_sysid.sim.robot.mini_pupper import (
-    CONTACT_BODIES,
     FOOT_RADIUS_M,
     STANDING_HEIGHT_M,
     default_pose,
@@ -40,7 +40,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 Array = NDArray[np.float64]
 
 FEET = len(LEGS)
-_TOUCHES = FEET + len(CONTACT_BODIES)
+_TOUCH_S = 0.006  # a foot is down if it was so in the last milliseconds: contacts flicker
 _THIGHS, _CALVES = np.arange(1, 12, 3), np.arange(2, 12, 3)
 
 
@@ -100,7 +100,15 @@ class RobotBatch:
             for name, own in servos.nominal().items()
         }
         self.model = mujoco.MjModel.from_xml_string(
-            robot_xml(longest, config.physics_step_s, config.knee, ground.xml, ground.assets)
+            robot_xml(
+                longest,
+                config.physics_step_s,
+                config.knee,
+                ground.xml,
+                ground.assets,
+                config.physics,
+                False,
+            )
         )
         ground.fill(self.model)
         buffer = self.model.actuator_history[:, 0].min() * config.physics_step_s
@@ -122,6 +130,8 @@ class RobotBatch:
         self._site_position = self.batch.bind("site_xpos")
         self._empty_lines = empty_delay_lines(self.model)
         self._feet_geoms = np.array([self.model.geom(f"{leg}_foot").id for leg in LEGS])
+        self._touch = np.array([self.model.sensor(f"{leg}_foot_touch").adr[0] for leg in LEGS])
+        self._touch_steps = max(round(_TOUCH_S / config.physics_step_s), 1)
         self._feet_sites = np.array([self.model.site(f"{leg}_foot").id for leg in LEGS])
         self._trunk = self.model.body("trunk").id
         self._low, self._high = limits()
@@ -175,6 +185,10 @@ class RobotBatch:
         height = at[..., 2] - FOOT_RADIUS_M - self.ground.height(at[..., 0], at[..., 1])
         return at[..., :2].copy(), height
 
+    def touching(self) -> NDArray[np.bool_]:
+        """Whether more than the feet touches the ground, shape (n,)."""
+        return touches_ground(self.qpos, self.gravity, self.ground)
+
     def to_servo(self, joints: Array) -> Array:
         """Servo angles of joint angles (..., 12): servo 3 holds thigh + calf behind a linkage."""
         if self.config.knee == "serial":
@@ -200,8 +214,8 @@ class RobotBatch:
         -------
         position, load : ndarray, shape (n, physics steps + 1, 12)
             Joint angles [rad] and servo torques [N·m] at the start and after each physics step.
-        touch : ndarray, shape (n, 3, feet + bodies)
-            Force on the feet and on what must not touch the ground, in the last three steps [N].
+        touch : ndarray, shape (n, 4)
+            Largest force on each foot in the last 6 ms [N].
         """
         config = self.config
         start = self.joints[:, None].copy()
@@ -221,7 +235,8 @@ class RobotBatch:
         position = np.concatenate([start, found["qpos"][:, :, 7:]], axis=1)
         force = found["actuator_force"]
         load = np.concatenate([force[:, :1], force], axis=1)
-        return position, load, found["sensordata"][:, -3:, :_TOUCHES]
+        touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
+        return position, load, touch
 
     def broken(self) -> NDArray[np.bool_]:
         """Robots that MuJoCo has reset since the last call, because they became NaN."""

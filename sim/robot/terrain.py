@@ -9,6 +9,7 @@ Steps (not in the paper) are 3 to 10 mm high and rise, as all of a field of heig
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from pupper_sysid.sim.robot.mini_pupper import FLAT_GROUND
 Terrain = Literal["flat", "rough", "slopes", "troughs", "steps", "mixed"]
 
 TILE_M, SPACING_M = 8.0, 0.05
+_NEAR_M = 0.15  # how far a robot reaches from the middle of its trunk, legs below the knee aside
 _PLATFORM_M = 0.6
 _ROUGH_M = (0.01, 0.02)
 _STEEPEST = 0.15
@@ -68,6 +70,32 @@ class Ground:
         beside = np.where(v >= u, h[i, j + 1], h[i + 1, j])
         more, less = np.maximum(u, v), np.minimum(u, v)
         return near + more * (beside - near) + less * (far - beside)
+
+    def highest_near(
+        self, x: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> NDArray[np.float64] | float:
+        """An upper bound of the heights [m] within 15 cm of positions [m]."""
+        highest = self._highest
+        if highest is None:
+            return 0.0
+        column, row = (
+            np.clip((at + self.half_size_m) / SPACING_M, 0, len(highest) - 1).astype(int)
+            for at in (x, y)
+        )
+        return highest[row, column]
+
+    @cached_property
+    def _highest(self) -> NDArray[np.float64] | None:
+        """Highest of the heights around each, in all squares within `_NEAR_M`."""
+        if self.heights is None:
+            return None
+        # from the corner of its square, a position is at most one height farther
+        reach = int(np.ceil(_NEAR_M / SPACING_M)) + 1
+        padded = np.pad(self.heights, reach, mode="edge")
+        for axis in (0, 1):
+            windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=axis)
+            padded = windows.max(axis=-1)
+        return padded
 
     def fill(self, model: Any) -> None:
         """Write the heights into a compiled `mujoco.MjModel`."""

@@ -11,10 +11,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sim.robot.mini_pupper import Knee
+from pupper_sysid.sim.robot.mini_pupper import Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.rewards import DEFAULT, PAPER, RELEASE, Rewards
+
+EVALUATION_STEP_S = 0.002
+"""Longest time step of the physics in which policies are evaluated."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,11 @@ class Walking:
     """Length of an episode."""
     physics_step_s: float = 0.002
     """Time step of the physics. In steps other than 2 ms the servos' delay is adapted so that they
-    keep the lag that was measured."""
+    keep the lag that was measured. Training in steps of 4 ms takes half the time."""
+    physics: Physics = "training"
+    """`training`: only feet touch the ground, and a few iterations solve the constraints nearly;
+    `evaluation`: the whole robot does, and they are solved to their end. Programs that evaluate
+    take the latter, in steps of 2 ms or less, whatever a policy was trained in."""
     control_step_s: float = 0.02
     """Time between two actions."""
     action_scale: float = 0.5
@@ -141,6 +148,13 @@ class Walking:
         for name in ("standing", "single"):
             if not 0 <= getattr(self.commands, name) <= 1:
                 raise InputError(f"commands.{name} must be between 0 and 1.")
+
+    def evaluated(self) -> Walking:
+        """The same task in the physics of evaluation."""
+        step = self.physics_step_s
+        if step > EVALUATION_STEP_S:
+            step = self.control_step_s / math.ceil(self.control_step_s / EVALUATION_STEP_S - 1e-6)
+        return replace(self, physics="evaluation", physics_step_s=step)
 
     @property
     def substeps(self) -> int:

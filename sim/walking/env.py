@@ -29,7 +29,6 @@ from pupper_sysid.sim.walking.shared_draws import Twins, generator
 
 Array = NDArray[np.float64]
 
-_TOUCH_N = 1.0  # published; of what must not touch the ground
 _FOOT_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
 _STRIDE_S = 0.2  # time constant of the average over a stride
 _EDGE_M = 0.5
@@ -288,15 +287,14 @@ class PupperEnv:
 
     def _contacts(self, touch: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which feet are on the ground, and which robots have fallen."""
-        force = touch.max(axis=1)
-        contact, touched = force[:, :FEET] > _FOOT_N, (force[:, FEET:] > _TOUCH_N).any(axis=1)
+        contact = touch > _FOOT_N
         span = self.config.control_step_s
         landed, lifted = contact & (self._air > 0), ~contact & (self._contact > 0)
         self._last_air = np.where(landed, self._air, self._last_air)
         self._last_contact = np.where(lifted, self._contact, self._last_contact)
         self._air = np.where(contact, 0.0, self._air + span)
         self._contact = np.where(contact, self._contact + span, 0.0)
-        return contact, touched | (self.robots.gravity[:, 2] > -FALLEN_TILT)
+        return contact, self.robots.touching() | (self.robots.gravity[:, 2] > -FALLEN_TILT)
 
     def _step_facts(
         self, velocity_before: Array, torque: Array, contact: NDArray[np.bool_]

@@ -97,10 +97,6 @@ class WalkingRobot:
             for s in robot.servos
         }
         self._model = mujoco.MjModel.from_xml_string(robot_xml(native, time_step_s))
-        # training's few PGS iterations let a standing robot creep round by 0.2 °/s; for a single
-        # robot the exact solver costs no more
-        self._model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-        self._model.opt.iterations = 100
         self._data = mujoco.MjData(self._model)
         self._gains = self._model.actuator_biasprm.copy()
         self._effort = np.array([s.actuator.effort_limit for s in robot.servos], float)

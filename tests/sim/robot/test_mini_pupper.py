@@ -16,6 +16,7 @@ from pupper_sysid.sim.robot.mini_pupper import (
     FOOT_RADIUS_M,
     STANDING_HEIGHT_M,
     Knee,
+    Physics,
     foot_position,
     joint_angles,
     limits,
@@ -52,8 +53,11 @@ PUBLISHED = {
 MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
-def model_of(knee: Knee = "linkage", servo: DelayedPDParameters = STIFF) -> Any:
-    return mujoco.MjModel.from_xml_string(robot_xml(dict.fromkeys(JOINT_NAMES, servo), H, knee))
+def model_of(
+    knee: Knee = "linkage", servo: DelayedPDParameters = STIFF, physics: Physics = "evaluation"
+) -> Any:
+    servos = dict.fromkeys(JOINT_NAMES, servo)
+    return mujoco.MjModel.from_xml_string(robot_xml(servos, H, knee, physics=physics))
 
 
 def inertia(model: Any, body: str) -> np.ndarray:
@@ -128,8 +132,9 @@ def test_the_standing_robots_soles_are_on_the_ground_where_the_facts_say():
         assert foot[2] - FOOT_RADIUS_M == pytest.approx(0.0, abs=1e-4)
 
 
-def test_a_robot_one_millimetre_lower_is_one_millimetre_deep_in_the_ground():
-    model = model_of()
+@pytest.mark.parametrize("physics", ["evaluation", "training"])
+def test_a_robot_one_millimetre_lower_is_one_millimetre_deep_in_the_ground(physics):
+    model = model_of(physics=physics)
     data = standing(model)
     data.qpos[2] -= 0.001
     mujoco.mj_forward(model, data)
@@ -138,8 +143,9 @@ def test_a_robot_one_millimetre_lower_is_one_millimetre_deep_in_the_ground():
     assert data.contact.dist.min() == pytest.approx(-0.001, abs=1e-4)
 
 
-def test_the_simulated_robot_stands_with_its_weight_on_its_feet():
-    model = model_of()
+@pytest.mark.parametrize("physics", ["evaluation", "training"])
+def test_the_simulated_robot_stands_with_its_weight_on_its_feet(physics):
+    model = model_of(physics=physics)
     data = standing(model)
     mujoco.mj_step(model, data, 500)
     assert data.qpos[2] == pytest.approx(STANDING_HEIGHT_M, abs=0.003)
@@ -254,22 +260,22 @@ def test_at_rest_the_accelerometer_reads_minus_one_g_on_the_chips_z():
 ACTUATORS = ("data/samples/calibrated.yaml", "paper")
 
 
-def swinging(actuator: str, knee: Knee, exactly_solved: bool) -> np.ndarray:
+def swinging(actuator: str, knee: Knee, physics: Physics = "evaluation") -> np.ndarray:
     servos = servo_ranges(actuator).nominal()
-    model = mujoco.MjModel.from_xml_string(robot_xml(servos, H, knee))
-    return error_in_air(model, [servos[name] for name in JOINT_NAMES], exactly_solved)
+    model = mujoco.MjModel.from_xml_string(robot_xml(servos, H, knee, physics=physics))
+    return error_in_air(model, [servos[name] for name in JOINT_NAMES], exactly_solved=False)
 
 
 @pytest.mark.parametrize("knee", ["linkage", "serial"])
 @pytest.mark.parametrize("actuator", ACTUATORS)
 def test_with_weightless_links_every_servo_of_the_robot_is_the_fitted_servo(actuator, knee):
-    np.testing.assert_allclose(swinging(actuator, knee, exactly_solved=True), 0.0, atol=1e-6)
+    np.testing.assert_allclose(swinging(actuator, knee), 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("knee", ["linkage", "serial"])
-def test_the_solvers_iterations_are_enough_for_the_measured_friction(knee):
+def test_the_iterations_of_training_are_enough_for_the_measured_friction(knee):
     # a count is 5.7 mrad; a tenth of it cannot be measured
-    assert swinging(ACTUATORS[0], knee, exactly_solved=False).max() < math.pi / 550 / 10
+    assert swinging(ACTUATORS[0], knee, "training").max() < math.pi / 550 / 10
 
 
 def test_each_actuator_has_its_own_joints_numbers():
