@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.servo_file import load_servo_model
     from pupper_sysid.servo_models.sparse_equation import SparseEquation
     from pupper_sysid.sim.walking.env import PupperEnv
+    from pupper_sysid.sysid.compare.compare import compare
     from pupper_sysid.sysid.doctor.examination import examine
     from pupper_sysid.sysid.identify.calibrate import calibrate
     from pupper_sysid.sysid.identify.dead_time import lag
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.recordings.files import load
     from pupper_sysid.sysid.recordings.recording import Recording
     from pupper_sysid.sysid.report.report import write_report as report
-    from pupper_sysid.sysid.servo_fit.compare import compare
     from pupper_sysid.sysid.servo_fit.fit import fit_servo
     from pupper_sysid.sysid.sparse.equations import sparse_equations
 
@@ -48,7 +48,7 @@ _MODULES = {
     "calibrate": "sysid.identify.calibrate",
     "sparse_equations": "sysid.sparse.equations",
     "fit_servo": "sysid.servo_fit.fit",
-    "compare": "sysid.servo_fit.compare",
+    "compare": "sysid.compare.compare",
     "report": "sysid.report.report:write_report",
     "load_calibration": "servo_models.calibration.calibration",
     "Calibration": "servo_models.calibration.calibration",

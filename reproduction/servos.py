@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.sysid.compare.compare import Comparison
+from pupper_sysid.sysid.compare.four_way import FITTED, PUBLISHED, four_way
 from pupper_sysid.sysid.doctor.examination import JointExamination, examine
 from pupper_sysid.sysid.identify.dead_time import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.servo_fit.compare import FITTED, PUBLISHED, Comparison, four_way
 from reproduction.claims import Claim, Finding, NotTestable, claim, holds
 
 

@@ -48,5 +48,9 @@ class AtControlRate:
 
     def rollout(self, commands: ArrayLike) -> NDArray[np.floating]:
         """Positions [rad] at the end of each command."""
+        return self.every_step(commands)[self.count - 1 :: self.count]
+
+    def every_step(self, commands: ArrayLike) -> NDArray[np.floating]:
+        """Positions [rad] after each step of the model, `count` of them per command."""
         held = np.repeat(np.asarray(commands, float), self.count, axis=0)
-        return self.model.rollout(held)[self.count - 1 :: self.count] + self.offset_rad
+        return self.model.rollout(held) + self.offset_rad

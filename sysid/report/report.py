@@ -34,9 +34,9 @@ from pupper_sysid.sysid.report.figure_data import hold_runs, tracks
 from pupper_sysid.sysid.report.tables import MODEL_NAMES
 
 if TYPE_CHECKING:  # they bring libraries that a page does not need
+    from pupper_sysid.sysid.compare.compare import Comparison
     from pupper_sysid.sysid.doctor.examination import Examination
     from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
-    from pupper_sysid.sysid.servo_fit.compare import Comparison
     from pupper_sysid.sysid.servo_fit.result import ServoFit
 
 PAGE = "report.html"
@@ -103,7 +103,7 @@ def write_report(
         Made from these recordings: its numbers are shown and its seed is used. By default the
         recordings are calibrated.
     models : sequence of str, Path, Calibration or ServoFit
-        Servo models to compare on the recordings, as in `sysid.servo_fit.compare`.
+        Servo models to compare on the recordings, as in `sysid.compare.compare`.
     seed : int
         Of the bootstrap and of the models' global starts.
     workers : int
@@ -152,7 +152,7 @@ def write_report(
         advance(joint)
     comparison = None
     if models:
-        from pupper_sysid.sysid.servo_fit.compare import compare  # brings torch
+        from pupper_sysid.sysid.compare.compare import compare  # brings torch
 
         comparison = compare(recordings, models, names, seed=seed)
     found = Findings(

@@ -8,6 +8,10 @@ models are interpolated by a cubic (`look_up`): linear interpolation of a 4 Hz m
 Where the feedback is held (more than a fifth of the rows repeat the one before while the servo
 moves), only fresh readings count, each at its own time; otherwise every row as logged.
 
+Every row has the instants at which its reading may have been measured (`Run.reading_tick`): the
+one found, where the poll lattice is known, else that of the read. `sysid.compare.readings` puts
+the instants of a known bus in their place; a predicted reading is the mean of a model over them.
+
 Trials that follow each other without a pause, like the loops of a playback, are one run. Nothing is
 carried over a pause. Every reading belongs to a group (its loop, or its tone), so that whole groups
 can be held out.
@@ -23,6 +27,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.feedback.poll_lattice import (
+    PollLattice,
     Readings,
     find_poll_lattice,
     fresh_rows,
@@ -52,10 +57,16 @@ class Run:
         Their times, in ticks, and values [rad].
     row_tick, held_tick : ndarray
         When each row was read, and when its value was taken (NaN if before the run).
+    reading_tick : ndarray, shape (rows, instants)
+        Equally probable instants at which each row's reading was measured.
     number, group : ndarray of int
         Trial number in its recording; index into `ServoData.groups`, -1 for rows of no group.
     elapsed_s : ndarray
         Since the first command of the row's trial.
+    recording : int
+        Place of the recording that the run belongs to.
+    rest_known : bool
+        Whether the recording says where the run began; otherwise its first reading is taken.
     """
 
     trial: Trial
@@ -64,9 +75,12 @@ class Run:
     position_rad: NDArray[np.float64]
     row_tick: NDArray[np.float64]
     held_tick: NDArray[np.float64]
+    reading_tick: NDArray[np.float64]
     number: NDArray[np.int64]
     group: NDArray[np.int64]
     elapsed_s: NDArray[np.float64]
+    recording: int
+    rest_known: bool
 
     @property
     def command_rad(self) -> NDArray[np.float64]:
@@ -113,6 +127,8 @@ class ServoData:
         Groups to hold out: "loop 0", "3 Hz", …
     modes : dict of str to str
         "fresh" or "all": which readings of the joint count.
+    lattices : dict of str to PollLattice
+        Poll of each joint's readings, as far as these recordings show it.
     """
 
     joints: tuple[str, ...]
@@ -120,6 +136,7 @@ class ServoData:
     runs: dict[str, tuple[Run, ...]]
     groups: tuple[str, ...]
     modes: dict[str, str]
+    lattices: dict[str, PollLattice]
 
 
 def servo_data(
@@ -145,12 +162,15 @@ def servo_data(
     labels: dict[str, int] = {}
     runs: dict[str, tuple[Run, ...]] = {}
     modes: dict[str, str] = {}
+    lattices: dict[str, PollLattice] = {}
     for joint in joints:
-        found, modes[joint] = _joint_runs(recordings, joint, mode, period, labels, seed)
+        found, modes[joint], lattices[joint] = _joint_runs(
+            recordings, joint, mode, period, labels, seed
+        )
         if not sum(len(r.tick) for r in found):
             raise InputError(f"{joint}: no reading changed; a model cannot be fitted.")
         runs[joint] = tuple(found)
-    return ServoData(tuple(joints), period, runs, tuple(labels), modes)
+    return ServoData(tuple(joints), period, runs, tuple(labels), modes, lattices)
 
 
 def look_up_weights(
@@ -208,7 +228,7 @@ def _joint_runs(
     period: float,
     labels: dict[str, int],
     seed: int,
-) -> tuple[list[Run], str]:
+) -> tuple[list[Run], str, PollLattice]:
     trials = joint_trials(recordings, joint)
     if not trials:
         raise InputError(f"{joint} was not recorded. Leave it out of `joints`.")
@@ -218,7 +238,7 @@ def _joint_runs(
         mode = "fresh" if held and lattice.kind != "every read" else "all"
     timed = iter([readings(t, lattice) for t in trials])
     runs = []
-    for recording in recordings:
+    for place, recording in enumerate(recordings):
         own = recording.trials(joint)
         known = joint in (recording.metadata.get("start_pose_rad") or {})
         prefix = f"{recording.name}, " if len(recordings) > 1 else ""
@@ -233,8 +253,9 @@ def _joint_runs(
                 rest = float(first[0]) if len(first) else trial.initial_command_rad
                 trial = replace(trial, initial_command_rad=rest)
             parts += _without_pauses(trial, counted, group, period)
-        runs += [_run(p, period) for p in _joined(parts, period)]
-    return runs, mode
+        dated = lattice.kind == "lattice"
+        runs += [_run(p, period, place, dated, known) for p in _joined(parts, period)]
+    return runs, mode, lattice
 
 
 def _fresh_while_moving(trials: Sequence[Trial]) -> float:
@@ -251,9 +272,8 @@ def _fresh_while_moving(trials: Sequence[Trial]) -> float:
 def _all_rows(trial: Trial, timed: Readings) -> Readings:
     rows = np.flatnonzero(np.isfinite(trial.position_rad))
     return replace(
-        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows],
-        held_time_s=trial.read_time_s,
-    )  # fmt: skip
+        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows]
+    )
 
 
 _ROWS = ("send_time_s", "read_time_s", "command_rad", "position_rad")
@@ -289,7 +309,7 @@ def _joined(parts: list[_Part], period: float) -> list[list[_Part]]:
     return joined
 
 
-def _run(parts: list[_Part], period: float) -> Run:
+def _run(parts: list[_Part], period: float, recording: int, dated: bool, pose_known: bool) -> Run:
     trials = [p[0] for p in parts]
     sizes = [len(t.send_time_s) for t in trials]
     merged = replace(
@@ -313,10 +333,13 @@ def _run(parts: list[_Part], period: float) -> Run:
     def to_tick(time: NDArray) -> NDArray[np.float64]:
         return np.where(np.isfinite(time), np.interp(time, edges, ticks), np.nan)
 
-    held = np.where(r.held_time_s >= edges[0], r.held_time_s, np.nan)
+    # after a gap a run begins at the last command
+    rest_known = pose_known or bool(merged.send_time_s[0] > parts[0][3])
+    held = to_tick(np.where(r.held_time_s >= edges[0], r.held_time_s, np.nan))
+    read = to_tick(merged.read_time_s)
+    measured = (held if dated else read)[:, None]
     return Run(
-        merged, r, to_tick(r.time_s), r.position_rad,
-        to_tick(merged.read_time_s), to_tick(held),
+        merged, r, to_tick(r.time_s), r.position_rad, read, held, measured,
         np.repeat([t.number for t in trials], sizes), np.repeat([p[2] for p in parts], sizes),
-        merged.send_time_s - np.repeat([p[3] for p in parts], sizes),
+        merged.send_time_s - np.repeat([p[3] for p in parts], sizes), recording, rest_known,
     )  # fmt: skip

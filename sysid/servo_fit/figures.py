@@ -19,7 +19,14 @@ from pupper_sysid.common.figure_style import (
     styled,
 )
 from pupper_sysid.sysid.servo_fit.data import ServoData
-from pupper_sysid.sysid.servo_fit.scores import Band, Errors, Tracks, band_half_width, rms
+from pupper_sysid.sysid.servo_fit.scores import (
+    Band,
+    Errors,
+    Tracks,
+    band_half_width,
+    rms,
+    steps_per_tick,
+)
 
 _LONGEST_S = 3.0
 _COLOURS = (BLUE, RED, GREEN, ORANGE, PINK)
@@ -63,6 +70,7 @@ def free_run_figure(
         axes.plot(when, run.position_rad[inside], "o", ms=3.2, color=INK, label="reading")
         for n, (name, found) in enumerate(tracks.items()):
             track = found[joint][index]
+            track = track[:: steps_per_tick(track, run)]
             colour = _COLOURS[n % len(_COLOURS)]
             error = 1e3 * rms(errors[name][joint].free_run)
             label = f"{name}, {error:.1f} mrad"

@@ -2,9 +2,11 @@
 
 A model is run freely from the start of each run. Its error is taken at the readings that count, at
 their own times (`free_run`); at every row when its value was measured (`held`); and at every row as
-logged (`raw`). `one_step` is the error when the model may start from the last reading: persistence
-scores well there, so it says little. Repeatability, where a command was repeated, is the least
-error that a model can reach. Intervals resample stretches of time.
+logged against the predicted reading (`raw`), which is the model's mean over the instants at which
+the reading may have been measured (`Run.reading_tick`). Where every row counts, `free_run` is of
+predicted readings, too. `one_step` is the error when the model may start from the last reading:
+persistence scores well there, so it says little. Repeatability, where a command was repeated, is
+the least error that a model can reach. Intervals resample stretches of time.
 """
 
 from __future__ import annotations
@@ -19,9 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import internal
 from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.control_rate import AtControlRate
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
-from pupper_sysid.sysid.servo_fit.data import ServoData, look_up
+from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen, chosen_rows
 
 LINEAR = "linear, fitted here"
@@ -113,53 +116,105 @@ Band = tuple[float, float]
 """Noise [rad] and timing [s] of a predictive band."""
 
 Tracks = dict[str, list[NDArray[np.float64]]]
-"""Per joint and run, positions at its ticks [rad], the start included."""
+"""Per joint and run, positions [rad] at the ticks, or a whole number of times per tick, the start
+included."""
 
 
-def tracks(model: ServoModel, data: ServoData) -> Tracks:
-    """Free run of `model`, whose last axis is the joints of `data`, over every run."""
-    commands, start, _ = _stacked(data)
+def tracks(model: ServoModel, data: ServoData, start: NDArray | None = None) -> Tracks:
+    """Free run of a model over every run.
+
+    Parameters
+    ----------
+    model : ServoModel
+        Its last axis is the joints of `data`.
+    data : ServoData
+    start : ndarray, shape (runs, joints), optional
+        Where each run starts [rad]; by default as recorded.
+    """
+    commands, recorded, _ = stacked(data)
+    start = recorded if start is None else start
     model.reset(start)
-    return _by_run(data, start, model.rollout(commands))
+    if isinstance(model, AtControlRate):  # all of its steps: it moves a lot within a slow tick
+        return by_run(data, start, model.every_step(commands), model.count)
+    return by_run(data, start, model.rollout(commands))
 
 
-def _by_run(data: ServoData, start: NDArray, positions: ArrayLike) -> Tracks:
-    """Positions (steps, runs, joints) after each command, as tracks from `start`."""
+def by_run(data: ServoData, start: NDArray, positions: ArrayLike, per_tick: int = 1) -> Tracks:
+    """Tracks of positions.
+
+    Parameters
+    ----------
+    data : ServoData
+    start : ndarray, shape (runs, joints)
+    positions : array_like, shape (steps, runs, joints)
+        After each step, the shorter runs padded.
+    per_tick : int
+        Steps per command.
+    """
     out = np.concatenate([start[None], np.asarray(positions, float)])
     return {
-        joint: [out[: len(r.command_rad) + 1, e, n] for e, r in enumerate(data.runs[joint])]
+        joint: [
+            out[: per_tick * len(r.command_rad) + 1, e, n] for e, r in enumerate(data.runs[joint])
+        ]
         for n, joint in enumerate(data.joints)
     }
 
 
-def errors(model: ServoModel, found: Tracks, data: ServoData, part: Part) -> dict[str, Errors]:
+def steps_per_tick(track: NDArray, run: Run) -> int:
+    """How many positions per tick a track of `run` has."""
+    return (len(track) - 1) // len(run.command_rad)
+
+
+def predicted(track: NDArray, run: Run, tick: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Readings that a track predicts: its mean over equally probable instants.
+
+    Parameters
+    ----------
+    track : ndarray
+        Of `run`.
+    run : Run
+    tick : ndarray, shape (readings, instants)
+    """
+    at = look_up(track, steps_per_tick(track, run) * tick.ravel())
+    return at.reshape(tick.shape).mean(axis=1)
+
+
+def counted_ticks(run: Run, mode: str) -> NDArray[np.float64]:
+    """Instants of the readings that count, shape (fresh, instants)."""
+    return run.reading_tick[run.readings.rows] if mode == "all" else run.tick[:, None]
+
+
+def errors(
+    model: ServoModel | None, found: Tracks, data: ServoData, part: Part
+) -> dict[str, Errors]:
     """Errors of a model on a part of the data, given its free run from `tracks`."""
     ahead = None
     if isinstance(model, CommandNetwork | RecurrentNetwork) and model.feedback:
-        commands, start, position = _stacked(data)
+        commands, start, position = stacked(data)
         model.reset(start)
-        ahead = _by_run(data, start, model.one_step(commands, position))
+        ahead = by_run(data, start, model.one_step(commands, position))
     made = {}
     for joint in data.joints:
         parts = []
         for n, run in enumerate(data.runs[joint]):
             track = found[joint][n]
-            error = look_up(track, run.tick) - run.position_rad
-            use, rows = chosen(run, part), chosen_rows(run, part)
+            when = counted_ticks(run, data.modes[joint])
+            error = predicted(track, run, when) - run.position_rad
+            use, rows = chosen(run, part) & np.isfinite(error), chosen_rows(run, part)
             if ahead is None:  # the model's move from the last reading on, added to that reading
                 step = np.diff(error, prepend=np.nan)
             else:
                 step = look_up(ahead[joint][n], np.round(run.tick)) - run.position_rad
-            speed = np.gradient(track) / data.period_s
+            speed = np.gradient(track) * steps_per_tick(track, run) / data.period_s
             alone = joint if _alone(data) else ""
             times = zip(run.number[run.readings.rows], run.reading_elapsed_s, use, strict=True)
-            held = look_up(track, run.held_tick) - run.trial.position_rad
-            raw = look_up(track, run.row_tick) - run.trial.position_rad
+            held = predicted(track, run, run.held_tick[:, None]) - run.trial.position_rad
+            raw = predicted(track, run, run.reading_tick) - run.trial.position_rad
             parts.append(
                 Errors(
                     free_run=error[use],
                     one_step=step[use & np.isfinite(step)],
-                    speed=np.abs(look_up(speed, run.tick)[use]),
+                    speed=np.abs(predicted(speed, run, when)[use]),
                     block=[(alone, int(t), int(s / _BLOCK_S)) for t, s, used in times if used],
                     held=held[rows & np.isfinite(held)],
                     raw=raw[rows & np.isfinite(raw)],
@@ -293,8 +348,14 @@ def _alone(data: ServoData) -> bool:
     return not np.array_equal(first.send_time_s, second.send_time_s)
 
 
-def _stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
-    """Commands and readings (steps, runs, joints), and where each run starts (runs, joints)."""
+def stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
+    """Commands and where each run starts, and readings, all padded to the longest run.
+
+    Returns
+    -------
+    commands, position : ndarray, shape (steps, runs, joints)
+    start : ndarray, shape (runs, joints)
+    """
     most = max(len(found) for found in data.runs.values())
     steps = max(len(r.command_rad) for found in data.runs.values() for r in found)
     commands = np.zeros((steps, most, len(data.joints)))

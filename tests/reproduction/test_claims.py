@@ -31,8 +31,8 @@ from pupper_sysid.policies.analysis.autonomy import (
 )
 from pupper_sysid.policies.analysis.paths import DirectionWalk
 from pupper_sysid.policies.analysis.robustness import AblationPoint, DelayPoint, GroundPoint
+from pupper_sysid.sysid.compare.four_way import FITTED, PUBLISHED, four_way
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.servo_fit.compare import FITTED, PUBLISHED, four_way
 from reproduction import servos as servo_claims
 from reproduction.claims import Claim
 from reproduction.evidence import PolicyEvidence, ScalePoint

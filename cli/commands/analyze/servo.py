@@ -31,7 +31,7 @@ class Servo(Analysis):
         """Fit and compare the models."""
         import numpy as np
 
-        from pupper_sysid.sysid.servo_fit.compare import four_way
+        from pupper_sysid.sysid.compare.four_way import four_way
 
         if len(self.policies) != 1:
             raise InputError("Servo models are compared on one recording or policy at a time.")

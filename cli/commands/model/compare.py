@@ -40,7 +40,7 @@ class Compare:
     def run(self) -> None:
         """Compare, print, draw."""
         from pupper_sysid.common.figure_style import refuse_picture, save
-        from pupper_sysid.sysid.servo_fit.compare import compare
+        from pupper_sysid.sysid.compare.compare import compare
 
         if not self.models:
             raise InputError(

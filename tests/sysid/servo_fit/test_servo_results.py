@@ -10,8 +10,8 @@ import pytest
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sysid.compare.compare import LINEAR, compare
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.servo_fit.compare import LINEAR, compare
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
 from pupper_sysid.sysid.servo_fit.result import ServoFit
 from support.servo_recordings import JOINT, P, recording, trial

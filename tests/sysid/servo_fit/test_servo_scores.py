@@ -154,7 +154,7 @@ def test_a_part_is_scored_on_its_own_readings_only():
     whole = pooled(parts)[JOINT]
     np.testing.assert_allclose(whole.free_run, -np.repeat([0.0, 1.0, 2.0], 50), atol=1e-6)
     assert [b[1] for b in whole.block] == [0] * 50 + [1] * 50 + [2] * 50
-    assert len(whole.held) == len(whole.raw) == len(whole.speed) == 150
+    assert len(whole.raw) == len(whole.speed) == 150
 
 
 def test_joints_recorded_together_share_stretches_and_others_do_not():
