@@ -212,7 +212,7 @@ def fit_joint(
         candidate_models=fitted,
         lag=lag,
         presets={
-            name: _score_preset(by_joint[joint], data, lag.offset_rad)
+            name: _score_preset(by_joint[joint], data)
             for name, by_joint in (presets or {}).items()
             if joint in by_joint
         },
@@ -221,14 +221,15 @@ def fit_joint(
     )
 
 
-def _score_preset(
-    parameters: DelayedPDParameters, data: tuple[TrialData, ...], offset_rad: float
-) -> Scores:
+def _score_preset(parameters: DelayedPDParameters, data: tuple[TrialData, ...]) -> Scores:
+    """Scores with the offset of these readings: their median about it, as in `sysid.compare`."""
     one = parameters.per_inertia()
     parts = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
-             one.velocity_limit, offset_rad)  # fmt: skip
+             one.velocity_limit, 0.0)  # fmt: skip
     values = np.array([np.asarray(part, float).item() for part in parts])
-    return score(free_run(candidate_model(PREFERRED), values, data), data, {})
+    model = candidate_model(PREFERRED)
+    values[-1] = -np.median(np.concatenate(fresh_residuals(model, values, data)))
+    return score(free_run(model, values, data), data, {})
 
 
 def _candidate_fit(
