@@ -22,7 +22,7 @@ import numpy as np
 
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sysid.identify.fleet import Settings, calibrate_fleet
+from pupper_sysid.sysid.fleet.calibration import Settings, calibrate_fleet
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
 

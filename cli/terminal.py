@@ -24,7 +24,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.identify.fleet import Fleet
+    from pupper_sysid.sysid.fleet.calibration import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
 # no markup: names of files and joints may have brackets; `Text` where something is to stand out
@@ -105,7 +105,7 @@ def print_fleet(
 
     `what` names the result per robot; `columns` gives title and digits by column of the table.
     """
-    from pupper_sysid.sysid.identify.fleet import TABLE
+    from pupper_sysid.sysid.fleet.calibration import TABLE
 
     if as_json:
         print_json(fleet.summary(folder, elapsed_s))

@@ -93,7 +93,7 @@ class Calibrate:
 
     def _fleet(self, root: Path, started: float) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.identify.fleet import Settings, calibrate_fleet, robots_in
+        from pupper_sysid.sysid.fleet.calibration import Settings, calibrate_fleet, robots_in
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")

@@ -115,8 +115,8 @@ class FitServo:
 
     def _fleet(self, root: Path, split: Split) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.identify.fleet import robots_in
-        from pupper_sysid.sysid.servo_fit.fleet import ServoSettings, fit_servo_fleet
+        from pupper_sysid.sysid.fleet.calibration import robots_in
+        from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")

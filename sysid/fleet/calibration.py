@@ -1,6 +1,6 @@
 """Calibrate the recordings of many robots at once, on some cores or on a Dask cluster.
 
-`run_fleet` does the same for any other product of a robot's recording (`sysid.servo_fit.fleet`).
+`run_fleet` does the same for any other product of a robot's recording (`sysid.fleet.servo_model`).
 
     fleet = calibrate_fleet(Path("robots"), Path("fleet"), Settings(seed=0), jobs=2)
     fleet.table                   # one row per robot and joint

@@ -14,7 +14,7 @@ from pathlib import Path
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sysid.identify.fleet import Fleet, robots_in, run_fleet
+from pupper_sysid.sysid.fleet.calibration import Fleet, robots_in, run_fleet
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split, fit_servo
@@ -51,7 +51,7 @@ def fit_servo_fleet(
 ) -> Fleet:
     """Fit a servo model to every recording in `root`; a folder per robot in `out`, and the table.
 
-    Parameters and errors as for `sysid.identify.fleet.calibrate_fleet`.
+    Parameters and errors as for `sysid.fleet.calibration.calibrate_fleet`.
     """
     targets = {path: out / name for path, name in robots_in(root).items()}
     return run_fleet(

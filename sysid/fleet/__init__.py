@@ -1,0 +1,1 @@
+"""Fleets: a calibration or a servo model for each of many robots, side by side."""
