@@ -28,6 +28,7 @@ from pupper_sysid.sysid.compare.readings import (
     age_spread_rad,
     as_rows,
     calibrated_run,
+    in_words,
     reading_rules,
     run_with_offset,
     shown,
@@ -127,10 +128,7 @@ class Comparison(Result):
 
     def reading_notes(self) -> list[str]:
         """How readings were predicted, one sentence per rule, and the rule of the offset."""
-        by_rule: dict[str, list[str]] = {}
-        for joint, rule in self.readings.items():
-            by_rule.setdefault(str(rule), []).append(joint)
-        return [OFFSET_RULE, *(f"{', '.join(own)}: {rule}." for rule, own in by_rule.items())]
+        return [OFFSET_RULE, *in_words(self.readings)]
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the models in free run beside commands and readings, a panel per joint.

@@ -55,23 +55,42 @@ class ReadingRule(Result):
     loss: float = math.nan
     mean_age_s: float = math.nan
 
-    def __str__(self) -> str:
-        poll = (
-            f"poll {1e3 * self.poll_period_s:.1f} ms, loss {self.loss:.2f}, "
-            f"mean age {1e3 * self.mean_age_s:.1f} ms"
-        )
-        return {
-            "live": f"readings are live: predicted at their read ({self.source})",
-            "own dates": f"predicted at the dates of {self.source}'s own poll lattice ({poll})",
-            "expected": (
-                "this recording does not show its poll: predicted in the mean over the phase and "
-                f"the losses of {self.source} ({poll})"
-            ),
-            "as logged": (
-                "nothing is known of the poll, so the age of readings counts as an error. Name a "
-                "calibration of a sweep on the same bus among the models"
-            ),
-        }[self.rule]
+
+def in_words(rules: Mapping[str, ReadingRule]) -> list[str]:
+    """How the readings of all joints are predicted, one sentence per rule and source."""
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for joint, rule in rules.items():
+        grouped.setdefault((rule.rule, rule.source), []).append(joint)
+    return [
+        f"{', '.join(joints)}: {_sentence(*key, [rules[j] for j in joints])}."
+        for key, joints in grouped.items()
+    ]
+
+
+def _sentence(rule: str, source: str, own: Sequence[ReadingRule]) -> str:
+    poll = (
+        f"poll {_span([1e3 * r.poll_period_s for r in own], 1)} ms, "
+        f"loss {_span([r.loss for r in own], 2)}, "
+        f"mean age {_span([1e3 * r.mean_age_s for r in own], 1)} ms"
+    )
+    return {
+        "live": f"the readings of {source} are live and predicted at their read",
+        "own dates": f"predicted at the dates of {source}'s own poll lattice ({poll})",
+        "expected": (
+            "the recording does not show its poll; predicted in the mean over the phase and the "
+            f"losses of {source} ({poll})"
+        ),
+        "as logged": (
+            "nothing is known of the poll, so the age of readings counts as an error; name a "
+            "calibration of a sweep on the same bus among the models"
+        ),
+    }[rule]
+
+
+def _span(values: Sequence[float], digits: int) -> str:
+    """One number, or the smallest and the largest."""
+    ends = list(dict.fromkeys(f"{x:.{digits}f}" for x in (min(values), max(values))))
+    return "–".join(ends)
 
 
 def reading_rules(

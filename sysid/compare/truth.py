@@ -157,6 +157,7 @@ def truth_table(
     truth: Mapping[str, Any],
     recordings: Recordings | None = None,
     seed: int = 0,
+    joints: Sequence[str] | None = None,
 ) -> TruthTable:
     """Each quantity of a calibration beside the true one.
 
@@ -170,11 +171,12 @@ def truth_table(
         on the commands.
     seed : int
         Of the calibration; the search for the poll uses it.
+    joints : sequence of str, optional
+        By default all that both have.
 
     Returns
     -------
     TruthTable
-        Rows of the joints that both have.
 
     Raises
     ------
@@ -183,14 +185,18 @@ def truth_table(
     """
     if isinstance(calibration, CalibrationResult):
         calibration = calibration.calibration
-    joints = [j for j in calibration.joint_names if j in truth["joints"]]
-    if not joints:
+    both = [j for j in calibration.joint_names if j in truth["joints"]]
+    if joints is not None:
+        both = [j for j in both if j in joints]
+    if not both:
         raise InputError(
             f"The calibration has {', '.join(calibration.joint_names)}, the truth "
-            f"{', '.join(truth['joints'])}: no joint in common."
+            f"{', '.join(truth['joints'])}"
+            + (f", and {', '.join(joints)} was asked for" if joints is not None else "")
+            + ": no joint in common."
         )
     rows: list[TruthRow] = []
-    for joint in joints:
+    for joint in both:
         found, true = calibration.joint(joint), truth["joints"][joint]
         actuator, feedback = true["actuator"], true["feedback"]
         stepped = _in_steps_of(actuator, true, found.actuator.physics_step_s)
@@ -315,13 +321,17 @@ def _row(joint: str, name: str, found: Quantity, truth: float) -> TruthRow:
 
 
 def compared_with_truth(
-    recordings: Recordings, truth: Mapping[str, Any], calibration: Calibration, seed: int = 0
+    recordings: Recordings,
+    truth: Mapping[str, Any],
+    calibration: Calibration,
+    joints: Sequence[str] | None = None,
 ) -> TruthTable:
     """`truth_table` with the lag where the recordings are the calibration's own, else a note."""
+    seed = calibration.seed or 0
     made_from = {i.sha256 for i in calibration.inputs}
     if {r.sha256 for r in as_sequence(recordings)} == made_from:
-        return truth_table(calibration, truth, recordings, seed)
-    table = truth_table(calibration, truth, None, seed)
+        return truth_table(calibration, truth, recordings, seed, joints)
+    table = truth_table(calibration, truth, None, seed, joints)
     names = ", ".join(i.name for i in calibration.inputs) or "no recording"
     note = (
         f"The calibration was made from {names}, so its lag, which depends on the commands, is "

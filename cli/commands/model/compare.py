@@ -16,6 +16,10 @@ from pupper_sysid.common.errors import InputError
 class Compare:
     """Which model moves like the servo? Free run of each on the same recording, per joint.
 
+    Every model predicts readings: with the age that the bus gives them, and the offset of this
+    recording. A calibration of a sweep on the same bus gives the poll where a recording of another
+    motion does not show it.
+
     Example: pupper-sysid compare recordings/playback.csv --models servo/ calibrated.yaml
     """
 
@@ -69,5 +73,13 @@ class Compare:
             means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in found.models.items()}
             text = ", ".join(f"{name} {terminal.ms(value)}" for name, value in means.items())
             terminal.out.print(f"Mean, {title.replace('_', ' ')}: {text}", soft_wrap=True)
+        shifted = {name: m.offset_rad for name, m in found.models.items() if m.offset_rad}
+        offsets = terminal.table("Offset of this recording, mrad", "joint", *shifted)
+        for joint in joints:
+            offsets.add_row(joint, *(terminal.ms(own[joint]) for own in shifted.values()))
+        terminal.out.print()
+        terminal.out.print(offsets)
+        for sentence in found.reading_notes():
+            terminal.out.print(sentence, soft_wrap=True)
         terminal.warn(found.notes)
         terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)
