@@ -1,8 +1,8 @@
 """Examination of a recording before anything is fitted to it: `examine`.
 
 Every joint gets a verdict, "use", "use with care" or "do not use", with reasons in sentences that
-say what to do. Stale feedback alone never makes a recording unusable: the other commands date each
-fresh reading. The checks of the signals themselves (units, swapped columns, clipping) are in
+say what to do. Stale feedback whose poll is found asks for no care: the other commands date each
+fresh reading. The checks of times and signals, which those commands make as well, are in
 `sysid.doctor.checks`.
 """
 
@@ -15,12 +15,14 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import JointResults, Result, internal
-from pupper_sysid.sysid.doctor import checks
-from pupper_sysid.sysid.doctor.checks import CARE, REFUSE, USE, Finding
+from pupper_sysid.sysid.doctor.causality import crossed
+from pupper_sysid.sysid.doctor.checks import findings, long_enough
+from pupper_sysid.sysid.doctor.clock import disorder
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, VERDICTS, Finding
+from pupper_sysid.sysid.doctor.signals import amplitude_ratio, offset, peak_speed
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
@@ -41,13 +43,12 @@ from pupper_sysid.sysid.recordings.recording import Trial
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MUCH_LOSS = 0.2
-_MUCH_HOLD = 0.2  # of the raw lag
-_UNEVEN = 0.2  # of the loop period
-_LEAST_ROWS = 3  # of a trial: fewer have no rate of change
-_LEAST_FRESH = 16
 _USUAL_SPEED_RAD_S = 7.5  # a Mini Pupper 2's servo, unloaded
-_FEW_MISSING = 0.02
+_HELD = (
+    "Feedback is held between polls, which these recordings stand: `delay`, `bode` and `calibrate` "
+    "date each new reading to the poll that measured it. Do not compute lag, gain or error from "
+    "all rows."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,11 +117,14 @@ class Examination(JointResults[JointExamination]):
         Its name; of several, all names.
     warnings : tuple of str
         What was repaired when it was read, e.g. repeated time stamps.
+    advice : tuple of str
+        What follows for all joints together.
     joints : dict of str to JointExamination
     """
 
     recording: str
     warnings: tuple[str, ...]
+    advice: tuple[str, ...] = ()
 
     def plot(self) -> Figure:
         """For how many rows each reading stayed the same; joints that can be used."""
@@ -164,13 +168,18 @@ def examine(
     rng = np.random.default_rng(seed)
     limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
     limit = max(float(each or _USUAL_SPEED_RAD_S) for each in limits)
+    recorded = {joint: joint_trials(given, joint) for joint in chosen_joints(given, joints)}
+    mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
+    found = {
+        joint: _examine_joint(joint, trials, mixed.get(joint), limit, rng)
+        for joint, trials in recorded.items()
+    }
+    held = any(j.feedback and j.feedback.kind == "lattice" for j in found.values())
     return Examination(
         recording=", ".join(r.name for r in given),
         warnings=tuple(w for r in given for w in r.warnings),
-        joints={
-            joint: _examine_joint(joint, joint_trials(given, joint), limit, rng)
-            for joint in chosen_joints(given, joints)
-        },
+        advice=(_HELD,) if held else (),
+        joints=found,
     )
 
 
@@ -187,42 +196,33 @@ def hold_histogram(trials: Sequence[Trial]) -> tuple[int, ...]:
 
 
 def _examine_joint(
-    joint: str, recorded: Sequence[Trial], limit_rad_s: float, rng: np.random.Generator
+    joint: str,
+    recorded: Sequence[Trial],
+    mixed: Finding | None,
+    limit_rad_s: float,
+    rng: np.random.Generator,
 ) -> JointExamination:
-    trials = [t for t in recorded if len(t.send_time_s) >= _LEAST_ROWS]
+    found = [*findings(recorded), *([mixed] if mixed else [])]
+    trials = long_enough(recorded)
     if not trials:
-        text = f"no trial has {_LEAST_ROWS} rows: the recording was cut short. Record it again."
-        return JointExamination(verdict=REFUSE, reasons=(text,))
+        return JointExamination(verdict=REFUSE, reasons=tuple(f.text for f in found))
     gaps = np.concatenate([np.diff(t.send_time_s) for t in trials])
-    loop = float(np.median(gaps))
     seen = np.concatenate([np.isfinite(t.position_rad) for t in trials])
-    disorder = sum(_disorder(t) for t in trials)
-    step = quantum(trials)
     fresh = sum(len(fresh_rows(t)) for t in trials)
-    findings = [
-        *_missing(float(1 - seen.mean()), len(recorded) - len(trials)),
-        *_timing(gaps, loop, disorder),
-    ]
-    unusable = checks.unusable(joint, trials, step)
-    if not unusable and fresh < _LEAST_FRESH:
-        unusable = [Finding(REFUSE, f"only {fresh} readings differ from the one before, too few to "
-                                  "measure anything. Record for longer, with a larger "
-                                  "amplitude.")]  # fmt: skip
+    usable = all(f.verdict != REFUSE for f in found)
     lattice = PollLattice(kind="unresolved", fresh_fraction=fresh / len(seen))
     hold_share = math.nan
-    speed = checks.peak_speed(trials)
-    if not unusable:
+    speed = peak_speed(trials)
+    if usable:
         lattice = find_poll_lattice(trials, rng)
         hold_share = _hold_share(joint, trials, lattice, rng)
-        findings += _held(lattice, hold_share)
-        findings += _coverage(trials, speed, limit_rad_s)
-        findings += checks.doubtful(trials, step)
-    findings = sorted([*unusable, *findings], key=lambda f: (REFUSE, CARE, USE).index(f.verdict))
+        found += [*_held(lattice, hold_share), *_coverage(trials, speed, limit_rad_s)]
+    found = sorted(found, key=lambda f: VERDICTS.index(f.verdict))
     return JointExamination(
-        verdict=findings[0].verdict if findings else USE,
-        reasons=tuple(f.text for f in findings)
+        verdict=found[0].verdict if found else USE,
+        reasons=tuple(f.text for f in found)
         or ("nothing wrong was found: timing is even, readings are new, motion covers its range.",),
-        loop_period_s=loop,
+        loop_period_s=float(np.median(gaps)),
         jitter_s=float(np.std(gaps)),
         fresh_fraction=lattice.fresh_fraction,
         poll_period_s=lattice.poll_period_s,
@@ -230,50 +230,16 @@ def _examine_joint(
         z_score=lattice.z_score,
         hit_rate=lattice.hit_rate,
         hold_share=hold_share,
-        quantum_rad=step,
-        offset_rad=checks.offset(trials),
+        quantum_rad=quantum(trials),
+        offset_rad=offset(trials),
         missing_fraction=float(1 - seen.mean()),
-        bad_time_stamps=disorder,
-        amplitude_ratio=checks.amplitude_ratio(trials),
+        bad_time_stamps=sum(disorder(t) for t in trials),
+        amplitude_ratio=amplitude_ratio(trials),
         peak_command_rad_s=speed,
         speed_share=speed / limit_rad_s,
-        hold_histogram=hold_histogram(trials),
-        feedback=None if unusable else lattice,
+        hold_histogram=hold_histogram(trials) if usable else (),
+        feedback=lattice if usable else None,
     )
-
-
-def _disorder(trial: Trial) -> int:
-    return int(np.sum((np.diff(trial.send_time_s) <= 0) | (np.diff(trial.read_time_s) <= 0)))
-
-
-def _missing(share: float, short_trials: int) -> list[Finding]:
-    found = []
-    if share > 0.5:
-        found.append(Finding(REFUSE, f"{100 * share:.0f} % of the readings are missing: check "
-                                     "wiring and power, then record again."))  # fmt: skip
-    elif share > _FEW_MISSING:
-        found.append(Finding(CARE, f"{100 * share:.0f} % of the readings are missing; the rest is "
-                                   "used. Check the plugs before the next recording."))  # fmt: skip
-    if short_trials:
-        found.append(Finding(CARE, f"{short_trials} trials have fewer than {_LEAST_ROWS} rows and "
-                                   "are left out. Record them again."))  # fmt: skip
-    return found
-
-
-def _timing(gaps: NDArray[np.float64], loop: float, disorder: int) -> list[Finding]:
-    found = []
-    if disorder:
-        found.append(Finding(CARE, f"{disorder} time stamps repeat or run backwards, so lags are "
-                                   "uncertain there. Record with a monotonic clock."))  # fmt: skip
-    if np.std(gaps) > _UNEVEN * loop:
-        found.append(Finding(CARE, f"the loop is uneven ({1e3 * np.std(gaps):.1f} ms of jitter on "
-                                   f"{1e3 * loop:.1f} ms); time stamps are used as they are, but "
-                                   "record on an idle machine."))  # fmt: skip
-    late = int(np.sum(gaps > 3 * loop))
-    if late:
-        found.append(Finding(CARE, f"the loop stood still {late} times for more than three "
-                                   "periods; record on an idle machine."))  # fmt: skip
-    return found
 
 
 def _hold_share(
@@ -303,12 +269,7 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
         )
     if math.isfinite(hold_share):
         text += f", {100 * hold_share:.0f} % of the lag that all rows show"
-    text += (
-        ". The recording is usable: `delay`, `bode` and `calibrate` date each fresh reading to the "
-        "poll that measured it; do not compute lag, gain or error from all rows."
-    )
-    care = lattice.loss > _MUCH_LOSS or hold_share > _MUCH_HOLD
-    return [Finding(CARE if care else USE, text)]
+    return [Finding(USE, f"{text}.")]
 
 
 def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Finding]:

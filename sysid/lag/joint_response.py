@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
+from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
 from pupper_sysid.sysid.lag.lag_budget import tone_lags
 from pupper_sysid.sysid.lag.multisine import multisine_responses
@@ -68,11 +69,14 @@ class FrequencyResponse(Result):
         upper end of infinity lies above the highest tone.
     transfer_functions : dict of str to TransferFunction
         Those with fewer parameters than there are numbers measured.
+    warnings : tuple of str
+        What asks for care in these recordings.
     """
 
     joint: str
     bandwidth_hz: Interval | None
     transfer_functions: dict[str, TransferFunction]
+    warnings: tuple[str, ...] = ()
     frequency_hz: NDArray[np.float64] = internal()
     amplitude_rad: NDArray[np.float64] = internal()
     response: NDArray[np.complex128] = internal()
@@ -183,6 +187,7 @@ def joint_response(
         joint=joint,
         bandwidth_hz=_bandwidth(tones, draws),
         transfer_functions=fit_transfer_functions(tones, draws),
+        warnings=cautions(joint, trials),
         frequency_hz=np.array([t.frequency_hz for t in tones]),
         amplitude_rad=np.array([abs(t.command_held) for t in tones]),
         response=np.array([t.response for t in tones]),

@@ -9,7 +9,9 @@ from zlib import crc32
 
 import numpy as np
 
+from pupper_sysid.common.children import end_with_parent
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
+from pupper_sysid.sysid.doctor.checks import refuse_unusable
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 Recordings = Recording | Sequence[Recording]
@@ -59,7 +61,7 @@ def each_joint(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Found]:
-    """`work(joint, trials)` of every joint, in joint order.
+    """`work(joint, trials)` of every joint, in joint order; none if one cannot be used.
 
     Parameters
     ----------
@@ -76,9 +78,10 @@ def each_joint(
     Raises
     ------
     InputError
-        If a joint is not recorded.
+        If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
     tasks = {j: joint_trials(recordings, j) for j in chosen_joints(recordings, joints)}
+    refuse_unusable(tasks)
     return map_joints(work, tasks, workers, progress)
 
 
@@ -116,7 +119,7 @@ def map_joints(
     else:
         from concurrent.futures import ProcessPoolExecutor, as_completed
 
-        with ProcessPoolExecutor(min(workers, len(tasks))) as pool:
+        with ProcessPoolExecutor(min(workers, len(tasks)), initializer=end_with_parent) as pool:
             futures = {pool.submit(work, joint, task): joint for joint, task in tasks.items()}
             for future in as_completed(futures):
                 done(futures[future], future.result())

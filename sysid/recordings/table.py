@@ -26,6 +26,7 @@ REQUIRED_COLUMNS = (
 OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
 
 _LEAST_ROWS = 20
+_MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
 TEXT_COLUMNS = ("joint", "signal")
@@ -170,6 +171,12 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
     for column in ("command_rad", "position_rad"):
         _refuse_degrees(path, column, table[column].to_numpy())
     again = table.duplicated(["joint", "trial", "send_time_s"])
+    if again.mean() > _MANY_REPEATED:
+        raise InputError(
+            f"{path}, column send_time_s: {100 * again.mean():.0f} % of the rows repeat a time "
+            "stamp of their trial: a clock too coarse, or two logs in one. Record with a clock of "
+            "1 ms or finer, and give each pass its own trial number."
+        )
     if again.any():
         warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
         table = table.loc[~again]

@@ -19,7 +19,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import physical_model
-from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, chosen_joints
+from pupper_sysid.sysid.doctor.checks import cautions
+from pupper_sysid.sysid.recordings.joints import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    joint_trials,
+)
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
@@ -161,7 +168,8 @@ def fit_servo(
             "Leave it out."
         )
     data = servo_data(recordings, joints, readings, seed)
-    recorded, notes = ", ".join(data.groups), list[str]()
+    recorded = ", ".join(data.groups)
+    notes = [text for j in joints for text in cautions(j, joint_trials(recordings, j))]
     whole = split.train or everything
     data, note = grouped(data, whole)
     notes += [note] if note else []

@@ -52,5 +52,6 @@ class Bode:
         for joint, response in found.items():
             terminal.out.print(Text(joint, "bold"))
             terminal.out.print(str(response), soft_wrap=True)
+            terminal.warn(response.warnings)
         if self.plot:
             terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)

@@ -1,0 +1,242 @@
+"""Checks of cause and effect: is the position that of a servo that follows this command?
+
+An echo, noise, an unrelated or an inverted position, one that moves before its command, and a
+scale or zero that changes, by what `sysid.doctor.following` explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.doctor.clock import clock_findings
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
+from pupper_sysid.sysid.doctor.following import Following, following
+from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_UNRELATED, _LOOSE = 0.25, 0.6  # share of the position's variance that the command explains
+_ECHO_ROWS, _ECHO_STEPS, _ECHO_SHARE = 30, 5.0, 0.99
+_LONGEST_ECHO_S, _MOST_SHIFTS = 0.6, 60
+_FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.5, 0.1
+_DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
+_SAME_TONE_HZ = 0.02
+_DIFFERENT = 0.35  # of the gain
+_UNITS = {
+    "degrees": 57.29578, "counts of 4,096 a turn": 651.8986, "counts of 1,024 a turn": 162.97466,
+    "milliradians": 1000.0,
+}  # fmt: skip
+_SAME_SCALE = 0.35  # of the logarithm
+_NO_ONE_LAG = 0.3
+_MUCH_BETTER = 0.5
+_NO_PERIOD_S = 0.1  # no tone of a sweep repeats within it
+_AMBIGUOUS = 0.01  # a tone may be late by a half or whole period as well
+
+
+def causality_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """Faults of the relation between the command and the position of one joint."""
+    if echo := _echo(trials, step):
+        return [echo]
+    how = following(trials, step)
+    if how is None:
+        return []
+    refused = _scale(how) or _not_a_servo(trials, how)
+    if refused:
+        return [refused]
+    return [*_loose(how), *_drift(trials, how), *_changed(trials, how)]
+
+
+def crossed(trials_by_joint: Mapping[str, Sequence[Trial]]) -> dict[str, Finding]:
+    """Joints whose position follows the command of another one, recorded at the same time."""
+    found = {}
+    for joint, trials in trials_by_joint.items():
+        others = {
+            name: theirs
+            for name, theirs in trials_by_joint.items()
+            if name != joint and trials and _simultaneous(trials, theirs)
+        }
+        if not others or any(f.verdict == REFUSE for f in clock_findings(trials)):
+            continue
+        step = quantum(trials)
+        own = following(trials, step)
+        if own is None or own.score > 1 - _MUCH_BETTER / 4:
+            continue
+        for other, theirs in others.items():
+            instead = [
+                replace(t, command_rad=o.command_rad, initial_command_rad=o.initial_command_rad)
+                for t, o in zip(trials, theirs, strict=True)
+            ]
+            how = following(instead, step)
+            if how and 1 - how.score < _MUCH_BETTER * (1 - own.score):
+                text = (
+                    f"its position follows the command of {other} and not its own: the joints are "
+                    "mixed up. Check servo ids and the joint map."
+                )
+                found[joint] = Finding(REFUSE, text)
+                break
+    return found
+
+
+def _simultaneous(one: Sequence[Trial], other: Sequence[Trial]) -> bool:
+    return len(one) == len(other) and all(
+        len(a.send_time_s) == len(b.send_time_s)
+        and abs(a.send_time_s[0] - b.send_time_s[0]) < 1.0
+        and np.ptp(b.command_rad) > 1e-3
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def _echo(trials: Sequence[Trial], step: float) -> Finding | None:
+    """The position is the command itself, some rows late, to within a quantisation step."""
+    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    near = 0.55 * step + 1e-5
+    fast = [_rows_after_motion(t, _ECHO_STEPS * near) for t in trials]
+    for shift in range(min(round(_LONGEST_ECHO_S / max(loop, 1e-4)), _MOST_SHIFTS) + 1):
+        parts = [
+            t.position_rad[late] - t.command_rad[late - shift]
+            for t, rows in zip(trials, fast, strict=True)
+            if len(late := rows[rows >= shift])
+        ]
+        left = np.concatenate([np.zeros(0), *parts])
+        if len(left) < _ECHO_ROWS:
+            return None
+        middle = 0.5 * float(np.sum(np.quantile(left, (0.01, 0.99))))
+        if np.mean(np.abs(left - middle) <= near) >= _ECHO_SHARE:
+            late = f"{shift} row{'s' if shift != 1 else ''} late" if shift else "in the same row"
+            text = (
+                f"the position is the command itself, {late}: an echo and no measurement. Read the "
+                "servo's Present_Position, not its goal."
+            )
+            return Finding(REFUSE, text)
+    return None
+
+
+def _rows_after_motion(trial: Trial, least: float) -> NDArray[np.int64]:
+    """Rows up to four after the command moved by more than `least`: no servo is there yet."""
+    moved = np.abs(np.diff(trial.command_rad, prepend=trial.command_rad[0])) > least
+    soon = np.convolve(moved, np.ones(5))[: len(moved)] > 0
+    return np.flatnonzero(np.isfinite(trial.position_rad) & soon)
+
+
+def _scale(how: Following) -> Finding | None:
+    """A position of another unit or scale than the command, whatever its sign."""
+    known = np.abs(how.gain[np.isfinite(how.gain)])
+    if not len(known) or how.explained < _LOOSE:
+        return None
+    gain, best = float(np.median(known)), float(np.max(known))
+    for value, large, small in (
+        (gain, "positions", "commands"), (1 / max(gain, 1e-9), "commands", "positions"),
+    ):  # fmt: skip
+        unit = next((u for u, f in _UNITS.items() if abs(np.log(value / f)) < _SAME_SCALE), None)
+        if unit:
+            text = (
+                f"{large} are {value:.0f} times as large as {small}, which looks like {unit}. "
+                "Convert them to radians: degrees times 0.0174533, counts times 2π over the counts "
+                "of a turn."
+            )
+            return Finding(REFUSE, text)
+    if gain > _FAR_TOO_LARGE:
+        text = (
+            f"the joint moves {gain:.2f} times as far as commanded, which no position servo does: "
+            "check the scale (counts per radian, gear, joint map), then record again."
+        )
+        return Finding(REFUSE, text)
+    # where a servo cannot follow it moves less: the scale is what it shows at its best
+    if best < _STILL:
+        text = (
+            f"the joint moves by {100 * best:.0f} % of its command at best: torque off, blocked, "
+            "or another scale. Check that it turns freely."
+        )
+        return Finding(REFUSE, text)
+    return None
+
+
+def _not_a_servo(trials: Sequence[Trial], how: Following) -> Finding | None:
+    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    text = None
+    if how.explained < _UNRELATED:
+        text = (
+            f"the command explains {100 * how.explained:.0f} % of the position's motion: the two "
+            "have nothing to do with each other. Check that both are of the same joint and on the "
+            "same clock."
+        )
+    elif how.early_lag_s < -0.2 * loop - 1e-3 and how.better(
+        how.early_score, 0.0 if how.early_lag_s > -_NO_PERIOD_S else _AMBIGUOUS
+    ):
+        text = (
+            f"the position moves {-1e3 * how.early_lag_s:.0f} ms before the command does: the "
+            "columns command_rad and position_rad look swapped, or a row holds the command of "
+            "another time. Swap them back, or shift one."
+        )
+    elif how.better(how.inverted_score, _AMBIGUOUS):
+        text = (
+            "the position moves against the command: its sign is inverted. Change the direction "
+            "in the joint map, or multiply one column by -1."
+        )
+    return None if text is None else Finding(REFUSE, text)
+
+
+def _loose(how: Following) -> list[Finding]:
+    found = []
+    if how.explained < _LOOSE:
+        text = (
+            f"the command explains {100 * how.explained:.0f} % of the position's motion: noise, "
+            "play or a load moves the joint as well. Record with a larger amplitude and a free "
+            "joint."
+        )
+        found.append(Finding(CARE, text))
+    elif how.explained - how.score > _NO_ONE_LAG:
+        text = (
+            "no lag below 0.8 s fits all trials: they are of different joints or settings, one "
+            "column is not what it is called, or readings are older than that. Look at the trials "
+            "one by one."
+        )
+        found.append(Finding(CARE, text))
+    gain = how.gain[np.isfinite(how.gain)]
+    if len(gain) and (np.median(gain) > _TOO_LARGE or np.max(gain) < _SMALL):
+        shown = float(np.median(gain) if np.median(gain) > _TOO_LARGE else np.max(gain))
+        text = (
+            f"the joint moves {shown:.2f} times as far as commanded: check the scale (counts per "
+            "radian) and mechanical stops, or record slower tones."
+        )
+        found.append(Finding(CARE, text))
+    return found
+
+
+def _drift(trials: Sequence[Trial], how: Following) -> list[Finding]:
+    """A zero that moves during a trial."""
+    for t, left in zip(trials, how.residual_rad, strict=True):
+        half = len(left) // 2
+        if half < 20:
+            continue
+        moved = abs(float(np.median(left[:half]) - np.median(left[half:])))
+        if moved > max(_DRIFT_RAD, _DRIFT_SHARE * float(np.ptp(t.command_rad))):
+            text = (
+                f"the joint's zero moves by {moved:.2f} rad within a trial: a slipping horn, a "
+                "servo that restarted, or two recordings in one trial. Record again."
+            )
+            return [Finding(CARE, text)]
+    return []
+
+
+def _changed(trials: Sequence[Trial], how: Following) -> list[Finding]:
+    """Trials of one tone and amplitude that differ."""
+    tones = [
+        (t.frequency_hz, float(np.ptp(t.command_rad)), g)
+        for t, g in zip(trials, how.gain, strict=True)
+        if t.frequency_hz > 0 and np.isfinite(g)
+    ]
+    for n, (f, a, g) in enumerate(tones):
+        for f2, a2, g2 in tones[:n]:
+            alike = abs(f - f2) < _SAME_TONE_HZ and abs(a - a2) < 0.05 * a
+            if alike and abs(g - g2) > _DIFFERENT * max(abs(g), abs(g2)):
+                text = (
+                    f"two trials of {f:.3g} Hz differ: the joint moves {g:.2f} and {g2:.2f} times "
+                    "as far as commanded. Settings, supply or load changed between them: use them "
+                    "apart."
+                )
+                return [Finding(CARE, text)]
+    return []
