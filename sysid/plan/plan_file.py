@@ -1,12 +1,12 @@
 """The plan file: the trials of a sweep that `plan` proposes and `sweep --plan` executes, as YAML.
 
 save_plan(proposal, Path("plan.yaml"))
-excitation = executable(load_plan(Path("plan.yaml")), path, margin_rad, start_pose_rad)
+executable(load_plan(path), path, joints, …)      # what the recorder takes
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -177,6 +177,7 @@ def load_plan(path: Path) -> SweepPlan:
 def executable(
     proposal: SweepPlan,
     path: Path,
+    joints: Sequence[str],
     margin_rad: Mapping[str, float],
     start_pose_rad: Mapping[str, float],
     speed_limit_rad_s: float,
@@ -188,6 +189,8 @@ def executable(
     proposal : SweepPlan
     path : Path
         Its file; name and hash go into the recording's header.
+    joints : sequence of str
+        Those of the plan that move.
     margin_rad : mapping of joint to float
         Largest excursion of each joint to either side of its start pose.
     start_pose_rad : mapping of joint to float
@@ -199,17 +202,18 @@ def executable(
     InputError
         If a tone cannot be commanded at the plan's rate, or a joint has no margin.
     """
+    chosen = [t for t in proposal.trials if t.joint in joints]
     parts = [
         plan(
             t.kind, [t.joint], [t.frequency_hz], t.amplitude_rad, t.duration_s,
             proposal.loop_period_s, min(proposal.speed_limit_rad_s, speed_limit_rad_s),
             proposal.poll_rate_hz, margin_rad, start_pose_rad,
         )
-        for t in proposal.trials
+        for t in chosen
     ]  # fmt: skip
     changes = tuple(
         dict.fromkeys(
-            f"{t.joint}: {w}" for t, p in zip(proposal.trials, parts, strict=True)
+            f"{t.joint}: {w}" for t, p in zip(chosen, parts, strict=True)
             for w in p.warnings
         )
     )  # fmt: skip
@@ -217,6 +221,7 @@ def executable(
         "kind": "plan",
         "file": path.name,
         "sha256": sha256(path),
+        "joints": list(joints),
         "made_from": plain(proposal.made_from),
         "lead_in_s": parts[0].description["lead_in_s"],
         "speed_limit_rad_s": speed_limit_rad_s,

@@ -34,11 +34,17 @@ CLEAR_NATS = 5.0
 
 DEAD_TIME = "dead_time_s"
 
+SHORTEST_S = 3.0
+"""Shortest trial without its lead-in [s]: a poll's phase needs as long."""
+
 _OTHERS = 0.25  # weight of the other parameters' mean logarithm beside the dead time's
 _FOLLOWED = 0.6  # of the command; `sysid.lag.lag_budget` leaves out what is below half
 _MOST_OF_A_TONE = 2  # no model is right at every tone: a plan does not rest on one
-_SHORTEST_S = 3.0  # a poll's phase needs as long
 _Z = float(ndtri((1 + LEVEL) / 2))
+
+LEAST_HALF_WIDTH_S = _Z * STEPPING_SD_S
+"""Half of a dead time's interval that no number of readings narrows [s]: the model's time step."""
+
 _UNSEEN_SD = float(np.log(2)) / _Z  # of a logarithm: an interval from half to twice the value
 _TELLS = 0.1  # share of `CLEAR_NATS` that makes telling models apart a trial's purpose
 _WORDS = {
@@ -139,9 +145,9 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
     seconds : float
         Recorded time, lead-ins included.
     """
-    count = max(1, int(seconds / trial_seconds(_SHORTEST_S) + 1e-9))
+    count = max(1, int(seconds / trial_seconds(SHORTEST_S) + 1e-9))
     duration = round(seconds / count - trial_seconds(0.0), 3)
-    choice = candidates(setup, max(duration, _SHORTEST_S))
+    choice = candidates(setup, max(duration, SHORTEST_S))
     worlds = [_World(servo, choice, setup.seen) for servo in servos]
     tones = [(c.kind, c.frequency_hz) for c in choice]
     usable = [k for k in range(len(choice)) if _followed(worlds, choice[k], k)]
@@ -255,7 +261,7 @@ def _criterion(worlds: Sequence[_World], chosen: Sequence[int]) -> float:
     total = 0.0
     for world in worlds:
         dead = world.dead_time_s(chosen)
-        floor = 2 * _Z * STEPPING_SD_S
+        floor = 2 * LEAST_HALF_WIDTH_S
         # without the part that no reading reduces, or nothing would seem to help near it
         width = np.sqrt(max((dead.high - dead.low) ** 2 - floor**2, 1e-12))
         variance = np.diag(world.covariance(0, chosen))[1:-1]
@@ -341,7 +347,7 @@ def _notes(
     if (after.high - after.low) > (1 - _HELPS) * (now.high - now.low):
         found.append(
             f"{joint}: no trial within the limits narrows the dead time's interval of "
-            f"± {500 * (now.high - now.low):.1f} ms; ± {1e3 * _Z * STEPPING_SD_S:.1f} ms of it "
+            f"± {500 * (now.high - now.low):.1f} ms; ± {1e3 * LEAST_HALF_WIDTH_S:.1f} ms of it "
             "are the model's time step."
         )
     return found

@@ -152,14 +152,14 @@ def plan_from_fits(
         If `seconds` is out of range.
     """
     base = Setup(
-        loop_period_s=float(np.median([r.loop_period_s for r in recordings])),
+        loop_period_s=round(float(np.median([r.loop_period_s for r in recordings])), 6),
         speed_limit_rad_s=_speed_limit(recordings),
     )
     plans, polls = [], []
     for joint, fit in fits.items():
         trials = joint_trials(recordings, joint)
         setup = feedback_setup(fit.lag, _within(base, joint, margins, _excursion(trials)))
-        length = _checked(seconds if seconds is not None else _recorded_s(trials))
+        length = min(recorded_s(trials), LONGEST_S) if seconds is None else _checked(seconds)
         plans.append(propose(joint, [fitted_servo(fit)], setup, length))
         polls.append(setup.poll_rate_hz)
     sources = tuple(
@@ -258,7 +258,7 @@ def _pooled(
         made_from=sources,
         seed=seed,
         loop_period_s=setup.loop_period_s,
-        poll_rate_hz=setup.poll_rate_hz,
+        poll_rate_hz=round(setup.poll_rate_hz, 3),
         speed_limit_rad_s=setup.speed_limit_rad_s,
         trials=tuple(t for p in plans for t in p.trials),
         predictions=tuple(x for p in plans for x in p.predictions),
@@ -291,8 +291,9 @@ def _checked(seconds: float) -> float:
     return seconds
 
 
-def _recorded_s(trials: Sequence[Trial]) -> float:
-    return min(float(sum(t.send_time_s[-1] - t.send_time_s[0] for t in trials)), LONGEST_S)
+def recorded_s(trials: Sequence[Trial]) -> float:
+    """Recorded time of all trials [s]."""
+    return float(sum(t.send_time_s[-1] - t.send_time_s[0] for t in trials))
 
 
 def _excursion(trials: Sequence[Trial]) -> float:

@@ -24,6 +24,20 @@ from pupper_sysid.sysid.sweep.excitation import Plan
 _LEAST_PAUSE_S = 0.5
 
 
+class Series(BaseModel):
+    """Place of a recording among those of a sweep that goes on until an interval is narrow."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    goal: str
+    most_seconds: float = Field(gt=0)
+    first: str
+    """File name of the first recording."""
+    joints: list[str]
+    """Joints of the first recording."""
+    number: int = Field(ge=1, le=1000)
+
+
 class Request(BaseModel):
     """Options of a sweep, as the command writes them into the header."""
 
@@ -42,6 +56,10 @@ class Request(BaseModel):
     playback: str | None
     loops: int = Field(1, ge=1, le=1000)
     """Of a playback; absent in recordings of older versions."""
+    plan: str | None = None
+    """Plan file that is executed."""
+    until: Series | None = None
+    """Absent unless the sweep goes on until an interval is narrow."""
 
 
 @dataclass(frozen=True)
@@ -76,15 +94,17 @@ def header_of(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If it is not a recording of this project, was completed, or does not hold its plan.
+        If it is not a recording of this project, was completed (and nothing follows it), or does
+        not hold its plan.
     """
     text = as_text(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")
     metadata = header(path, text.splitlines())
-    if "completed" in metadata:
-        raise InputError(f"{path} was recorded to its end; there is nothing to continue.")
     request = metadata.get("sweep")
+    follows = isinstance(request, dict) and bool(request.get("until"))
+    if "completed" in metadata and not follows:
+        raise InputError(f"{path} was recorded to its end; there is nothing to continue.")
     if request is None:
         raise InputError(
             f"{path} does not hold its plan (an older version wrote it). Record it again."

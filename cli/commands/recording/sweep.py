@@ -14,7 +14,7 @@ import numpy as np
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect
 from pupper_sysid.common.errors import BusError, InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
 from pupper_sysid.hardware.bus import ServoBus
@@ -52,6 +52,14 @@ class Sweep:
     """Play the commands of this recording or command file instead."""
     loops: int = 1
     """How often to play them."""
+    plan: Path | None = None
+    """Execute this plan (of `pupper-sysid plan`): its joints, motions, durations and rate."""
+    until: str | None = None
+    """Fit and go on with planned trials until an interval is narrow: dead_time:2ms until half of
+    the 90 % interval of every joint's dead time is at most 2 ms. Each round is a recording of its
+    own beside the first, named _2, _3, …"""
+    most_seconds: float = 180.0
+    """With --until: longest recorded time of a joint [s], all rounds together."""
     amplitude: float = 0.3
     """Largest excursion from the start pose [rad]; less where the speed limit asks for it."""
     duration: float | None = None
@@ -75,86 +83,85 @@ class Sweep:
 
     def run(self) -> None:
         """Plan, record, and name the next commands."""
-        from pupper_sysid.sim.emulator.bus import EmulatedBus
         from pupper_sysid.sysid.recordings.files import FOLDER
-        from pupper_sysid.sysid.sweep.recorder import record
-        from pupper_sysid.sysid.sweep.resume import header_of, resume_point
+        from pupper_sysid.sysid.sweep.resume import header_of
 
+        started = time.perf_counter()
         if self.resume:
             path = self.resume
-            request = dict(header_of(path)["sweep"])
+            metadata = header_of(path)
+            request, whole = dict(metadata["sweep"]), "completed" in metadata
         else:
-            request = self._request()
-            name = "playback" if self.playback else self.kind
+            request, whole = self._request(), False
+            name = "playback" if self.playback else "plan" if self.plan else self.kind
             path = self.out or FOLDER / f"{name}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
             if path.suffix != ".csv":
                 raise InputError(f"--out {path}: a recording is a .csv file.")
             refuse_overwrite(path, self.force)
+            if request["until"]:
+                request["until"]["first"] = path.name
         stem = path.with_suffix("")
         for other in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
             refuse_overwrite(Path(other), self.force)
         if self.truth and (self.resume or request["bus"] != EMULATED):
             raise InputError("--truth: only a new recording of the emulated robot has true values.")
-        bus = _open(request)
-        try:
-            chosen = _plan(request, bus)
-            resume = resume_point(path, chosen, request["loop_period_s"]) if self.resume else None
-        except BaseException:
-            bus.close()
-            raise
-        terminal.warn(chosen.warnings)
-        if resume:
-            terminal.err.print(
-                f"Continuing {path} at trial {resume.next_trial + 1} of {len(chosen.trials)}."
-            )
-        started = time.perf_counter()
-        existed = path.exists()
-        try:
-            with (
-                _priority(request) as priority,
-                terminal.seconds_progress("recording", chosen.duration_s) as advance,
-            ):
-                record(
-                    bus, chosen, path, loop_period_s=request["loop_period_s"],
-                    metadata={"seed": request["seed"], "sweep": request, "priority": priority},
-                    force=self.force, resume=resume, progress=advance,
-                )  # fmt: skip
-        except (BusError, KeyboardInterrupt):
-            if path.exists() and (resume or not existed or self.force):
-                terminal.err.print(
-                    f"The recording up to here is in {path}; continue it with\n"
-                    f"  pupper-sysid sweep --resume {path}",
-                    soft_wrap=True,
-                )
-            raise
-        terminal.warn(_guard_warnings(path))
-        written = [path]
-        if self.truth and isinstance(bus, EmulatedBus):
-            written += bus.write_truth(stem, self.force)
+        if request.get("until"):
+            from pupper_sysid.cli.commands.recording.rounds import run_rounds
+
+            run_rounds(self, path, request, whole, started)
+            return
+        chosen, written = record_one(self, path, request, self.resume is not None)
         self._print(request["joints"], chosen, written, time.perf_counter() - started)
 
     def _request(self) -> dict[str, Any]:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
         terminal.need_positive("--rate", self.rate)
+        terminal.need_positive("--most-seconds", self.most_seconds)
         bus = bus_name(self.bus)
         if self.loops < 1:
             raise InputError(f"--loops is {self.loops}; it must be at least 1.")
         if self.real_time and bus != EMULATED:
             raise InputError("--real-time: a real bus always runs in real time; leave it out.")
+        loop_period_s = 1.0 / self.rate
+        if self.plan is None:
+            joints = select_joints(self.joints, self._joints_there())
+        else:
+            from pupper_sysid.sysid.plan.plan_file import load_plan
+
+            if self.playback:
+                raise InputError("--plan and --playback: give one of the two.")
+            proposal = load_plan(self.plan)
+            joints = select_joints(self.joints, proposal.joints)
+            loop_period_s = proposal.loop_period_s
         return {
             "bus": bus,
             "joint_map": self.joint_map,
             "real_time": self.real_time,
             "seed": self.seed,
-            "loop_period_s": 1.0 / self.rate,
+            "loop_period_s": loop_period_s,
             "kind": self.kind,
-            "joints": select_joints(self.joints, self._joints_there()),
+            "joints": joints,
             "frequencies_hz": parse_frequencies(self.freqs),
             "amplitude_rad": self.amplitude,
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
             "loops": self.loops,
+            "plan": str(self.plan) if self.plan else None,
+            "until": self._series(joints) if self.until else None,
         }
+
+    def _series(self, joints: list[str]) -> dict[str, Any]:
+        """What the recordings of a sweep with `until` have in common, and the number of this."""
+        from pupper_sysid.sysid.plan.until import parse_goal
+
+        assert self.until is not None
+        parse_goal(self.until)
+        if self.playback:
+            raise InputError("--until and --playback: give one of the two.")
+        return {
+            "goal": self.until, "most_seconds": self.most_seconds, "first": "", "joints": joints,
+            "number": 1,
+        }  # fmt: skip
 
     def _joints_there(self) -> tuple[str, ...]:
         """Joints to choose from: those of the joint map that is named or is in this folder."""
@@ -187,6 +194,57 @@ class Sweep:
         )
 
 
+def record_one(
+    options: Sweep, path: Path, request: dict[str, Any], resume: bool
+) -> tuple[Plan, list[Path]]:
+    """Record a request, or the rest of it; returns what was executed, and the files written."""
+    from pupper_sysid.sim.emulator.bus import EmulatedBus
+    from pupper_sysid.sysid.sweep.recorder import record
+    from pupper_sysid.sysid.sweep.resume import resume_point
+
+    bus = _open(request)
+    try:
+        chosen = _plan(request, bus)
+        point = resume_point(path, chosen, request["loop_period_s"]) if resume else None
+    except BaseException:
+        bus.close()
+        raise
+    terminal.warn(chosen.warnings)
+    if point:
+        terminal.err.print(
+            f"Continuing {path} at trial {point.next_trial + 1} of {len(chosen.trials)}."
+        )
+    existed = path.exists()
+    try:
+        with (
+            _priority(request) as priority,
+            terminal.seconds_progress("recording", chosen.duration_s) as advance,
+        ):
+            record(
+                bus, chosen, path, loop_period_s=request["loop_period_s"],
+                metadata={"seed": request["seed"], "sweep": request, "priority": priority},
+                force=options.force, resume=point, progress=advance,
+            )  # fmt: skip
+    except (BusError, KeyboardInterrupt):
+        if path.exists() and (point or not existed or options.force):
+            say_how_to_resume(path)
+        raise
+    terminal.warn(_guard_warnings(path))
+    written = [path]
+    if options.truth and isinstance(bus, EmulatedBus):
+        written += bus.write_truth(path.with_suffix(""), options.force)
+    return chosen, written
+
+
+def say_how_to_resume(path: Path) -> None:
+    """Print the command that continues a recording."""
+    terminal.err.print(
+        f"The recording up to here is in {path}; continue it with\n"
+        f"  pupper-sysid sweep --resume {path}",
+        soft_wrap=True,
+    )
+
+
 def _open(request: dict[str, Any]) -> ServoBus:
     """The bus that a request names."""
     if request["bus"] == EMULATED:
@@ -200,6 +258,9 @@ def _open(request: dict[str, Any]) -> ServoBus:
         how = ", in real time" if real_time else ""
         terminal.err.print(f"No robot: using {robot}{how}.", soft_wrap=True)
         drawn = draw_robot(rng, directly_read(own) if own else None, own)
+        if request.get("plan"):  # the same robot, but not once more the same noise
+            noise = int(sha256(Path(request["plan"]))[:12], 16)
+            rng = np.random.default_rng([request["seed"], noise])
         return EmulatedBus(drawn, rng, real_time=real_time)
     return connect(request["bus"], request["joint_map"], request["joints"])
 
@@ -213,12 +274,18 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
     pose = bus.metadata["rest_pose_rad"]
-    margin = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
+    free = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
+    margin = dict(zip(bus.joint_names, map(float, free), strict=True))
+    speed_limit = bus.metadata["speed_limit_rad_s"]
+    if request.get("plan"):
+        from pupper_sysid.sysid.plan.plan_file import executable, load_plan
+
+        path = Path(request["plan"])
+        return executable(load_plan(path), path, joints, margin, pose, speed_limit)
     return plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
-        request["duration_s"], request["loop_period_s"], bus.metadata["speed_limit_rad_s"],
-        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ),
-        dict(zip(bus.joint_names, map(float, margin), strict=True)), pose,
+        request["duration_s"], request["loop_period_s"], speed_limit,
+        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ), margin, pose,
     )  # fmt: skip
 
 

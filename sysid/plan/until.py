@@ -1,0 +1,241 @@
+"""Record until an interval is narrow: fit what there is, plan what narrows it most, record that.
+
+    goal = parse_goal("dead_time:2ms")
+    outcome = record_until(goal, paths, joints, fit, record_next, most_seconds=120.0)
+
+A goal is reached by a joint when half of its dead time's 90 % interval, (high - low) / 2, is at
+most the goal's width. Joints that have reached it, or cannot, are not recorded again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.results import Result, derived
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.plan.candidates import trial_seconds
+from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S
+from pupper_sysid.sysid.plan.proposal import Margins, SweepPlan, plan_from_fits, recorded_s
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.joints import joint_trials
+from pupper_sysid.sysid.recordings.recording import Recording
+
+ROUND_S = 20.0
+"""Most recorded seconds per joint between two fits."""
+
+_QUANTITIES = ("dead_time",)
+_UNITS = {"ms": 1e-3, "s": 1.0}
+_GOAL = re.compile(r"([a-z_]+):([0-9.eE+-]+) ?([a-z]*)")
+_PROGRESS = 0.97  # of the width before: more, twice in a row, is none
+_EXPECTED = 0.98  # of the present width: a plan that promises more promises nothing
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A quantity, and half the width that its 90 % interval may have."""
+
+    quantity: str
+    half_width_s: float
+
+    def reached(self, interval: Interval) -> bool:
+        """Whether an interval is narrow enough."""
+        return half_width(interval) <= self.half_width_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOutcome(Result):
+    """How far a joint came.
+
+    Attributes
+    ----------
+    dead_time_s : Interval
+    recorded_s : float
+        Of all rounds.
+    rounds : int
+        Recordings with this joint.
+    why : str
+        Why its interval is not narrow enough; empty if it is.
+    """
+
+    dead_time_s: Interval
+    recorded_s: float
+    rounds: int
+    why: str = ""
+
+    @derived
+    def reached(self) -> bool:
+        """Whether the interval is narrow enough."""
+        return not self.why
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Result):
+    """All joints and recordings of `record_until`.
+
+    Attributes
+    ----------
+    joints : dict of str to JointOutcome
+    recordings : tuple of Path
+    """
+
+    joints: dict[str, JointOutcome]
+    recordings: tuple[Path, ...]
+
+    @derived
+    def reached(self) -> bool:
+        """Whether every joint has reached the goal."""
+        return all(joint.reached for joint in self.joints.values())
+
+
+Fit = Callable[[Sequence[Recording], list[str]], Mapping[str, JointCalibrationResult]]
+"""Fits joints to recordings, pooled (`sysid.identify.joint_fit.fit_joint`)."""
+
+RecordNext = Callable[[SweepPlan, int], Path]
+"""Records a plan as the round of this number, from 2, and returns the recording's file."""
+
+
+def half_width(interval: Interval) -> float:
+    """Half of an interval's width."""
+    return (interval.high - interval.low) / 2
+
+
+def parse_goal(text: str) -> Goal:
+    """Goal that `text` names: quantity, colon, half width with its unit.
+
+    Raises
+    ------
+    InputError
+        If it is not of that form, or narrower than any recording can make it.
+
+    Examples
+    --------
+    >>> parse_goal("dead_time:2ms")
+    Goal(quantity='dead_time', half_width_s=0.002)
+    """
+    form = "write dead_time:2ms for a dead time known within ± 2 ms"
+    found = _GOAL.fullmatch(text.strip())
+    if found is None or found[1] not in _QUANTITIES:
+        raise InputError(f"`until`: '{text}' is not a goal; {form}.")
+    if found[3] not in _UNITS:
+        raise InputError(f"`until`: '{text}' has no unit of time; {form}.")
+    try:
+        half = float(found[2]) * _UNITS[found[3]]
+    except ValueError:
+        raise InputError(f"`until`: '{found[2]}' is not a number; {form}.") from None
+    if not LEAST_HALF_WIDTH_S < half <= 1:
+        raise InputError(
+            f"`until`: ± {1e3 * half:g} ms is out of reach. The model's time step alone leaves "
+            f"± {1e3 * LEAST_HALF_WIDTH_S:.2g} ms; give a half width above it, up to 1 s."
+        )
+    return Goal(found[1], half)
+
+
+def record_until(
+    goal: Goal,
+    paths: Sequence[Path],
+    joints: Sequence[str],
+    fit: Fit,
+    record_next: RecordNext,
+    *,
+    most_seconds: float,
+    margins: Margins | None = None,
+    seed: int = 0,
+    report: Callable[[dict[str, JointOutcome]], None] | None = None,
+) -> Outcome:
+    """Fit, plan and record until every joint has reached a goal or cannot.
+
+    Parameters
+    ----------
+    goal : Goal
+    paths : sequence of Path
+        Recordings that there are: the first sweep, and rounds of an earlier call.
+    joints : sequence of str
+    fit : callable
+        See `Fit`.
+    record_next : callable
+        See `RecordNext`.
+    most_seconds : float
+        Most recorded time of a joint, the first sweep included [s].
+    margins : mapping of joint to float, optional
+        Largest excursions [rad].
+    seed : int
+        For the plans' record.
+    report : callable, optional
+        Called with the joints' state after every round of fits.
+
+    Raises
+    ------
+    InputError
+        If a joint has too little motion.
+    """
+    files, found, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
+    left = list(joints)
+    while True:
+        recordings = [load(path) for path in files]
+        plans: dict[str, SweepPlan] = {}
+        for joint, one in fit(recordings, left).items():
+            widths.setdefault(joint, []).append(half_width(one.dead_time_s))
+            found[joint], plan = _judged(
+                goal, one, recordings, widths[joint], most_seconds, margins, seed
+            )
+            if plan is not None:
+                plans[joint] = plan
+        left = list(plans)
+        if report:
+            report(found)
+        if not left:
+            ordered = {joint: found[joint] for joint in joints}
+            return Outcome(joints=ordered, recordings=tuple(files))
+        files.append(record_next(_together(plans), len(files) + 1))
+
+
+def _judged(
+    goal: Goal,
+    fit: JointCalibrationResult,
+    recordings: Sequence[Recording],
+    widths: Sequence[float],
+    most_seconds: float,
+    margins: Margins | None,
+    seed: int,
+) -> tuple[JointOutcome, SweepPlan | None]:
+    """State of a joint, and what to record next if that may help."""
+    trials = joint_trials(recordings, fit.joint)
+    done = recorded_s(trials)
+    rounds = sum(bool(r.trials(fit.joint)) for r in recordings)
+
+    def state(why: str = "") -> JointOutcome:
+        return JointOutcome(
+            dead_time_s=fit.dead_time_s, recorded_s=done, rounds=rounds, why=why
+        )  # fmt: skip
+
+    if goal.reached(fit.dead_time_s):
+        return state(), None
+    seconds = min(most_seconds - done, ROUND_S)
+    if seconds < trial_seconds(SHORTEST_S):
+        return state(
+            f"{done:.0f} s are recorded and `most_seconds` is {most_seconds:g}; allow more"
+        ), None
+    plan = plan_from_fits(recordings, {fit.joint: fit}, seconds=seconds, margins=margins, seed=seed)
+    notes = " ".join(n.removeprefix(f"{fit.joint}: ") for n in plan.notes if "dead time" in n)
+    if len(widths) > 2 and min(widths[-2:]) > _PROGRESS * widths[-3]:
+        return state(f"the last two rounds did not narrow it. {notes}".strip().rstrip(".")), None
+    (dead,) = (p for p in plan.predictions if p.quantity == DEAD_TIME)
+    if half_width(dead.after) > _EXPECTED * half_width(dead.now):
+        return state(notes.rstrip(".") or "no trial within the limits would narrow it"), None
+    return state("more is to be recorded"), plan
+
+
+def _together(plans: Mapping[str, SweepPlan]) -> SweepPlan:
+    """One plan of several joints."""
+    first = next(iter(plans.values()))
+    return replace(
+        first,
+        trials=tuple(t for p in plans.values() for t in p.trials),
+        predictions=tuple(x for p in plans.values() for x in p.predictions),
+        notes=tuple(n for p in plans.values() for n in p.notes),
+    )
