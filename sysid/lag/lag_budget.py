@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived, flat
+from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
@@ -174,7 +175,7 @@ def lag_budget(
         )
     tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
     tones = [t for t in tones if t is not None]
-    warnings: list[str] = []
+    warnings = list(cautions(joint, trials))
     if tones:
         moved = max(abs(t.response) for t in tones)
         if moved < _MOVES:
