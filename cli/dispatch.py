@@ -29,6 +29,8 @@ class Command(NamedTuple):
     where: str
     """`module:Class` below `pupper_sysid.cli.commands`: a dataclass with a method `run`, or a union
     of such dataclasses as subcommands."""
+    holds_bus: bool = False
+    """Whether it must let go of a bus before it ends."""
 
     def load(self) -> Any:
         """Import the class."""
@@ -70,7 +72,8 @@ def run_command(
         # a union has no docstring of its own, and Python's would be shown
         described = None if isinstance(kind, type) else chosen.summary
         command = parse(kind, rest, f"{program} {first}", described)
-        end_politely()
+        if chosen.holds_bus:
+            end_politely()
         command.run()
 
 
@@ -79,7 +82,7 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
     group_width = 2 + max(len(c.group) for c in commands.values())
     width = 2 + max(map(len, commands))
     lines, last = [f"usage: {program} COMMAND [OPTIONS]", "", description.strip(), ""], None
-    for word, (group, summary, _) in commands.items():
+    for word, (group, summary, *_) in commands.items():
         shown = "" if group == last else group
         lines.append(f"{shown:{group_width}}{word:{width}}{summary}")
         last = group

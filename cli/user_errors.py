@@ -1,6 +1,8 @@
 """Exit codes and errors of every program: 0, 2 for bad input, 1 for anything else.
 
-An error is one sentence; `--debug` shows the traceback. The options that every program has are
+A termination signal ends a program at once (143 after SIGTERM), as the system does by default; its
+worker processes end with it. Programs that hold a robot call `end_politely`, which stops them as
+Ctrl-C does. An error is one sentence; `--debug` shows the traceback. The options that every program has are
 here: `--debug`, `--version` and `--install-completion`.
 """
 
@@ -65,16 +67,30 @@ def parse(
     return parsed
 
 
-def end_politely() -> None:
-    """Treat SIGTERM and a closed terminal as Ctrl-C, so that the robot is parked first."""
+class _Stop:
+    """Handler of a termination signal: as Ctrl-C, and the signal decides the exit code."""
 
-    def stop(number: int, frame: object) -> None:
+    exit_code = 0
+
+    def __call__(self, number: int, frame: object) -> None:
+        self.exit_code = 128 + number
         raise KeyboardInterrupt
 
+
+def end_politely() -> None:
+    """Treat SIGTERM and a closed terminal as Ctrl-C, so that the robot is parked first."""
     if threading.current_thread() is threading.main_thread():
+        stop = _Stop()
         for name in ("SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), stop)
+            number = getattr(signal, name, None)
+            if number and signal.getsignal(number) != signal.SIG_IGN:  # `nohup` ignores the latter
+                signal.signal(number, stop)
+
+
+def _signalled() -> int:
+    """Exit code for the termination signal that a polite program received; 0 for none."""
+    handler = signal.getsignal(signal.SIGTERM)
+    return handler.exit_code if isinstance(handler, _Stop) else 0
 
 
 @contextmanager
@@ -87,6 +103,8 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         if "--install-completion" in arguments:
             arguments = _completion(program)
         yield [a for a in arguments if a != "--debug"]
+        if code := _signalled():  # it ended as after Ctrl-C, with everything done
+            sys.exit(code)
     except PupperError as error:
         if debug:
             raise
@@ -94,7 +112,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         err.print("Stopped.")
-        sys.exit(1)
+        sys.exit(_signalled() or 1)
     except BrokenPipeError:  # `| head` closed its end: no error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)

@@ -41,11 +41,15 @@ _SUMMARIES = {
         "export": "Convert for MuJoCo, Isaac Lab, Newton, CSV …",
     },
 }
+_HOLD_BUS = {"scan", "monitor", "calibrate-joints", "emulate", "sweep"}
 # `fit-servo` of the group `model` is the class FitServo in commands/model/fit_servo.py
 COMMANDS = {
     word: Command(
-        group, summary, f"{group}.{word.replace('-', '_')}:{word.title().replace('-', '')}"
-    )
+        group,
+        summary,
+        f"{group}.{word.replace('-', '_')}:{word.title().replace('-', '')}",
+        word in _HOLD_BUS,
+    )  # fmt: skip
     for group, summaries in _SUMMARIES.items()
     for word, summary in summaries.items()
 }

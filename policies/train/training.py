@@ -34,6 +34,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 
 LAST, BEST = "last.pt", "best.pt"
 _SAVE_EVERY = 10
+_GRACE_S = 0.7
 _SMOOTHED = 0.1  # weight of the newest update in the mean reward that decides what is best
 
 
@@ -91,7 +92,9 @@ def train(
 ) -> Learner:
     """Begin a run in an empty folder, or (with `run` None) resume the one in it.
 
-    Ctrl-C (or a termination signal) ends it after the present update, with everything saved.
+    Ctrl-C ends it after the present update, with everything saved. So does a termination signal if
+    the update ends in time; else the process ends within a second, and the run can be resumed from
+    its last checkpoint.
 
     Parameters
     ----------
@@ -297,12 +300,21 @@ def _fresh_optimiser(learner: Learner) -> None:
 
 @contextmanager
 def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and termination as a flag that is checked between updates."""
+    """Ctrl-C and termination as a flag that is checked between updates.
+
+    Termination waits for the update for `_GRACE_S` only; then the system's default action ends the
+    process.
+    """
     stop_requested = False
+    end = threading.Timer(_GRACE_S, signal.raise_signal, (signal.SIGTERM,))
+    end.daemon = True
 
     def note(number, frame) -> None:
         nonlocal stop_requested
         stop_requested = True
+        if number == signal.SIGTERM and not end.is_alive():
+            signal.signal(number, signal.SIG_DFL)
+            end.start()
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
@@ -311,5 +323,6 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
     try:
         yield lambda: stop_requested
     finally:
+        end.cancel()
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -120,7 +120,12 @@ def map_joints(
         from concurrent.futures import ProcessPoolExecutor, as_completed
 
         with ProcessPoolExecutor(min(workers, len(tasks)), initializer=end_with_parent) as pool:
-            futures = {pool.submit(work, joint, task): joint for joint, task in tasks.items()}
-            for future in as_completed(futures):
-                done(futures[future], future.result())
+            try:
+                futures = {pool.submit(work, joint, task): joint for joint, task in tasks.items()}
+                for future in as_completed(futures):
+                    done(futures[future], future.result())
+            except BaseException:  # an error, Ctrl-C: leaving the block would wait for the rest
+                for worker in (pool._processes or {}).values():
+                    worker.kill()
+                raise
     return {joint: found[joint] for joint in tasks}

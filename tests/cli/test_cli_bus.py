@@ -148,7 +148,7 @@ def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind)
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=10)
     assert "pupper-sysid sweep --freqs 1-10 --joints LF --bus" in out and "Ctrl-C" in out
-    assert process.returncode == 1 and "Stopped." in err and "Traceback" not in err
+    assert process.returncode == 143 and "Stopped." in err and "Traceback" not in err
     assert not (tmp_path / "s").exists(), "it leaves nothing behind"
     truth = yaml.safe_load((tmp_path / "t.yaml").read_text())
     assert truth["joints"]["LF_hip"]["actuator"]["dead_time_s"] > 0
