@@ -258,7 +258,6 @@ def calibrated_run(
     the positions are looked up several times per tick.
     """
     model = calibration.delayed_pd(data.joints, TIME_STEP_S)
-    per_tick = max(1, math.ceil(data.period_s / TIME_STEP_S))
     tail = math.ceil(data.period_s / TIME_STEP_S) + 1
     shape = stacked(data)[1].shape
     received = {
@@ -275,18 +274,34 @@ def calibrated_run(
     def run(start: NDArray[np.float64]) -> Tracks:
         model.reset(start)
         positions = np.concatenate([start[None], model.rollout(commands)])
-        found: Tracks = {}
-        for n, joint in enumerate(data.joints):
-            found[joint] = []
-            for e, own in enumerate(data.runs[joint]):
-                send = own.trial.send_time_s - own.trial.send_time_s[0]
-                edges = np.append(send, send[-1] + data.period_s)
-                ticks = np.arange(per_tick * len(send) + 1) / per_tick
-                step = np.interp(ticks, np.arange(len(edges)), edges) / TIME_STEP_S
-                found[joint].append(np.interp(step, np.arange(steps + 1), positions[:, e, n]))
-        return found
+        return {
+            joint: [
+                on_ticks(positions[:, e, n], own, data.period_s)
+                for e, own in enumerate(data.runs[joint])
+            ]
+            for n, joint in enumerate(data.joints)
+        }
 
     return run
+
+
+def on_ticks(positions: NDArray[np.float64], run: Run, period_s: float) -> NDArray[np.float64]:
+    """Positions at physics steps as a track: several times per tick, at the run's own times.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (steps + 1,)
+        From the run's first command on, beyond its last tick.
+    run : Run
+    period_s : float
+        Between ticks; the last one has no other.
+    """
+    per_tick = max(1, math.ceil(period_s / TIME_STEP_S))
+    send = run.trial.send_time_s - run.trial.send_time_s[0]
+    edges = np.append(send, send[-1] + period_s)
+    ticks = np.arange(per_tick * len(send) + 1) / per_tick
+    step = np.interp(ticks, np.arange(len(edges)), edges) / TIME_STEP_S
+    return np.interp(step, np.arange(len(positions)), positions)
 
 
 def shown(tracks: Tracks, data: ServoData) -> Tracks:
