@@ -31,7 +31,7 @@ from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S, FreeAirServo
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.lag.lag_budget import tone_lags, tone_weights
+from pupper_sysid.sysid.lag.phase_slope import tone_lags, tone_weights
 from pupper_sysid.sysid.lag.tone import tone_response
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording

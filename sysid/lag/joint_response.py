@@ -19,8 +19,9 @@ from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
-from pupper_sysid.sysid.lag.lag_budget import tone_lags
 from pupper_sysid.sysid.lag.multisine import multisine_responses
+from pupper_sysid.sysid.lag.phase_slope import tone_lags
+from pupper_sysid.sysid.lag.step_response import joint_impulse_response
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction, fit_transfer_functions
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -168,13 +169,14 @@ def joint_response(
     """
     lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     tones: list[ToneResponse] = []
-    for trial in trials:
-        reading = readings(trial, lattice)
+    read = [readings(trial, lattice) for trial in trials]
+    impulse = joint_impulse_response(joint, trials, read, rng)
+    for trial, reading in zip(trials, read, strict=True):
         if trial.frequency_hz > 0:
-            tone = tone_response(trial, reading, rng)
+            tone = tone_response(trial, reading, rng, impulse=impulse)
             tones += [] if tone is None else [tone]
         else:
-            tones += multisine_responses(trial, reading, rng)
+            tones += multisine_responses(trial, reading, rng, impulse=impulse)
     if not tones:
         raise InputError(
             f"{joint}: this recording has no tone of two periods or more, and no multisine, so "

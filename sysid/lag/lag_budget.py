@@ -4,15 +4,16 @@
     servo lag = dead time + dynamics
 
 `lag_budget` measures the raw lag and its three parts; the dead time needs a model
-(`sysid.identify.joint_fit`). Estimators, each on all rows and on fresh rows:
+(`sysid.identify.joint_fit`). Only the dead time is the servo's own: the lag moves with gain,
+amplitude and load.
 
-* integer cross-correlation, which resolves whole loop periods only;
-* sub-sample cross-correlation, bounded to one period of the tone;
-* sine phase per trial; and the phase slope over all tones, where a lag common to all frequencies
-  has no whole-period ambiguity below half a second.
+* Tones (`sysid.lag.tone`): the phase slope of fresh rows at their measurement times, against the
+  zero-order-held command, without the staircase's ripple. Intervals are from a bootstrap over
+  periods.
+* Any other motion (`sysid.lag.time_shift`): the time shift of the held command that resembles the
+  motion best, through an impulse response fitted to the readings.
 
-The default, "hold-aware", is the phase slope of fresh rows at their measurement times, against the
-zero-order-held command. Intervals are from a bootstrap over periods.
+`sysid.lag.estimators` has the usual ones, for comparison.
 """
 
 from __future__ import annotations
@@ -20,16 +21,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived, flat
-from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
@@ -37,16 +35,18 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     quantum,
     readings,
 )
+from pupper_sysid.sysid.lag.estimators import estimators
+from pupper_sysid.sysid.lag.phase_slope import lag_near, slope, tone_lags, tone_weights
+from pupper_sysid.sysid.lag.step_response import LONGEST_S, ImpulseResponse, joint_impulse_response
+from pupper_sysid.sysid.lag.time_shift import EARLIEST_S, command_hold, row_shift, shift_draws
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
 
-LONGEST_LAG_S = 0.5
-
-_BLOCK_S = 0.5  # of the bootstrap where there are no periods
-_ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
 _MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
-_FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the raw lag of a tone
+_EXPLAINED = 0.1  # share of the motion, below which it is no answer to the command
+_NEAR_END_S = 0.02
+_USUAL_SHIFT_S = 0.15  # about the lag, where rows' own correlation is looked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +81,16 @@ class LagBudget(Result):
     ----------
     joint : str
     raw_lag_s : Interval
-        From a command's row to the position's row, all rows.
+        From a command's row to the reading of a position, all rows; without tones, the sum of its
+        parts.
     fresh_lag_s : Interval
         The same of fresh rows at their measurement times.
     lag_s : Interval
-        From a command's edge to the measured motion: the servo's own lag.
+        From the held command to the motion: the servo's lag at the gain, amplitude and load of
+        this recording. Of tones the phase delay, of other motion as in `sysid.lag.time_shift`.
     feedback_age_s, command_hold_s : float
-        What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`.
+        What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`. The hold is half a
+        loop, and with tones what readings at one phase of the loop see of the staircase's ripple.
     dead_time_s : Interval or None
         Part of `lag_s` before the servo moves; None if no model was fitted.
     feedback : PollLattice
@@ -123,6 +126,27 @@ class LagBudget(Result):
     def dynamics_s(self) -> float:
         """Part of the servo's lag that is not dead time [s]."""
         return self.lag_s.value - (self.dead_time_s.value if self.dead_time_s else math.nan)
+
+    def with_dead_time(self, dead_time_s: Interval, offset_rad: float) -> LagBudget:
+        """The budget with a fitted model's dead time and offset.
+
+        A dead time longer than the lag leaves nothing for the dynamics: a warning says so.
+
+        Parameters
+        ----------
+        dead_time_s : Interval
+        offset_rad : float
+        """
+        warnings = self.warnings
+        if dead_time_s.value > self.lag_s.value:
+            apart = dead_time_s.low > self.lag_s.high
+            warnings += (
+                f"{self.joint}: the model's dead time ({1e3 * dead_time_s.value:.1f} ms) is longer "
+                f"than the lag ({1e3 * self.lag_s.value:.1f} ms), "
+                + ("so one of them is wrong." if apart else "within their intervals.")
+                + " The dynamics are not identified.",
+            )
+        return replace(self, dead_time_s=dead_time_s, offset_rad=offset_rad, warnings=warnings)
 
     def rows(self) -> list[dict[str, Any]]:
         """A single row, without the estimators."""
@@ -173,40 +197,10 @@ def lag_budget(
             "too few to measure a lag. Was the joint moving and its torque on? See "
             "`pupper-sysid doctor`."
         )
-    tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
-    tones = [t for t in tones if t is not None]
-    warnings = list(cautions(joint, trials))
-    if tones:
-        moved = max(abs(t.response) for t in tones)
-        if moved < _MOVES:
-            raise InputError(
-                f"{joint}: it moved by at most {100 * moved:.0f} % of its command, so there is no "
-                "lag to measure. Was its torque on, and does it turn freely?"
-            )
-        raw = _slope(tones, "raw_rows")
-        fresh = _slope(tones, "fresh_rows")
-        lag = _slope(tones, "fresh_held")
-        lost = [t for t, w in zip(tones, tone_weights(tones), strict=True) if w == 0]
-        if lost:
-            listed = ", ".join(f"{t.frequency_hz:.3g}" for t in lost)
-            warnings.append(
-                f"{joint}: at {listed} Hz it moves less than half as far as commanded, so these "
-                "tones are left out of the lag; record them with a smaller amplitude."
-            )
-        if len({round(t.frequency_hz, 2) for t in tones}) == 1:
-            warnings.append(
-                f"{joint}: one frequency only, so a lag of one period "
-                f"({1e3 / tones[0].frequency_hz:.0f} ms) more would look the same; record several."
-            )
-    else:
-        raw, fresh, lag = _shifts(trials, read, rng)
-        warnings.append(
-            f"{joint}: no tones in this recording, so the lag is one time shift of all its "
-            "motion. Record a sweep for a lag per frequency."
-        )
-    frequency = np.array([t.frequency_hz for t in tones])
-    lags = tone_lags(np.array([t.response for t in tones]), frequency) if tones else []
-    by_frequency = tuple(_at_frequency(t, float(own)) for t, own in zip(tones, lags, strict=True))
+    seen = _seen(joint, trials, read, rng)
+    tones, raw, fresh, lag = seen.tones, seen.raw, seen.fresh, seen.lag
+    by_frequency = seen.by_frequency()
+    warnings = _warnings(joint, seen)
     doubt = max(t.read_time_doubt_s for t in trials)
     if lattice.kind == "unresolved":
         doubt += lattice.time_doubt_s
@@ -216,6 +210,17 @@ def lag_budget(
             f"({1e3 * lattice.time_doubt_s:.0f} ms). A longer sweep would settle it."
         )
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
+    by_frequency = tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency)
+    if lattice.readings == "cannot tell":
+        # they may be live after all: dated to their reads, with all rows of a joint that stands
+        live = replace(lattice, kind="every read", readings="live")
+        other = _seen(joint, trials, [readings(t, live) for t in trials], rng)
+        fresh, lag = _hull(fresh, other.fresh), _hull(lag, other.lag)
+        if len(other.tones) == len(tones):
+            by_frequency = tuple(
+                replace(a, lag_s=_hull(a.lag_s, b.lag_s))
+                for a, b in zip(by_frequency, other.by_frequency(), strict=True)
+            )
     return LagBudget(
         joint=joint,
         raw_lag_s=raw,
@@ -225,8 +230,8 @@ def lag_budget(
         command_hold_s=fresh.value - lag.value,
         feedback=lattice,
         quantum_rad=quantum(trials),
-        by_frequency=tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency),
-        estimators_s=_estimators(trials, read, tones, lag.value),
+        by_frequency=by_frequency,
+        estimators_s=estimators(trials, read, tones, lag.value),
         noise_rad=float(np.sqrt(np.mean([t.residual_rad**2 for t in tones])))
         if tones
         else math.nan,
@@ -234,207 +239,117 @@ def lag_budget(
     )
 
 
-# --------------------------------------------------------------------------- phase slope
+@dataclass(frozen=True)
+class _Seen:
+    """What readings dated in one way show."""
 
-_PAIRS = {
-    "raw_rows": ("raw", "command_rows"),
-    "fresh_rows": ("fresh", "command_rows"),
-    "fresh_held": ("fresh", "command_held"),
-}
+    tones: list[ToneResponse]
+    near_s: float
+    raw: Interval
+    fresh: Interval
+    lag: Interval
 
-
-def _slope(tones: Sequence[ToneResponse], pair: str) -> Interval:
-    """Lag common to all tones: the slope of the phase through the origin, with its interval."""
-    output, command = _PAIRS[pair]
-    frequency = np.array([t.frequency_hz for t in tones])
-    response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
-    draws = np.stack([getattr(t, f"{output}_draws") / getattr(t, command) for t in tones])
-    weight = tone_weights(tones)
-    lags = tone_lags(response, frequency)
-    drawn = _lag_near(draws, frequency[:, None], lags[:, None])
-    return Interval.of_draws(float(weight @ lags), weight @ drawn)
+    def by_frequency(self) -> tuple[FrequencyLag, ...]:
+        if not self.tones:
+            return ()
+        frequency = np.array([t.frequency_hz for t in self.tones])
+        lags = tone_lags(np.array([t.response for t in self.tones]), frequency, self.near_s)
+        pairs = zip(self.tones, lags, strict=True)
+        return tuple(_at_frequency(t, float(own)) for t, own in pairs)
 
 
-def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
-    """Weight of each tone in the joint's lag: inverse variance, 0 where the servo cannot follow.
-
-    Below half of the largest gain the torque or speed limit clips the motion, and its phase is no
-    delay.
-    """
-    gain = np.array([abs(t.response) for t in tones])
-    weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
-    weight = np.where(gain >= _FOLLOWS * gain.max(), weight, 0.0)
-    return weight / weight.sum()
-
-
-def tone_lags(response: NDArray, frequency_hz: NDArray) -> NDArray[np.float64]:
-    """Lag of every tone [s], the right whole period of each included.
-
-    A phase leaves the lag open to whole periods. The lowest tone has the longest period and
-    settles itself below 2 Hz; above, the lag on which all tones agree best settles it. From there
-    each tone takes the period nearest to the lag of the tone below it, for a servo's lag changes
-    by far less than half a period from one tone to the next.
-
-    Parameters
-    ----------
-    response : ndarray of complex, shape (tones,)
-    frequency_hz : ndarray, shape (tones,)
-    """
-    order = np.argsort(frequency_hz, kind="stable")
-    lowest = frequency_hz[order[0]]
-    if lowest <= 2.0:
-        near = 0.4 / lowest  # from a tenth of a period early to nine tenths late
-    else:
-        near = _common_lag(response, frequency_hz)
-    lags = np.empty(len(order))
-    for i in order:
-        near = lags[i] = _lag_near(response[i], frequency_hz[i], near)
-    return lags
+def _seen(
+    joint: str, trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator
+) -> _Seen:
+    """Measure the lag with readings dated as in `read`."""
+    impulse = joint_impulse_response(joint, trials, read, rng)
+    drawn = shift_draws(impulse, rng)
+    near = float(np.median(drawn))
+    tones = [tone_response(t, r, rng, impulse=impulse) for t, r in zip(trials, read, strict=True)]
+    tones = [t for t in tones if t is not None]
+    if tones:
+        moved = max(abs(t.response) for t in tones)
+        if moved < _MOVES:
+            raise InputError(
+                f"{joint}: it moved by at most {100 * moved:.0f} % of its command, so there is no "
+                "lag to measure. Was its torque on, and does it turn freely?"
+            )
+        raw, fresh, lag = (slope(tones, p, near) for p in ("raw_rows", "fresh_rows", "fresh_held"))
+        return _Seen(tones, near, raw, fresh, lag)
+    _check(joint, impulse)
+    sd = max(r.time_sd_s for r in read)
+    lag = Interval.of_draws(near, drawn + sd * rng.standard_normal(len(drawn)))
+    fresh = _later(lag, command_hold(trials))
+    around = fresh.value - _USUAL_SHIFT_S, fresh.value + _USUAL_SHIFT_S
+    shifts = [
+        (len(r.rows), row_shift(t, t.read_time_s, t.position_rad, *around)
+         - row_shift(t, r.time_s, r.position_rad, *around))
+        for t, r in zip(trials, read, strict=True)
+    ]  # fmt: skip
+    count, age = np.array([s for s in shifts if np.isfinite(s[1])] or [(1.0, 0.0)]).T
+    return _Seen([], near, _later(fresh, float(np.average(age, weights=count))), fresh, lag)
 
 
-def _common_lag(response: NDArray, frequency: NDArray) -> float:
-    """The lag on which all phases agree best."""
-    spacing = np.diff(np.unique(frequency))
-    # two trials of one tone differ by the error of their fits only
-    spacing = spacing[spacing > _ONE_TONE_HZ]
-    # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
-    repeat = 1.0 / (spacing.min() if len(spacing) else frequency[0])
-    lags = np.arange(0.0, min(LONGEST_LAG_S, 0.95 * repeat), 2e-4)
-    turned = np.angle(response)[:, None] + 2 * np.pi * frequency[:, None] * lags
-    return float(lags[int(np.argmax(np.cos(turned).sum(axis=0)))])
+def _check(joint: str, impulse: ImpulseResponse) -> None:
+    """Refuse motion that is no answer to the command."""
+    if impulse.explained < _EXPLAINED:
+        raise InputError(
+            f"{joint}: the command explains {100 * max(impulse.explained, 0):.0f} % of the motion, "
+            "so there is no lag to measure. Was its torque on, and do commands and positions "
+            "belong to one joint? See `pupper-sysid doctor`."
+        )
+    if np.mean(impulse.masses.sum(axis=1) < 0) > 0.95:
+        raise InputError(
+            f"{joint}: it moves against its command (gain {impulse.gain:.2f}), so there is no lag "
+            "to measure. Turn the sign of its position or of its command."
+        )
 
 
-def _lag_near(response, frequency, centre):
-    """Lag of a phase, in the period around `centre` [s]; arrays broadcast."""
-    turned = np.angle(response * np.exp(2j * np.pi * frequency * centre))
-    return centre - turned / (2 * np.pi * frequency)
+def _warnings(joint: str, seen: _Seen) -> list[str]:
+    tones, lag, found = seen.tones, seen.lag, []
+    if not tones:
+        found.append(
+            f"{joint}: no tones in this recording, so the lag is the time shift of its held "
+            "command that resembles the motion best. Record a sweep for a lag per frequency."
+        )
+    lost = [t for t, w in zip(tones, tone_weights(tones), strict=True) if w == 0] if tones else []
+    if lost:
+        listed = ", ".join(f"{t.frequency_hz:.3g}" for t in lost)
+        found.append(
+            f"{joint}: at {listed} Hz it moves less than half as far as commanded, so these "
+            "tones are left out of the lag; record them with a smaller amplitude."
+        )
+    if len({round(t.frequency_hz, 2) for t in tones}) == 1:
+        found.append(
+            f"{joint}: one frequency only, so a lag of one period "
+            f"({1e3 / tones[0].frequency_hz:.0f} ms) more would look the same; record several."
+        )
+    if not EARLIEST_S + _NEAR_END_S < lag.low <= lag.high < LONGEST_S - _NEAR_END_S:
+        found.append(
+            f"{joint}: the lag's interval reaches the end of its search range "
+            f"({1e3 * EARLIEST_S:.0f} to {1e3 * LONGEST_S:.0f} ms), so the lag is not identified."
+        )
+    return found
+
+
+def _later(interval: Interval, by: float) -> Interval:
+    return Interval(interval.value + by, interval.low + by, interval.high + by)
+
+
+def _hull(one: Interval, other: Interval) -> Interval:
+    return Interval(one.value, min(one.low, other.low), max(one.high, other.high))
 
 
 def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
     f, response = tone.frequency_hz, tone.response
-    draws = _lag_near(tone.response_draws, f, lag)
+    draws = lag_near(tone.response_draws, f, lag)
     raw = tone.raw / tone.command_rows
     return FrequencyLag(
         frequency_hz=f,
         gain=abs(response),
         phase_deg=-360.0 * f * lag,
         lag_s=Interval.of_draws(lag, draws),
-        raw_lag_s=float(_lag_near(raw, f, lag + _USUAL_AGE_S)),
+        raw_lag_s=float(lag_near(raw, f, lag + _USUAL_AGE_S)),
         raw_gain=abs(raw),
         trial=tone.trial,
     )
-
-
-# ------------------------------------------------------------------- time shift, any excitation
-
-
-def _shifts(
-    trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator, draws: int = 400
-) -> tuple[Interval, Interval, Interval]:
-    """Naive, fresh and servo lag as the shift of the command that correlates best."""
-    lags = np.arange(0.0, LONGEST_LAG_S, 1e-3)
-    results = []
-    for kind in _PAIRS:
-        parts = [_shift_sums(t, r, kind, lags) for t, r in zip(trials, read, strict=True)]
-        sums = np.concatenate(parts)  # (blocks, 6, lags)
-        weights = rng.exponential(size=(draws, len(sums)))
-        value = _best_shift(sums.sum(axis=0), lags)
-        drawn = [_best_shift(np.tensordot(w, sums, axes=1), lags) for w in weights]
-        results.append(Interval.of_draws(value, np.array(drawn)))
-    return results[0], results[1], results[2]
-
-
-def _shift_sums(trial: Trial, read: Readings, kind: str, lags: NDArray) -> NDArray[np.float64]:
-    """Sums behind the correlation of position and shifted command, per block of half a second."""
-    if kind == "raw_rows":
-        rows = np.flatnonzero(np.isfinite(trial.position_rad))
-        time, position = trial.send_time_s[rows], trial.position_rad[rows]
-    else:
-        time, position = read.time_s, read.position_rad
-    block = np.floor((time - time[:1]) / _BLOCK_S)
-    edges = [0, *(np.flatnonzero(np.diff(block)) + 1), len(time)] if len(time) else []
-    sums = np.empty((max(len(edges) - 1, 0), 6, len(lags)))
-    # a block at a time: all lags of all rows would be gigabytes for a long walk
-    for n, (first, last) in enumerate(pairwise(edges)):
-        y, past = position[first:last], time[first:last, None] - lags
-        if kind == "fresh_held":
-            row = np.searchsorted(trial.send_time_s, past, side="right") - 1
-            c = np.where(row < 0, trial.initial_command_rad, trial.command_rad[np.maximum(row, 0)])
-        else:
-            c = np.interp(past, trial.send_time_s, trial.command_rad)
-        one = np.ones(len(lags))
-        sums[n] = (
-            len(y) * one, y.sum() * one, c.sum(axis=0), (y @ y) * one, y @ c, (c * c).sum(axis=0),
-        )  # fmt: skip
-    return sums
-
-
-def _best_shift(sums: NDArray, lags: NDArray) -> float:
-    n, y, c, yy, yc, cc = sums
-    covariance = yc - y * c / n
-    scale = np.sqrt(np.maximum((yy - y * y / n) * (cc - c * c / n), 1e-18))
-    return _parabolic_peak(covariance / scale, lags)
-
-
-def _parabolic_peak(score: NDArray, lags: NDArray) -> float:
-    """Position of the maximum of a sampled curve, refined by the parabola through its top."""
-    k = int(np.argmax(score))
-    if not 0 < k < len(score) - 1:
-        return float(lags[k])
-    left, top, right = score[k - 1 : k + 2]
-    bend = left - 2 * top + right
-    return float(lags[k] + (0.5 * (left - right) / bend if bend < 0 else 0.0) * (lags[1] - lags[0]))
-
-
-# ------------------------------------------------------------------------- for comparison
-
-
-def _estimators(
-    trials: Sequence[Trial], read: Sequence[Readings], tones: Sequence[ToneResponse], lag: float
-) -> dict[str, float]:
-    """All estimators side by side, each the mean over trials [s]."""
-    pairs = list(zip(trials, read, strict=True))
-    found = {
-        "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
-        "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
-        "sub-sample cross-correlation, all rows": [_bounded(t, r, "raw_rows") for t, r in pairs],
-        "sub-sample cross-correlation, fresh rows": [
-            _bounded(t, r, "fresh_rows") for t, r in pairs
-        ],
-    }
-    frequency = np.array([t.frequency_hz for t in tones])
-    for kind, name in (("raw_rows", "all rows"), ("fresh_rows", "fresh rows")):
-        output, command = _PAIRS[kind]
-        response = np.array([getattr(t, output) / getattr(t, command) for t in tones])
-        found[f"sine phase, {name}"] = list(tone_lags(response, frequency)) if tones else []
-    result = {
-        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()
-    }
-    if tones:
-        result["phase slope, all rows"] = _slope(tones, "raw_rows").value
-        result["phase slope, fresh rows"] = _slope(tones, "fresh_rows").value
-        result["hold-aware (default)"] = lag
-    return result
-
-
-def _longest(trial: Trial) -> float:
-    return min(LONGEST_LAG_S, 1.0 / trial.frequency_hz if trial.frequency_hz > 0 else LONGEST_LAG_S)
-
-
-def _integer(trial: Trial, rows: NDArray | None) -> float:
-    """Lag in whole loop periods at which raw correlation peaks [s]."""
-    c = trial.command_rad - trial.command_rad.mean()
-    loop = float(np.median(np.diff(trial.send_time_s)))
-    shifts = np.arange(0, max(2, int(_longest(trial) / loop)))
-    rows = np.flatnonzero(np.isfinite(trial.position_rad)) if rows is None else rows
-    rows = rows[rows >= shifts[-1]]
-    if len(rows) < 8:
-        return float("nan")
-    y = trial.position_rad[rows] - trial.position_rad[rows].mean()
-    return float(shifts[int(np.argmax([np.sum(y * c[rows - s]) for s in shifts]))] * loop)
-
-
-def _bounded(trial: Trial, read: Readings, kind: str) -> float:
-    lags = np.arange(0.0, _longest(trial), 1e-3)
-    sums = _shift_sums(trial, read, kind, lags)
-    return _best_shift(sums.sum(axis=0), lags) if len(sums) else float("nan")

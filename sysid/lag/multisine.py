@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.lag.tone import ToneResponse
+from pupper_sysid.sysid.lag.step_response import ImpulseResponse
+from pupper_sysid.sysid.lag.tone import ToneResponse, ripples
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_LINES = 24
@@ -23,7 +24,11 @@ _BLOCK_S = 0.5
 
 
 def multisine_responses(
-    trial: Trial, reading: Readings, rng: np.random.Generator, draws: int = 400
+    trial: Trial,
+    reading: Readings,
+    rng: np.random.Generator,
+    draws: int = 400,
+    impulse: ImpulseResponse | None = None,
 ) -> list[ToneResponse]:
     """Response at each line of the command of `trial`; empty if it is no multisine.
 
@@ -35,6 +40,8 @@ def multisine_responses(
     rng : numpy.random.Generator
         Weights stretches of half a second for the draws.
     draws : int
+    impulse : ImpulseResponse, optional
+        Of the same joint, to remove the staircase's ripple; by default it stays.
     """
     send = trial.send_time_s
     if len(send) < 100 or np.ptp(trial.command_rad) < 1e-3:
@@ -53,14 +60,20 @@ def multisine_responses(
     held = trial.command_rad[np.searchsorted(send, grid, side="right") - 1]
     command_held = _phasors(grid, held, lines)
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
-    raw = _draw(send[rows], trial.position_rad[rows], lines, rng, draws)
+    raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, draws)
     measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
+    seen = np.zeros((1, len(lines)), np.complex128)
+    if impulse is not None:
+        time = reading.time_s[fresh]
+        seen = ripples(trial, time, _design(time, lines), lines, command_held, first, impulse)
+    drawn = seen[rng.integers(len(seen), size=draws)]
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     return [
         ToneResponse(
             trial.number, float(f), complex(command_rows[k]), complex(command_held[k]),
             complex(raw[0][k]), complex(measured[0][k]), raw[1][:, k],
             measured[1][:, k] * np.exp(2j * np.pi * f * shift),
+            complex(np.mean(seen[:, k])), drawn[:, k],
             int(fresh.sum()), measured[2], reading.time_sd_s,
         )
         for k, f in enumerate(lines)

@@ -3,6 +3,13 @@
 A tone `offset + Re(P exp(2πj f t))`, with a third harmonic for the flat tops that friction makes,
 is fitted by least squares to readings at irregular times; a bootstrap over its periods gives the
 uncertainty (`common.tones`).
+
+Between two commands a servo moves in ripples of the loop's rate. Readings at one phase of the loop
+see the ripple as part of the tone: the staircase's images at multiples of the loop rate, plus and
+minus the tone, are sampled down onto it. At 30 Hz that is up to a millisecond of lag. The part is
+computed from the recording's own staircase and readings with the impulse response fitted to them
+(`sysid.lag.step_response`), subtracted, and its uncertainty added. Polled readings meet all phases
+of the loop, and nothing is left of it.
 """
 
 from __future__ import annotations
@@ -14,6 +21,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
+from pupper_sysid.sysid.lag.held_command import HeldCommand, past_tones
+from pupper_sysid.sysid.lag.step_response import ImpulseResponse
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _ALIASED = 30.0  # condition number beyond which a harmonic looks like the tone or the offset
@@ -37,6 +46,9 @@ class ToneResponse:
         Position of fresh rows at the times they were measured.
     raw_draws, fresh_draws : ndarray of complex, shape (draws,)
         The same under random weights of the periods.
+    ripple : complex
+        Part of `fresh` that is ripple of the staircase, seen at one phase of the loop.
+    ripple_draws : ndarray of complex, shape (draws,)
     fresh_count : int
         Fresh rows in the window.
     residual_rad : float
@@ -53,6 +65,8 @@ class ToneResponse:
     fresh: complex
     raw_draws: NDArray[np.complex128]
     fresh_draws: NDArray[np.complex128]
+    ripple: complex
+    ripple_draws: NDArray[np.complex128]
     fresh_count: int
     residual_rad: float
     time_sd_s: float
@@ -60,12 +74,12 @@ class ToneResponse:
     @property
     def response(self) -> complex:
         """Frequency response from the held command to the measured motion."""
-        return self.fresh / self.command_held
+        return (self.fresh - self.ripple) / self.command_held
 
     @property
     def response_draws(self) -> NDArray[np.complex128]:
         """Bootstrap draws of `response`."""
-        return self.fresh_draws / self.command_held
+        return (self.fresh_draws - self.ripple_draws) / self.command_held
 
     @property
     def lag_variance_s2(self) -> float:
@@ -78,7 +92,11 @@ class ToneResponse:
 
 
 def tone_response(
-    trial: Trial, reading: Readings, rng: np.random.Generator, draws: int = 1000
+    trial: Trial,
+    reading: Readings,
+    rng: np.random.Generator,
+    draws: int = 1000,
+    impulse: ImpulseResponse | None = None,
 ) -> ToneResponse | None:
     """Fit the tone of `trial`; None if it is no tone or has fewer than two steady periods.
 
@@ -90,6 +108,8 @@ def tone_response(
     rng : numpy.random.Generator
         Weights the periods.
     draws : int
+    impulse : ImpulseResponse, optional
+        Of the same joint, to remove the staircase's ripple; by default it stays.
     """
     if not trial.frequency_hz > 0 or len(reading.rows) < 8:
         return None
@@ -110,19 +130,62 @@ def tone_response(
     def fitted(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
         return _fit(time, value, frequency, start, rng, draws)
 
-    raw, raw_draws, _ = fitted(send[rows], trial.position_rad[rows])
+    raw, raw_draws, _ = fitted(trial.read_time_s[rows], trial.position_rad[rows])
     result, fresh_draws, residual = fitted(reading.time_s[fresh], reading.position_rad[fresh])
     grid = np.arange(start, stop, 5e-4)
     row = np.clip(np.searchsorted(send, grid, side="right") - 1, 0, None)
     held = _phasor(grid, trial.command_rad[row], frequency)
     sent = _phasor(send[window], trial.command_rad[window], frequency)
+    ripple, ripple_draws = 0j, np.zeros(draws, np.complex128)
+    if impulse is not None:
+        time = reading.time_s[fresh]
+        tone = np.array([frequency]), np.array([held])
+        design = _design(time, frequency)
+        seen = ripples(trial, time, design, *tone, start - _SETTLE_S, impulse)[:, 0]
+        ripple = complex(np.mean(seen))
+        ripple_draws = seen[rng.integers(len(seen), size=draws)]
     # an error of the poll's phase shifts all times of the trial together
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     fresh_draws = fresh_draws * np.exp(2j * np.pi * frequency * shift)
     return ToneResponse(
-        trial.number, frequency, sent, held, raw, result, raw_draws, fresh_draws,
-        int(fresh.sum()), residual, reading.time_sd_s,
+        trial.number, frequency, sent, held, raw, result, raw_draws, fresh_draws, ripple,
+        ripple_draws, int(fresh.sum()), residual, reading.time_sd_s,
     )  # fmt: skip
+
+
+def ripples(
+    trial: Trial,
+    time_s: NDArray[np.float64],
+    design: NDArray[np.float64],
+    frequency_hz: NDArray[np.float64],
+    held: NDArray[np.complex128],
+    start_s: float,
+    impulse: ImpulseResponse,
+) -> NDArray[np.complex128]:
+    """Phasors that a fit at the tones finds in the response to what is no tone: the images.
+
+    Parameters
+    ----------
+    trial : Trial
+    time_s : ndarray, shape (readings,)
+    design : ndarray, shape (readings, columns)
+        `common.tones.sine_design` of the fit, the tones first.
+    frequency_hz, held : ndarray, shape (tones,)
+        The tones, and their phasors in the held command.
+    start_s : float
+        From here on the command consists of these tones.
+    impulse : ImpulseResponse
+
+    Returns
+    -------
+    ndarray of complex, shape (draws, tones)
+    """
+    edges = impulse.edges_s
+    images = HeldCommand.of(trial).means(time_s, edges)
+    images -= past_tones(time_s, edges, frequency_hz, held)
+    images = np.where(time_s[:, None] - edges[1:] >= start_s, images, 0.0)
+    found = least_squares(design, images) @ impulse.masses.T
+    return phasors(found.T)[:, : len(frequency_hz)]
 
 
 def _design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:

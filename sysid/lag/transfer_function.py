@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived
-from pupper_sysid.sysid.lag.lag_budget import tone_lags
+from pupper_sysid.sysid.lag.phase_slope import tone_lags
 from pupper_sysid.sysid.lag.tone import ToneResponse
 
 if TYPE_CHECKING:

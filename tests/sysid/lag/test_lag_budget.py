@@ -12,7 +12,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     quantum,
     readings,
 )
-from pupper_sysid.sysid.lag.lag_budget import lag_budget, tone_lags
+from pupper_sysid.sysid.lag.lag_budget import lag_budget
+from pupper_sysid.sysid.lag.phase_slope import tone_lags
 from pupper_sysid.sysid.lag.tone import tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import LOOP_S, held_trial, tone_trials

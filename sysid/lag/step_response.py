@@ -1,0 +1,313 @@
+"""Impulse response of a servo from any recording, with its uncertainty: `impulse_response`.
+
+Readings y at times t answer the held command c, known exactly as a function of time
+(`sysid.lag.held_command`): y(t) = offset + ∫ h(u) c(t - u) du + rest. The impulse response h is a
+Gaussian process that is zero up to a dead time and decays after it (the "tuned correlated" and
+"stable spline" kernels); what the recording cannot tell, above all where a fast servo moves
+between two readings at one phase of the loop, stays as wide as the process is. Dead time, decay,
+smoothness and size are averaged over by their marginal likelihood.
+
+The rest is no white noise: a servo is not linear. So its share of the uncertainty comes from
+random weights of blocks of time, as does the count of effective readings in the likelihood.
+
+References
+----------
+G. Pillonetto et al., "Kernel methods in system identification, machine learning and function
+estimation: a survey", Automatica 50 (2014); D. Rubin, "The Bayesian bootstrap", Annals of
+Statistics 9 (1981).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.feedback.poll_lattice import Readings
+from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, Sums
+from pupper_sysid.sysid.recordings.recording import Trial
+
+LONGEST_S = 1.2
+"""Length of the impulse response."""
+
+_BLOCKS = 16
+_FEWEST_BLOCKS = 8
+_PER_LOOP = 8  # bins in a loop period
+_FINEST_S, _COARSEST_S = 0.001, 0.005
+_MOST_FINE = 60
+_GROWTH = 1.12  # of bins beyond the lag
+_BEYOND_S = 0.03
+_DECAYS_S = (0.006, 0.012, 0.025, 0.05, 0.1, 0.2)
+_SIZES = 10.0 ** np.arange(-4, 8.1, 0.5)
+_UNLIKELY = 12.0  # nats
+_TINY = 1e-6  # of the motion's variance: no model of bins fits better
+_STARTS_S, _LONG_ENOUGH_S = 0.3, 3.0  # what came before a motion's first command is not known
+
+
+@dataclass(frozen=True)
+class ImpulseResponse:
+    """Draws of an impulse response, each a mass per bin of past time.
+
+    Attributes
+    ----------
+    edges_s : ndarray, shape (bins + 1,)
+    masses : ndarray, shape (draws, bins)
+        They add up to the static gain.
+    weights : ndarray, shape (draws, blocks)
+        Of the blocks of time behind each draw.
+    stretches : tuple of Stretch
+        The readings it was found in.
+    explained : float
+        Share of the readings' variance that it explains.
+    """
+
+    edges_s: NDArray[np.float64]
+    masses: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    stretches: tuple[Stretch, ...]
+    explained: float
+
+    @property
+    def gain(self) -> float:
+        """Static gain, the median of the draws."""
+        return float(np.median(self.masses.sum(axis=1)))
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """One dead time and kernel: the posterior for every size of the response."""
+
+    dead_time_s: float
+    bins: NDArray[np.int64]
+    root: NDArray[np.float64]
+    strength: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    moment: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    complexity: NDArray[np.float64]
+
+    def mean(self, k: int) -> NDArray[np.float64]:
+        """Posterior mean of the masses at the k-th size."""
+        return self.root @ (self.turn @ (self.moment * self.shrink(k)))
+
+    def shrink(self, k: int) -> NDArray[np.float64]:
+        """Posterior variance of the whitened coordinates over that of the noise."""
+        return _SIZES[k] / (1.0 + _SIZES[k] * self.strength)
+
+    def score(self, count: float) -> NDArray[np.float64]:
+        """Logarithm of the marginal likelihood of `count` effective readings, per size."""
+        return -0.5 * (count * np.log(self.variance) + self.complexity)
+
+
+def joint_impulse_response(
+    joint: str, trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator
+) -> ImpulseResponse:
+    """Impulse response of a joint, from all of its trials.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+    read : sequence of Readings
+        Of each trial.
+    rng : numpy.random.Generator
+
+    Raises
+    ------
+    InputError
+        If the command does not move, or nothing is read where it does.
+    """
+    parts = []
+    for trial, reading in zip(trials, read, strict=True):
+        send, order = trial.send_time_s, np.argsort(reading.time_s, kind="stable")
+        tone = trial.frequency_hz > 0 or send[-1] - send[0] < _LONG_ENOUGH_S
+        time = reading.time_s[order]
+        used = time > send[0] + (0.0 if tone else _STARTS_S)
+        still = np.ptp(trial.command_rad) == 0 and trial.command_rad[0] == trial.initial_command_rad
+        if np.sum(used) >= 8 and np.ptp(time[used]) > 0 and not still:
+            value = reading.position_rad[order]
+            parts.append((HeldCommand.of(trial), time[used], value[used]))
+    if not parts or not any(np.ptp(value) > 0 for _, _, value in parts):
+        raise InputError(
+            f"{joint}: its command does not move, or its position does not, so there is no lag to "
+            "measure. Record a sweep with `pupper-sysid sweep`."
+        )
+    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    return impulse_response(_stretches(parts), loop, rng)
+
+
+def _stretches(
+    parts: Sequence[tuple[HeldCommand, NDArray[np.float64], NDArray[np.float64]]],
+) -> tuple[Stretch, ...]:
+    """Cut trials into blocks: some sixteen in all, at least one per trial."""
+    spans = np.array([time[-1] - time[0] for _, time, _ in parts])
+    shares = np.maximum(1, np.round(_BLOCKS * spans / spans.sum())).astype(int)
+    shares = np.maximum(shares, int(np.ceil(_FEWEST_BLOCKS / len(parts))))
+    return tuple(Stretch(*part, int(k)) for part, k in zip(parts, shares, strict=True))
+
+
+def impulse_response(
+    parts: Sequence[Stretch], loop_s: float, rng: np.random.Generator, draws: int = 300
+) -> ImpulseResponse:
+    """Draw impulse responses that the readings allow.
+
+    Parameters
+    ----------
+    parts : sequence of Stretch
+        Of one joint; the command must move in at least one.
+    loop_s : float
+        Loop period.
+    rng : numpy.random.Generator
+    draws : int
+    """
+    edges = _edges(_rough_lag(parts), loop_s)
+    sums = _pooled([part.sums(edges) for part in parts])
+    gram, moment = sums.gram.sum(axis=0), sums.moment.sum(axis=0)
+    square, count = float(sums.square.sum()), float(sums.count.sum())
+    bins = np.flatnonzero(edges[1:] <= edges[1] * _MOST_FINE * 1.01)
+    dead_times = edges[bins]
+
+    def fit(chosen: NDArray) -> list[_Prior]:
+        return [
+            prior
+            for d in chosen
+            for decay in _DECAYS_S
+            for smooth in (False, True)
+            if (prior := _fit(gram, moment, square, count, edges, d, decay, smooth)) is not None
+        ]
+
+    priors = fit(dead_times[::3])
+    inflation = _inflation(sums, *_best(priors, count))
+    for _ in range(2):
+        # dead times between the tried ones, where they are likely
+        score = np.array([p.score(count / inflation).max() for p in priors])
+        tried = np.array([p.dead_time_s for p in priors])
+        near = np.unique(tried[score > score.max() - _UNLIKELY])
+        reach = np.min(np.abs(dead_times[:, None] - near), axis=1) < 2.5 * edges[1]
+        priors += fit(dead_times[reach & ~np.isin(dead_times, tried)])
+        best = _best(priors, count / inflation)
+        inflation = _inflation(sums, *best)
+    masses, weights = _draw(priors, sums, inflation, len(edges) - 1, rng, draws)
+    prior, k = best
+    return ImpulseResponse(
+        edges, masses, weights, tuple(parts), 1.0 - float(prior.variance[k]) * count / square
+    )
+
+
+def _rough_lag(parts: Sequence[Stretch]) -> float:
+    """Where bins must be fine: the shift at which command and readings correlate best [s]."""
+    edges = np.linspace(0.0, LONGEST_S, 81)
+    sums = _pooled([part.sums(edges) for part in parts])
+    gram, moment = sums.gram.sum(axis=0), sums.moment.sum(axis=0)
+    square, count = float(sums.square.sum()), float(sums.count.sum())
+    decays = 0.05, 0.1, 0.2, 0.4
+    priors = [_fit(gram, moment, square, count, edges, 0.0, d, False) for d in decays]
+    prior, k = _best([p for p in priors if p is not None], count)
+    # the readings' own correlation with the command would see one phase of the staircase only
+    return float(edges[int(np.argmax(np.abs(gram @ prior.mean(k))))] + edges[1] / 2)
+
+
+def _edges(lag_s: float, loop_s: float) -> NDArray[np.float64]:
+    """Bins: fine up to beyond the lag, then growing."""
+    top = lag_s + loop_s + _BEYOND_S
+    fine = max(np.clip(loop_s / _PER_LOOP, _FINEST_S, _COARSEST_S), top / _MOST_FINE)
+    edges = list(np.arange(0.0, top, fine))
+    width = fine
+    while edges[-1] < LONGEST_S:
+        width *= _GROWTH
+        edges.append(edges[-1] + width)
+    return np.array(edges)
+
+
+def _pooled(sums: Sequence[Sums]) -> Sums:
+    """All blocks of all stretches, in units of the command's variance."""
+    unit = sum(np.trace(s.gram.sum(axis=0)) for s in sums)
+    unit /= sums[0].gram.shape[1] * sum(s.count.sum() for s in sums)
+    return Sums(
+        np.concatenate([s.gram for s in sums]) / unit,
+        np.concatenate([s.moment for s in sums]) / unit,
+        np.concatenate([s.square for s in sums]) / unit,
+        np.concatenate([s.count for s in sums]),
+    )
+
+
+def _fit(
+    gram: NDArray, moment: NDArray, square: float, count: float, edges: NDArray,
+    dead_time_s: float, decay_s: float, smooth: bool,
+) -> _Prior | None:  # fmt: skip
+    """Posteriors under one kernel, for all sizes at once; None if it has no square root."""
+    middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    bins = np.flatnonzero(middle > dead_time_s)
+    past = middle[bins] - dead_time_s
+    later = np.maximum(past[:, None], past)
+    if smooth:
+        total = 0.5 / decay_s * (past[:, None] + past)
+        later *= 0.5 / decay_s
+        kernel = np.exp(-total - later) / 2 - np.exp(-3 * later) / 6
+    else:
+        kernel = np.exp(-later / decay_s)
+    kernel *= width[bins, None] * width[bins]
+    kernel /= np.trace(kernel)
+    kernel[np.diag_indices_from(kernel)] *= 1 + 1e-9
+    kernel[np.diag_indices_from(kernel)] += 1e-14
+    try:
+        root = np.linalg.cholesky(kernel)
+    except np.linalg.LinAlgError:
+        return None
+    strength, turn = np.linalg.eigh(root.T @ gram[np.ix_(bins, bins)] @ root)
+    strength = np.maximum(strength, 0.0)
+    own = turn.T @ (root.T @ moment[bins])
+    grown = _SIZES[:, None] * strength
+    left = square - np.sum(own**2 * _SIZES[:, None] / (1 + grown), axis=1)
+    variance = np.maximum(left, _TINY * square) / count
+    complexity = np.log1p(grown).sum(axis=1)
+    return _Prior(dead_time_s, bins, root, strength, turn, own, variance, complexity)
+
+
+def _best(priors: Sequence[_Prior], count: float) -> tuple[_Prior, int]:
+    scores = np.array([p.score(count) for p in priors])
+    i, k = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    return priors[int(i)], int(k)
+
+
+def _scores(sums: Sums, prior: _Prior, k: int) -> NDArray[np.float64]:
+    """Gradient of the fit in every block, in the prior's coordinates."""
+    mean, bins = prior.mean(k), prior.bins
+    left = sums.moment[:, bins] - sums.gram[:, bins][:, :, bins] @ mean
+    return left @ prior.root @ prior.turn
+
+
+def _inflation(sums: Sums, prior: _Prior, k: int) -> float:
+    """Readings per effective reading, from how much the blocks differ; at least 1."""
+    used = prior.shrink(k) * prior.strength
+    spread = np.sum(_scores(sums, prior, k) ** 2, axis=0)
+    ratio = spread / np.maximum(prior.strength * prior.variance[k], 1e-300)
+    return max(1.0, float(np.sum(used * ratio) / np.sum(used)))
+
+
+def _draw(
+    priors: Sequence[_Prior], sums: Sums, inflation: float, size: int,
+    rng: np.random.Generator, draws: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Draws of the masses and of the weights of blocks that belong to them."""
+    count, blocks = float(sums.count.sum()), len(sums.count)
+    score = np.array([p.score(count / inflation) for p in priors])
+    chance = np.exp(score - score.max()).ravel()
+    picked = rng.choice(chance.size, draws, p=chance / chance.sum())
+    weights = rng.exponential(size=(draws, blocks))
+    masses = np.zeros((draws, size))
+    for flat in np.unique(picked):
+        i, k = divmod(int(flat), len(_SIZES))
+        prior, own = priors[i], np.flatnonzero(picked == flat)
+        used = float(np.sum(prior.shrink(k) * prior.strength))
+        # what was fitted away from the blocks is missing from their spread
+        lost = np.sqrt(count / max(count - inflation * used, count / 4) * blocks / (blocks - 1))
+        noise = (weights[own] - 1.0) @ _scores(sums, prior, k) * lost
+        free = np.sqrt(inflation * prior.variance[k] / _SIZES[k])
+        noise += free * rng.standard_normal((len(own), len(prior.bins)))
+        whitened = (prior.moment + noise) * prior.shrink(k)
+        masses[np.ix_(own, prior.bins)] = whitened @ prior.turn.T @ prior.root.T
+    return masses, weights
