@@ -7,6 +7,7 @@ is the effort limit; so armature = stall torque / (effort limit per inertia), an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
     utc_now,
 )
 from pupper_sysid.servo_models.calibration.parts import (
+    NO_SPEED_LIMIT_RAD_S,
     Actuator,
     CandidateModel,
     Feedback,
@@ -35,8 +37,12 @@ from pupper_sysid.servo_models.calibration.parts import (
 )
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
+
+_LIMITS = {"velocity_limit_rad_s": NO_SPEED_LIMIT_RAD_S, "back_emf_per_s": 0.0}
+"""The two limits on a servo's speed, with the value that stands for none."""
 
 
 def to_calibration(
@@ -81,7 +87,7 @@ def to_calibration(
 
 
 def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCalibration:
-    pd, lag = result.delayed_pd, result.lag
+    pd, lag = _covering(result), result.lag
     low, high = result.delay_steps
     armature = stall / pd.values["effort_rad_s2"]
     names = {
@@ -89,6 +95,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         "damping": "damping_per_s",
         "friction_loss": "friction_rad_s2",
         "effort_limit": "effort_rad_s2",
+        "back_emf": "back_emf_per_s",
     }
     ratios = {ours: _ratio(pd, fitted, 1.0) for ours, fitted in names.items()}
     torque = {ours: _ratio(pd, fitted, armature, "ratio only") for ours, fitted in names.items()}
@@ -102,7 +109,8 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             value=stall, identified="no", why="the anchor itself: taken as known, see scale"
         ),
         velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
-        dead_time_s=_quantity(result.dead_time_s),
+        back_emf_nm_s_per_rad=torque["back_emf"],
+        dead_time_s=_known(result.dead_time_s, pd.undecided.get("dead_time_s")),
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
@@ -134,11 +142,34 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
     )
 
 
+def _covering(result: JointCalibrationResult) -> CandidateFit:
+    """The fit that is carried, its intervals widened to the other structure if it may be that."""
+    own, rival = result.delayed_pd, result.rival
+    parameters, undecided = dict(own.parameters), dict(own.undecided)
+    if rival is not None:
+        for name in parameters.keys() & rival.parameters.keys():
+            mine, other = parameters[name], rival.parameters[name]
+            low, high = min(mine.low, other.low), max(mine.high, other.high)
+            parameters[name] = Interval(mine.value, low, high)
+            if name in rival.undecided:
+                undecided.setdefault(name, rival.undecided[name])
+    for name, absent in _LIMITS.items():
+        mine = parameters.get(name, Interval(absent, absent, absent))
+        if rival is not None:  # it may have none, or the other's
+            other = rival.parameters.get(name, Interval(absent, absent, absent))
+            mine = Interval(mine.value, min(mine.low, other.low), max(mine.high, other.high))
+            undecided[name] = "the data do not tell a set-point of limited rate from back-EMF"
+        elif name not in parameters:
+            undecided[name] = "the chosen model has none"
+        parameters[name] = mine
+    return replace(own, parameters=parameters, undecided=undecided)
+
+
 def _candidate(fit: CandidateFit) -> CandidateModel:
     s = fit.scores
     return CandidateModel(
         model=fit.model,
-        parameter_count=len(fit.parameters),
+        parameter_count=len(candidate_model(fit.model).parameters),
         rmse_fresh_rad=_finite(s.rmse_fresh_rad),
         rmse_held_rad=_finite(s.rmse_held_rad),
         rmse_raw_rad=_finite(s.rmse_raw_rad),
@@ -200,9 +231,8 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
             else "readings are held, but no poll period is significant"
         )
         period = loss = Quantity(value=0.0, identified="no", why=why)
-        age = Quantity(
-            value=max(lag.feedback_age_s, 0.0), identified="yes", why="from raw minus fresh lag"
-        )
+        live = lattice.kind == "every read"
+        age = Quantity(value=0.0 if live else lattice.time_doubt_s, identified="no", why=why)
     return Feedback(
         poll_period_s=period, loss=loss, quantum_rad=quantum, offset_rad=_quantity(offset_rad),
         mean_age_s=age,
@@ -211,11 +241,17 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
 
 def _quantity(interval: Interval) -> Quantity:
     """An interval as an identified quantity, its ends never inside of its value."""
+    return _known(interval, None)
+
+
+def _known(interval: Interval, why: str | None) -> Quantity:
+    """An interval as a quantity that is identified unless there is a reason why not."""
     return Quantity(
         value=interval.value,
         low=min(interval.low, interval.value),
         high=max(interval.high, interval.value),
-        identified="yes",
+        identified="no" if why else "yes",
+        why=why,
     )
 
 

@@ -1,51 +1,58 @@
 """Fit the candidate models to one joint, choose one, and find what the data do not identify.
 
 The candidates of `sysid.identify.models` are fitted to fresh readings by output error, from seeded
-global starts, and scored by leaving one frequency out. The model with the smallest error on unseen
-frequencies is chosen; `DelayedPD` where it is within 5 % of the best, because training runs it.
-Residuals of a real servo are not white: intervals count effective samples, not nominal ones.
+global starts, and scored by leaving one frequency out. Simulators run DelayedPD with one of two
+limits on its speed, the set-point's slew or the motor's back-EMF; of these the one with the smaller
+error on unseen frequencies is carried. The intervals of its numbers are quantiles of their
+posterior (`sysid.identify.posterior`), over both where the data do not tell them apart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, flat, internal
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
-from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, quantum, readings
 from pupper_sysid.sysid.identify.models import (
     CANDIDATE_MODELS,
     CandidateModel,
     Parameter,
     candidate_model,
 )
+from pupper_sysid.sysid.identify.noise import command_jitter
 from pupper_sysid.sysid.identify.output_error import Fit
+from pupper_sysid.sysid.identify.posterior import Posterior, posterior
+from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint, refit
 from pupper_sysid.sysid.identify.scores import Scores, rms, score
 from pupper_sysid.sysid.identify.search import (
     PREFERRED,
-    dead_time_profile,
+    SIMULATED,
     fit_with_folds,
     fresh_residuals,
     held_out_residuals,
     integrated_autocorrelation_time,
     leave_one_out_folds,
 )
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
-from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
-from pupper_sysid.sysid.recordings.joints import joint_rng
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 
 Presets = Mapping[str, Mapping[str, DelayedPDParameters]]
 """Published settings by name, then by joint."""
 
 _PREFERENCE = 1.05
+_TELLING_NATS = 5.0
+"""Difference of the log-likelihoods of two structures that tells them apart."""
+_WIDE = 4.0
+_AT_BOUND = 0.03
+"""Distance from a bound, in fitted coordinates, that counts as on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +89,12 @@ class JointCalibrationResult(Result):
     ----------
     model : str
         The candidate with the smallest error on unseen frequencies.
+    simulated_model : str
+        Of `SIMULATED`, the one that calibrations carry.
+    structure_nats : dict of str to float
+        Of those: by how much the log-likelihood of each is below that of the best.
+    command_jitter_s : Interval
+        Standard deviation of the latency of commands that the noise of fast tones amounts to.
     candidate_models : dict of str to CandidateFit
         Simplest first.
     lag : LagBudget
@@ -95,6 +108,9 @@ class JointCalibrationResult(Result):
 
     joint: str
     model: str
+    simulated_model: str
+    structure_nats: dict[str, float]
+    command_jitter_s: Interval
     candidate_models: dict[str, CandidateFit]
     lag: LagBudget
     presets: dict[str, Scores]
@@ -103,12 +119,18 @@ class JointCalibrationResult(Result):
 
     @property
     def delayed_pd(self) -> CandidateFit:
-        """The fit that simulators run."""
-        return self.candidate_models[PREFERRED]
+        """The fit that simulators run: DelayedPD with the speed limit of `simulated_model`."""
+        return self.candidate_models[self.simulated_model]
+
+    @property
+    def rival(self) -> CandidateFit | None:
+        """The other fit that simulators could run, if the data do not tell the two apart."""
+        others = [n for n in plausible(self.structure_nats) if n != self.simulated_model]
+        return self.candidate_models[others[0]] if others else None
 
     @property
     def dead_time_s(self) -> Interval:
-        """Dead time with its profile-likelihood interval [s]."""
+        """Dead time [s]; the interval covers every structure that the data allow."""
         assert self.lag.dead_time_s is not None
         return self.lag.dead_time_s
 
@@ -133,44 +155,9 @@ class JointCalibrationResult(Result):
         ]
 
 
-@dataclass(frozen=True)
-class PreparedJoint:
-    """One joint's trials on the physics clock, with the noise of its readings."""
-
-    rng: np.random.Generator
-    lag: LagBudget
-    data: tuple[TrialData, ...]
-    noise_rad: float
-
-    def fit_rng(self) -> np.random.Generator:
-        """The same generator for every fit, so that a fit does not depend on those before it."""
-        return deepcopy(self.rng)
-
-
-def prepare_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> PreparedJoint:
-    """Measure the lag of a joint and put its trials on the physics clock; nothing is fitted.
-
-    Raises
-    ------
-    InputError
-        If there is too little motion.
-    """
-    rng = joint_rng(seed, joint)
-    lattice = find_poll_lattice(trials, rng.spawn(1)[0])
-    lag = lag_budget(joint, trials, rng, lattice)
-    data = tuple(prepare(t, readings(t, lattice)) for t in trials)
-    data = tuple(d for d in data if len(d.sample_step))
-    # fits of a noise-free servo still meet rounding: a third of a quantisation step
-    noise = max(lag.noise_rad, quantum(trials) / 3, 1e-4) if np.isfinite(lag.noise_rad) else 0.012
-    return PreparedJoint(rng, lag, data, noise)
-
-
 def joint_lag(joint: str, trials: tuple[Trial, ...], seed: int = 0) -> LagBudget:
-    """Lag budget of one joint, its dead time from a fit of DelayedPD alone."""
-    ready, model = prepare_joint(joint, trials, seed), candidate_model(PREFERRED)
-    (best,) = fit_with_folds(model, ready.data, {}, ready.noise_rad, ready.fit_rng(), {})
-    dead_time, best = dead_time_profile(model, ready.data, ready.noise_rad, best)
-    return replace(ready.lag, dead_time_s=dead_time, offset_rad=float(best.values[-1]))
+    """Lag budget of one joint, its dead time that of `fit_joint`."""
+    return _fit_simulated(prepare_joint(joint, trials, seed)).lag
 
 
 def fit_joint(
@@ -194,31 +181,102 @@ def fit_joint(
         If there is too little motion.
     """
     ready = prepare_joint(joint, trials, seed)
-    data, noise, folds = ready.data, ready.noise_rad, leave_one_out_folds(ready.data)
-    fitted: dict[str, CandidateFit] = {}
-    best: dict[str, list[Fit]] = {}
-    lag = ready.lag
+    data, noise = ready.data, ready.noise_rad
+    pd = _fit_simulated(ready)
+    best = dict(pd.fits)
+    fitted = dict(pd.fitted)
     for model in CANDIDATE_MODELS:
-        best[model.name] = fit_with_folds(model, data, folds, noise, ready.fit_rng(), best)
-        if model.name == PREFERRED:
-            dead_time, fit = dead_time_profile(model, data, noise, best[PREFERRED][0])
-            best[PREFERRED][0] = fit
-            lag = replace(lag, dead_time_s=dead_time, offset_rad=float(fit.values[-1]))
-        fitted[model.name] = _candidate_fit(model, best[model.name], data, folds, noise)
-    chosen = _choose(fitted)
+        if model.name not in best:
+            best[model.name] = fit_with_folds(model, data, pd.folds, noise, ready.fit_rng(), best)
+            fitted[model.name] = _candidate_fit(model, best[model.name], ready, pd.folds)
+    fitted = {model.name: fitted[model.name] for model in CANDIDATE_MODELS}
+    chosen = _choose(fitted, pd.carried)
+    carried = candidate_model(pd.carried)
+    values = pd.fits[pd.carried][0].values
     return JointCalibrationResult(
         joint=joint,
         model=chosen,
+        simulated_model=pd.carried,
+        structure_nats=pd.nats,
+        command_jitter_s=command_jitter(
+            carried, values, ready.recorded, data, noise, ready.fit_rng()
+        ),
         candidate_models=fitted,
-        lag=lag,
+        lag=pd.lag,
         presets={
             name: _score_preset(by_joint[joint], data)
             for name, by_joint in (presets or {}).items()
             if joint in by_joint
         },
-        warnings=(*lag.warnings, *_warnings(joint, fitted, chosen)),
+        warnings=(*pd.lag.warnings, *_warnings(joint, fitted, chosen, pd)),
         trials=data,
     )
+
+
+def plausible(structure_nats: Mapping[str, float]) -> list[str]:
+    """Structures that the data do not tell from the best."""
+    return [name for name, nats in structure_nats.items() if nats <= _TELLING_NATS]
+
+
+@dataclass(frozen=True)
+class _Simulated:
+    """Fits of the models that simulators run.
+
+    Attributes
+    ----------
+    fits : dict of str to list of Fit
+        To all trials, then without each fold's.
+    fitted : dict of str to CandidateFit
+    nats : dict of str to float
+        By how much the log-likelihood of each is below that of the best.
+    carried : str
+    lag : LagBudget
+        With dead time and offset.
+    folds : dict of float to tuple of bool
+    """
+
+    fits: dict[str, list[Fit]]
+    fitted: dict[str, CandidateFit]
+    nats: dict[str, float]
+    carried: str
+    lag: LagBudget
+    folds: dict[float, tuple[bool, ...]] = field(repr=False)
+
+
+def _fit_simulated(ready: PreparedJoint) -> _Simulated:
+    data, noise, folds = ready.data, ready.noise_rad, leave_one_out_folds(ready.data)
+    fits: dict[str, list[Fit]] = {}
+    drawn: dict[str, Posterior] = {}
+    fitted: dict[str, CandidateFit] = {}
+    for name in SIMULATED:
+        model = candidate_model(name)
+        fits[name] = fit_with_folds(model, data, folds, noise, ready.fit_rng(), fits)
+        fits[name][0] = min(fits[name][0], ready.first[name], key=lambda f: f.cost)
+        drawn[name] = posterior(model, data, noise, fits[name][0], ready.fit_rng())
+        again = refit(name, data, noise, replace(fits[name][0], values=drawn[name].best))
+        fits[name][0] = min(fits[name][0], again, key=lambda f: f.cost)
+        fitted[name] = _candidate_fit(model, fits[name], ready, folds, drawn[name])
+    # both are counted at the temperature of the better one, or the worse fit would excuse itself
+    best = min(drawn, key=lambda name: drawn[name].lowest_cost)
+    nats = {
+        name: (d.lowest_cost - drawn[best].lowest_cost) / drawn[best].temperature
+        for name, d in drawn.items()
+    }
+    errors = {n: f.scores.rmse_leave_one_frequency_out_rad for n, f in fitted.items()}
+    known = np.isfinite(list(errors.values())).all()
+    # within a hundredth an error on unseen frequencies says less than the likelihood
+    close = [n for n in errors if not known or errors[n] <= 1.01 * min(errors.values())]
+    carried = min(close, key=lambda name: nats[name])
+    intervals = [fitted[n].parameters["dead_time_s"] for n in {carried, *plausible(nats)}]
+    dead_time = Interval(
+        fitted[carried].parameters["dead_time_s"].value,
+        min(i.low for i in intervals),
+        max(i.high for i in intervals),
+    ).widened(ready.lag.feedback.time_doubt_s)
+    dead_time = replace(dead_time, low=max(dead_time.low, 0.0))
+    offset = fitted[carried].parameters["offset_rad"].value
+    lag = replace(ready.lag, dead_time_s=dead_time, offset_rad=offset)
+    return _Simulated(fits, fitted, nats, carried, lag, folds)
 
 
 def _score_preset(parameters: DelayedPDParameters, data: tuple[TrialData, ...]) -> Scores:
@@ -235,22 +293,33 @@ def _score_preset(parameters: DelayedPDParameters, data: tuple[TrialData, ...]) 
 def _candidate_fit(
     model: CandidateModel,
     fits: list[Fit],
-    data: tuple[TrialData, ...],
+    ready: PreparedJoint,
     folds: dict[float, tuple[bool, ...]],
-    noise: float,
+    drawn: Posterior | None = None,
 ) -> CandidateFit:
-    best = fits[0]
-    residual = fresh_residuals(model, best.values, data)
-    # soft-L1 works in units of the noise; its covariance is for residuals of that size
-    inflation = integrated_autocorrelation_time(residual) * max(1.0, rms(residual) ** 2 / noise**2)
-    sd = np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
+    data, best = ready.data, fits[0]
     speed = max(_command_speed(d) for d in data)
-    parameters, undecided = {}, {}
-    for j, p in enumerate(model.parameters):
-        parameters[p.name] = _interval(p, float(best.values[j]), float(sd[j]))
-        nominal_sd = float(np.sqrt(best.covariance[j, j]))
-        if why := _why_unidentified(p, float(best.values[j]), float(sd[j]), nominal_sd, speed):
-            undecided[p.name] = why
+    if drawn is None:
+        sd = _spread(model, best, ready)
+        parameters = {
+            p.name: _interval(p, float(v), float(s))
+            for p, v, s in zip(model.parameters, best.values, sd, strict=True)
+        }
+    else:
+        parameters, sd = drawn.intervals(best.values), drawn.spread
+    undecided = {
+        p.name: why
+        for p, v, s in zip(model.parameters, best.values, sd, strict=True)
+        if (why := _why_unidentified(p, float(v), float(s), parameters[p.name], speed))
+    }
+    if "back_emf_per_s" in parameters and "no_load_speed_rad_s" in undecided:
+        undecided["back_emf_per_s"] = undecided["no_load_speed_rad_s"]
+    if ready.lag.feedback.time_doubt_s > 0:
+        undecided["dead_time_s"] = (
+            "readings are held, their poll is unknown"
+            if ready.lag.feedback.readings == "polled"
+            else "it is not known whether readings are live"
+        )
     return CandidateFit(
         model=model.name,
         parameters=parameters,
@@ -261,6 +330,18 @@ def _candidate_fit(
             held_out_residuals(model, fits[1:], folds, data),
         ),
     )
+
+
+def _spread(model: CandidateModel, best: Fit, ready: PreparedJoint) -> NDArray[np.float64]:
+    """Standard deviations from the curvature of the cost, for models without a posterior."""
+    residual = [
+        r / n for r, n in zip(
+            fresh_residuals(model, best.values, ready.data), ready.noise_rad, strict=True
+        )
+    ]  # fmt: skip
+    # soft-L1 works in units of the noise; its covariance is for residuals of that size
+    inflation = integrated_autocorrelation_time(residual) * max(1.0, rms(residual) ** 2)
+    return np.sqrt(np.maximum(np.diag(best.covariance) * inflation, 0.0))
 
 
 def _interval(parameter: Parameter, value: float, sd: float) -> Interval:
@@ -274,33 +355,45 @@ def _interval(parameter: Parameter, value: float, sd: float) -> Interval:
 
 
 def _why_unidentified(
-    p: Parameter, value: float, sd: float, nominal_sd: float, speed: float
+    p: Parameter, value: float, sd: float, interval: Interval, speed: float
 ) -> str | None:
     """Why the data do not identify a parameter; None if they do."""
     limit = p.name.endswith("_rad_s") and p.name != "natural_frequency_rad_s"
     if limit and speed < 0.8 * value:
         return f"commands reach {speed:.1f} rad/s only, so the limit was never reached"
-    if p.logarithmic and (value <= p.low * 1.01 or value >= p.high / 1.01):
-        return f"the value is at its bound {p.low if value <= p.low * 1.01 else p.high:g}"
-    if nominal_sd > 0.7 * p.prior_sd:
+    for bound, end in ((p.low, min(value, interval.low)), (p.high, max(value, interval.high))):
+        on = float(abs(p.encode(end) - p.encode(bound))) < _AT_BOUND
+        if on and (p.logarithmic or abs(value - bound) < _AT_BOUND):
+            return f"on its bound, {bound:g}: the recording does not limit it on that side"
+    if sd > 0.7 * p.prior_sd:
         return "these recordings do not excite it; the value is the prior's"
-    if p.logarithmic and sd > 0.5:
-        return "its interval is wider than a factor of two"
+    if p.logarithmic and interval.high > _WIDE * interval.low:
+        return f"its interval is wider than a factor of {_WIDE:g}"
     return None
 
 
-def _choose(fitted: dict[str, CandidateFit]) -> str:
-    """The model with the smallest leave-one-out error; DelayedPD where it is as good."""
+def _choose(fitted: dict[str, CandidateFit], carried: str) -> str:
+    """The model with the smallest leave-one-out error; the one carried where it is as good."""
     errors = {n: f.scores.rmse_leave_one_frequency_out_rad for n, f in fitted.items()}
     if not np.isfinite(list(errors.values())).all():
-        return PREFERRED  # one frequency: nothing to choose by
+        return carried  # one frequency: nothing to choose by
     best = min(errors, key=lambda name: errors[name])
-    return PREFERRED if errors[PREFERRED] <= _PREFERENCE * errors[best] else best
+    return carried if errors[carried] <= _PREFERENCE * errors[best] else best
 
 
-def _warnings(joint: str, fitted: dict[str, CandidateFit], chosen: str) -> list[str]:
-    pd = fitted[PREFERRED]
+def _warnings(
+    joint: str, fitted: dict[str, CandidateFit], chosen: str, simulated: _Simulated
+) -> list[str]:
+    pd = fitted[simulated.carried]
     found = []
+    if why := pd.undecided.get("dead_time_s"):
+        found.append(f"{joint}: the dead time is not identified: {why}.")
+    if len(plausible(simulated.nats)) > 1:
+        found.append(
+            f"{joint}: the data do not tell a set-point of limited rate from back-EMF "
+            f"({max(simulated.nats.values()):.1f} nats); dead time and gains cover both. Faster "
+            "tones at a smaller amplitude would tell (`pupper-sysid plan`)."
+        )
     if "velocity_limit_rad_s" in pd.undecided:
         found.append(
             f"{joint}: the speed limit was not excited: "
@@ -311,7 +404,7 @@ def _warnings(joint: str, fitted: dict[str, CandidateFit], chosen: str) -> list[
             quantity = name.split("_")[0]
             found.append(f"{joint}: {quantity} is not identified: {pd.undecided[name]}.")
     own = pd.scores.rmse_leave_one_frequency_out_rad
-    if chosen != PREFERRED:
+    if chosen != simulated.carried:
         best = fitted[chosen].scores.rmse_leave_one_frequency_out_rad
         found.append(
             f"{joint}: {chosen} predicts unseen frequencies better ({1e3 * best:.1f} against "

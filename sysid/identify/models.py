@@ -84,6 +84,20 @@ class CandidateModel:
         """Parameter names in order."""
         return [p.name for p in self.parameters]
 
+    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bounds of the fitted coordinates, shape (parameters,) each."""
+        ends = ([float(p.encode(x)) for x in (p.low, p.high)] for p in self.parameters)
+        low, high = np.array(list(ends)).T
+        return low, high
+
+    def encode(self, values: NDArray) -> NDArray[np.float64]:
+        """Fitted coordinates of values (..., parameters)."""
+        return np.stack([p.encode(values[..., j]) for j, p in enumerate(self.parameters)], axis=-1)
+
+    def decode(self, points: NDArray) -> NDArray[np.float64]:
+        """Values of fitted coordinates (..., parameters)."""
+        return np.stack([p.decode(points[..., j]) for j, p in enumerate(self.parameters)], axis=-1)
+
 
 def _pure_delay(values: NDArray, track: NDArray) -> None:
     track *= values[0]
@@ -156,23 +170,23 @@ def _delayed_pd_backlash(values: NDArray, track: NDArray) -> None:
         track[k] = y
 
 
-_DELAY = Parameter("dead_time_s", 0.02, 0.001, 0.12)
+_DELAY = Parameter("dead_time_s", 0.02, 0.001, 0.4)
 _OFFSET = Parameter("offset_rad", 0.0, -2.0, 2.0)
 _GAIN = Parameter("gain", 1.0, 0.5, 1.5)
 # The priors cover hobby servos. Speed: data sheets say 0.08 to 0.2 s per 60 degrees, 13 to 5 rad/s,
 # about a geometric mean of 8.3. The rest: stiff enough to hold a leg, and torque enough to bring
 # it to that speed within a few hundredths of a second.
-_STIFFNESS = Parameter("stiffness_per_s2", 9000.0, 300.0, 120000.0, 1.0)
-_DAMPING = Parameter("damping_per_s", 90.0, 2.0, 1500.0, 1.0)
-_FRICTION = Parameter("friction_rad_s2", 120.0, 0.5, 2000.0, 1.2)
-_EFFORT = Parameter("effort_rad_s2", 450.0, 30.0, 8000.0, 0.6)
-_SPEED = Parameter("velocity_limit_rad_s", 8.3, 1.5, 30.0, 0.3)
+_STIFFNESS = Parameter("stiffness_per_s2", 9000.0, 30.0, 200000.0, 1.0)
+_DAMPING = Parameter("damping_per_s", 90.0, 1.0, 2000.0, 1.0)
+_FRICTION = Parameter("friction_rad_s2", 120.0, 0.1, 10000.0, 1.2)
+_EFFORT = Parameter("effort_rad_s2", 450.0, 5.0, 20000.0, 0.6)
+_SPEED = Parameter("velocity_limit_rad_s", 8.3, 0.3, 60.0, 0.3)
 _PD = (_DELAY, _STIFFNESS, _DAMPING, _FRICTION, _EFFORT, _SPEED)
 
 _TIME_CONSTANT = Parameter("time_constant_s", 0.02, 0.0005, 0.5)
 _NATURAL_FREQUENCY = Parameter("natural_frequency_rad_s", 90.0, 8.0, 600.0)
 _DAMPING_RATIO = Parameter("damping_ratio", 0.8, 0.1, 4.0)
-_NO_LOAD_SPEED = Parameter("no_load_speed_rad_s", 9.0, 1.5, 40.0, 0.4)
+_NO_LOAD_SPEED = Parameter("no_load_speed_rad_s", 9.0, 0.3, 60.0, 0.4)
 _BACKLASH = Parameter("backlash_rad", 0.01, 0.0005, 0.15, 1.0)
 
 CANDIDATE_MODELS = (
@@ -186,8 +200,11 @@ CANDIDATE_MODELS = (
     ),
     CandidateModel("delayed_pd", (*_PD, _OFFSET), _delayed_pd, _without_back_emf),
     CandidateModel(
-        "delayed_pd_back_emf", (*_PD[:-1], _NO_LOAD_SPEED, _OFFSET), _back_emf_pd,
-        _from_no_load_speed, "delayed_pd",
+        "delayed_pd_back_emf",
+        (*_PD[:-1], _NO_LOAD_SPEED, _OFFSET),
+        _back_emf_pd,
+        _from_no_load_speed,
+        "delayed_pd",
     ),
     CandidateModel(
         "delayed_pd_backlash", (*_PD, _BACKLASH, _OFFSET), _delayed_pd_backlash, _without_back_emf

@@ -35,16 +35,26 @@ class Problem:
     trials : tuple of TrialData
     use : tuple of bool
         Which trials count in the fit.
-    noise_rad : float
-        Scale of the residuals: the soft-L1 loss bends here, the prior is weighed against it.
+    noise_rad : float or tuple of float
+        Scale of the residuals, of all or per trial: the soft-L1 loss bends here, the prior is
+        weighed against it.
     frozen : dict of str to float
         Parameters held at a value.
+    recorded_minus_own : ndarray, optional, shape (samples of the used trials,)
+        For a synthetic recording with other readings at the same times [rad].
     """
 
     trials: tuple[TrialData, ...]
     use: tuple[bool, ...]
-    noise_rad: float
+    noise_rad: float | tuple[float, ...]
     frozen: dict[str, float]
+    recorded_minus_own: NDArray[np.float64] | None = None
+
+    def scale(self) -> NDArray[np.float64]:
+        """Noise of each reading of the used trials [rad]."""
+        noise = np.broadcast_to(self.noise_rad, len(self.trials))
+        counts = [len(t.sample_step) * used for t, used in zip(self.trials, self.use, strict=True)]
+        return np.repeat(noise, counts)
 
 
 @dataclass(frozen=True)
@@ -124,6 +134,8 @@ def fit(
             free[i, j], z[i, j] = False, float(par[j].encode(value))
     z = np.where(free, np.clip(z, low, high), z)
 
+    scales: dict[int, NDArray] = {id(p): p.scale() for p in problems}
+
     def evaluate(index: NDArray, points: NDArray, difference: float = difference):
         """Cost, gradient and curvature of the problems `index` at `points`."""
         step = difference * scale
@@ -132,10 +144,10 @@ def fit(
         residuals = _residuals(model, [problems[i] for i in index], cloud)
         costs, gradients, curvatures = [], [], []
         for n, i in enumerate(index):
-            r = residuals[n] / problems[i].noise_rad
+            noise = scales[id(problems[i])]
+            r = residuals[n] / noise
             slopes = (r[1:] - r[0]).T / step[:-1]
-            constant = np.full((r.shape[1], 1), 1.0 / problems[i].noise_rad)
-            jacobian = np.hstack([slopes, constant]) * free[i]
+            jacobian = np.hstack([slopes, 1.0 / noise[:, None]]) * free[i]
             weight = 1.0 / np.sqrt(1.0 + r[0] ** 2)
             pull = space.precision * (points[n] - space.centre) * free[i]
             costs.append(space.cost(r[0], points[n]))
@@ -190,7 +202,7 @@ def evolve(
     starts: NDArray,
     rng: np.random.Generator,
     generations: int,
-) -> Fit:
+) -> tuple[Fit, NDArray[np.float64]]:
     """The best of a population that starts at `starts` and evolves, fitted to the end.
 
     Differential evolution finds its way between the local optima of a servo with dry friction,
@@ -204,24 +216,30 @@ def evolve(
     starts : ndarray, shape (population, parameters)
     rng : numpy.random.Generator
     generations : int
+
+    Returns
+    -------
+    Fit
+    ndarray, shape (population, parameters)
+        The last population, in fitted coordinates.
     """
-    par, space = model.parameters, _Space.of(model)
-
-    def cost(points: NDArray) -> NDArray:  # (parameters, candidates)
-        r = _residuals(model, [problem], points.T[None])[0] / problem.noise_rad
-        return space.cost(r, points.T)
-
-    population: Any = np.clip(  # SciPy's annotations know names of methods only
-        np.stack([p.encode(column) for p, column in zip(par, starts.T, strict=True)], 1),
-        space.low, space.high,
-    )  # fmt: skip
+    low, high = model.box()
+    # SciPy's annotations know names of methods only
+    population: Any = np.clip(model.encode(starts), low, high)
     found = differential_evolution(
-        cost, list(zip(space.low, space.high, strict=True)), init=population, rng=rng,
-        maxiter=generations, mutation=(0.4, 0.9), recombination=0.9, tol=0.0, polish=False,
-        vectorized=True, updating="deferred",
+        lambda points: costs(model, problem, points.T), list(zip(low, high, strict=True)),
+        init=population, rng=rng, maxiter=generations, mutation=(0.4, 0.9), recombination=0.9,
+        tol=0.0, polish=False, vectorized=True, updating="deferred",
     )  # fmt: skip
-    values = np.array([float(p.decode(x)) for p, x in zip(par, found.x, strict=True)])
-    return fit(model, [problem], values[None])[0]
+    return fit(model, [problem], model.decode(found.x)[None])[0], found.population
+
+
+def costs(
+    model: CandidateModel, problem: Problem, points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Cost of each of `points`, which are fitted coordinates (candidates, parameters)."""
+    r = _residuals(model, [problem], points[None])[0] / problem.scale()
+    return _Space.of(model).cost(r, points)
 
 
 def global_starts(
@@ -270,7 +288,7 @@ def global_starts(
         shifted[:, 0] += TIME_STEP_S * later[np.argmin(square - mean**2, axis=0)]
         r = residuals(model, shifted, used)
         offset = -np.median(r, axis=1)
-        robust = np.sqrt(1 + ((r + offset[:, None]) / problem.noise_rad) ** 2).sum(axis=1)
+        robust = np.sqrt(1 + ((r + offset[:, None]) / problem.scale()) ** 2).sum(axis=1)
         order = np.argsort(robust)[:keep]
         chosen = shifted[order]
         chosen[:, -1] += offset[order]
@@ -291,4 +309,7 @@ def _residuals(
         used = [t for t, u in zip(problems[members[0]].trials, use, strict=True) if u]
         each = residuals(model, values[members].reshape(-1, values.shape[-1]), used)
         found.update(zip(members, each.reshape(len(members), points.shape[1], -1), strict=True))
+    for i, problem in enumerate(problems):
+        if problem.recorded_minus_own is not None:
+            found[i] = found[i] + problem.recorded_minus_own
     return [found[i] for i in range(len(problems))]

@@ -4,9 +4,7 @@ A servo's cost has many local optima (delay trades against damping, friction aga
 every fit is the same search, `fit_problems`: many seeded starts are simulated once, the best are
 improved a little, and the best of those are fitted to convergence. `fit_with_folds` runs it for all
 trials and for each left-out frequency, to score a model on unseen motion; the fit of DelayedPD to
-all trials, whose numbers are exported, evolves a population besides. `dead_time_profile` fits the
-other parameters at fixed dead times; the rise of the cost gives the interval, counted in effective
-samples (`integrated_autocorrelation_time`) because residuals of a real servo are not white.
+all trials, whose numbers are exported, evolves a population besides.
 
 `sysid.identify.joint_fit`, `sysid.sparse.equations` and `sysid.servo_fit.physics` fit
 their models with it.
@@ -19,10 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, ndtri
 
-from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.identify.models import CandidateModel
 from pupper_sysid.sysid.identify.output_error import (
     DIFFERENCE,
@@ -35,18 +30,16 @@ from pupper_sysid.sysid.identify.output_error import (
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 
 PREFERRED = "delayed_pd"
-"""The model that simulators and training run."""
+"""DelayedPD with a set-point of limited rate: what a simulator runs unless the data say more."""
 
-STEPPING_SD_S = 0.5 * TIME_STEP_S
-"""Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
-standard deviation over random emulated servos with half that step
-(`benchmarks/dead_time_accuracy.py`)."""
+SIMULATED = (PREFERRED, "delayed_pd_back_emf")
+"""Candidate models that simulators and training can run: DelayedPD with one limit on its speed."""
 
 _MOST_FOLDS = 6
 _CANDIDATES = 512
 _SHORT, _FINAL = 8, 20  # iterations: enough to rank the starts, enough to converge
 _SEARCH_DIFFERENCE = 0.05
-_POPULATION, _GENERATIONS = 48, 50
+_POPULATION, _GENERATIONS = 64, 120
 
 
 def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
@@ -75,7 +68,7 @@ def fit_with_folds(
     model: CandidateModel,
     data: tuple[TrialData, ...],
     folds: dict[float, tuple[bool, ...]],
-    noise: float,
+    noise: float | tuple[float, ...],
     rng: np.random.Generator,
     lower: dict[str, list[Fit]],
     more_starts: NDArray | None = None,
@@ -91,8 +84,8 @@ def fit_with_folds(
     data : tuple of TrialData
     folds : dict of float to tuple of bool
         From `leave_one_out_folds`; may be empty.
-    noise : float
-        Size of residuals beyond which one counts as an outlier [rad].
+    noise : float or tuple of float
+        Size of ordinary residuals, of all trials or of each [rad].
     rng : numpy.random.Generator
     lower : dict of str to list of Fit
         Fits of simpler models, by name; a model that contains `PREFERRED` starts from its fits.
@@ -120,11 +113,11 @@ def fit_with_folds(
     # `folds`, so that a fit without folds finds what the same fit with folds finds.
     keep, final = (24, 4) if len(leave_one_out_folds(data)) <= 4 else (8, 3)
     fits = fit_problems(model, problems, rng, keep, final, more_starts)
-    if model.name == PREFERRED:  # its numbers are exported: no local optimum will do
+    if model.name in SIMULATED:  # its numbers are exported: no local optimum will do
         crowd = global_starts(model, [everything], rng, _CANDIDATES, _POPULATION)[0]
         crowd[-1] = fits[0].values
         fits[0] = min(
-            fits[0], evolve(model, everything, crowd, rng, _GENERATIONS), key=lambda f: f.cost
+            fits[0], evolve(model, everything, crowd, rng, _GENERATIONS)[0], key=lambda f: f.cost
         )
     return fits
 
@@ -200,74 +193,6 @@ def _fit_all(
     flat = [p for p in problems for _ in range(count)]
     fits = fit(model, flat, starts.reshape(-1, starts.shape[-1]), iterations, difference)
     return [fits[i : i + count] for i in range(0, len(fits), count)]
-
-
-def dead_time_profile(
-    model: CandidateModel, data: tuple[TrialData, ...], noise: float, best: Fit
-) -> tuple[Interval, Fit]:
-    """Dead time with its profile-likelihood interval, and the best fit met on the way.
-
-    Parameters
-    ----------
-    model : CandidateModel
-        Its first parameter is `dead_time_s`.
-    data : tuple of TrialData
-    noise : float
-        Size of residuals beyond which one counts as an outlier [rad].
-    best : Fit
-        Where the profile starts.
-
-    Returns
-    -------
-    Interval
-        Dead time [s] at the confidence `common.interval.LEVEL`.
-    Fit
-        `best`, or a better one.
-    """
-    everything = Problem(data, (True,) * len(data), noise, {})
-    residual = fresh_residuals(model, best.values, data)
-    # half of the quantile of chi² with one degree of freedom
-    threshold = float(gammaincinv(0.5, LEVEL)) * integrated_autocorrelation_time(residual)
-    fits, lowest, delays = [best], best, np.array([best.values[0]])
-    for _ in range(3):
-        centre = best.values[0]
-        spread = np.array([0.001, 0.002, 0.0035, 0.005, 0.0075, 0.010, 0.014])
-        delays = np.concatenate([centre - spread[::-1], [centre], centre + spread])
-        delays = delays[(delays >= model.parameters[0].low) & (delays <= model.parameters[0].high)]
-        problems = [replace(everything, frozen={"dead_time_s": float(d)}) for d in delays]
-        fits = fit(model, problems, np.tile(best.values, (len(delays), 1)), 10)
-        # a neighbour's solution may be a better start: pass each on, outward and back
-        for shift in (1, -1):
-            moved = fit(model, problems, np.roll([f.values for f in fits], shift, axis=0), 4)
-            fits = [min(pair, key=lambda f: f.cost) for pair in zip(fits, moved, strict=True)]
-        lowest = min(fits, key=lambda f: f.cost)
-        if lowest.cost > best.cost - 0.5:
-            break
-        best = min(*fit(model, [everything], lowest.values[None], 25), best, key=lambda f: f.cost)
-    cost = np.array([f.cost for f in fits]) - min(best.cost, lowest.cost)
-    low, high = _crossings(delays, cost, best.values[0], threshold)
-    centre, grain = float(best.values[0]), ndtri(0.5 + LEVEL / 2) * STEPPING_SD_S
-    ends = centre - np.hypot(centre - low, grain), centre + np.hypot(high - centre, grain)
-    return Interval(centre, max(float(ends[0]), 0.0), float(ends[1])), best
-
-
-def _crossings(
-    delays: NDArray, cost: NDArray, centre: float, threshold: float
-) -> tuple[float, float]:
-    """Where the profile rises through the threshold on either side of `centre`."""
-    below = cost <= threshold
-    inside = np.flatnonzero(below)
-    if not len(inside):
-        return float(centre), float(centre)
-    ends = []
-    for edge, step in ((inside[0], -1), (inside[-1], 1)):
-        beyond = edge + step
-        if 0 <= beyond < len(delays):
-            part = (threshold - cost[edge]) / max(cost[beyond] - cost[edge], 1e-9)
-            ends.append(float(delays[edge] + part * (delays[beyond] - delays[edge])))
-        else:
-            ends.append(float(delays[edge]))
-    return min(ends[0], float(centre)), max(ends[1], float(centre))
 
 
 def fresh_residuals(

@@ -8,7 +8,7 @@ received them; `sysid.identify.kernel` does the arithmetic.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,7 @@ from pupper_sysid.sysid.identify import kernel
 from pupper_sysid.sysid.identify.models import CandidateModel
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_PAD = 64  # steps of rest before each trial: longer than the longest dead time, 0.12 s
-_STEPPING = (_PAD, TIME_STEP_S, -FRICTION_IMPEDANCE)
+LONGEST_DEAD_TIME_S = 0.4
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,8 @@ class TrialData:
         Per row: when the value it shows was measured, and when it was sent.
     row_rad : ndarray, shape (rows,)
         Position of each row relative to rest [rad], NaN where missing.
+    step_s : float
+        Length of a physics step [s].
     """
 
     frequency_hz: float
@@ -50,6 +51,15 @@ class TrialData:
     held_step: NDArray[np.float64]
     row_step: NDArray[np.float64]
     row_rad: NDArray[np.float64]
+    step_s: float = TIME_STEP_S
+
+    def in_half_steps(self) -> TrialData:
+        """The same trial in physics steps of half the length."""
+        return replace(
+            self, command=np.repeat(self.command, 2), step_s=0.5 * self.step_s,
+            sample_step=2 * self.sample_step, held_step=2 * self.held_step,
+            row_step=2 * self.row_step,
+        )  # fmt: skip
 
 
 _WHOLE_COUNT = {
@@ -62,13 +72,9 @@ _WHOLE_COUNT = {
 def prepare(trial: Trial, reading: Readings) -> TrialData:
     """Put one trial on the physics clock."""
     rest, start = trial.initial_command_rad, trial.send_time_s[0]
-    command = whole_counts(trial) - rest
     stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
     steps = int(np.ceil(stop / TIME_STEP_S)) + 2
-    edges = TIME_STEP_S * np.arange(steps + 1)
-    sent = np.append(trial.send_time_s - start, edges[-1] + 1.0)
-    area = np.concatenate([[0.0], np.cumsum(command * np.diff(sent))])
-    average = np.diff(np.interp(edges, sent, area)) / TIME_STEP_S
+    average = _averaged(trial.send_time_s - start, whole_counts(trial) - rest, steps, TIME_STEP_S)
 
     def to_step(time: NDArray) -> NDArray[np.float64]:
         return np.clip((time - start) / TIME_STEP_S, 0.0, steps)
@@ -80,6 +86,35 @@ def prepare(trial: Trial, reading: Readings) -> TrialData:
         to_step(np.where(np.isfinite(reading.held_time_s), reading.held_time_s, start)),
         to_step(trial.send_time_s), trial.position_rad - rest,
     )  # fmt: skip
+
+
+def _averaged(sent_s: NDArray, command: NDArray, steps: int, step_s: float) -> NDArray[np.float64]:
+    """Mean of a held command over each physics step; 0, the rest, before the first."""
+    edges = step_s * np.arange(steps + 1)
+    sent = np.append(sent_s, max(edges[-1], sent_s[-1]) + 1.0)
+    area = np.concatenate([[0.0], np.cumsum(command * np.diff(sent))])
+    return np.diff(np.interp(edges, sent, area)) / step_s
+
+
+def with_late_commands(
+    data: TrialData, trial: Trial, jitter_s: float, rng: np.random.Generator
+) -> TrialData:
+    """The trial with every command late or early at random, with a mean of 0.
+
+    Parameters
+    ----------
+    data : TrialData
+    trial : Trial
+        The same, as recorded.
+    jitter_s : float
+        Standard deviation of the latency [s], which is exponential: most commands come a little
+        early, few much too late. None overtakes another.
+    rng : numpy.random.Generator
+    """
+    late = jitter_s * (rng.exponential(1.0, len(trial.send_time_s)) - 1.0)
+    sent = np.maximum.accumulate(np.maximum(trial.send_time_s - trial.send_time_s[0] + late, 0.0))
+    command = whole_counts(trial) - trial.initial_command_rad
+    return replace(data, command=_averaged(sent, command, len(data.command), data.step_s))
 
 
 def whole_counts(trial: Trial) -> NDArray[np.float64]:
@@ -111,7 +146,7 @@ def free_run(
     tracks = []
     for trial in trials:
         out = np.empty((len(trial.command) + 1, 1))
-        kernel.positions(*_candidates(model, values[None]), _padded(trial), *_STEPPING, out)
+        kernel.positions(*_candidates(model, values[None], trial), *_stepped(trial), out)
         tracks.append(out[:, 0] + values[-1])
     return tracks
 
@@ -131,9 +166,10 @@ def residuals(
     parts = [np.empty((len(values), 0))]
     for trial in trials:
         out = np.empty((len(values), len(trial.sample_step)))
+        command, *stepping = _stepped(trial)
         kernel.residuals(
-            *_candidates(model, values), offset, _padded(trial), trial.sample_step,
-            trial.sample_rad, *_STEPPING, out,
+            *_candidates(model, values, trial), offset, command, trial.sample_step,
+            trial.sample_rad, *stepping, out,
         )  # fmt: skip
         parts.append(out)
     return np.concatenate(parts, axis=1)
@@ -154,7 +190,7 @@ def moments_if_later(
         Their offsets are not added.
     trial : TrialData
     later : ndarray, shape (delays,)
-        In physics steps.
+        In physics steps of the trial.
 
     Returns
     -------
@@ -164,21 +200,31 @@ def moments_if_later(
         In rad².
     """
     total, square = np.zeros((2, len(later), len(values)))
+    command, *stepping = _stepped(trial)
     kernel.moments_if_later(
-        *_candidates(model, values), _padded(trial), trial.sample_step, trial.sample_rad, later,
-        *_STEPPING, total, square,
+        *_candidates(model, values, trial), command, trial.sample_step, trial.sample_rad, later,
+        *stepping, total, square,
     )  # fmt: skip
     return total, square
 
 
-def _candidates(model: CandidateModel, values: NDArray) -> tuple[int, NDArray, NDArray]:
+def _candidates(
+    model: CandidateModel, values: NDArray, trial: TrialData
+) -> tuple[int, NDArray, NDArray]:
     """What the kernel takes of candidates: the model's number, parameters, dead times in steps."""
     own = values[:, 1:-1] if model.columns is None else model.columns(values[:, 1:-1])
-    return kernel.KINDS.index(model.kernel or model.name), np.ascontiguousarray(own), values[:, 0] / TIME_STEP_S
+    return (
+        kernel.KINDS.index(model.kernel or model.name),
+        np.ascontiguousarray(own),
+        values[:, 0] / trial.step_s,
+    )
 
 
-def _padded(trial: TrialData) -> NDArray[np.float64]:
-    return np.concatenate([np.zeros(_PAD), trial.command])
+def _stepped(trial: TrialData) -> tuple[NDArray[np.float64], int, float, float]:
+    """The command after a rest longer than any dead time; its length, step and stopping share."""
+    rest = int(LONGEST_DEAD_TIME_S / trial.step_s) + 4
+    command = np.concatenate([np.zeros(rest), trial.command])
+    return command, rest, trial.step_s, -FRICTION_IMPEDANCE
 
 
 def look_up(track: NDArray, step: NDArray) -> NDArray[np.float64]:

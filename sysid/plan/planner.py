@@ -18,7 +18,7 @@ from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result
-from pupper_sysid.sysid.identify.search import STEPPING_SD_S
+from pupper_sysid.sysid.identify.posterior import STEPPING_SD_S
 from pupper_sysid.sysid.plan.candidates import Candidate, Setup, candidates, trial_seconds
 from pupper_sysid.sysid.plan.information import (
     Hypothesis,
@@ -46,6 +46,7 @@ LEAST_HALF_WIDTH_S = _Z * STEPPING_SD_S
 """Half of a dead time's interval that no number of readings narrows [s]: the model's time step."""
 
 _UNSEEN_SD = float(np.log(2)) / _Z  # of a logarithm: an interval from half to twice the value
+_PRIOR_SHARE = 0.7  # of the prior's standard deviation: beyond, the prior decides
 _TELLS = 0.1  # share of `CLEAR_NATS` that makes telling models apart a trial's purpose
 _WORDS = {
     "dead_time_s": "dead time",
@@ -65,9 +66,10 @@ class Servo:
     hypotheses : tuple of Hypothesis
     noise : Noise
     nats : tuple of float
-        By how much the recording prefers the first hypothesis to each.
+        By how much the log-likelihood of each is below that of the best.
     inflation : float
-        Variance of the fit's own interval over that of the information; at least 1.
+        Variance of the fit's own interval over that of the information; at least 1. New trials
+        are counted with it.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -197,29 +199,30 @@ class _World:
             before = by_tone.get(self.tones[k], 0.0)
             by_tone[self.tones[k]] = before + self.information[which][k]
         for information in by_tone.values():
-            total = total + without_shift(information)
-        return self.servo.inflation * np.linalg.inv(total)
+            total = total + without_shift(information) / self.servo.inflation
+        return np.linalg.inv(total)
 
     def nats(self, which: int, chosen: Sequence[int]) -> float:
         """Expected preference for the first hypothesis to `which` after `chosen`."""
-        if which == 0:
-            return 0.0
+        if which == 0 or not chosen:
+            return self.servo.nats[which]
         pair = [self._picked(0, chosen), self._picked(which, chosen)]
         known = [self.servo.hypotheses[k].known for k in (0, which)]
         ways = separation(pair[0], pair[1], known[1]), separation(pair[1], pair[0], known[0])
-        return self.servo.nats[which] + min(ways) / self.servo.inflation
+        return abs(self.servo.nats[which] - self.servo.nats[0]) + min(ways) / self.servo.inflation
 
-    def dead_time_s(self, chosen: Sequence[int]) -> Interval:
-        """Expected interval [s]: the hull over the hypotheses, as far as they are not told apart.
+    def dead_time_s(self, chosen: Sequence[int], smooth: bool = False) -> Interval:
+        """Expected interval [s]: the hull over the hypotheses that are not told apart.
 
-        The ends move smoothly from the hull to the first hypothesis' own interval, so that a trial
-        that tells two of them apart by less than `CLEAR_NATS` counts, too.
+        With `smooth` its ends move from the hull to the first hypothesis' own interval as the nats
+        grow, so that a trial counts that tells two apart by less than `CLEAR_NATS`.
         """
         own = self.interval(0, 0, chosen)
         low, high = own.low, own.high
         for which in range(1, len(self.servo.hypotheses)):
             share = 1.0 - self.nats(which, chosen) / CLEAR_NATS
-            if share > 0:
+            if share >= 0:
+                share = share if smooth else 1.0
                 rival = self.interval(which, 0, chosen)
                 low = min(low, own.low + share * (rival.low - own.low))
                 high = max(high, own.high + share * (rival.high - own.high))
@@ -260,7 +263,7 @@ def _criterion(worlds: Sequence[_World], chosen: Sequence[int]) -> float:
     """What a plan minimises: mean over the servos of the logarithms of expected widths."""
     total = 0.0
     for world in worlds:
-        dead = world.dead_time_s(chosen)
+        dead = world.dead_time_s(chosen, smooth=True)
         floor = 2 * LEAST_HALF_WIDTH_S
         # without the part that no reading reduces, or nothing would seem to help near it
         width = np.sqrt(max((dead.high - dead.low) ** 2 - floor**2, 1e-12))
@@ -323,13 +326,14 @@ def _notes(
     )
     for k, parameter in enumerate(world.servo.hypotheses[0].model.parameters[1:-1], 1):
         name = word(parameter.name)
-        if best[k] > _UNSEEN_SD:
+        most = min(_UNSEEN_SD, _PRIOR_SHARE * parameter.prior_sd)
+        if best[k] > most:
             found.append(
                 f"{joint}: {name} cannot be seen at any amplitude within the limits "
                 f"(excursion {max(c.amplitude_rad for c in choice):g} rad): its interval would "
                 f"span a factor of {np.exp(2 * _Z * best[k]):.1f} at best."
             )
-        elif sd[k] > _UNSEEN_SD:
+        elif sd[k] > most:
             found.append(
                 f"{joint}: {name} would still span a factor of {np.exp(2 * _Z * sd[k]):.1f}; more "
                 "seconds would narrow it."

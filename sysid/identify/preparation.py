@@ -1,0 +1,135 @@
+"""Trials of a joint made ready for its fits: readings dated, commands on the physics clock, noise.
+
+A first fit of the simulated models, to readings dated by the poll lattice, gives the expected
+motion. With it the lattice is searched for slips and the readings are dated anew, and each tone
+gets the noise that its residuals show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    PollLattice,
+    find_poll_lattice,
+    quantum,
+    readings,
+    redate,
+)
+from pupper_sysid.sysid.feedback.slips import Motion
+from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.noise import noise_by_trial
+from pupper_sysid.sysid.identify.output_error import Fit, Problem, fit
+from pupper_sysid.sysid.identify.search import SIMULATED, fit_problems, fresh_residuals
+from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
+from pupper_sysid.sysid.recordings.joints import joint_rng
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_NOISE_RAD = 0.012  # where no lag could be measured, as on the first real joints
+_LEAST_NOISE_RAD = 3e-4
+_KEEP, _FINAL = 12, 2  # starts of the first fit
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class PreparedJoint:
+    """One joint's trials on the physics clock.
+
+    Attributes
+    ----------
+    rng : numpy.random.Generator
+    lag : LagBudget
+        Without dead time.
+    recorded : tuple of Trial
+        The trials that `data` is of.
+    data : tuple of TrialData
+    noise_rad : tuple of float
+        Size of ordinary residuals of each trial [rad].
+    first : dict of str to Fit
+        First fits of the simulated models.
+    """
+
+    rng: np.random.Generator
+    lag: LagBudget
+    recorded: tuple[Trial, ...]
+    data: tuple[TrialData, ...]
+    noise_rad: tuple[float, ...]
+    first: dict[str, Fit]
+
+    def fit_rng(self) -> np.random.Generator:
+        """The same generator for every fit, so that a fit does not depend on those before it."""
+        return deepcopy(self.rng)
+
+
+def prepare_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> PreparedJoint:
+    """Measure the lag of a joint, date its readings, and put its trials on the physics clock.
+
+    Raises
+    ------
+    InputError
+        If there is too little motion.
+    """
+    rng = joint_rng(seed, joint)
+    lattice = find_poll_lattice(trials, rng.spawn(1)[0])
+    lag = lag_budget(joint, trials, rng, lattice)
+    recorded, data = _dated(trials, lattice)
+    # fits of a noise-free servo still meet rounding: a third of a quantisation step
+    least = max(quantum(trials) / 3, _LEAST_NOISE_RAD)
+    scale = max(lag.noise_rad, least) if np.isfinite(lag.noise_rad) else _NOISE_RAD
+    noise = (scale,) * len(data)
+    first = _first_fits(data, noise, deepcopy(rng))
+    for _ in range(_ROUNDS):
+        best = min(first, key=lambda name: first[name].cost)
+        model, values = candidate_model(best), first[best].values
+        dated = redate(recorded, lattice, _motions(recorded, data, free_run(model, values, data)))
+        if dated is not lattice and dated.phases != lattice.phases:
+            lattice = dated
+            recorded, data = _dated(trials, lattice)
+        noise = noise_by_trial(fresh_residuals(model, values, data), data, least)
+        first = {name: refit(name, data, noise, f) for name, f in first.items()}
+    if lattice is not lag.feedback:
+        lag = lag_budget(joint, trials, rng, lattice)
+    return PreparedJoint(rng, lag, recorded, data, noise, first)
+
+
+def refit(name: str, data: tuple[TrialData, ...], noise_rad: tuple[float, ...], start: Fit) -> Fit:
+    """The candidate `name` fitted to all trials from `start` on."""
+    problem = Problem(data, (True,) * len(data), noise_rad, {})
+    return fit(candidate_model(name), [problem], start.values[None])[0]
+
+
+def _dated(
+    trials: Sequence[Trial], lattice: PollLattice
+) -> tuple[tuple[Trial, ...], tuple[TrialData, ...]]:
+    """The trials that have fresh readings, as recorded and on the physics clock."""
+    both = [(t, prepare(t, readings(t, lattice))) for t in trials]
+    used = [(t, d) for t, d in both if len(d.sample_step)]
+    return tuple(t for t, _ in used), tuple(d for _, d in used)
+
+
+def _first_fits(
+    data: tuple[TrialData, ...], noise: tuple[float, ...], rng: np.random.Generator
+) -> dict[str, Fit]:
+    problem = Problem(data, (True,) * len(data), noise, {})
+    return {
+        name: fit_problems(candidate_model(name), [problem], deepcopy(rng), _KEEP, _FINAL)[0]
+        for name in SIMULATED
+    }
+
+
+def _motions(
+    recorded: Sequence[Trial], data: Sequence[TrialData], tracks: Sequence[NDArray]
+) -> list[Motion]:
+    """Simulated positions as functions of time on the recording's clock."""
+
+    def motion(trial: Trial, own: TrialData, track: NDArray) -> Motion:
+        edges = trial.send_time_s[0] + own.step_s * np.arange(len(track))
+        return lambda time: np.interp(time, edges, track + own.rest_rad)
+
+    return [motion(*parts) for parts in zip(recorded, data, tracks, strict=True)]
