@@ -254,6 +254,7 @@ class JointMap:
             "joint_map": self.file.name,
             "count_frame": self.frame,
             "coordinates": self.coordinates,
+            "linkage": self.file.linkage,
             "command_quantum_rad": {j: 1 / self._entry(j).counts_per_rad for j in names},
             "command_rounding": dict.fromkeys(names, "nearest"),
             "count_zero_rad": {j: float(z) for j, z in zip(names, zero, strict=True)},

@@ -98,6 +98,7 @@ class EmulatedBus:
             "kind": "emulated",
             "readings": "polled" if spec.poll_period_s > 0 or spec.loss > 0 else "live",
             "coordinates": "servo",
+            "linkage": robot.joint_map.file.linkage,
             "command_quantum_rad": {s.joint: spec.quantum_rad for s in robot.servos},
             "command_rounding": {s.joint: s.command_rounding for s in robot.servos},
             "count_zero_rad": {s.joint: s.zero_rad for s in robot.servos},

@@ -61,6 +61,8 @@ def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> 
         "joints": joints,
         "bus": {
             "kind": "esp32 proxy",
+            # both scripts add a joint's deviation to its own servo, a calf's to the absolute one
+            "coordinates": "servo",
             "command_quantum_rad": dict(zip(joints, 1 / servos.counts_per_rad(), strict=True)),
             "command_rounding": dict(zip(joints, moved, strict=True)),
             "count_zero_rad": dict(zip(joints, servos.zero_rad(), strict=True)),

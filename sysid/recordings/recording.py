@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
+from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
 from pupper_sysid.sysid.recordings.layouts import READ_AFTER_SEND_S, convert
 from pupper_sysid.sysid.recordings.table import (
     OPTIONAL_COLUMNS,
@@ -283,7 +284,7 @@ class Recording:
         return in_order(self._trials)
 
     def trials(self, joint: str) -> list[Trial]:
-        """Trials of `joint` in time order."""
+        """Trials of `joint` in time order; a calf on a linkage in servo coordinates."""
         return list(self._trials.get(joint, []))
 
     @property
@@ -324,4 +325,4 @@ class Recording:
                     bus.get("read_time_doubt_s") or 0.0,
                 )
             )
-        return found
+        return in_servo_coordinates(found, bus)
