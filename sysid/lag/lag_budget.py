@@ -28,6 +28,7 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived, flat
+from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
@@ -200,7 +201,7 @@ def lag_budget(
     seen = _seen(joint, trials, read, rng)
     tones, raw, fresh, lag = seen.tones, seen.raw, seen.fresh, seen.lag
     by_frequency = seen.by_frequency()
-    warnings = _warnings(joint, seen)
+    warnings = [*cautions(joint, trials), *_warnings(joint, seen)]
     doubt = max(t.read_time_doubt_s for t in trials)
     if lattice.kind == "unresolved":
         doubt += lattice.time_doubt_s
