@@ -2,8 +2,8 @@
 
 A termination signal ends a program at once (143 after SIGTERM), as the system does by default; its
 worker processes end with it. Programs that hold a robot call `end_politely`, which stops them as
-Ctrl-C does. An error is one sentence; `--debug` shows the traceback. The options that every program has are
-here: `--debug`, `--version` and `--install-completion`.
+Ctrl-C does. An error is one sentence; `--debug` shows the traceback. The options that every
+program has are here: `--debug`, `--version` and `--install-completion`.
 """
 
 from __future__ import annotations

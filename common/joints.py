@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from pupper_sysid.common.errors import InputError
 
@@ -65,6 +65,24 @@ def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
         if not _NAME.fullmatch(name):
             return name, "use letters, digits and _, beginning with a letter."
     return None
+
+
+def share_sentences(by_joint: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
+    """Sentences on joints, each once, with the joints that it is about.
+
+    Examples
+    --------
+    >>> share_sentences({"LF_hip": ["slow.", "weak."], "LF_thigh": ["slow."]})
+    [('LF_hip, LF_thigh', 'slow.'), ('LF_hip', 'weak.')]
+    """
+    joints: dict[str, list[str]] = {}
+    for joint, sentences in by_joint.items():
+        for sentence in sentences:
+            joints.setdefault(sentence, []).append(joint)
+    return [
+        ("All joints" if len(own) == len(by_joint) > 2 else ", ".join(own), sentence)
+        for sentence, own in joints.items()
+    ]
 
 
 def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str]:

@@ -49,7 +49,7 @@ COMMANDS = {
         summary,
         f"{group}.{word.replace('-', '_')}:{word.title().replace('-', '')}",
         word in _HOLD_BUS,
-    )  # fmt: skip
+    )
     for group, summaries in _SUMMARIES.items()
     for word, summary in summaries.items()
 }

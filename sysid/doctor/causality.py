@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from pupper_sysid.sysid.doctor.clock import clock_findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
@@ -20,6 +21,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _LOOSE = 0.25, 0.6  # share of the position's variance that the command explains
 _ECHO_ROWS, _ECHO_STEPS, _ECHO_SHARE = 30, 5.0, 0.99
+_DELAYED_STEPS = 20.0  # per row: then a gain or lag that changes by a twentieth of a row shows
 _LONGEST_ECHO_S, _MOST_SHIFTS = 0.6, 60
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.5, 0.1
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
@@ -111,7 +113,36 @@ def _echo(trials: Sequence[Trial], step: float) -> Finding | None:
                 "servo's Present_Position, not its goal."
             )
             return Finding(REFUSE, text)
-    return None
+    return _delayed(trials, near, loop)
+
+
+def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | None:
+    """The position is the command at a constant time before, between rows as well."""
+    rows = [_rows_after_motion(t, _DELAYED_STEPS * near) for t in trials]
+    if sum(map(len, rows)) < _ECHO_ROWS:
+        return None
+
+    def left(lag: float) -> NDArray[np.float64]:
+        parts = [
+            t.position_rad[r] - np.interp(t.read_time_s[r] - lag, t.send_time_s, t.command_rad)
+            for t, r in zip(trials, rows, strict=True)
+        ]
+        away = np.concatenate(parts)
+        return away - 0.5 * float(np.sum(np.quantile(away, (0.01, 0.99))))
+
+    def spread(lag: float) -> float:
+        return float(np.mean(left(lag) ** 2))
+
+    coarse = min(np.arange(-loop, _LONGEST_ECHO_S / 2, loop / 2), key=spread)
+    fine = minimize_scalar(spread, bounds=(coarse - loop / 2, coarse + loop / 2), method="bounded")
+    if np.mean(np.abs(left(float(fine.x))) <= near) < _ECHO_SHARE:
+        return None
+    text = (
+        f"the position is the command itself, {1e3 * float(fine.x):.1f} ms late at every speed: an "
+        "echo or a computed value and no measurement. Read the servo's Present_Position, not its "
+        "goal."
+    )
+    return Finding(REFUSE, text)
 
 
 def _rows_after_motion(trial: Trial, least: float) -> NDArray[np.int64]:

@@ -20,6 +20,7 @@ from pupper_sysid.sysid.doctor.signals import (
     interpolation_findings,
     motion_findings,
     offset_findings,
+    start_findings,
     stop_findings,
     unit_findings,
     wrap_findings,
@@ -35,7 +36,7 @@ _FEW_MISSING, _MANY_MISSING = 0.02, 0.5
 _LEAST_FRESH = 16
 _CHECKS = (
     motion_findings, tone_findings, wrap_findings, unit_findings, frozen_findings, offset_findings,
-    causality_findings, stop_findings, interpolation_findings,
+    causality_findings, start_findings, stop_findings, interpolation_findings,
 )  # fmt: skip
 
 

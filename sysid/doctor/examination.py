@@ -45,9 +45,9 @@ if TYPE_CHECKING:
 
 _USUAL_SPEED_RAD_S = 7.5  # a Mini Pupper 2's servo, unloaded
 _HELD = (
-    "Feedback is held between polls, which these recordings stand: `delay`, `bode` and `calibrate` "
-    "date each new reading to the poll that measured it. Do not compute lag, gain or error from "
-    "all rows."
+    "Feedback is held between polls, and the polls are known: `delay`, `bode` and `calibrate` date "
+    "each new reading to the poll that measured it. Do not compute lag, gain or error from all "
+    "rows."
 )
 
 

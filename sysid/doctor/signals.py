@@ -183,6 +183,22 @@ def offset_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
                     "fitted, but check the joint's zero.")]  # fmt: skip
 
 
+def start_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """A header that says the joint starts where it does not."""
+    first = min(trials, key=lambda t: t.send_time_s[0])
+    seen = np.flatnonzero(np.isfinite(first.position_rad))
+    rest, began = first.initial_command_rad, first.command_rad[0]
+    if not len(seen) or rest == began:
+        return []
+    stands = first.position_rad[seen[0]] - offset(trials)
+    reach = max(float(np.ptp(first.command_rad)), _NOTED_RAD)
+    if abs(rest - stands) < reach or abs(rest - began) < reach:
+        return []
+    return [Finding(CARE, f"`start_pose_rad` is {rest:.2f}, and the joint stands at {stands:.2f} "
+                          "rad when the first trial begins. Correct the header, or leave the pose "
+                          "out.")]  # fmt: skip
+
+
 def amplitude_ratio(trials: Sequence[Trial]) -> float:
     """Range of the position over range of the command, median over the trials that move."""
     ratios = [

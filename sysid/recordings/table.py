@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
@@ -29,7 +29,21 @@ _LEAST_ROWS = 20
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
+_FINEST_RAD, _COARSEST_RAD = 1e-7, 0.2  # of a count
+_FARTHEST_ZERO_RAD = 100.0  # angle of count 0: a servo of several turns
+_LARGEST_COUNT = 2**31
 TEXT_COLUMNS = ("joint", "signal")
+
+
+def _a_count(quantum_rad: float) -> float:
+    if 0 < quantum_rad < _FINEST_RAD:
+        raise ValueError(f"no encoder is as fine as {quantum_rad:g} rad; 0 stands for none")
+    return quantum_rad
+
+
+_Angle = Annotated[float, Field(ge=-_LARGEST_RAD, le=_LARGEST_RAD)]
+_Zero = Annotated[float, Field(ge=-_FARTHEST_ZERO_RAD, le=_FARTHEST_ZERO_RAD)]
+_Quantum = Annotated[float, Field(ge=0, le=_COARSEST_RAD), AfterValidator(_a_count)]
 
 
 class Bus(BaseModel):
@@ -38,24 +52,24 @@ class Bus(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
     kind: str | None = None
-    command_quantum_rad: float | dict[str, float | None] | None = None
+    command_quantum_rad: _Quantum | dict[str, _Quantum | None] | None = None
     command_rounding: dict[str, Literal["up", "down", "nearest"] | None] | None = None
-    count_zero_rad: dict[str, float | None] | None = None
-    speed_limit_rad_s: Annotated[float, Field(gt=0)] | None = None
+    count_zero_rad: dict[str, _Zero | None] | None = None
+    speed_limit_rad_s: Annotated[float, Field(ge=0.01, le=1000)] | None = None
     read_time_doubt_s: Annotated[float, Field(ge=0, le=1)] | None = None
 
 
 class Header(BaseModel):
     """Known entries of a recording's header; other keys are kept."""
 
-    model_config = ConfigDict(extra="allow", strict=True)
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
     schema_version: int = 1
     bus: Bus = Bus()
     joints: list[str] = []
     readings: Literal["live", "polled"] | None = None
-    start_pose_rad: dict[str, float] = {}
-    read_after_send_s: float | None = None
+    start_pose_rad: dict[str, _Angle] = {}
+    read_after_send_s: Annotated[float, Field(ge=-1, le=1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -159,6 +173,11 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
     if lost.any():
         warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
         table = table.loc[~lost]
+    numbers = table["trial"].to_numpy(float)
+    if (np.abs(numbers) >= _LARGEST_COUNT).any() or (numbers % 1 != 0).any():
+        raise InputError(f"{path}, column trial: trials are counted by whole numbers.")
+    if "position_count" in table and (table["position_count"].abs() >= _LARGEST_COUNT).any():
+        raise InputError(f"{path}, column position_count: a value is larger than any encoder's.")
     position = table["position_rad"].to_numpy(float)
     missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
     if missing == 1.0:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
 from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import PREFERRED
 
@@ -34,22 +34,16 @@ def advice(
     examinations : sequence of (str, pupper_sysid.sysid.doctor.examination.Examination)
         Name of the recording and what the doctor found.
     """
-    grouped: dict[str, list[str]] = {}
+    again: dict[str, list[str]] = {joint: [] for joint in results}
     for recording, examination in examinations:
-        for joint, found in examination.joints.items():
-            if joint in results and found.verdict == "do not use":
-                sentence = (
+        for joint, examined in examination.joints.items():
+            if joint in results and examined.verdict == "do not use":
+                again[joint].append(
                     f"record {recording} again: the doctor's verdict is not to use it "
-                    f"({' '.join(found.reasons).rstrip('.')})."
+                    f"({' '.join(examined.reasons).rstrip('.')})."
                 )
-                grouped.setdefault(sentence, []).append(joint)
-    for joint, result in results.items():
-        for sentence in _gaps(result):
-            grouped.setdefault(sentence, []).append(joint)
-    found = [
-        f"{'All joints' if len(joints) == len(results) > 2 else ', '.join(joints)}: {sentence}"
-        for sentence, joints in grouped.items()
-    ]
+    gaps = {joint: _gaps(result) for joint, result in results.items()}
+    found = [f"{j}: {text}" for own in (again, gaps) for j, text in share_sentences(own)]
     found.append(
         "Torques rest on an assumed stall torque, because a joint that swings in free air shows "
         "only ratios to its inertia. Hang a known mass at a known distance from the joint and "

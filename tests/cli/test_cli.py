@@ -71,7 +71,7 @@ def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys):
 def test_doctor_json_has_the_documented_keys(capsys):
     code, out, _ = run(capsys, "doctor", SWEEP, "--json")
     joint = json.loads(out)["joints"]["LF_thigh"]
-    assert code == 0 and joint["verdict"] == "use with care"
+    assert code == 0 and joint["verdict"] == "use"
     assert {
         "verdict", "reasons", "loop_period_s", "jitter_s", "fresh_fraction", "poll_period_s",
         "loss", "quantum_rad", "offset_rad",

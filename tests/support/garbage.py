@@ -1,15 +1,14 @@
 """Recordings in which something is wrong, each by one fault on a good one.
 
-`GARBAGE` maps a fault's name to `Fault`: a function of a generator that makes the recording (which
-may be refused right there, as a file would be when it is read), and whether it must be refused or
-may be used with care.
+`GARBAGE` maps a fault's name to a `Fault`, which changes the rows of a good recording. `spoilt`
+makes the recording, which may be refused right there, as a file would be when it is read.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,15 +19,27 @@ from support.made_recordings import USUAL_SERVO, Setup, made, record
 DEGREE = 180 / np.pi
 
 
-class Fault(NamedTuple):
-    """How to make a recording with one fault."""
+Rows = pd.DataFrame
+Change = Callable[[Rows, np.random.Generator], Rows]
 
-    make: Callable[[np.random.Generator], Recording]
+
+class Fault(NamedTuple):
+    """How to spoil a recording."""
+
+    change: Change
     refused: bool
     """Whether no number may come of it; else a warning will do."""
+    base: dict[str, Any]
+    """Keywords of `good`."""
 
 
 GARBAGE: dict[str, Fault] = {}
+
+
+def spoilt(name: str, rng: np.random.Generator, rows: Rows | None = None) -> Recording:
+    """A good recording, or other rows, with the fault `name`."""
+    fault = GARBAGE[name]
+    return made(fault.change(good(**fault.base) if rows is None else rows, rng))
 
 
 @cache
@@ -42,8 +53,8 @@ def good(kind: str = "tones", quantum: float = 2 * np.pi / 4096, rate: float = 5
     return _good(kind, quantum, rate).copy()
 
 
-def _add(name: str, change: Callable, refused: bool = True, **kind) -> None:
-    GARBAGE[name] = Fault(lambda rng: made(change(good(**kind), rng)), refused)
+def _add(name: str, change: Change, refused: bool = True, **base: Any) -> None:
+    GARBAGE[name] = Fault(change, refused, base)
 
 
 def _each(table: pd.DataFrame, change: Callable[[pd.DataFrame], pd.DataFrame]) -> pd.DataFrame:
@@ -92,6 +103,11 @@ _add("echo in coarse counts", _set(
     position_rad=lambda t, rng: 0.0057 * np.round(_late(t, 2) / 0.0057)))  # fmt: skip
 _add("echo with noise", _set(
     position_rad=lambda t, rng: t.command_rad + 0.003 * rng.standard_normal(len(t))))  # fmt: skip
+_add("echo between rows", lambda t, rng: _each(t, lambda r: r.assign(
+    position_rad=np.interp(r.send_time_s - 0.033, r.send_time_s, r.command_rad))))  # fmt: skip
+_add("echo of teleoperation between rows", lambda t, rng: _each(t, lambda r: r.assign(
+    position_rad=np.interp(r.send_time_s - 0.033, r.send_time_s, r.command_rad))),
+    kind="teleoperation")  # fmt: skip
 _add("echo of a chirp", _set(position_rad=lambda t, rng: _late(t, 1)), kind="chirp")
 _add("echo of teleoperation", _set(position_rad=lambda t, rng: t.command_rad), kind="teleoperation")
 _add("echo of steps", _set(position_rad=lambda t, rng: _late(t, 1)), kind="steps")
@@ -116,7 +132,8 @@ _add("error instead of position", _set(position_rad=lambda t, rng: t.command_rad
 _add("noise twice the motion", _set(
     position_rad=lambda t, rng: t.position_rad + 0.6 * rng.standard_normal(len(t))))  # fmt: skip
 _add("noise as large as the motion", _set(
-    position_rad=lambda t, rng: t.position_rad + 0.25 * rng.standard_normal(len(t))), False)  # fmt: skip
+    position_rad=lambda t, rng: t.position_rad + 0.25 * rng.standard_normal(len(t))),
+    False)  # fmt: skip
 
 # ----- sign, order, columns
 _add("inverted", _scaled(-1.0, "position_rad"))
@@ -126,7 +143,8 @@ _add("inverted and far", _set(position_rad=lambda t, rng: 1.2 - t.position_rad))
 _add("swapped columns", lambda t, rng: t.rename(
     columns={"command_rad": "position_rad", "position_rad": "command_rad"}))  # fmt: skip
 _add("swapped columns of a PRBS", lambda t, rng: t.rename(
-    columns={"command_rad": "position_rad", "position_rad": "command_rad"}), kind="prbs")  # fmt: skip
+    columns={"command_rad": "position_rad", "position_rad": "command_rad"}),
+    kind="prbs")  # fmt: skip
 _add("position 60 ms ahead", _set(position_rad=lambda t, rng: _late(t, -3)))
 _add("position three servo lags ahead", _set(
     position_rad=lambda t, rng: _late(t, -8, "position_rad")), kind="chirp")  # fmt: skip
@@ -190,7 +208,8 @@ _add("two recordings in one trial", lambda t, rng: t.assign(
 _add("zero moves within a trial", lambda t, rng: _each(t, lambda r: r.assign(
     position_rad=r.position_rad + 0.4 * (np.arange(len(r)) > 100))), False)  # fmt: skip
 _add("two servos in turn", lambda t, rng: t.assign(
-    position_rad=np.where(t.index % 2, t.position_rad, 0.8 - 0.5 * t.position_rad)), False)  # fmt: skip
+    position_rad=np.where(t.index % 2, t.position_rad, 0.8 - 0.5 * t.position_rad)),
+    False)  # fmt: skip
 
 
 def _twice(t: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
@@ -205,7 +224,8 @@ _add("two servos under one name", _twice, False)
 
 # ----- units, scale, zero
 _add("degrees", _scaled(DEGREE, "command_rad", "position_rad"))
-_add("small degrees", _scaled(0.06 * DEGREE, "command_rad", "position_rad"))
+# slow enough, they could be radians of a very fast servo
+_add("small degrees", _scaled(0.06 * DEGREE, "command_rad", "position_rad"), False)
 _add("small degrees of 4,096 counts", lambda t, rng: _scaled(
     0.1 * DEGREE, "command_rad", "position_rad")(t, rng).pipe(lambda d: d.assign(
         position_rad=360 / 4096 * np.round(d.position_rad * 4096 / 360))))  # fmt: skip
@@ -245,7 +265,8 @@ _add(
 _add("never moves", _set(position_rad=lambda t, rng: 0.1))
 _add("moves by one count", _set(position_rad=lambda t, rng: 0.0015 * (rng.random(len(t)) < 0.1)))
 _add("frozen at a third", lambda t, rng: _each(t, lambda r: r.assign(
-    position_rad=r.position_rad.where(np.arange(len(r)) < 55, r.position_rad.iloc[55]))))  # fmt: skip
+    position_rad=r.position_rad.where(np.arange(len(r)) < len(r) // 3,
+                                      r.position_rad.iloc[len(r) // 3]))))  # fmt: skip
 _add("frozen in one trial", lambda t, rng: t.assign(
     position_rad=t.position_rad.where(t.trial != 1, 0.05)), False)  # fmt: skip
 _add("frozen in most trials", lambda t, rng: t.assign(
@@ -288,30 +309,15 @@ _add("three rows", lambda t, rng: t[:3])
 _add("a quarter of a second", lambda t, rng: t[:22], False)
 
 
-def _joints(change: Callable[[dict[str, pd.DataFrame]], None]):
-    """Two joints that move at the same time, each by its own teleoperation."""
-
-    def make(rng: np.random.Generator) -> Recording:
-        tables = {
-            joint: record(
-                Setup(USUAL_SERVO, kind="teleoperation"), np.random.default_rng([9, n])
-            ).table.drop(columns="joint")
-            for n, joint in enumerate(("LF_hip", "LF_thigh"))
-        }
-        rows = min(map(len, tables.values()))
-        tables = {j: t[:rows].copy() for j, t in tables.items()}
-        first = tables["LF_hip"]
-        for t in tables.values():
-            t["send_time_s"], t["read_time_s"] = first.send_time_s, first.read_time_s
-        change(tables)
-        return made(pd.concat([t.assign(joint=j) for j, t in tables.items()], ignore_index=True))
-
-    return make
+def _exchanged(t: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Two joints that move at the same time, each with the other's position."""
+    setup = Setup(USUAL_SERVO, kind="teleoperation")
+    hip, thigh = (record(setup, np.random.default_rng([9, n])).table for n in range(2))
+    rows = min(len(hip), len(thigh))
+    hip, thigh = hip[:rows].copy(), thigh[:rows].copy()
+    thigh[["send_time_s", "read_time_s"]] = hip[["send_time_s", "read_time_s"]]
+    hip["position_rad"], thigh["position_rad"] = thigh.position_rad, hip.position_rad
+    return pd.concat([hip.assign(joint="LF_hip"), thigh.assign(joint="LF_thigh")])
 
 
-def _exchange(tables: dict[str, pd.DataFrame]) -> None:
-    hip, thigh = (t.position_rad.to_numpy().copy() for t in tables.values())
-    tables["LF_hip"]["position_rad"], tables["LF_thigh"]["position_rad"] = thigh, hip
-
-
-GARBAGE["positions of two joints exchanged"] = Fault(_joints(_exchange), True)
+_add("positions of two joints exchanged", _exchanged)

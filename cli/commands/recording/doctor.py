@@ -9,6 +9,7 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.common.joints import share_sentences
 
 
 @dataclass(frozen=True)
@@ -45,5 +46,8 @@ class Doctor:
                 terminal.number(j.loss), terminal.ms(j.quantum_rad, 3), terminal.ms(j.offset_rad),
             )  # fmt: skip
         terminal.out.print(shown)
-        for name, j in found.items():
-            terminal.out.print(Text.assemble("\n", (name, "bold"), f": {j}"), soft_wrap=True)
+        terminal.out.print()
+        for joints, text in share_sentences({name: j.reasons for name, j in found.items()}):
+            terminal.out.print(Text.assemble((joints, "bold"), f": {text}"), soft_wrap=True)
+        for text in found.advice:
+            terminal.out.print(f"\n{text}", soft_wrap=True)
