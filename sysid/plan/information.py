@@ -14,19 +14,18 @@ been fitted again (T-optimality: Atkinson and Fedorov, Biometrika 62, 1975).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.identify.models import CandidateModel
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up, residuals
 
-SHIFT_SD_S = 0.0005
-"""Standard deviation of the time shift common to a tone's readings [s]: a quarter of the model's
-time step, and about the phase of a poll that was estimated from a few seconds."""
+SHIFT_SD_S = 0.0003
+"""Standard deviation of the time shift common to a tone's readings [s], about that of the phase of
+a poll estimated from a few seconds."""
 
 _STEP = 0.03  # of the sensitivities: the slope over a likely error, not of one kink
 _LINEAR_STEP = 3e-4
@@ -77,15 +76,13 @@ class Response:
     ----------
     position_rad, weights : ndarray, shape (samples,)
         Readings, and their inverse variances [1/rad²].
-    sensitivity : ndarray, shape (samples, parameters)
-        Of the readings to the fitted coordinates [rad].
-    speed_rad_s : ndarray, shape (samples,)
+    sensitivity : ndarray, shape (samples, parameters + 1)
+        Of the readings to the fitted coordinates, and to the shift in time of the tone.
     """
 
     position_rad: NDArray[np.float64]
     weights: NDArray[np.float64]
     sensitivity: NDArray[np.float64]
-    speed_rad_s: NDArray[np.float64]
 
     def inner(self, a: NDArray, b: NDArray) -> NDArray[np.float64]:
         """aᵀWb, shape (columns of a, columns of b)."""
@@ -94,14 +91,23 @@ class Response:
     @property
     def information(self) -> NDArray[np.float64]:
         """Of the trial about parameters and shift, shape (parameters + 1, parameters + 1)."""
-        columns = np.column_stack([self.sensitivity, self.speed_rad_s])
-        return self.inner(columns, columns)
+        return self.inner(self.sensitivity, self.sensitivity)
 
 
 def without_shift(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Information of a tone's trials, summed, about the parameters whatever its shift in time."""
     shift, own = information[:-1, -1], information[-1, -1] + SHIFT_SD_S**-2
     return information[:-1, :-1] - np.outer(shift, shift) / own
+
+
+def pooled(
+    informations: Iterable[tuple[Hashable, NDArray[np.float64]]],
+) -> NDArray[np.float64] | float:
+    """Information of trials about the parameters, each with the name of its tone; 0 of none."""
+    by_tone: dict[Hashable, NDArray[np.float64]] = {}
+    for tone, information in informations:
+        by_tone[tone] = by_tone.get(tone, 0.0) + information
+    return sum((without_shift(total) for total in by_tone.values()), start=0.0)
 
 
 def prior_information(model: CandidateModel) -> NDArray[np.float64]:
@@ -130,12 +136,13 @@ def respond(hypothesis: Hypothesis, trial: TrialData, noise: Noise, seen: float 
     ends = np.stack([p.decode(cloud[:, j]) for j, p in enumerate(par)], axis=-1)
     off = residuals(model, ends, [trial])
     track = free_run(model, values, [trial])[0]
-    speed = look_up(np.gradient(track) / TIME_STEP_S, trial.sample_step)
+    speed = look_up(np.gradient(track) / trial.step_s, trial.sample_step)
+    slope = (off[: len(par)] - off[len(par) :]).T / (2 * step)
+    shift = slope[:, :1] / values[0]  # of the logarithm: a tone's shift is a dead time of its own
     return Response(
         look_up(track, trial.sample_step),
         seen * noise.weights(speed),
-        (off[: len(par)] - off[len(par) :]).T / (2 * step),
-        speed,
+        np.hstack([slope, shift]),
     )
 
 
@@ -162,7 +169,7 @@ def fitted_noise(
         off = look_up(track, trial.sample_step) - trial.sample_rad
         bound = 4 * 1.4826 * np.median(np.abs(off)) + 1e-12  # an upset is not the noise
         square.append(np.mean(np.clip(off, -bound, bound) ** 2))
-        speed.append(np.mean(np.gradient(track) ** 2) / TIME_STEP_S**2)
+        speed.append(np.mean(np.gradient(track) ** 2) / trial.step_s**2)
     rows = np.column_stack([np.ones(len(square)), speed]) / np.maximum(square, 1e-12)[:, None]
     (floor, jitter), _ = nnls(rows, np.ones(len(rows)))
     return Noise(max(float(np.sqrt(floor)), least_rad), float(np.sqrt(jitter)))
@@ -183,7 +190,9 @@ def separation(
     total, pull, curvature = 0.0, np.zeros(len(known)), known.copy()
     for true, wrong in zip(truth, rival, strict=True):
         off = (wrong.position_rad - true.position_rad)[:, None]
-        total += wrong.inner(off, off).item()
-        pull += wrong.inner(wrong.sensitivity, off)[:, 0]
-        curvature += without_shift(wrong.information)
+        push, information = wrong.inner(wrong.sensitivity, off)[:, 0], wrong.information
+        own = information[-1, -1] + SHIFT_SD_S**-2
+        total += wrong.inner(off, off).item() - push[-1] ** 2 / own
+        pull += push[:-1] - information[:-1, -1] * push[-1] / own
+        curvature += without_shift(information)
     return 0.5 * max(total - float(pull @ np.linalg.solve(curvature, pull)), 0.0)

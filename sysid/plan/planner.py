@@ -24,9 +24,9 @@ from pupper_sysid.sysid.plan.information import (
     Hypothesis,
     Noise,
     Response,
+    pooled,
     respond,
     separation,
-    without_shift,
 )
 
 CLEAR_NATS = 5.0
@@ -158,7 +158,7 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
         used = [tones[k] for k in chosen]
         left = [k for k in usable if used.count(tones[k]) < _MOST_OF_A_TONE] or usable
         chosen.append(min(left, key=lambda k: _criterion(worlds, [*chosen, k])))
-    chosen.sort(key=lambda k: (choice[k].kind != "sine", choice[k].frequency_hz))
+    purposes = [_purpose(worlds, chosen[:n], chosen[n]) for n in range(count)]
     trials = tuple(
         PlannedTrial(
             joint=joint,
@@ -166,9 +166,12 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
             frequency_hz=choice[k].frequency_hz,
             amplitude_rad=choice[k].amplitude_rad,
             duration_s=choice[k].duration_s,
-            purpose=_purpose(worlds, chosen, n),
+            purpose=purpose,
         )
-        for n, k in enumerate(chosen)
+        for k, purpose in sorted(
+            zip(chosen, purposes, strict=True),
+            key=lambda pair: (choice[pair[0]].kind != "sine", choice[pair[0]].frequency_hz),
+        )
     )
     predictions = tuple(_predictions(joint, worlds[0], chosen)) if len(worlds) == 1 else ()
     notes = tuple(_notes(joint, worlds[0], choice, chosen)) if len(worlds) == 1 else ()
@@ -194,13 +197,8 @@ class _World:
     def covariance(self, which: int, chosen: Sequence[int]) -> NDArray[np.float64]:
         """Expected covariance of a hypothesis' fitted coordinates after `chosen`."""
         hypothesis = self.servo.hypotheses[which]
-        total, by_tone = hypothesis.known, dict[tuple[str, float], NDArray[np.float64]]()
-        for k in chosen:
-            before = by_tone.get(self.tones[k], 0.0)
-            by_tone[self.tones[k]] = before + self.information[which][k]
-        for information in by_tone.values():
-            total = total + without_shift(information) / self.servo.inflation
-        return np.linalg.inv(total)
+        said = pooled((self.tones[k], self.information[which][k]) for k in chosen)
+        return np.linalg.inv(hypothesis.known + said / self.servo.inflation)
 
     def nats(self, which: int, chosen: Sequence[int]) -> float:
         """Expected preference for the first hypothesis to `which` after `chosen`."""
@@ -272,16 +270,16 @@ def _criterion(worlds: Sequence[_World], chosen: Sequence[int]) -> float:
     return total / len(worlds)
 
 
-def _purpose(worlds: Sequence[_World], chosen: Sequence[int], n: int) -> str:
-    """What trial `n` of a plan is for: the quantities that would lose most without it."""
-    rest = [*chosen[:n], *chosen[n + 1 :]]
+def _purpose(worlds: Sequence[_World], before: Sequence[int], one: int) -> str:
+    """What a trial is for: the quantities that it narrows most after those chosen before it."""
+    chosen = [*before, one]
     names = [p.name for p in worlds[0].servo.hypotheses[0].model.parameters[:-1]]
     gain, told = np.zeros(len(names)), 0.0
     for world in worlds:
-        with_, without = (np.diag(world.covariance(0, c)) for c in (chosen, rest))
+        with_, without = (np.diag(world.covariance(0, c)) for c in (chosen, before))
         gain += np.log(without / with_)[:-1]
         for which in range(1, len(world.servo.hypotheses)):
-            least, most = (min(world.nats(which, c), CLEAR_NATS) for c in (rest, chosen))
+            least, most = (min(world.nats(which, c), CLEAR_NATS) for c in (before, chosen))
             told += (most - least) / CLEAR_NATS
     if told > _TELLS * len(worlds):
         return "structure"

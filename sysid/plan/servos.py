@@ -6,30 +6,29 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration, Quantity
 from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
-from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, CandidateModel, candidate_model
-from pupper_sysid.sysid.identify.simulation import TrialData, residuals
+from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
+from pupper_sysid.sysid.identify.search import SIMULATED
+from pupper_sysid.sysid.identify.simulation import TrialData
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.plan.candidates import Setup
 from pupper_sysid.sysid.plan.information import (
     Hypothesis,
     Noise,
     fitted_noise,
+    pooled,
     prior_information,
     respond,
-    without_shift,
 )
-from pupper_sysid.sysid.plan.planner import CLEAR_NATS, Servo, now
-
-STRUCTURES = ("delayed_pd", "delayed_pd_back_emf")
-"""Candidate models that a simulator can run and that differ in what limits the speed."""
+from pupper_sysid.sysid.plan.planner import CLEAR_NATS, DEAD_TIME, LEAST_HALF_WIDTH_S, Servo
 
 _LEAST_NOISE_RAD = 1e-4
-_MOST_INFLATION = 400.0
+_MOST_INFLATION = 100.0
 _Z = float(ndtri((1 + LEVEL) / 2))
 
 _DRAWS = 6
@@ -38,26 +37,56 @@ _USUAL_NOISE = Noise(0.004, 0.001)
 
 
 def fitted_servo(result: JointCalibrationResult) -> Servo:
-    """The servo that the fits of a recording's joint describe.
+    """The servo that the fits of a recording's joint describe, with their intervals.
 
     Parameters
     ----------
     result : JointCalibrationResult
         Of `sysid.identify.joint_fit.fit_joint`.
     """
-    fits = [result.candidate_models[n] for n in STRUCTURES if n in result.candidate_models]
-    trials, least = result.trials, max(result.lag.quantum_rad / math.sqrt(12), _LEAST_NOISE_RAD)
-    costs, hypotheses = [], []
-    noise = _noise(fits[0], trials, least)
-    for fit in fits:
-        hypothesis = _hypothesis(fit)
-        seen = sum(without_shift(respond(hypothesis, t, noise).information) for t in trials)
-        hypotheses.append(replace(hypothesis, known=hypothesis.known + seen))
-        costs.append(_cost(hypothesis, trials, noise))
-    order = np.argsort(costs, kind="stable")
-    nats = tuple(float(costs[k] - costs[order[0]]) for k in order)
-    servo = Servo(tuple(hypotheses[k] for k in order), noise, nats)
-    return _agreeing(servo, result.dead_time_s)
+    trials, nats = result.trials, result.structure_nats
+    best = result.candidate_models[min(nats, key=lambda name: nats[name])]
+    least = max(result.lag.quantum_rad / math.sqrt(12), _LEAST_NOISE_RAD)
+    noise = fitted_noise(candidate_model(best.model), _values(best), trials, least)
+    # the carried structure first: its value is the one that is reported
+    names = sorted(nats, key=lambda name: name != result.simulated_model)
+    hypotheses, inflations = [], []
+    for name in names:
+        hypothesis, inflation = _fitted(result.candidate_models[name], trials, noise)
+        hypotheses.append(hypothesis)
+        inflations.append(inflation)
+    return Servo(tuple(hypotheses), noise, tuple(nats[n] for n in names), max(inflations))
+
+
+def _fitted(
+    fit: CandidateFit, trials: tuple[TrialData, ...], noise: Noise
+) -> tuple[Hypothesis, float]:
+    """A fit as a hypothesis as uncertain as its intervals, and the inflation which that takes.
+
+    The information of the trials gives the correlations, the fit's intervals the scales.
+    """
+    model = candidate_model(fit.model)
+    bare = Hypothesis(model, _values(fit), prior_information(model))
+    seen = pooled((round(t.frequency_hz, 2), respond(bare, t, noise).information) for t in trials)
+    covariance = np.linalg.inv(bare.known + seen)
+    ratio = np.ones(len(model.parameters))
+    for k, p in enumerate(model.parameters):
+        reported = _sd(p, fit.parameters[p.name])
+        if np.isfinite(reported) and reported > 0:
+            ratio[k] = reported / math.sqrt(covariance[k, k])
+    inflation = float(np.exp(2 * np.mean(np.log(ratio[:-1]))))
+    known = np.linalg.inv(covariance) / np.outer(ratio, ratio)
+    return replace(bare, known=known), float(np.clip(inflation, 1.0, _MOST_INFLATION))
+
+
+def _sd(parameter: Parameter, interval: Interval) -> float:
+    """Standard deviation of a fitted coordinate, from the interval of its value."""
+    if parameter.name == DEAD_TIME:
+        half = (interval.high - interval.low) / 2
+        own = math.sqrt(max(half**2 - LEAST_HALF_WIDTH_S**2, (0.05 * half) ** 2))
+        return own / (_Z * interval.value)
+    low, high = (float(parameter.encode(end)) for end in (interval.low, interval.high))
+    return (high - low) / (2 * _Z)
 
 
 def calibrated_servo(joint: JointCalibration) -> Servo:
@@ -71,10 +100,10 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
     floor = max(joint.feedback.quantum_rad.value / math.sqrt(12), _LEAST_NOISE_RAD)
     noise = replace(_USUAL_NOISE, floor_rad=max(joint.scores.rmse_free_run_fresh_rad or 0, floor))
     found = []
-    for name in STRUCTURES:
-        model = next((m for m in CANDIDATE_MODELS if m.name == name), None)
-        values = named.get(name) or (_preset(joint.actuator) if name == STRUCTURES[0] else None)
-        if model is not None and values is not None and set(values) == set(model.names):
+    for name in SIMULATED:
+        model = candidate_model(name)
+        values = named.get(name) or (_preset(joint.actuator) if name == SIMULATED[0] else None)
+        if values is not None and set(values) == set(model.names):
             known = prior_information(model) + _interval_information(model, joint.actuator)
             found.append(Hypothesis(model, np.array([values[n] for n in model.names]), known))
     chosen = joint.selection.model
@@ -102,7 +131,7 @@ def unknown_servos(seed: int) -> list[Servo]:
     while len(found) < _DRAWS:
         hypotheses = []
         shared: dict[str, float] = {}
-        for model in map(candidate_model, _known_structures()):
+        for model in map(candidate_model, SIMULATED):
             for p in model.parameters:
                 centre, sd = float(p.encode(p.nominal)), min(p.prior_sd, 1.0) / 2
                 if p.name == "dead_time_s":
@@ -138,47 +167,8 @@ def calibrated_setup(joint: JointCalibration, setup: Setup) -> Setup:
     )  # fmt: skip
 
 
-def _known_structures() -> list[str]:
-    names = {m.name for m in CANDIDATE_MODELS}
-    return [n for n in STRUCTURES if n in names]
-
-
-def _hypothesis(fit: CandidateFit) -> Hypothesis:
-    model = candidate_model(fit.model)
-    values = np.array([fit.values[n] for n in model.names])
-    return Hypothesis(model, values, prior_information(model))
-
-
-def _noise(fit: CandidateFit, trials: tuple[TrialData, ...], least_rad: float) -> Noise:
-    hypothesis = _hypothesis(fit)
-    return fitted_noise(hypothesis.model, hypothesis.values, trials, least_rad)
-
-
-def _cost(hypothesis: Hypothesis, trials: tuple[TrialData, ...], noise: Noise) -> float:
-    """Robust misfit of the readings in nats, each against its own noise."""
-    total = 0.0
-    for trial in trials:
-        response = respond(hypothesis, trial, noise)
-        off = residuals(hypothesis.model, hypothesis.values[None], [trial])[0]
-        total += float(np.sum(np.sqrt(1 + response.weights * off**2) - 1))
-    return total
-
-
-def _agreeing(servo: Servo, reported: Interval) -> Servo:
-    """`servo` with the inflation that makes its present interval as wide as the reported one."""
-    wanted = reported.high - reported.low
-
-    def width(log_inflation: float) -> float:
-        interval = now(replace(servo, inflation=math.exp(log_inflation)))
-        return interval.high - interval.low
-
-    low, high = 0.0, math.log(_MOST_INFLATION)
-    if width(low) >= wanted:
-        return servo
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if width(middle) < wanted else (low, middle)
-    return replace(servo, inflation=math.exp(high))
+def _values(fit: CandidateFit) -> NDArray[np.float64]:
+    return np.array([fit.values[name] for name in candidate_model(fit.model).names])
 
 
 def _preset(actuator: Actuator) -> dict[str, float]:
@@ -186,7 +176,7 @@ def _preset(actuator: Actuator) -> dict[str, float]:
     one = actuator.parameters.per_inertia()
     numbers = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
                one.velocity_limit, 0.0)  # fmt: skip
-    model = candidate_model(STRUCTURES[0])
+    model = candidate_model(SIMULATED[0])
     boxed = []
     for p, number in zip(model.parameters, numbers, strict=True):
         boxed.append(float(np.clip(np.asarray(number, float), p.low, p.high)))
@@ -203,7 +193,7 @@ _QUANTITIES = {
 }
 
 
-def _interval_information(model: CandidateModel, actuator: Actuator) -> np.ndarray:
+def _interval_information(model: CandidateModel, actuator: Actuator) -> NDArray[np.float64]:
     """What a calibration's intervals say about each parameter on its own."""
     precision = np.zeros(len(model.parameters))
     for k, p in enumerate(model.parameters):
