@@ -120,7 +120,7 @@ def real_table() -> str:
     data = as_rows(servo_data([walk], joints, "all"), joints)
     rules = reading_rules(data, "the walk", {"the sweeps": made.calibration})
     aged = with_ages(data, rules)
-    carried = {j: made.calibration.held_feedback(j).offset_rad for j in joints}
+    carried = {j: made.calibration.joint(j).feedback.offset_rad.value for j in joints}
     calibrated = calibrated_run(made.calibration, data)
     lines = lines_of("calibration", calibrated, data, aged, carried)
     for name in next(iter(made.values())).candidate_models:
@@ -222,7 +222,7 @@ def errors_on(
         name: with_ages(data, reading_rules(replace(data, lattices=hidden), "walk", {name: known}))
         for name, known in (("found", made.calibration), ("true", truth))
     }
-    carried = {joint: made.calibration.held_feedback(joint).offset_rad}
+    carried = {joint: made.calibration.joint(joint).feedback.offset_rad.value}
     lines = lines_of(
         "calibration", calibrated_run(made.calibration, data), data, aged["found"], carried
     )

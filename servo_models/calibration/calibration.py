@@ -201,7 +201,10 @@ class Calibration(Part):
         return DelayedPD(parameters, time_step_s)
 
     def held_feedback(self, joint: str) -> HeldFeedback:
-        """The feedback of one joint.
+        """The feedback of one joint, as a simulator or another recording has it.
+
+        Without an offset: `feedback.offset_rad` is that of the recordings that were calibrated
+        (their zero), and neither the servo's nor another recording's.
 
         Raises
         ------
@@ -213,7 +216,6 @@ class Calibration(Part):
             poll_period_s=feedback.poll_period_s.value,
             loss=feedback.loss.value,
             quantum_rad=feedback.quantum_rad.value,
-            offset_rad=feedback.offset_rad.value,
         )
 
     def to_yaml(self) -> str:

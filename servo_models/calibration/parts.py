@@ -256,7 +256,8 @@ class Feedback(Part):
     quantum_rad: Annotated[Quantity, _SMALL_ANGLE]
     """Quantisation step [rad]; 0 if readings are continuous."""
     offset_rad: Annotated[Quantity, _OFFSET]
-    """Reading minus position, constant [rad]."""
+    """Reading minus position in the recordings of this calibration [rad]: the error of their zero.
+    Simulations and other recordings do not take it over."""
     mean_age_s: Annotated[Quantity, _AGE]
     """Mean feedback age when the host reads [s]."""
 

@@ -22,7 +22,8 @@ class HeldFeedback:
     Parameters
     ----------
     feedback : dict of joint name to dict
-        `poll_period_s`, `loss`, `quantum_rad` and `offset_rad` of each joint.
+        `poll_period_s`, `loss`, `quantum_rad` and `offset_rad` of each joint. The offset, an error
+        of the joint's zero, is 0 unless you give one: that of a recording is not the servo's.
     joint_names : sequence of str
         Order of the columns of what `step` is given.
     num_envs : int

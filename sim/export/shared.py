@@ -131,10 +131,13 @@ def call(function: str, *arguments: tuple[str, Any] | tuple[str, Quantity, str])
 
 
 def feedback_block(calibration: Calibration) -> str:
-    """`FEEDBACK = {…}`: the numbers of each joint's feedback."""
+    """`FEEDBACK = {…}`: the numbers of each joint's feedback; an offset is the recording's own."""
     return block("FEEDBACK", [
         f'"{name}": '
-        + json.dumps({key: getattr(joint.feedback, key).value for key in FEEDBACK_KEYS})
+        + json.dumps(
+            {key: getattr(joint.feedback, key).value for key in FEEDBACK_KEYS}
+            | {"offset_rad": 0.0}
+        )
         + ","
         for name, joint in calibration.joints.items()
     ])  # fmt: skip

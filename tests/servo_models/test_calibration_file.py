@@ -93,8 +93,9 @@ def test_every_number_reaches_the_models_it_is_for():
     ]  # fmt: skip
     feedback = hip.held_feedback("LF_hip")
     assert vars(feedback) == {
-        "poll_period_s": 0.02685, "loss": 0.42, "quantum_rad": math.pi / 550, "offset_rad": -0.1,
+        "poll_period_s": 0.02685, "loss": 0.42, "quantum_rad": math.pi / 550, "offset_rad": 0.0,
     }  # fmt: skip
+    assert hip.joint("LF_hip").feedback.offset_rad.value == -0.1  # of its recording, not the servo
 
 
 def test_asking_for_a_joint_that_was_not_calibrated_says_which_were():
