@@ -174,6 +174,12 @@ def _on_grid(
     return command, np.bincount(place[inside], position, points), number
 
 
+def _rest(trial: Trial) -> float:
+    """Command before the trial; its first one where the header's is far away."""
+    rest, first = trial.initial_command_rad, float(trial.command_rad[0])
+    return rest if abs(rest - first) <= np.ptp(trial.command_rad) + 0.1 else first
+
+
 def _low_pass(command: NDArray, pole_s: float, grid: float) -> NDArray[np.float64]:
     """Command behind two equal poles; before it, its first value."""
     if pole_s <= 0:
@@ -211,7 +217,7 @@ def _correlations(trial: Trial, live: bool, grid: float, count: int) -> NDArray[
     n = correlate(mask, there)
     sy, syy = correlate(y, there), correlate(square, there)
     rho = np.zeros((len(_POLES_S), count))
-    rest = trial.initial_command_rad
+    rest = _rest(trial)
     for k, pole in enumerate(_POLES_S):
         own = np.concatenate([np.full(before, rest), command])
         u = _low_pass(own, pole, grid) - command.mean()
@@ -231,7 +237,7 @@ def _fitted(
     command, _, _ = _on_grid(trial, live, grid)
     rows, time = _samples(trial, live)
     before = round(LATEST_S / grid)
-    own = np.concatenate([np.full(before, trial.initial_command_rad), command])
+    own = np.concatenate([np.full(before, _rest(trial)), command])
     past = trial.send_time_s[0] + grid * (np.arange(len(own)) - before)
     rows, time = rows[time <= past[-1]], time[time <= past[-1]]
     x, y = np.interp(time - lag, past, _low_pass(own, pole, grid)), trial.position_rad[rows]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.sysid.recordings.recording import Recording
 
-STEP_S = 0.001
+STEP_S = 0.002
 JOINT = "LF_hip"
 KINDS = ("tones", "chirp", "prbs", "teleoperation", "steps")
 

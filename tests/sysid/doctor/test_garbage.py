@@ -1,0 +1,158 @@
+"""Recordings in which something is wrong give no number without a warning."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pupper_sysid as ps
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.doctor.checks import cautions, findings, refuse_unusable
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.identify.preparation import prepare_joint
+from support.garbage import GARBAGE, good, spoilt
+from support.made_recordings import JOINT, good_recording, made
+
+
+def verdict(recording) -> str:
+    """The worst verdict of a recording's joints, and the refusal or warnings that belong to it."""
+    trials = {j: tuple(recording.trials(j)) for j in recording.joints}
+    try:
+        refuse_unusable(trials)
+    except InputError as refused:
+        joint, _, reason = str(refused).partition(": ")
+        assert joint in trials and len(reason) > 60  # where, what, what to do
+        return "do not use"
+    return "use with care" if any(cautions(j, t) for j, t in trials.items()) else "use"
+
+
+@pytest.mark.parametrize("name", GARBAGE)
+def test_no_number_of_garbage_without_a_warning(name):
+    rng = np.random.default_rng([3, list(GARBAGE).index(name)])
+    try:
+        recording = spoilt(name, rng)
+    except InputError as refused:  # as it is read
+        assert str(refused).startswith("made")
+        return
+    wanted = {"do not use"} if GARBAGE[name].refused else {"do not use", "use with care"}
+    assert verdict(recording) in wanted
+
+
+def test_good_recordings_of_random_servos_are_for_use():
+    found = []
+    for seed in range(8):
+        recording = good_recording(np.random.default_rng([11, seed]))
+        found += [f.verdict for f in findings(recording.trials(JOINT)) if f.verdict != "use"]
+    assert found == []  # one in a hundred asks for care: benchmarks/garbage.py
+
+
+@pytest.mark.parametrize("kind", ["tones", "chirp", "prbs", "teleoperation", "steps"])
+def test_what_is_spoilt_below_is_good(kind):
+    assert findings(made(good(kind)).trials(JOINT)) == []
+
+
+@pytest.mark.parametrize(
+    "function", [ps.lag, ps.calibrate, ps.frequency_response, ps.fit_servo, ps.sparse_equations]
+)
+def test_what_the_doctor_refuses_every_function_refuses_with_its_sentence(function):
+    recording = spoilt("echo one row late", np.random.default_rng(0))
+    (reason,) = ps.examine(recording)[JOINT].reasons
+    with pytest.raises(InputError) as refused:
+        function(recording)
+    assert str(refused.value) == f"{JOINT}: {reason}"
+
+
+def test_a_joint_beside_a_bad_one_can_be_chosen():
+    table = good("teleoperation")
+    both = [table.assign(joint="LF_hip"), table.assign(joint="LF_thigh", position_rad=0.1)]
+    recording = made(pd.concat(both, ignore_index=True))
+    with pytest.raises(InputError, match=r"LF_thigh: .*leave the joint out of `joints`"):
+        ps.frequency_response(recording)
+    with pytest.raises(InputError, match="LF_hip: this recording has no tone"):
+        ps.frequency_response(recording, "LF_hip")
+
+
+def test_what_asks_for_care_is_a_warning_of_every_number():
+    recording = spoilt("clock steps of 1 s", np.random.default_rng(0))
+    trials = tuple(recording.trials(JOINT))
+    wanted = cautions(JOINT, trials)
+    assert any("stood still 3 times" in text for text in wanted)
+    examined = ps.examine(recording)[JOINT]
+    assert examined.verdict == "use with care"
+    assert {f"{JOINT}: {reason}" for reason in examined.reasons} >= set(wanted)
+    # what lag and calibrate both begin with
+    assert set(prepare_joint(JOINT, trials, 0).lag.warnings) >= set(wanted)
+    assert set(ps.frequency_response(recording)[JOINT].warnings) >= set(wanted)
+
+
+@pytest.mark.parametrize("unit", ["ms", "µs", "ns"])
+def test_times_of_another_unit_cost_no_memory(unit):
+    recording = spoilt(f"times in {unit}", np.random.default_rng(0))
+    tracemalloc.start()
+    assert ps.examine(recording)[JOINT].verdict == "do not use"
+    with pytest.raises(InputError, match="seconds: divide them"):
+        ps.lag(recording)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 50e6
+
+
+def test_a_resolved_poll_asks_for_no_care_and_its_consequence_is_told_once():
+    found = ps.examine(ps.load("data/samples/sweep.csv"), "LF_hip")
+    (joint,) = found.values()
+    assert joint.verdict == "use"
+    assert "the bus reads this servo every" in " ".join(joint.reasons)
+    assert "Do not compute lag" in found.advice[0] and "Do not" not in " ".join(joint.reasons)
+
+
+NAN, HUGE = float("nan"), 1e300
+
+
+@pytest.mark.parametrize(
+    ("header", "place"),
+    [
+        ({"start_pose_rad": {JOINT: NAN}}, "start_pose_rad.LF_hip"),
+        ({"start_pose_rad": {JOINT: HUGE}}, "start_pose_rad.LF_hip"),
+        ({"start_pose_rad": {JOINT: 10**400}}, "start_pose_rad.LF_hip"),
+        ({"start_pose_rad": {JOINT: [1.0]}}, "start_pose_rad.LF_hip"),
+        ({"start_pose_rad": [1.0]}, "start_pose_rad"),
+        ({"bus": {"count_zero_rad": {JOINT: NAN}}}, "bus.count_zero_rad.LF_hip"),
+        ({"bus": {"count_zero_rad": {JOINT: HUGE}}}, "bus.count_zero_rad.LF_hip"),
+        ({"bus": {"command_quantum_rad": NAN}}, "bus.command_quantum_rad"),
+        ({"bus": {"command_quantum_rad": HUGE}}, "bus.command_quantum_rad"),
+        ({"bus": {"command_quantum_rad": -0.001}}, "bus.command_quantum_rad"),
+        ({"bus": {"command_quantum_rad": 1e-300}}, "bus.command_quantum_rad"),
+        ({"bus": {"command_quantum_rad": {JOINT: {"a": 1}}}}, "bus.command_quantum_rad"),
+        ({"bus": {"speed_limit_rad_s": 0.0}}, "bus.speed_limit_rad_s"),
+        ({"bus": {"speed_limit_rad_s": float("inf")}}, "bus.speed_limit_rad_s"),
+        ({"bus": {"read_time_doubt_s": -1.0}}, "bus.read_time_doubt_s"),
+        ({"bus": [1]}, "bus"),
+        ({"read_after_send_s": 1e9}, "read_after_send_s"),
+    ],
+)
+def test_every_entry_of_the_header_that_is_computed_with_is_checked(header, place):
+    with pytest.raises(InputError, match=f"^made, header: {place} "):
+        made(good(), **header)
+
+
+def test_a_start_pose_that_is_not_where_the_joint_stands_is_told():
+    (caution,) = cautions(JOINT, made(good(), start_pose_rad={JOINT: 2.0}).trials(JOINT))
+    assert "`start_pose_rad` is 2.00" in caution
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "expected"),
+    [("trial", 0.5, "whole numbers"), ("trial", 1e300, "whole numbers"),
+     ("position_count", 1e18, "position_count")],
+)  # fmt: skip
+def test_numbers_that_are_counted_with_are_checked(column, value, expected):
+    with pytest.raises(InputError, match=expected):
+        made(good().assign(**{column: value}))
+
+
+def test_a_bus_that_lost_every_read_has_a_mean_age_without_end():
+    lattice = PollLattice(kind="lattice", poll_period_s=0.02, loss=1.0, fresh_fraction=0.1)
+    assert lattice.mean_age_s == np.inf
