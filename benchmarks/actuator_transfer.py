@@ -15,8 +15,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import torch
 
-from pupper_sysid.policies.analysis.evaluation import evaluation_task, summary, walk
+from pupper_sysid.policies.analysis.evaluation import summary, walk
 from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.policies.walks.conditions import evaluation_task
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 

@@ -33,10 +33,11 @@ from pupper_sysid.common.figure_style import (
     save,
     styled,
 )
-from pupper_sysid.policies.analysis.evaluation import evaluation_task, summary, walk
+from pupper_sysid.policies.analysis.evaluation import summary, walk
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train.curves import IMITATION, PROGRESS
 from pupper_sysid.policies.train.run_file import Run, load_run
+from pupper_sysid.policies.walks.conditions import evaluation_task
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 COLOURS = {"mlp": BLUE, "mlp-actions": SKY, "lstm": RED, "gru": ORANGE, "transformer": GREEN}

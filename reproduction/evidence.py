@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,11 @@ from pupper_sysid.policies.analysis.robustness import (
     delay_curve,
     terrain,
 )
-from pupper_sysid.policies.analysis.rollouts import Rollout
 from pupper_sysid.policies.analysis.trial import Outcome, Trial, outcome
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, load_run
+from pupper_sysid.policies.walks.rollouts import Rollout
 from reproduction.claims import NotTestable
 
 KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
@@ -118,12 +118,11 @@ def gather(
 
 def scales(policy: Policy, trial: Trial) -> list[ScalePoint]:
     """Walks with other scales of what is sent, as deployed robots had."""
+    given = sorted({*SCALES_RAD, trial.task.action_scale})
+    walks = trial.walks(policy, [trial.condition(action_scale=scale) for scale in given])
     return [
-        ScalePoint(
-            scale_rad=scale,
-            **outcome(replace(trial, task=replace(trial.task, action_scale=scale)).walk(policy)),
-        )
-        for scale in sorted({*SCALES_RAD, trial.task.action_scale})
+        ScalePoint(scale_rad=scale, **outcome(walked))
+        for scale, walked in zip(given, walks, strict=True)
     ]
 
 

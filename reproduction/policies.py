@@ -21,8 +21,8 @@ from pupper_sysid.policies.analysis.rhythm import (
     sine_fit_r2,
     sine_frequency,
 )
-from pupper_sysid.policies.analysis.tracking import ERRORS
 from pupper_sysid.policies.deploy.stacks import STACKS
+from pupper_sysid.policies.walks.tracking import ERRORS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from reproduction import gait as gait_claims
 from reproduction import training as training_claims

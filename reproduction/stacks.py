@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.policies.analysis.rhythm import mean_of
-from pupper_sysid.policies.analysis.tracking import ERRORS
 from pupper_sysid.policies.deploy.emulated_walk import walk_once
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.tracking import ERRORS
 
 
 @dataclass(frozen=True)

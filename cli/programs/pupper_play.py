@@ -71,7 +71,7 @@ def _run(options: Play) -> None:
         refuse_overwrite(options.video, options.force)
     import torch
 
-    from pupper_sysid.policies.analysis.evaluation import evaluation_task
+    from pupper_sysid.policies.walks.conditions import evaluation_task
     from pupper_sysid.sim.walking.env import PupperEnv
     from pupper_sysid.sim.walking.servo_ranges import servo_model_of
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.rhythm import mean_of, sine_frequency
-from pupper_sysid.policies.analysis.rollouts import Disturb, Rollout, heading
 from pupper_sysid.policies.analysis.trial import (
     NAN,
     STILL_RAD,
@@ -29,6 +28,8 @@ from pupper_sysid.policies.analysis.trial import (
     still,
 )
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.conditions import Disturb
+from pupper_sysid.policies.walks.rollouts import Rollout, heading
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 
@@ -41,6 +42,7 @@ NUDGE_M_S = 0.01
 RATES_HZ = (25.0, 31.25, 50.0, 71.43, 100.0)
 _PUSH_S = 4.0
 _PUSHES = 4  # spread over one period
+_RATES_SHARE = 0.4  # of the time of all tests
 _EARLY_S, _LATE_S = (1.0, 3.0), (3.0, 5.0)  # after the push
 _LAST_ACTION = OBSERVATION_PARTS["last_action"]
 
@@ -97,6 +99,7 @@ class Autonomy(Result):
 
 def autonomy(policy: Policy, trial: Trial) -> Autonomy:
     """Run all tests of a policy."""
+    # first, since the walk with nothing altered is among them
     rate = rate_response(policy, trial)
     return Autonomy(
         frozen=frozen(policy, trial), push=push_response(policy, trial), rate=rate,
@@ -134,8 +137,10 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
     Each robot walks twice, with and without the push; pushes come at times spread over a period.
     The shift is between the sines of the two walks' actions. Empty if no robot walks to the end.
     """
-    trial = replace(trial, seconds=_PUSH_S + _LATE_S[1] + 1.0)
-    plain = trial.walk(policy)
+    seconds = _PUSH_S + _LATE_S[1] + 1.0
+    if trial.seconds != seconds:
+        trial = replace(trial, seconds=seconds)
+    (plain,) = trial.walks(policy, [trial.condition()], (_RATES_SHARE, _RATES_SHARE))
     step_s = plain.step_s
     begin = round(_PUSH_S / step_s)
     settled = plain.action_rad[round(SETTLE_S / step_s) :]
@@ -145,11 +150,13 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
     rates = {i: sine_frequency(settled[:, i], step_s) for i in robots}
     period = 1 / float(np.median(list(rates.values())))
     found = []
-    for speed in (NUDGE_M_S, PUSH_M_S):
+    times = [begin + round(k * period / _PUSHES / step_s) for k in range(_PUSHES)]
+    speeds = (NUDGE_M_S, PUSH_M_S)
+    conditions = [trial.condition(None, _pusher(at, speed)) for speed in speeds for at in times]
+    walks = iter(trial.walks(policy, conditions, (_RATES_SHARE, 1.0)))
+    for speed in speeds:
         shifts, phases, survived = [], [], []
-        for k in range(_PUSHES):
-            at = begin + round(k * period / _PUSHES / step_s)
-            pushed = trial.walk(policy, None, _pusher(at, speed))
+        for at, pushed in zip(times, walks, strict=False):
             survived.append(pushed.alive[-1][robots].mean())
             both = [i for i in robots if pushed.alive[-1, i]]
             shifts += [
@@ -174,15 +181,14 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
 
 def rate_response(policy: Policy, trial: Trial) -> tuple[RatePoint, ...]:
     """Walks at control rates below and above that of the training."""
-    physics_s = trial.task.physics_step_s
-    found = []
-    for rate in RATES_HZ:
-        step_s = round(1 / rate / physics_s) * physics_s
-        task = replace(trial.task, control_step_s=step_s)
-        walked = outcome(replace(trial, task=task).walk(policy))
-        cycles = walked["frequency_hz"] * step_s
-        found.append(RatePoint(rate_hz=1 / step_s, cycles_per_step=cycles, **walked))
-    return tuple(found)
+    physics_s = trial.condition().task.physics_step_s
+    steps_s = [round(1 / rate / physics_s) * physics_s for rate in RATES_HZ]
+    conditions = [trial.condition(control_step_s=step_s) for step_s in steps_s]
+    walks = map(outcome, trial.walks(policy, conditions, (0.0, _RATES_SHARE)))
+    return tuple(
+        RatePoint(rate_hz=1 / step_s, cycles_per_step=walked["frequency_hz"] * step_s, **walked)
+        for step_s, walked in zip(steps_s, walks, strict=True)
+    )
 
 
 def rate_exponent(rows: Sequence[RatePoint]) -> float:
@@ -219,14 +225,13 @@ def _driven(
 def _pusher(at: int, speed: float) -> Disturb:
     """One push of each trunk to the left."""
 
-    def disturb(step: int, env: PupperEnv) -> None:
+    def disturb(step: int, env: PupperEnv, robots: NDArray[np.intp]) -> None:
         if step != at:
             return
-        robots = env.robots
-        velocity = robots.qvel[:, :2].copy()
-        angle = heading(robots.qpos)
+        velocity = env.robots.qvel[robots, :2]
+        angle = heading(env.robots.qpos[robots])
         velocity += speed * np.column_stack([-np.sin(angle), np.cos(angle)])
-        robots.push(np.arange(env.environments), velocity)
+        env.robots.push(robots, velocity)
 
     return disturb
 

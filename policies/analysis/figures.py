@@ -22,7 +22,7 @@ from pupper_sysid.policies.analysis.autonomy import Autonomy
 from pupper_sysid.policies.analysis.gait import SETTLE_S, intervals
 from pupper_sysid.policies.analysis.paths import DirectionWalk
 from pupper_sysid.policies.analysis.robustness import AblationPoint, DelayPoint, GroundPoint
-from pupper_sysid.policies.analysis.rollouts import Rollout
+from pupper_sysid.policies.walks.rollouts import Rollout
 
 _MODES = {"fixed": "-", "jittered": "--", "replay": ":"}
 _SHOWN_S = 2.0

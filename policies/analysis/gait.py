@@ -31,7 +31,7 @@ from pupper_sysid.policies.analysis.rhythm import (
     standardised,
     times,
 )
-from pupper_sysid.policies.analysis.rollouts import Rollout
+from pupper_sysid.policies.walks.rollouts import Rollout
 
 SETTLE_S = 2.0
 """From a stand to a steady walk [s]."""

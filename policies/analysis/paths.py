@@ -7,7 +7,7 @@ the frame of the heading at that time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, internal
-from pupper_sysid.policies.analysis.evaluation import DIRECTIONS
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.rhythm import UNKNOWN, mean_of
-from pupper_sysid.policies.analysis.rollouts import Rollout
 from pupper_sysid.policies.analysis.trial import Trial
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.conditions import DIRECTIONS
+from pupper_sysid.policies.walks.rollouts import Rollout
 
 Array = NDArray[np.float64]
 
@@ -49,15 +49,15 @@ class DirectionWalk(Result):
 
 def compliance(policy: Policy, trial: Trial) -> list[DirectionWalk]:
     """Walk in every direction of `evaluation.DIRECTIONS` that moves."""
-    found = []
-    for name, command in DIRECTIONS.items():
-        if any(command):
-            walked = replace(trial, command=command).walk(policy)
-            up = float(walked.alive[-1].mean())
-            found.append(
-                DirectionWalk(direction=name, command=command, survival=up, **_measured(walked))
-            )
-    return found
+    moving = {name: command for name, command in DIRECTIONS.items() if any(command)}
+    walks = trial.walks(policy, [trial.condition(command=c) for c in moving.values()])
+    return [
+        DirectionWalk(
+            direction=name, command=walked.command, survival=float(walked.alive[-1].mean()),
+            **_measured(walked),
+        )
+        for name, walked in zip(moving, walks, strict=True)
+    ]  # fmt: skip
 
 
 def _measured(walked: Rollout) -> dict[str, Any]:

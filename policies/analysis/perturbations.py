@@ -1,6 +1,6 @@
 """Perturbations of observations: delay, noise, zeros, staleness.
 
-Each function makes a `Change` for `policies.analysis.rollouts.collect`, or alters a recorded
+Each function makes a `Change` for a `policies.walks.conditions.Condition`, or alters a recorded
 sequence for `replay`. Parts are named as in `sim.walking.observation.OBSERVATION`.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.policies.analysis.rollouts import Change
+from pupper_sysid.policies.walks.conditions import Change
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 
 Observations = NDArray[np.float32]

@@ -8,7 +8,7 @@ acts on them. Replay shows how a network reacts, closed loop whether it walks.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from pupper_sysid.policies.analysis import perturbations
 from pupper_sysid.policies.analysis.gait import correlation, steady
 from pupper_sysid.policies.analysis.perturbations import JOINTS
-from pupper_sysid.policies.analysis.rollouts import Change, Rollout, replay
 from pupper_sysid.policies.analysis.trial import (
     NAN,
     Outcome,
@@ -29,12 +28,17 @@ from pupper_sysid.policies.analysis.trial import (
     walking,
 )
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.conditions import Change
+from pupper_sysid.policies.walks.rollouts import Rollout, replay
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
+
+Array = NDArray[np.float64]
 
 EXTRA_DELAYS_MS = (0, 40, 80, 160, 240, 320, 400)
 NOISE_SHARES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 HOLD_MS = (40, 80, 160, 320)
+_REPLAYED = 11
 CHANNELS = {
     name: PARTS[name]
     for name in ("joint_position_relative", "joint_velocity", "joint_effort", "last_action")
@@ -80,17 +84,26 @@ def delay_curve(
     since a servo cannot answer out of order.
     """
     step_ms = 1e3 * trial.task.control_step_s
-    rng = np.random.default_rng(trial.seed)
-    plain = trial.walk(policy)
+    late = [extra for extra in extra_ms if extra]
+    jitters = [
+        perturbations.jittered(JOINTS, round(extra / step_ms), rng)
+        for extra, rng in zip(late, _generators(trial, len(late)), strict=True)
+    ]
+    plain, *walks = trial.walks(
+        policy,
+        [
+            trial.condition(),
+            *(trial.condition(extra_dead_time_s=extra / 1e3) for extra in late),
+            *(trial.condition(change) for change in jitters),
+        ],
+    )
+    altered = iter(zip(walks, walks[len(late) :], strict=False))
+    walked = [next(altered) if extra else (plain, plain) for extra in extra_ms]
+    replays = _replayed(
+        policy, plain, [perturbations.delayed(JOINTS, round(e / step_ms)) for e in extra_ms]
+    )
     found = []
-    for extra in extra_ms:
-        steps = round(extra / step_ms)
-        seen = perturbations.applied(perturbations.delayed(JOINTS, steps), plain.observation)
-        actions, _ = replay(policy, seen)
-        later = replace(trial, servos=trial.servos.later(extra / 1e3))
-        fixed = plain if extra == 0 else later.walk(policy)
-        change = perturbations.jittered(JOINTS, steps, rng)
-        moving = plain if extra == 0 else trial.walk(policy, change)
+    for extra, actions, (fixed, moving) in zip(extra_ms, replays, walked, strict=True):
         found += [
             DelayPoint(extra_delay_ms=extra, mode="replay", **gait_of_actions(plain, actions)),
             DelayPoint(extra_delay_ms=extra, mode="fixed", **outcome(fixed)),
@@ -107,52 +120,77 @@ def ablation(
     Noise is in shares of a channel's own standard deviation while walking. Its points are NaN if no
     robot walked long enough to know that deviation.
     """
-    rng = np.random.default_rng(trial.seed)
-    plain = trial.walk(policy)
-    walked = steady(plain)
-    found = []
+    (plain,) = trial.walks(policy, [trial.condition()], (0.0, 0.02))
+    rows: list[dict[str, Any]] = []
+    changes: list[Callable[[np.random.Generator], Change]] = []
     for name in channels:
-        part = CHANNELS[name]
-        spread = np.full(part.stop - part.start, np.nan)
-        if walked:
-            shown = [plain.observation[now, i, part] for i, now in walked.items()]
-            spread = np.concatenate(shown).std(axis=0)
+        part, spread = CHANNELS[name], _spread(plain, CHANNELS[name])
         sigma = float(spread.mean()) if name != "all joints" else NAN
-        cases: list[tuple[Literal["noise", "zero", "hold"], float, float, Callable[[], Change]]] = [
-            ("noise", share, share * sigma, partial(perturbations.noisy, part, share * spread, rng))
-            for share in NOISE_SHARES
-        ]
-        cases.append(("zero", 0.0, NAN, partial(perturbations.zeroed, part)))
+        for share in NOISE_SHARES:
+            rows.append({"kind": "noise", "level": share, "sigma": share * sigma})
+            changes.append(partial(perturbations.noisy, part, share * spread))
+        rows.append({"kind": "zero", "level": 0.0, "sigma": NAN})
+        changes.append(lambda rng, part=part: perturbations.zeroed(part))
         for ms in HOLD_MS:
             steps = max(round(ms / 1e3 / plain.step_s), 1)
-            cases.append(("hold", ms, NAN, partial(perturbations.held, part, steps)))
-        for kind, level, size, change in cases:
-            row: dict[str, Any] = {"channel": name, "kind": kind, "level": level, "sigma": size}
-            if kind == "noise" and not walked:
-                found.append(AblationPoint(**row, correlation=NAN))
-                continue
-            closed_loop: dict[str, Any] = outcome(trial.walk(policy, change()))
-            actions, _ = replay(policy, perturbations.applied(change(), plain.observation))
-            found.append(
-                AblationPoint(**row, correlation=_agreement(plain, actions), **closed_loop)
-            )
-    return found
+            rows.append({"kind": "hold", "level": ms, "sigma": NAN})
+            changes.append(lambda rng, part=part, steps=steps: perturbations.held(part, steps))
+    channel = [name for name in channels for _ in range(len(rows) // len(channels))]
+    known = [i for i, row in enumerate(rows) if row["kind"] != "noise" or steady(plain)]
+    # a change keeps a memory: one for the walk, one for the replay
+    walked, replayed = (
+        [changes[i](rng) for i, rng in zip(known, rngs, strict=True)]
+        for rngs in (_generators(trial, len(known), k) for k in (0, 1))
+    )
+    walks = trial.walks(policy, [trial.condition(change) for change in walked], (0.02, 1.0))
+    outcomes = dict(zip(known, map(outcome, walks), strict=True))
+    agreements = dict(zip(known, _agreements(policy, plain, replayed), strict=True))
+    return [
+        AblationPoint(
+            channel=name, **row, correlation=agreements.get(i, NAN), **outcomes.get(i, {})
+        )
+        for i, (name, row) in enumerate(zip(channel, rows, strict=True))
+    ]
 
 
 def terrain(policy: Policy, trial: Trial) -> list[GroundPoint]:
     """Survival, tracking and gait on every kind of ground."""
+    kinds = get_args(Terrain)
+    walks = trial.walks(policy, [trial.condition(terrain=kind) for kind in kinds])
     return [
-        GroundPoint(
-            ground=kind,
-            **outcome(replace(trial, task=replace(trial.task, terrain=kind)).walk(policy)),
-        )
-        for kind in get_args(Terrain)
+        GroundPoint(ground=kind, **outcome(walked))
+        for kind, walked in zip(kinds, walks, strict=True)
     ]
 
 
-def _agreement(plain: Rollout, altered: NDArray[np.floating]) -> float:
+def _generators(trial: Trial, count: int, which: int = 0) -> list[np.random.Generator]:
+    """One for each condition: conditions may run side by side."""
+    return np.random.default_rng([trial.seed, which]).spawn(count)
+
+
+def _spread(plain: Rollout, part: slice) -> Array:
+    """Standard deviation of a channel's numbers while walking; NaN if no robot walked."""
+    shown = [plain.observation[now, i, part] for i, now in steady(plain).items()]
+    return np.concatenate(shown).std(axis=0) if shown else np.full(part.stop - part.start, np.nan)
+
+
+def _replayed(
+    policy: Policy, plain: Rollout, changes: Sequence[Change]
+) -> list[NDArray[np.float32]]:
+    """Actions on the walk's observations, each changed in its way; all at once."""
+    seen = [perturbations.applied(change, plain.observation) for change in changes]
+    actions, _ = replay(policy, np.concatenate(seen, axis=1))
+    return np.split(actions, len(changes), axis=1)
+
+
+def _agreements(policy: Policy, plain: Rollout, changes: Sequence[Change]) -> list[float]:
     """Gait correlation of replayed actions with the walk's, mean over walking robots."""
-    return mean(
-        [correlation(plain.action[now, i], altered[now, i])
-         for i, now in walking(plain).items()]
-    )  # fmt: skip
+    found = []
+    for start in range(0, len(changes), _REPLAYED):  # a few at a time, for their memory's sake
+        for altered in _replayed(policy, plain, changes[start : start + _REPLAYED]):
+            alike = [
+                correlation(plain.action[now, i], altered[now, i])
+                for i, now in walking(plain).items()
+            ]
+            found.append(mean(alike))
+    return found

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,15 @@ from numpy.typing import NDArray
 from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.gait import amplitude, jitter, steady
 from pupper_sysid.policies.analysis.rhythm import frequency, mean_of
-from pupper_sysid.policies.analysis.rollouts import Change, Disturb, Rollout, collect
-from pupper_sysid.policies.analysis.tracking import pooled_errors
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.conditions import (
+    Change,
+    Condition,
+    Disturb,
+    evaluation_task,
+)
+from pupper_sysid.policies.walks.rollouts import Rollout, collect
+from pupper_sysid.policies.walks.tracking import pooled_errors
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
@@ -34,28 +41,64 @@ class Trial:
     seconds: float = 10.0
     seed: int = 0
     threads: int = 0
+    progress: Callable[[float], None] = field(default=lambda share: None, compare=False)
+    """Called with the share of an analysis that is done."""
     _plain: list[tuple[Policy, Rollout]] = field(
         init=False, repr=False, compare=False, default_factory=list
     )
 
+    def condition(
+        self,
+        change: Change | None = None,
+        disturb: Disturb | None = None,
+        extra_dead_time_s: float = 0.0,
+        **different: Any,
+    ) -> Condition:
+        """What these robots walk under, perhaps altered; `different` are fields of the task, and
+        `command`.
+        """
+        command = different.pop("command", self.command)
+        task = evaluation_task(replace(self.task, **different))
+        return Condition(task, self.robots, command, extra_dead_time_s, change, disturb)
+
     def walk(
         self, policy: Policy, change: Change | None = None, disturb: Disturb | None = None
     ) -> Rollout:
-        """One rollout, perhaps with altered observations or disturbed robots.
+        """One rollout, perhaps with altered observations or disturbed robots."""
+        return self.walks(policy, [self.condition(change, disturb)])[0]
 
-        A rollout with neither is kept per policy: most analyses begin with it.
+    def walks(
+        self,
+        policy: Policy,
+        conditions: Sequence[Condition],
+        part: tuple[float, float] = (0.0, 1.0),
+    ) -> list[Rollout]:
+        """Rollouts under several conditions at once.
+
+        The one with nothing altered is kept per policy: most analyses begin with it. Altered ones
+        have no observations and hidden states if there are several.
+
+        Parameters
+        ----------
+        policy : Policy
+        conditions : sequence of Condition
+            See `condition`.
+        part : (float, float)
+            Shares of the analysis that are done before and after.
         """
-        plain = change is None and disturb is None
+        plain = self.condition()
         known = next((r for p, r in self._plain if p is policy), None)
-        if plain and known:
-            return known
+        new = [c for c in conditions if known is None or c != plain]
+        start, end = part
         found = collect(
-            policy, self.task, self.servos, self.command, self.robots, self.seconds,
-            self.seed, self.threads, change, disturb,
-        )  # fmt: skip
-        if plain:
-            self._plain.append((policy, found))
-        return found
+            policy, self.servos, new, self.seconds, self.seed, self.threads,
+            lambda share: self.progress(start + share * (end - start)), len(conditions) > 1,
+        ) if new else []  # fmt: skip
+        walked = iter(found)
+        rollouts = [known if known and c == plain else next(walked) for c in conditions]
+        if known is None and plain in conditions:
+            self._plain.append((policy, rollouts[list(conditions).index(plain)]))
+        return rollouts
 
 
 @dataclass(frozen=True, kw_only=True)

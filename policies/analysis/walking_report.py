@@ -79,7 +79,8 @@ def walking_sections(
             findings=[
                 (
                     "Falls",
-                    f"{100 * found.fall_rate:.0f} % of {found.episodes} episodes of 20 s "
+                    f"{100 * found.fall_rate:.0f} % of {found.episodes} episodes of "
+                    f"{found.episode_s:g} s "
                     "with random commands.",
                 ),
                 (

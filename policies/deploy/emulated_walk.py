@@ -16,12 +16,12 @@ import numpy as np
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from pupper_sysid.policies.analysis.tracking import ERRORS, named, tracking_errors
 from pupper_sysid.policies.deploy.assembly import assemble
 from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, deploy
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.tracking import ERRORS, named, tracking_errors
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.walking.bus import WalkingBus
 from pupper_sysid.sim.walking.robot import WalkingRobot

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pupper_sysid.policies.analysis.rollouts import Rollout
+from pupper_sysid.policies.walks.rollouts import Rollout
 
 STEP = 0.02
 """Their control step [s]."""

@@ -16,9 +16,9 @@ from pupper_sysid.policies.analysis.autonomy import (
     rate_exponent,
     rate_response,
 )
-from pupper_sysid.policies.analysis.evaluation import DIRECTIONS
 from pupper_sysid.policies.analysis.paths import _measured, compliance
 from pupper_sysid.policies.analysis.robustness import terrain
+from pupper_sysid.policies.walks.conditions import DIRECTIONS
 from reproduction.evidence import scales
 from support.walks import STEP, walked
 

@@ -13,8 +13,8 @@ from pupper_sysid.policies.analysis.attractor import orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response
 from pupper_sysid.policies.analysis.perturbations import JOINTS
 from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
-from pupper_sysid.policies.analysis.rollouts import Rollout
 from pupper_sysid.policies.analysis.trial import Trial, moving_frequency
+from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
@@ -103,8 +103,8 @@ def recorded(rollout: Rollout) -> Trial:
     """A trial whose walks are all this one."""
 
     class Recorded(Trial):
-        def walk(self, policy, change=None, disturb=None):
-            return rollout
+        def walks(self, policy, conditions, part=(0.0, 1.0)):
+            return [rollout] * len(conditions)
 
     return Recorded(Walking(), servo_ranges("ideal"), robots=rollout.alive.shape[1])
 

@@ -15,19 +15,9 @@ from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, simulator
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.analysis import evaluation
-from pupper_sysid.policies.analysis.evaluation import (
-    DIRECTIONS,
-    RANDOM,
-    evaluate,
-    evaluation_task,
-    summary,
-    walk,
-)
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import CONTRACT, WEIGHTS, load_policy, refuse_bad
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
-from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 
@@ -269,90 +259,6 @@ def test_the_actuator_of_the_training_is_found_beside_a_policy_and_known_by_its_
 def test_what_is_neither_run_nor_policy_is_refused(tmp_path):
     with pytest.raises(InputError, match="neither a run nor a policy"):
         policy_at(tmp_path)
-
-
-# ------------------------------------------------------------------------------ evaluation
-
-
-class Scripted:
-    """Robots with even numbers stand; the others fold all legs and fall on their bellies."""
-
-    def reset(self, action):
-        self.rows = np.arange(len(action))
-
-    def act(self, observation):
-        return np.outer(self.rows % 2, [0.0, 4.0, -4.0] * 4)
-
-
-def test_a_robot_that_stands_still_is_wrong_by_what_it_was_asked_and_what_it_moved():
-    """Triangle inequality, |error - asked| ≤ mean speed, for every episode and axis."""
-    task = evaluation_task(Walking(), 1.0)
-    found = walk(None, task, servo_ranges("ideal"), 6, 3, threads=1)
-    assert not found.fell.any() and found.alive[:-1].all()
-    moved = np.abs(found.velocity[:-1]).mean(axis=0)
-    assert (np.abs(found.error - found.commanded) <= moved + 1e-9).all()
-    # ideal servos stand still after a drop of 2 mm: what is left is the command
-    np.testing.assert_allclose(found.error.mean(axis=0), found.commanded.mean(axis=0), rtol=0.05)
-    ends = np.array([RANDOM.forward_m_s[1], RANDOM.sideways_m_s[1], RANDOM.yaw_rad_s[1]])
-    assert (found.commanded <= ends).all() and (found.commanded > 0).all()
-
-
-def test_the_error_is_that_of_the_command_given():
-    task = evaluation_task(Walking(), 0.4)
-    command = (0.15, -0.05, 0.4)
-    found = walk(None, task, servo_ranges(CALIBRATION), 3, 3, command, threads=1)
-    np.testing.assert_allclose(found.commanded, [np.abs(command)] * 3)
-    expected = np.abs(found.velocity[:-1] - command).mean(axis=0)
-    np.testing.assert_allclose(found.error, expected)
-
-
-def test_the_share_of_falls_counts_each_robot_that_fell_once_and_no_time_out():
-    task = evaluation_task(Walking(), 2.0)
-    found = walk(Scripted(), task, servo_ranges(CALIBRATION), 6, 3, (0.0, 0.0, 0.0), threads=1)
-    assert found.fell.tolist() == [False, True] * 3
-    assert summary(found).fall_rate == 0.5
-    lived = found.alive.sum(axis=0)
-    assert (lived[1::2] < task.episode_steps - 1).all()
-    assert (lived[::2] == task.episode_steps - 1).all()
-
-
-def test_an_evaluation_covers_all_commands_and_says_where():
-    stages = []
-    found = evaluate(
-        None, Walking(episode_s=0.1), servo_ranges(CALIBRATION), 5, 0, 1, progress=stages.append
-    )
-    assert [row.name for row in found.by_command] == list(DIRECTIONS) == stages
-    assert [row.command for row in found.by_command] == list(DIRECTIONS.values())
-    commands = np.array(list(DIRECTIONS.values()))
-    for axis in range(3):
-        assert (commands[:, axis] > 0).any() and (commands[:, axis] < 0).any()
-    assert not commands[list(DIRECTIONS).index("stand")].any()
-    assert found.episodes == 5 and found.actuator == CALIBRATION
-
-
-def test_an_evaluation_has_no_pushes_no_curriculum_and_gentle_starts():
-    task = evaluation_task(Walking())
-    assert task.randomisation.push_m_s == 0 and task.randomisation.on_the_move == 0
-    assert not task.curriculum.on and task.commands == RANDOM
-    assert task.episode_s == Walking().episode_s
-
-
-def test_an_evaluation_is_the_same_for_the_same_seed_and_another_for_another():
-    task, servos = evaluation_task(Walking(), 0.2), servo_ranges(CALIBRATION)
-    one, same, other = (walk(None, task, servos, 3, seed, threads=1).error for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
-
-
-def test_a_policy_is_evaluated_on_the_learned_servos_it_was_trained_with(monkeypatch, tmp_path):
-    """A folder as actuator is a learned servo model, not ideal servos."""
-    model, given = object(), []
-    monkeypatch.setattr(evaluation, "servo_model_of", lambda source, step: (model, source, step))
-    monkeypatch.setattr(evaluation, "PupperEnv", lambda *all_: given.extend(all_) or 1 / 0)
-    servos = replace(servo_ranges("ideal"), source=str(tmp_path))
-    with pytest.raises(ZeroDivisionError):
-        walk(None, evaluation_task(Walking()), servos, 2, 3, threads=1)
-    assert given[-1] == (model, str(tmp_path), 0.02)
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)

@@ -1,9 +1,9 @@
 """Rollouts: observations, actions and hidden states of a policy while it walks, step by step.
 
-`collect` runs a policy in the simulator under one command and records everything that the analyses
-of gait and internal dynamics need; observations may be altered on the way (ablated, delayed,
-frozen). `replay` feeds recorded observations to a policy in open loop. Neither changes the state of
-the given policy, so a policy can be probed in the middle of a walk.
+`collect` runs a policy in the simulator under a number of conditions and records everything that
+the analyses of gait and internal dynamics need; observations may be altered on the way (ablated,
+delayed, frozen). `replay` feeds recorded observations to a policy in open loop. Neither changes the
+state of the given policy, so a policy can be probed in the middle of a walk.
 
 The hidden state is that of the published analyses: the cell of an LSTM, the state of a GRU, the
 latent of a Transformer, the last hidden layer of an MLP.
@@ -11,10 +11,11 @@ latent of a Transformer, the last hidden layer of an MLP.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,22 +23,14 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.utils.hooks import RemovableHandle
 
-from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.analysis.evaluation import evaluation_task
-from pupper_sysid.policies.analysis.tracking import planar_velocity
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.policies.walks.conditions import Condition, Moment, walk_together
+from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]
-Change = Callable[[int, NDArray[np.float32]], NDArray[np.floating]]
-"""`change(step, observation)` returns the observation, shape (n, 60), for the policy; it may alter
-the one it was given."""
-
-Disturb = Callable[[int, PupperEnv], None]
-"""`disturb(step, environment)` acts on the robots before their action, such as a push."""
 
 _LAST_ACTION = slice(-ACTIONS, None)  # of an observation
 
@@ -57,11 +50,13 @@ class Rollout:
     action_scale: float
     """Radians per unit of action."""
     observation: NDArray[np.float32]
-    """As given to the policy, changes included; shape (steps, n, 60)."""
+    """As given to the policy, changes included; shape (steps, n, 60), or (steps, 0, 60) of
+    lean rollouts."""
     action: NDArray[np.float32]
     """Raw outputs of the policy; shape (steps, n, 12)."""
     hidden: NDArray[np.float32]
-    """LSTM: cell; GRU: state; Transformer: latent; MLP: last hidden layer; shape (steps, n, k)."""
+    """LSTM: cell; GRU: state; Transformer: latent; MLP: last hidden layer; shape (steps, n, k), or
+    (steps, 0, k)."""
     joint_position: Array
     """True joint angles [rad], not readings; shape (steps, n, 12)."""
     contact: NDArray[np.bool_]
@@ -82,79 +77,84 @@ class Rollout:
 
 def collect(
     policy: Policy,
-    task: Walking,
     servos: ServoRanges,
-    command: tuple[float, float, float],
-    robots: int,
+    conditions: Sequence[Condition],
     seconds: float,
     seed: int,
     threads: int = 0,
-    change: Change | None = None,
-    disturb: Disturb | None = None,
-) -> Rollout:
-    """Walk from a gentle start, without pushes but those of `disturb`.
+    progress: Callable[[float], None] = lambda share: None,
+    lean: bool = False,
+) -> list[Rollout]:
+    """Walk from a gentle start under every condition, without pushes but those of a condition.
 
-    Rollouts of one seed have the same servos, ground, start and noise until a robot falls.
+    Robot k of every rollout of one seed has the same servos, start and noise until one falls.
 
     Parameters
     ----------
     policy : Policy
         Keeps its own state.
-    task : Walking
-        Made gentle by `evaluation_task`.
     servos : ServoRanges
-    command : (float, float, float)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    robots : int
+    conditions : sequence of Condition
+        Each with a command.
     seconds : float
         Duration; a rollout ends sooner when no robot is up any more.
     seed, threads : int
-    change : Change, optional
-        Alters observations.
-    disturb : Disturb, optional
-        Acts on the robots.
+    progress : callable
+        Called with the share of the work that is done.
+    lean : bool
+        Whether to leave out observations and hidden states of altered walks: of 16 robots over
+        10 s, 4 MB or more.
 
     Raises
     ------
     InputError
         If `seconds` is shorter than a step, or the environment cannot be made.
     """
-    step_s = task.control_step_s
-    steps = round(seconds / step_s)
-    if steps < 1:
-        raise InputError(f"A rollout of {seconds} s is shorter than one step of {step_s} s.")
-    # a step longer, so that no episode times out within it
-    task = evaluation_task(task, (steps + 1) * step_s)
-    env = PupperEnv(task, servos, robots, seed, threads, servo_model_of(servos.source, step_s))
-    env.set_command(np.array(command))
-    observation, _ = env.observe()
-    alive = np.ones(robots, bool)
-    seen, acted, joints, contact, velocity, position, lives = ([] for _ in range(7))
-    with _observed(policy) as (own, hidden):
-        own.reset(env.action)
-        for step in range(steps):
-            shown = observation if change is None else change(step, observation)
-            action = own.act(shown)
-            if disturb:
-                disturb(step, env)
-            found = env.step(action)
-            observation, facts = found.observation, found.facts
-            alive = alive & ~found.done
-            seen.append(np.array(shown, np.float32))
-            acted.append(action)
-            joints.append(facts.position_relative + env.default)
-            contact.append(facts.contact)
-            velocity.append(planar_velocity(facts))
-            position.append(np.column_stack([env.robots.qpos[:, :2], heading(env.robots.qpos)]))
-            lives.append(alive)
-            if not alive.any():
-                break
-    place = np.array(position)
-    place[..., 2] = np.unwrap(place[..., 2], axis=0)
-    return Rollout(
-        step_s, command, task.action_scale, np.array(seen), np.array(acted), np.array(hidden),
-        np.array(joints), np.array(contact), np.array(velocity), place, np.array(lives),
-    )  # fmt: skip
+    recorder = partial(_Recorder, lean=lean)
+    return walk_together(policy, servos, conditions, seconds, seed, threads, recorder, progress)
+
+
+class _Recorder:
+    """Rollouts of one environment."""
+
+    def __init__(
+        self, env: PupperEnv, policy: Policy | None, conditions: Sequence[Condition], lean: bool
+    ):
+        assert policy is not None
+        self._env = env
+        whole = [not (lean and (c.change or c.disturb)) for c in conditions]
+        self._whole = np.flatnonzero(np.repeat(whole, [c.robots for c in conditions]))
+        self._steps: list[dict[str, NDArray]] = []
+        self._inside: list[dict[str, NDArray]] = []
+        self._hidden: list[NDArray[np.float32]] = []
+        _listen(policy.network, lambda state: self._hidden.append(state.numpy()[self._whole]))
+
+    def keep(self, now: Moment) -> None:
+        qpos = self._env.robots.qpos
+        seen = now.observation[self._whole].astype(np.float32)
+        self._inside.append({"observation": seen, "hidden": self._hidden.pop()})
+        self._steps.append(
+            {
+                "action": now.action, "contact": now.facts.contact, "alive": now.alive,
+                "joint_position": now.facts.position_relative + self._env.default,
+                "velocity": planar_velocity(now.facts),
+                "position": np.column_stack([qpos[:, :2], heading(qpos)]),
+            }
+        )  # fmt: skip
+
+    def of(self, condition: Condition, robots: slice, steps: int) -> Rollout:
+        found = _stacked(self._steps[:steps], np.arange(robots.start, robots.stop))
+        found["position"][..., 2] = np.unwrap(found["position"][..., 2], axis=0)
+        inside = np.flatnonzero((self._whole >= robots.start) & (self._whole < robots.stop))
+        found |= _stacked(self._inside[:steps], inside)
+        task, command = condition.task, condition.command
+        assert command is not None
+        return Rollout(task.control_step_s, command, task.action_scale, **found)
+
+
+def _stacked(steps: Sequence[dict[str, NDArray]], robots: NDArray[np.intp]) -> dict[str, NDArray]:
+    """Arrays of some robots over all steps, by name."""
+    return {name: np.stack([step[name][robots] for step in steps]) for name in steps[0]}
 
 
 def replay(

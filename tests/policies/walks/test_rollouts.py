@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.analysis.evaluation import evaluation_task, walk
-from pupper_sysid.policies.analysis.rollouts import collect, replay
+from pupper_sysid.policies.analysis.evaluation import walk
 from pupper_sysid.policies.network.hyperparameters import Architecture
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import Policy, load_policy
 from pupper_sysid.policies.network.transformer import WIDTH
+from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
+from pupper_sysid.policies.walks.rollouts import collect, replay
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.observation import OBSERVATION
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
@@ -39,8 +40,12 @@ def policies(tmp_path_factory) -> dict[str, Policy]:
 
 
 def run(policy, **more):
-    settings = {"robots": 3, "seconds": 0.5, "seed": 3, "threads": 1} | more
-    return collect(policy, TASK, servo_ranges(CALIBRATION), COMMAND, **settings)
+    settings = {"robots": 3, "seconds": 0.5, "change": None} | more
+    condition = Condition(
+        evaluation_task(TASK), settings["robots"], COMMAND, change=settings["change"]
+    )
+    servos = servo_ranges(CALIBRATION)
+    return collect(policy, servos, [condition], settings["seconds"], seed=3, threads=1)[0]
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)

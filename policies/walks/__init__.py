@@ -1,0 +1,1 @@
+"""Walks of policies in the simulator: conditions, rollouts and tracking errors."""

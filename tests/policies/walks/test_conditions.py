@@ -1,0 +1,153 @@
+"""Walks under many conditions at once are the walks under each of them alone."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.policies.analysis.evaluation import _Recorder
+from pupper_sysid.policies.walks import conditions as module
+from pupper_sysid.policies.walks.conditions import (
+    RANDOM,
+    Condition,
+    _random_commands,
+    _shares,
+    evaluation_task,
+    walk_together,
+)
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+
+SERVOS = servo_ranges(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
+TASK = evaluation_task(Walking())
+ROUGH = replace(TASK, terrain="rough")
+
+
+class Stepping:
+    """Lifts the legs in turn, in each robot alike; robots of the other kind fold up and fall."""
+
+    def __init__(self, falls: bool = False):
+        self.falls = falls
+
+    def reset(self, action):
+        self.step = 0
+
+    def act(self, observation):
+        self.step += 1
+        if self.falls:
+            return np.tile([0.0, 4.0, -4.0] * 4, (len(observation), 1))
+        wave = 0.2 * np.sin(0.4 * self.step + np.arange(12))
+        return np.repeat(wave[None], len(observation), axis=0)
+
+
+def together(given, policy=None, seconds=0.5, threads=2, seed=3, recorder=_Recorder, **more):
+    return walk_together(
+        policy or Stepping(), SERVOS, given, seconds, seed, threads, recorder, **more
+    )
+
+
+GIVEN = (
+    Condition(TASK, 3), Condition(TASK, 3, (0.1, 0.0, 0.2)), Condition(TASK, 3, None, 0.04),
+    Condition(ROUGH, 3), Condition(ROUGH, 3, (0.0, 0.05, 0.0)),
+)  # fmt: skip
+
+
+def test_conditions_walked_together_are_those_walked_alone():
+    """To the last bit, on any number of threads: robots share draws and an environment only."""
+    found = together(GIVEN, seconds=0.3)
+    for threads in (1, 3):
+        for one, other in zip(found, together(GIVEN, seconds=0.3, threads=threads), strict=True):
+            np.testing.assert_array_equal(one.velocity, other.velocity)
+    for condition, walked in zip(GIVEN, found, strict=True):
+        (alone,) = together([condition], seconds=0.3)
+        np.testing.assert_array_equal(walked.velocity, alone.velocity)
+        np.testing.assert_array_equal(walked.command, alone.command)
+    usual, _, late, rough, _ = found
+    assert not np.allclose(usual.velocity, late.velocity)
+    assert not np.allclose(usual.velocity, rough.velocity)
+    # the same robots at the same commands
+    np.testing.assert_array_equal(usual.command, rough.command)
+    assert (found[1].command == (0.1, 0.0, 0.2)).all()
+
+
+def test_changed_observations_and_pushes_reach_the_robots_of_their_condition_only():
+    seen, pushed = [], []
+
+    class Watching(_Recorder):
+        def keep(self, now):
+            seen.append(now.observation.copy())
+            super().keep(now)
+
+    def blind(step, observation):
+        return np.zeros_like(observation)
+
+    def push(step, env, robots):
+        pushed.append(robots.tolist())
+        env.robots.push(robots, np.tile([0.0, 0.3], (len(robots), 1)))
+
+    given = [Condition(TASK, 2), Condition(TASK, 2, change=blind), Condition(TASK, 2, disturb=push)]
+    usual, same, moved = together(given, seconds=0.2, threads=1, recorder=Watching)
+    np.testing.assert_array_equal(usual.velocity, same.velocity)  # these legs do not look
+    assert np.abs(moved.velocity - usual.velocity)[..., :2].max() > 0.05
+    shown = [np.abs(rows).max() > 0 for step in seen for rows in np.split(step, len(step) // 2)]
+    assert sum(not any_ for any_ in shown) == 10 and len(pushed) == 10
+    assert all(len(robots) == 2 for robots in pushed)
+
+
+def test_a_walk_ends_with_the_last_robot_of_its_condition():
+    (fallen,) = together([Condition(TASK, 2)], Stepping(falls=True), seconds=2.0)
+    assert len(fallen.alive) < 60 and fallen.fell.all()
+    assert not fallen.alive[-1].any() and fallen.alive[-2].any()
+
+
+def test_progress_grows_to_its_end_and_an_error_or_interruption_ends_all_walks():
+    shares = []
+    together(GIVEN, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1.0)
+    assert len(shares) == 4 * 25  # environments times steps
+    before = threading.active_count()
+
+    def interrupt(share):
+        if share > 0.2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        together(GIVEN, progress=interrupt)
+    assert threading.active_count() == before
+
+
+def test_random_commands_are_new_every_five_seconds_and_within_their_ranges():
+    command = _random_commands(200, 1000, 0.02, 0)
+    changes = (np.diff(command, axis=0) != 0).all(axis=-1).sum(axis=0)
+    assert changes.mean() == pytest.approx(20.0 / RANDOM.every_s, rel=0.1)
+    assert changes.var() == pytest.approx(changes.mean(), rel=0.3)  # exponential intervals
+    for axis, ends in enumerate((RANDOM.forward_m_s, RANDOM.sideways_m_s, RANDOM.yaw_rad_s)):
+        assert command[..., axis].min() == pytest.approx(ends[0], rel=0.02)
+        assert command[..., axis].max() == pytest.approx(ends[1], rel=0.02)
+    np.testing.assert_array_equal(command[:, :5], _random_commands(200, 1000, 0.02, 0)[:, :5])
+
+
+def test_work_is_shared_evenly_with_one_environment_per_ground():
+    given = [Condition(TASK, 100), *[Condition(TASK, 20)] * 7, *[Condition(ROUGH, 50)] * 5]
+    shares = _shares(given)
+    assert sorted(i for share in shares for chosen in share for i in chosen) == list(range(13))
+    robots = [sum(given[i].robots for chosen in share for i in chosen) for share in shares]
+    assert len(robots) == 2 and abs(robots[0] - robots[1]) <= 20
+    for share in shares:
+        tasks = [given[chosen[0]].task for chosen in share]
+        assert len(tasks) == len({t.terrain for t in tasks})
+
+
+def test_robots_walk_on_the_learned_servos_that_were_given(monkeypatch, tmp_path):
+    """A folder as actuator is a learned servo model, not ideal servos."""
+    model, given = object(), []
+    monkeypatch.setattr(module, "servo_model_of", lambda source, step: (model, source, step))
+    monkeypatch.setattr(module, "PupperEnv", lambda *all_: given.extend(all_) or 1 / 0)
+    servos = replace(servo_ranges("ideal"), source=str(tmp_path))
+    with pytest.raises(ZeroDivisionError):
+        walk_together(None, servos, [Condition(TASK, 2)], 1.0, 3, 1, _Recorder)
+    assert (model, str(tmp_path), 0.02) in given
