@@ -32,7 +32,7 @@ lags = ps.lag(recording, "LF_thigh")
 print(lags)
 
 lag = lags["LF_thigh"]
-print(f"feedback age {1e3 * lag.feedback_age_s:.1f} ms")
+print(f"stale readings {1e3 * lag.stale_lag_s:.1f} ms")
 print(f"command hold {1e3 * lag.command_hold_s:.1f} ms")
 print(f"servo        {1e3 * lag.lag_s.value:.1f} ms")
 low_s, high_s = lag.dead_time_s.low, lag.dead_time_s.high

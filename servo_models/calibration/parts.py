@@ -268,7 +268,7 @@ class Lag(Part):
     lag_s: Annotated[Quantity | None, _LAG] = None
     """From a command's edge to the motion [s]: the servo's own lag."""
     raw_lag_s: Annotated[Quantity | None, _LAG] = None
-    """Cross-correlation of all rows [s]: lag, feedback age and zero-order hold."""
+    """Cross-correlation of all rows [s]: lag, stale readings and zero-order hold."""
     fresh_lag_s: Annotated[Quantity | None, _LAG] = None
     """The same on fresh rows only [s]: lag and zero-order hold."""
 

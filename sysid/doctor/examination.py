@@ -67,7 +67,7 @@ class JointExamination(Result):
     poll_period_s, loss, z_score, hit_rate : float
         See `sysid.feedback.poll_lattice.PollLattice`.
     hold_share : float
-        Share of the raw lag that is feedback age.
+        Share of the raw lag that stale readings add.
     quantum_rad : float
         Quantisation step; 0 if there is none.
     offset_rad : float
@@ -250,7 +250,7 @@ def _hold_share(
     except InputError:  # too few fresh readings: reported elsewhere
         return math.nan
     raw = budget.raw_lag_s.value
-    return budget.feedback_age_s / raw if raw > 0 else math.nan
+    return budget.stale_lag_s / raw if raw > 0 else math.nan
 
 
 def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:

@@ -34,7 +34,7 @@ def lag(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> LagBudgets:
-    """Measure the lag of every joint: feedback age, command hold, dead time and dynamics.
+    """Measure the lag of every joint: stale readings, command hold, dead time and dynamics.
 
     Parameters
     ----------

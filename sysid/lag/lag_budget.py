@@ -1,6 +1,6 @@
-"""Lag budget of one joint: how much is feedback age, command hold and servo.
+"""Lag budget of one joint: how much is stale readings, command hold and servo.
 
-    raw lag = feedback age + command hold (half a loop) + servo lag
+    raw lag = lag of stale readings + command hold (half a loop) + servo lag
     servo lag = dead time + dynamics
 
 `lag_budget` measures the raw lag and its three parts; the dead time needs a model
@@ -89,8 +89,9 @@ class LagBudget(Result):
     lag_s : Interval
         From the held command to the motion: the servo's lag at the gain, amplitude and load of
         this recording. Of tones the phase delay, of other motion as in `sysid.lag.time_shift`.
-    feedback_age_s, command_hold_s : float
-        What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`. The hold is half a
+    stale_lag_s, command_hold_s : float
+        What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`. Stale readings add
+        less to the lag of a fast tone than their mean age (`feedback.mean_age_s`). The hold is half a
         loop, and with tones what readings at one phase of the loop see of the staircase's ripple.
     dead_time_s : Interval or None
         Part of `lag_s` before the servo moves; None if no model was fitted.
@@ -112,7 +113,7 @@ class LagBudget(Result):
     raw_lag_s: Interval
     fresh_lag_s: Interval
     lag_s: Interval
-    feedback_age_s: float
+    stale_lag_s: float
     command_hold_s: float
     dead_time_s: Interval | None = None
     feedback: PollLattice
@@ -162,7 +163,7 @@ class LagBudget(Result):
             )
         return (
             f"raw lag {1e3 * self.raw_lag_s.value:.0f} ms = "
-            f"{1e3 * self.feedback_age_s:.0f} ms feedback age + "
+            f"{1e3 * self.stale_lag_s:.0f} ms stale readings + "
             f"{1e3 * self.command_hold_s:.0f} ms command hold + {servo}."
         )
 
@@ -227,7 +228,7 @@ def lag_budget(
         raw_lag_s=raw,
         fresh_lag_s=fresh,
         lag_s=lag,
-        feedback_age_s=raw.value - fresh.value,
+        stale_lag_s=raw.value - fresh.value,
         command_hold_s=fresh.value - lag.value,
         feedback=lattice,
         quantum_rad=quantum(trials),

@@ -78,7 +78,7 @@ _LAG_KINDS = (
     ("command hold", SKY, ""),
     ("dead time", BLUE, ""),
     ("dynamics", GREEN, ""),
-    ("feedback age (bus poll)", ORANGE, "///"),
+    ("stale readings (bus poll)", ORANGE, "///"),
 )
 
 
@@ -86,7 +86,7 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
     """Draw one joint's bar; returns where it ends [ms]."""
     raw, dead_time = 1e3 * part.raw_lag_s.value, part.dead_time_s
     assert dead_time is not None
-    lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.feedback_age_s)
+    lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.stale_lag_s)
     left = 0.0
     for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
         shown = max(1e3 * length, 0.0)
@@ -262,7 +262,7 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     def gathered(name: str) -> NDArray:
         return np.concatenate([getattr(t, name) for t in found])
 
-    age = 1e3 * result.lag.feedback_age_s
+    age = 1e3 * result.lag.stale_lag_s
     over_speed.plot(
         gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
         label=f"all rows at their own time (dashed: speed × {age:.0f} ms)",

@@ -41,13 +41,14 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     columns = (
         KEY,
         number("raw, ms", "raw_lag_s", 1, _MS),
-        number("= feedback age", "feedback_age_s", 1, _MS),
+        number("= stale readings", "stale_lag_s", 1, _MS),
         number("+ command hold", "command_hold_s", 1, _MS),
         _ranged(f"+ servo lag {_LEVEL}", "lag_s", 1, _MS),
         _ranged(f"of it dead time {_LEVEL}", "dead_time_s", 1, _MS),
         number("and dynamics", "dynamics_s", 1, _MS),
         number("poll, ms", "feedback_poll_period_s", 2, _MS),
         number("lost polls, %", "feedback_loss", 0, 100.0),
+        number("mean feedback age, ms", "feedback_mean_age_s", 1, _MS),
     )
     return Table("lag_budget", "Lag budget", columns, tuple(rows))
 

@@ -35,7 +35,7 @@ def test_delay_json_is_one_object_with_the_documented_keys(capsys):
     joint = json.loads(out)["joints"]["LF_hip"]
     assert code == 0
     assert {
-        "raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s", "dynamics_s", "feedback_age_s",
+        "raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s", "dynamics_s", "stale_lag_s",
         "command_hold_s", "quantum_rad", "offset_rad", "feedback", "by_frequency", "estimators_s",
     } <= set(joint)  # fmt: skip
     assert {"poll_period_s", "loss", "mean_age_s"} <= set(joint["feedback"])

@@ -43,15 +43,15 @@ class Delay:
             terminal.print_json(found)
             return
         budget = terminal.table(
-            "Lag budget, ms: raw = feedback age + command hold + servo lag", "joint", "raw",
-            "feedback age", "command hold", "servo lag", "90 % interval", "of it dead time",
+            "Lag budget, ms: raw = stale readings + command hold + servo lag", "joint", "raw",
+            "stale readings", "command hold", "servo lag", "90 % interval", "of it dead time",
             "90 % interval",
         )  # fmt: skip
         for name, b in found.items():
             dead = b.dead_time_s
             assert dead is not None
             budget.add_row(
-                name, terminal.ms(b.raw_lag_s.value), terminal.ms(b.feedback_age_s),
+                name, terminal.ms(b.raw_lag_s.value), terminal.ms(b.stale_lag_s),
                 terminal.ms(b.command_hold_s), terminal.ms(b.lag_s.value), _ends(b.lag_s),
                 terminal.ms(dead.value), _ends(dead),
             )  # fmt: skip

@@ -35,7 +35,7 @@ def test_the_parts_of_the_budget_are_those_of_the_theory():
     b = lag_budget("LF_hip", tone_trials(0.040, rng), rng)
     age_s = 0.02685 * (0.5 + 0.42 / 0.58)  # mean age of a held reading: T (1/2 + p / (1 - p))
     assert b.command_hold_s == pytest.approx(LOOP_S / 2, abs=2e-4)
-    assert b.feedback_age_s == pytest.approx(age_s, abs=5e-3)
+    assert b.stale_lag_s == pytest.approx(age_s, abs=5e-3)
     assert b.raw_lag_s.value == pytest.approx(0.040 + LOOP_S / 2 + age_s, abs=5e-3)
 
 
@@ -135,7 +135,7 @@ def test_readings_that_are_never_held_are_dated_to_the_read():
     lattice = find_poll_lattice(trials, np.random.default_rng(0))
     assert lattice.kind == "every read"
     np.testing.assert_array_equal(readings(trials[0], lattice).time_s, trials[0].read_time_s)
-    assert lag_budget("LF_hip", trials, rng).feedback_age_s == pytest.approx(0.0, abs=1e-3)
+    assert lag_budget("LF_hip", trials, rng).stale_lag_s == pytest.approx(0.0, abs=1e-3)
 
 
 def test_fresh_readings_are_dated_to_the_poll_that_made_them():

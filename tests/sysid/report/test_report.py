@@ -96,7 +96,7 @@ def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
     )  # fmt: skip
     lag = LagBudget(
         joint=joint, raw_lag_s=interval(0.081), fresh_lag_s=interval(0.0535),
-        lag_s=interval(0.044), feedback_age_s=0.0275, command_hold_s=0.0095,
+        lag_s=interval(0.044), stale_lag_s=0.0275, command_hold_s=0.0095,
         dead_time_s=Interval(0.024, 0.0205, 0.0275), feedback=LATTICE, quantum_rad=np.pi / 550,
         offset_rad=0.01, by_frequency=tones,
         estimators_s={
@@ -232,7 +232,7 @@ def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
 
 def test_the_finding_says_what_the_raw_lag_is_made_of(page):
     assert (
-        "raw lag 81 ms = 28 ms feedback age + 10 ms command hold + 44 ms servo "
+        "raw lag 81 ms = 28 ms stale readings + 10 ms command hold + 44 ms servo "
         "(24 ms dead time + 20 ms dynamics)." in page.text
     )
 
@@ -240,7 +240,7 @@ def test_the_finding_says_what_the_raw_lag_is_made_of(page):
 def test_the_parts_of_the_lag_add_up_to_the_raw_lag():
     lag = result_of().lag
     assert lag.dead_time_s is not None
-    total = lag.command_hold_s + lag.dead_time_s.value + lag.dynamics_s + lag.feedback_age_s
+    total = lag.command_hold_s + lag.dead_time_s.value + lag.dynamics_s + lag.stale_lag_s
     assert total == pytest.approx(lag.raw_lag_s.value)
 
 
@@ -248,7 +248,7 @@ def test_lag_budget_csv_has_the_numbers_of_the_result(written):
     (row,) = rows_of(written, "lag_budget")
     assert row["joint"] == "LF_thigh"
     assert float(row["raw_lag_s"]) == pytest.approx(0.081)
-    assert float(row["feedback_age_s"]) == pytest.approx(0.0275)
+    assert float(row["stale_lag_s"]) == pytest.approx(0.0275)
     assert float(row["dead_time_s_low"]) == pytest.approx(0.0205)
     assert float(row["dynamics_s"]) == pytest.approx(0.020)
     # 20.5 to 27.5 ms in steps of 2 ms, rounded outward
