@@ -21,7 +21,7 @@ import tyro
 import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pupper_sysid.cli.terminal import err, out, print_json
+from pupper_sysid.cli.terminal import err, out, print_json, warn
 from pupper_sysid.cli.user_errors import parse, user_errors
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import plain
@@ -115,7 +115,7 @@ def _run(options: Options, given: list[str]) -> None:
         )
     with _bar() as watch:
         if options.resume:
-            train(folder, None, watch, *_extension(options, given))
+            train(folder, None, watch, *_extension(options, given), lambda text: warn([text]))
         else:
             train(folder, run, watch)
     if ranks.rank > 0:

@@ -102,6 +102,11 @@ class Ranks:
 class Learner:
     """An environment, a policy, a critic and PPO.
 
+    Attributes
+    ----------
+    exact : bool
+        Whether a loaded checkpoint goes on exactly; see `PupperEnv.restore`.
+
     Raises
     ------
     InputError
@@ -151,7 +156,7 @@ class Learner:
         if group:
             self.ppo.broadcast_parameters()
             torch.manual_seed(seed + 1000 * self.ranks.rank)
-        self.iteration = 0
+        self.iteration, self.exact = 0, True
 
     @property
     def actor(self) -> MLPModel:
@@ -254,13 +259,10 @@ class Learner:
             k: v.numpy() if isinstance(v, torch.Tensor) else v
             for k, v in content["environment"].items()
         }
-        differ = sorted(state.keys() ^ self.env.state.keys())
-        if differ:
-            raise InputError(
-                f"{path} does not fit this run's environments ({differ[0]}). Resume with the "
-                "settings of the run."
-            )
-        self.env.restore(state)
+        try:
+            self.exact = self.env.restore(state)
+        except InputError as error:
+            raise InputError(f"{path} does not fit this run's environments: {error}") from error
         hidden = content["hidden"]
         self.actor.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
         self.observations = TensorDict(content["observations"], batch_size=[self.env.num_envs])

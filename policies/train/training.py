@@ -89,6 +89,7 @@ def train(
     watch: Callable[[Progress], None] | None = None,
     iterations: int | None = None,
     minutes: float | None = None,
+    notice: Callable[[str], None] = lambda text: None,
 ) -> Learner:
     """Begin a run in an empty folder, or (with `run` None) resume the one in it.
 
@@ -104,6 +105,8 @@ def train(
         Called after each update.
     iterations, minutes : optional
         New end of a resumed run.
+    notice : callable
+        Called with a sentence where a run does not go on exactly.
 
     Raises
     ------
@@ -115,6 +118,11 @@ def train(
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run
     session = _Session(folder, settings, resumed, watch)
+    if not session.learner.exact and session.ranks.rank == 0:
+        notice(
+            f"{folder} was begun with another model of the robot, by an older version: it goes on "
+            "with the present one, from its networks and poses, not exactly as it would have."
+        )
     with _interruptible() as stop_requested:
         session.learn_first_gait(stop_requested)
         session.improve(stop_requested)

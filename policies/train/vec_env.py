@@ -84,10 +84,19 @@ class WalkingVecEnv:
         """The whole state, for `restore`."""
         return self.env.state | {"past_actions": self._past.copy()}
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go back to a `state`."""
-        self.env.restore(state)
-        self._past[:] = state["past_actions"]
+    def restore(self, state: dict[str, Any]) -> bool:
+        """Go back to a `state`; whether exactly, see `PupperEnv.restore`.
+
+        Raises
+        ------
+        InputError
+            If it is of another number of environments, or of other ones.
+        """
+        own = dict(state)
+        past = own.pop("past_actions", self._past)
+        exact = self.env.restore(own)
+        self._past[:] = past
+        return exact
 
     def _groups(self, observation, privileged, past) -> TensorDict:
         groups = {"policy": observation, "privileged": privileged}

@@ -4,10 +4,17 @@ The physics of `sim.walking.env` without its task: draw robots, place them, step
 state. Arrays are (environments, …) NumPy; joint angles are in the order of `JOINT_NAMES`, absolute.
 Servo delay, gains, limits and friction are MuJoCo's own, so a control step of ten physics steps is
 one call (`Batch.rollout`) without Python inside.
+
+With several threads, many robots are stepped in two parts, one after the other, in a thread that
+holds no lock: while the second part moves, the caller works on the first. The state of each robot
+is the same as in one part, whatever the number of threads.
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +25,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.falls import touches_ground
 from pupper_sysid.sim.robot.mini_pupper import (
     FOOT_RADIUS_M,
     STANDING_HEIGHT_M,
@@ -26,6 +32,7 @@ from pupper_sysid.sim.robot.mini_pupper import (
     limits,
     robot_xml,
 )
+from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.robot.servo_mjcf import (
     BATCH_FIELDS,
     TENDON_FIELDS,
@@ -41,6 +48,10 @@ Array = NDArray[np.float64]
 
 FEET = len(LEGS)
 _TOUCH_S = 0.006  # a foot is down if it was so in the last milliseconds: contacts flicker
+_RECORD = ("qpos", "actuator_force", "sensordata")
+_MANY = 256  # robots from which parts are worth a second call of every NumPy function
+_FIRST_PART = 0.625  # while the rest moves, there is time for what follows on the first part
+
 _THIGHS, _CALVES = np.arange(1, 12, 3), np.arange(2, 12, 3)
 
 
@@ -66,8 +77,10 @@ class RobotBatch:
         MuJoCo's, live: root first, then the joints.
     drawn : dict of str to ndarray, shape (n, 12)
         The servos of each robot, by field of `DelayedPDParameters`.
-    friction : ndarray, shape (n,)
-        Of the feet on the ground.
+    friction, payload_kg : ndarray, shape (n,)
+        Of the feet on the ground; added to the trunk.
+    linked : tuple of int
+        Servos that turn their joint and the one before it.
 
     Raises
     ------
@@ -99,17 +112,10 @@ class RobotBatch:
             name: replace(own, dead_time_s=np.array(longest_s))
             for name, own in servos.nominal().items()
         }
-        self.model = mujoco.MjModel.from_xml_string(
-            robot_xml(
-                longest,
-                config.physics_step_s,
-                config.knee,
-                ground.xml,
-                ground.assets,
-                config.physics,
-                False,
-            )
-        )
+        step_s, knee = config.physics_step_s, config.knee
+        xml = robot_xml(longest, step_s, knee, ground.xml, ground.assets, config.physics, False)
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self._hash = hashlib.sha256(xml.encode()).hexdigest()
         ground.fill(self.model)
         buffer = self.model.actuator_history[:, 0].min() * config.physics_step_s
         if longest_s > buffer:
@@ -140,7 +146,15 @@ class RobotBatch:
         self._bend = self.to_servo(default) - default
         self._warnings = self.batch.warning.copy()
         self.drawn = {f: np.zeros((environments, len(JOINT_NAMES))) for f in servos.value}
-        self.friction = np.zeros(environments)
+        self.friction, self.payload_kg = np.zeros(environments), np.zeros(environments)
+        self.linked: tuple[int, ...] = tuple(on_tendons)
+        cut = round(_FIRST_PART * environments)
+        whole = self.batch.nthread == 1 or environments < _MANY
+        self._parts = [slice(0, environments)] if whole else [slice(0, cut), slice(cut, environments)]
+        everyone = np.arange(environments, dtype=np.int32)
+        self._ids = [None if whole else everyone[part] for part in self._parts]
+        self._records: list[dict[Any, Array]] = [{} for _ in self._parts]
+        self._worker = None if whole else ThreadPoolExecutor(1, "physics")
 
     # ------------------------------------------------------------------------- reading
 
@@ -154,40 +168,11 @@ class RobotBatch:
         """Joint velocities [rad/s], live, shape (n, 12)."""
         return self.qvel[:, 6:]
 
-    @property
-    def rate(self) -> Array:
-        """Angular velocity of the trunk in its own frame [rad/s], live, shape (n, 3)."""
-        return self.qvel[:, 3:6]
-
-    @property
-    def gravity(self) -> Array:
-        """Direction of gravity in the trunk's frame, shape (n, 3)."""
-        w, x, y, z = self.qpos[:, 3:7].T
-        return -np.stack(
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1
-        )
-
-    @property
-    def velocity(self) -> Array:
-        """Velocity of the trunk in its own frame [m/s], shape (n, 3)."""
-        w, x, y, z = self.qpos[:, 3:7].T
-        a, b, c = self.qvel[:, :3].T
-        # rotate by the inverse: v + w t + t × q with t = 2 (v × q), by hand: np.cross is slow
-        t, u, v = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
-        return np.stack(
-            [a + w * t + u * z - v * y, b + w * u + v * x - t * z, c + w * v + t * y - u * x],
-            axis=1,
-        )
-
-    def feet(self) -> tuple[Array, Array]:
-        """Feet along the ground, (n, 4, 2), and heights of the soles, (n, 4) [m]; one step old."""
-        at = self._site_position[:, self._feet_sites]
+    def feet(self, rows: slice | NDArray[np.intp] = slice(None)) -> tuple[Array, Array]:
+        """Feet along the ground, (k, 4, 2), and heights of the soles, (k, 4) [m]; one step old."""
+        at = self._site_position[rows][:, self._feet_sites]
         height = at[..., 2] - FOOT_RADIUS_M - self.ground.height(at[..., 0], at[..., 1])
-        return at[..., :2].copy(), height
-
-    def touching(self) -> NDArray[np.bool_]:
-        """Whether more than the feet touches the ground, shape (n,)."""
-        return touches_ground(self.qpos, self.gravity, self.ground)
+        return at[..., :2], height
 
     def to_servo(self, joints: Array) -> Array:
         """Servo angles of joint angles (..., 12): servo 3 holds thigh + calf behind a linkage."""
@@ -207,42 +192,49 @@ class RobotBatch:
 
     # ------------------------------------------------------------------------- stepping
 
-    def step(self, target: Array) -> tuple[Array, Array, Array]:
+    def step(self, target: Array) -> Iterator[Moved]:
         """Let one control step pass under joint set-points [rad], shape (n, 12).
 
-        Returns
-        -------
-        position, load : ndarray, shape (n, physics steps + 1, 12)
-            Joint angles [rad] and servo torques [N·m] at the start and after each physics step.
-        touch : ndarray, shape (n, 4)
-            Largest force on each foot in the last 6 ms [N].
+        The physics runs from this call on; parts of the robots are given as they are done, and must
+        all be taken before anything else is called here. The state of those given can be read and
+        written meanwhile.
         """
-        config = self.config
-        start = self.joints[:, None].copy()
-        control = None
+        start, control = self.joints.copy(), None
         if self.servo_model is None:
             self._control[:] = self.to_servo(target)
         else:
-            before = self._control.copy()
-            predicted = np.asarray(self.servo_model.step(self.to_servo(target) - self._bend), float)
-            joints = self.from_servo(predicted + self._bend)
-            after = self.to_servo(np.clip(joints, self._low, self._high))
-            share = np.arange(1, config.substeps + 1)[:, None] / config.substeps
-            control = before[:, None] + share * (after - before)[:, None]
-        found = self.batch.rollout(
-            config.substeps, control, record=("qpos", "actuator_force", "sensordata")
+            control = self._predicted(self.servo_model, target)
+        if self._worker is None:
+            return iter([self._rollout(0, start, control)])
+        jobs = [
+            self._worker.submit(self._rollout, i, start, control) for i in range(len(self._parts))
+        ]
+        return _results(jobs)
+
+    def _rollout(self, part: int, start: Array, control: Array | None) -> Moved:
+        """The physics of one part."""
+        rows, records = self._parts[part], self._records[part]
+        own = None if control is None else control[rows]
+        found = self._records[part] = self.batch.rollout(
+            self.config.substeps, own, record=_RECORD, ids=self._ids[part], out=records
         )
-        position = np.concatenate([start, found["qpos"][:, :, 7:]], axis=1)
-        force = found["actuator_force"]
-        load = np.concatenate([force[:, :1], force], axis=1)
         touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
-        return position, load, touch
+        return Moved(rows, start[rows], found["qpos"], found["actuator_force"], touch)
+
+    def _predicted(self, model: JointArrays, target: Array) -> Array:
+        """Controls of each physics step, from the positions that a servo model predicts."""
+        before, steps = self._control.copy(), self.config.substeps
+        predicted = np.asarray(model.step(self.to_servo(target) - self._bend), float)
+        joints = self.from_servo(predicted + self._bend)
+        after = self.to_servo(np.clip(joints, self._low, self._high))
+        share = np.arange(1, steps + 1)[:, None] / steps
+        return before[:, None] + share * (after - before)[:, None]
 
     def broken(self) -> NDArray[np.bool_]:
         """Robots that MuJoCo has reset since the last call, because they became NaN."""
         now = self.batch.warning
         raised = (now != self._warnings).reshape(self.environments, -1).any(axis=1)
-        raised |= ~np.isfinite(self.batch.state).all(axis=1)
+        raised |= ~np.isfinite(self.qpos.sum(axis=1) + self.qvel.sum(axis=1))
         self._warnings = now.copy()
         return raised
 
@@ -250,16 +242,22 @@ class RobotBatch:
 
     def draw(self, ids: NDArray[np.intp], delay_share: float, rng: np.random.Generator) -> None:
         """Draw servos, friction and payload of some robots; dead times times `delay_share`."""
-        random, f = self.config.randomisation, self._fields
+        random = self.config.randomisation
         drawn = self.servos.draw(len(ids), random.torque_scale, rng)
         drawn["dead_time_s"] = (drawn["dead_time_s"] + self._extra_s[ids, None]) * delay_share
         for name, value in drawn.items():
             self.drawn[name][ids] = value
-        write_servos(f, ids, drawn, self._dof_of, self._tendon_of)
         self.friction[ids] = rng.uniform(*random.friction, len(ids))
-        f["geom_friction"][ids[:, None], self._feet_geoms, 0] = self.friction[ids, None]
-        payload = rng.uniform(*random.payload_kg, len(ids))
-        f["body_mass"][ids, self._trunk] = self.model.body_mass[self._trunk] + payload
+        self.payload_kg[ids] = rng.uniform(*random.payload_kg, len(ids))
+        self._write(ids)
+
+    def _write(self, ids: NDArray[np.intp]) -> None:
+        """Give some robots what was drawn for them."""
+        drawn, fields = {k: v[ids] for k, v in self.drawn.items()}, self._fields
+        write_servos(fields, ids, drawn, self._dof_of, self._tendon_of)
+        fields["geom_friction"][ids[:, None], self._feet_geoms, 0] = self.friction[ids, None]
+        mass = self.model.body_mass[self._trunk] + self.payload_kg[ids]
+        fields["body_mass"][ids, self._trunk] = mass
         self.batch.set_const(ids)
 
     def place(
@@ -314,45 +312,45 @@ class RobotBatch:
     # ------------------------------------------------------------------------- state
 
     @property
-    def state(self) -> dict[str, NDArray]:
+    def state(self) -> dict[str, Any]:
         """Everything that changes, as copies, for an exact restart."""
-        found = {f"batch.{name}": np.array(v, copy=True) for name, v in self._fields.items()}
-        found |= {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
-        found |= {"batch.state": self.batch.state.copy(), "friction": self.friction.copy()}
+        found: dict[str, Any] = {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
+        found |= {"friction": self.friction.copy(), "payload_kg": self.payload_kg.copy()}
+        found |= {"batch.state": self.batch.state.copy()}
+        found |= {"robot": self._hash, "knee": self.config.knee}
         if self.servo_model is not None:
             found |= {f"servo.{k}": v.copy() for k, v in self.servo_model.memory.items()}
         return found
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go back to a `state` exactly.
+    def restore(self, state: dict[str, Any]) -> bool:
+        """Go back to a `state`; whether what follows is exactly what would have followed.
+
+        It is not where the state is of another model of the robot, from an older version.
 
         Raises
         ------
         InputError
             If it is of another number of robots, or of another robot.
         """
-        if state["batch.state"].shape != self.batch.state.shape:
+        shape, own = state["batch.state"].shape, self.batch.state.shape
+        if shape != own or state["knee"] != self.config.knee:
             raise InputError(
-                f"The saved environments have state {state['batch.state'].shape}, these "
-                f"{self.batch.state.shape}. Resume with the settings of the run."
+                f"The saved environments have a knee with {state['knee']} and state {shape}, these "
+                f"{self.config.knee} and {own}. Resume with the settings of the run."
             )
-        for name, value in self._fields.items():
-            value[:] = state[f"batch.{name}"]
-        self.batch.set_const()
+        for k, v in self.drawn.items():
+            v[:] = state[f"drawn.{k}"]
+        self.friction[:], self.payload_kg[:] = state["friction"], state["payload_kg"]
+        self._write(np.arange(self.environments))
         self.batch.state[:] = state["batch.state"]
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
         # forward changes what warm-starts the solver
         self.batch.state[:] = state["batch.state"]
-        for k, v in self.drawn.items():
-            name = (
-                "drawn.delay_s" if k == "dead_time_s" and "drawn.delay_s" in state else f"drawn.{k}"
-            )
-            v[:] = state[name]  # older checkpoints have the old name of the dead time
-        self.friction[:] = state["friction"]
         if self.servo_model is not None:
             for k, v in self.servo_model.memory.items():
                 v[:] = state[f"servo.{k}"]
         self._warnings = self.batch.warning.copy()
+        return state["robot"] == self._hash
 
     def _check_servo_model(self, model: JointArrays) -> None:
         if model.joints != JOINT_NAMES:
@@ -368,3 +366,12 @@ class RobotBatch:
         """Highest ground under a robot at `place`, shape (n,) [m]."""
         x, y = np.meshgrid([-0.1, 0.0, 0.1], [-0.1, 0.0, 0.1])
         return self.ground.height(place[:, :1] + x.ravel(), place[:, 1:] + y.ravel()).max(axis=1)
+
+
+def _results(jobs: list[Future[Moved]]) -> Iterator[Moved]:
+    """Results in order; waits for all, also if the caller gives up."""
+    try:
+        for job in jobs:
+            yield job.result()
+    finally:
+        wait(jobs)

@@ -17,13 +17,22 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.joint_arrays import JointArrays
+from pupper_sysid.sim.robot.falls import touches_ground
 from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
+from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity
 from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking import rewards as walking_rewards
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.held_readings import HeldReadings
-from pupper_sysid.sim.walking.observation import FALLEN_TILT, VELOCITY_STEPS, observed
+from pupper_sysid.sim.walking.observation import (
+    FALLEN_TILT,
+    OBSERVATION_SIZE,
+    VELOCITY_STEPS,
+    noise_of,
+    observed,
+)
+from pupper_sysid.sim.walking.older_states import of_today
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
 
@@ -37,6 +46,16 @@ _ARRAYS = (
     "_until_push", "_air", "_contact", "_last_air", "_last_contact", "_foot_at", "_seen",
     "_average",
 )  # fmt: skip
+
+
+_PRIVILEGED = 50
+_FACTS = {
+    "linear_velocity": 3, "angular_velocity": 3, "gravity": 3, "position_relative": 12,
+    "velocity": 12, "acceleration": 12, "torque": 12, "air_s": FEET, "contact_s": FEET,
+    "last_air_s": FEET, "last_contact_s": FEET, "foot_height_m": FEET, "foot_speed_m_s": FEET,
+    "stride_velocity": 3,
+}  # fmt: skip
+"""Columns of what `_take` fills in."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +86,22 @@ class StepResult:
     terms: dict[str, Array]
     terminal: dict[str, NDArray]
     facts: walking_rewards.Step
+
+
+@dataclass(frozen=True)
+class _Now:
+    """A step that is going on: what was drawn for it, and what its parts fill in."""
+
+    velocity_before: Array
+    chances: Array
+    noise: NDArray[np.float32] | None
+    pushed: NDArray[np.intp]
+    push: Array
+    facts: dict[str, Any]
+    terms: dict[str, Array]
+    observation: NDArray[np.float32]
+    privileged: NDArray[np.float32]
+    fallen: NDArray[np.bool_]
 
 
 class PupperEnv:
@@ -153,8 +188,9 @@ class PupperEnv:
         self.trot = config.trot
         n = environments
         self._readings = HeldReadings(
-            servos.feedback, n, config.physics_step_s, generator([seed, 2], twins)
-        )
+            servos.feedback, n, config.physics_step_s, generator([seed, 2], twins),
+            self.robots.linked,
+        )  # fmt: skip
         self.nan_resets = 0
         self.steps = 0
         self.level = config.curriculum.level(0)
@@ -170,7 +206,8 @@ class PupperEnv:
         self._last_air, self._last_contact = zeros(FEET), zeros(FEET)
         self._foot_at = zeros(FEET, 2)
         self._average = zeros(3)  # velocity over about a stride
-        self._seen = zeros(VELOCITY_STEPS + 1, 12)  # readings, newest first
+        # readings in turn, the newest where `steps` says
+        self._seen = np.zeros((VELOCITY_STEPS + 1, n, 12))
         self.reset()
 
     # ------------------------------------------------------------------------- public
@@ -185,20 +222,12 @@ class PupperEnv:
 
         Draws noise, but does not let time pass.
         """
-        config, robots = self.config.observation, self.robots
-        blind = np.zeros((self.environments, 3))
-        span = VELOCITY_STEPS * self.config.control_step_s
-        seen = [
-            robots.velocity if config.base_velocity == "true" else blind,
-            robots.rate,
-            robots.gravity,
-            self.command,
-            self._seen[:, 0] - self.default,
-            (self._seen[:, 0] - self._seen[:, -1]) / span,
-            self._readings.load,
-            self.action,
-        ]
-        return observed(config, seen, self.rng), self._privileged()
+        n = self.environments
+        observation = np.empty((n, OBSERVATION_SIZE), np.float32)
+        privileged = np.empty((n, _PRIVILEGED), np.float32)
+        noise = noise_of(self.config.observation, n, self.rng)
+        self._look(slice(None), noise, observation, privileged)
+        return observation, privileged
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Let every robot act for one control step.
@@ -208,46 +237,45 @@ class PupperEnv:
         action : ndarray, shape (n, 12)
             Outputs of the policy: set-point = default pose + scale · action, within joint limits.
         """
-        config, span = self.config, self.config.control_step_s
+        config = self.config
         self.steps += 1
         self.earlier_action, self.last_action = self.last_action, self.action
-        self.action = np.asarray(action, float).copy()
-        target = np.clip(self.default + self._scale() * self.action, self._low, self._high)
-        velocity = self.robots.joint_velocity.copy()
-        position, load, touch = self.robots.step(target)
-        self._readings.advance(self.robots.to_servo(position), load)
-        self._seen = np.concatenate([self._read()[:, None], self._seen[:, :-1]], axis=1)
-        self.episode_step += 1
-        contact, fallen = self._contacts(touch)
-        facts = self._step_facts(velocity, load[:, -1], contact)
+        self.action = np.array(action, float)
+        target = self.action * self._scale()
+        target += self.default
+        np.clip(target, self._low, self._high, out=target)
+        before = self.robots.joint_velocity.copy()
+        moving = self.robots.step(target)
+        # what does not need the new state is done while it is computed
+        now = self._begin(before)
+        for moved in moving:
+            self._take(moved, now)
         broken = self.robots.broken()
-        self.nan_resets += int(broken.sum())
-        terms = walking_rewards.weighted(facts, config.rewards, self._easy(self.level))
-        terms = {k: v * span for k, v in terms.items()}
         if broken.any():
-            terms = {k: np.where(broken, 0.0, v) for k, v in terms.items()}
-        reward = np.sum(list(terms.values()), axis=0)
-        away = np.abs(self.robots.qpos[:, :2]).max(axis=1)
+            self.nan_resets += int(broken.sum())
+            for term in now.terms.values():
+                term[broken] = 0.0
+        reward = np.sum(list(now.terms.values()), axis=0)
         timed_out = self.episode_step >= config.episode_steps
-        timed_out |= away > self.ground.half_size_m - _EDGE_M
-        timed_out &= ~(fallen | broken)
-        done = fallen | broken | timed_out
-        self._until_command -= span
-        due = np.flatnonzero(self._until_command <= 0)
-        if len(due):
-            self._draw_commands(due)
-        self._push(span)
+        if np.isfinite(self.ground.half_size_m):
+            away = np.abs(self.robots.qpos[:, :2]).max(axis=1)
+            timed_out |= away > self.ground.half_size_m - _EDGE_M
+        timed_out &= ~(now.fallen | broken)
+        done = now.fallen | broken | timed_out
         self.level = config.curriculum.level(self.steps)
         late = np.flatnonzero(timed_out)
         terminal: dict[str, NDArray] = {"ids": late}
         if len(late):
-            observation, privileged = self.observe()
-            terminal |= {"observation": observation[late], "privileged": privileged[late]}
+            terminal |= {"observation": now.observation[late], "privileged": now.privileged[late]}
         over = np.flatnonzero(done)
         if len(over):
             self._restart(over)
-        observation, privileged = self.observe()
-        return StepResult(observation, privileged, reward, done, timed_out, terms, terminal, facts)
+            noise = None if now.noise is None else now.noise[over]
+            now.observation[over], now.privileged[over] = self._look(over, noise)
+        facts = walking_rewards.Step(**now.facts)
+        return StepResult(
+            now.observation, now.privileged, reward, done, timed_out, now.terms, terminal, facts
+        )
 
     def set_command(self, command: NDArray[np.floating]) -> None:
         """Give all robots a command, shape (3,) or (n, 3), until the end of their episodes."""
@@ -257,7 +285,7 @@ class PupperEnv:
     @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, as arrays and strings; `restore` takes it back exactly."""
-        found: dict[str, Any] = dict(self.robots.state)
+        found = self.robots.state
         found |= {f"readings.{k}": v.copy() for k, v in self._readings.state.items()}
         found |= {name: getattr(self, name).copy() for name in _ARRAYS}
         found["counters"] = np.array([self.nan_resets, self.steps])
@@ -265,15 +293,21 @@ class PupperEnv:
         found["rng"] = json.dumps([rng.bit_generator.state for rng in rngs])
         return found
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Any]) -> bool:
         """Go back to a `state` of an environment with the same settings.
+
+        Returns whether what follows is exactly what would have followed; it is not where an older
+        version wrote the state, with another model of the robot.
 
         Raises
         ------
         InputError
             If it is of another number of environments or another robot.
         """
-        self.robots.restore(state)
+        state = of_today(state, VELOCITY_STEPS + 1)
+        if differ := sorted(state.keys() ^ self.state.keys()):
+            raise InputError(f"they differ in {differ[0]}. Resume with the settings of the run.")
+        exact = self.robots.restore(state)
         for k, v in self._readings.state.items():
             v[:] = state[f"readings.{k}"]
         for name in _ARRAYS:
@@ -282,48 +316,100 @@ class PupperEnv:
         for rng, own in zip((self.rng, self._readings.rng), json.loads(state["rng"]), strict=True):
             rng.bit_generator.state = own
         self.level = self.config.curriculum.level(self.steps)
+        return exact
 
     # ------------------------------------------------------------------------- one step
 
-    def _contacts(self, touch: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which feet are on the ground, and which robots have fallen."""
-        contact = touch > _FOOT_N
-        span = self.config.control_step_s
-        landed, lifted = contact & (self._air > 0), ~contact & (self._contact > 0)
-        self._last_air = np.where(landed, self._air, self._last_air)
-        self._last_contact = np.where(lifted, self._contact, self._last_contact)
-        self._air = np.where(contact, 0.0, self._air + span)
-        self._contact = np.where(contact, self._contact + span, 0.0)
-        return contact, self.robots.touching() | (self.robots.gravity[:, 2] > -FALLEN_TILT)
-
-    def _step_facts(
-        self, velocity_before: Array, torque: Array, contact: NDArray[np.bool_]
-    ) -> walking_rewards.Step:
-        robots = self.robots
-        at, height = robots.feet()
-        speed = np.linalg.norm(at - self._foot_at, axis=-1) / self.config.control_step_s
-        self._foot_at = at
-        velocity = robots.velocity
-        now = np.column_stack([velocity[:, :2], robots.rate[:, 2]])
-        share = self.config.control_step_s / _STRIDE_S
-        self._average = self._average + share * (now - self._average)
-        # copies: robots whose episode ends in this step are moved before the facts are read
-        return walking_rewards.Step(
-            self.command.copy(), velocity, robots.rate.copy(), robots.gravity,
-            robots.joints - self.default, robots.joint_velocity.copy(),
-            (robots.joint_velocity - velocity_before) / self.config.control_step_s, torque,
-            self.action.copy(), self.last_action.copy(), self.earlier_action.copy(), contact,
-            self._air.copy(), self._contact.copy(), self._last_air.copy(),
-            self._last_contact.copy(), height, speed, self._average.copy(),
+    def _begin(self, velocity_before: Array) -> _Now:
+        """All of a step that its physics does not decide."""
+        n, config, span = self.environments, self.config, self.config.control_step_s
+        chances = self._readings.chances(config.substeps)
+        facts: dict[str, Any] = {
+            "command": self.command.copy(), "action": self.action.copy(),
+            "last_action": self.last_action.copy(), "earlier_action": self.earlier_action.copy(),
+        }  # fmt: skip
+        facts |= {name: np.empty((n, size)) for name, size in _FACTS.items()}
+        facts["contact"] = np.empty((n, FEET), bool)
+        self.episode_step += 1
+        self._until_command -= span
+        due = np.flatnonzero(self._until_command <= 0)
+        if len(due):
+            self._draw_commands(due)
+        self._until_push -= span
+        pushed, most = np.flatnonzero(self._until_push <= 0), config.randomisation.push_m_s
+        push = np.zeros((0, 2))
+        if len(pushed):
+            push = self.rng.uniform(-most, most, (len(pushed), 2))
+            pause = self.rng.uniform(*config.randomisation.push_every_s, len(pushed))
+            self._until_push[pushed] = pause
+        noise = noise_of(config.observation, n, self.rng)
+        return _Now(
+            velocity_before, chances, noise, pushed if most > 0 else pushed[:0], push, facts, {},
+            np.empty((n, OBSERVATION_SIZE), np.float32), np.empty((n, _PRIVILEGED), np.float32),
+            np.empty(n, bool),
         )  # fmt: skip
 
-    def _push(self, span: float) -> None:
-        most = self.config.randomisation.push_m_s
-        self._until_push -= span
-        due = np.flatnonzero(self._until_push <= 0)
-        if len(due) and most > 0:
-            self.robots.push(due, self.rng.uniform(-most, most, (len(due), 2)))
-        self._until_push[due] = self.rng.uniform(*self.config.randomisation.push_every_s, len(due))
+    def _take(self, moved: Moved, now: _Now) -> None:
+        """What follows from the physics, for the robots that have moved."""
+        robots, rows, span = self.robots, moved.rows, self.config.control_step_s
+        qpos, qvel = robots.qpos[rows].copy(), robots.qvel[rows].copy()
+        self._readings.advance(moved.start, moved.qpos, moved.load, now.chances, rows)
+        self._seen[self.steps % len(self._seen), rows] = self._read(rows)
+        gravity, velocity = gravity_direction(qpos), own_velocity(qpos, qvel)
+        fallen = gravity[:, 2] > -FALLEN_TILT
+        fallen |= touches_ground(qpos, gravity, self.ground)
+        now.fallen[rows] = fallen
+        facts = {name: value[rows] for name, value in now.facts.items()}
+        np.greater(moved.touch, _FOOT_N, out=facts["contact"])
+        self._count_swings(rows, facts["contact"])
+        at, facts["foot_height_m"][:] = robots.feet(rows)
+        foot_speed = at - self._foot_at[rows]
+        self._foot_at[rows] = at
+        foot_speed *= foot_speed
+        np.sqrt(foot_speed.sum(axis=-1), out=facts["foot_speed_m_s"])
+        facts["foot_speed_m_s"] /= span
+        average = self._average[rows]
+        average[:, :2] += span / _STRIDE_S * (velocity[:, :2] - average[:, :2])
+        average[:, 2] += span / _STRIDE_S * (qvel[:, 5] - average[:, 2])
+        facts["stride_velocity"][:] = average
+        facts["linear_velocity"][:], facts["gravity"][:] = velocity, gravity
+        facts["angular_velocity"][:], facts["torque"][:] = qvel[:, 3:6], moved.load[:, -1]
+        np.subtract(qpos[:, 7:], self.default, out=facts["position_relative"])
+        facts["velocity"][:] = qvel[:, 6:]
+        np.subtract(qvel[:, 6:], now.velocity_before[rows], out=facts["acceleration"])
+        facts["acceleration"] /= span
+        for name in ("air_s", "contact_s", "last_air_s", "last_contact_s"):
+            facts[name][:] = getattr(self, f"_{name.removesuffix('_s')}")[rows]
+        step = walking_rewards.Step(**facts)
+        terms = walking_rewards.weighted(step, self.config.rewards, self._easy(self.level))
+        for name, term in terms.items():
+            whole = now.terms.setdefault(name, np.empty(self.environments))
+            np.multiply(term, span, out=whole[rows])
+        first, last = np.searchsorted(now.pushed, (rows.start, rows.stop))
+        if last > first:
+            ids = now.pushed[first:last]
+            robots.push(ids, now.push[first:last])
+            qvel = robots.qvel[rows]
+            velocity = own_velocity(qpos, qvel)
+        noise = None if now.noise is None else now.noise[rows]
+        self._look(
+            rows,
+            noise,
+            now.observation[rows],
+            now.privileged[rows],
+            (qpos, qvel, gravity, velocity),
+        )
+
+    def _count_swings(self, rows: slice, contact: NDArray[np.bool_]) -> None:
+        """Times that feet have been in the air and on the ground."""
+        span = self.config.control_step_s
+        air, stance = self._air[rows], self._contact[rows]
+        np.copyto(self._last_air[rows], air, where=contact & (air > 0))
+        np.copyto(self._last_contact[rows], stance, where=~contact & (stance > 0))
+        air += span
+        stance += span
+        air[contact] = 0.0
+        stance[~contact] = 0.0
 
     # ------------------------------------------------------------------------- a new episode
 
@@ -333,11 +419,11 @@ class PupperEnv:
         start, speed = self._draw_pose(ids)
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
         self._readings.reset(ids, self.robots.to_servo(start))
-        self._seen[ids] = self._read()[ids][:, None]
-        self._average[ids] = np.column_stack(
-            [self.robots.velocity[ids, :2], self.robots.rate[ids, 2]]
-        )
-        self._foot_at[ids] = self.robots.feet()[0][ids]
+        self._seen[:, ids] = self._read(ids)
+        qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
+        self._average[ids, :2] = own_velocity(qpos, qvel)[:, :2]
+        self._average[ids, 2] = qvel[:, 5]
+        self._foot_at[ids] = self.robots.feet(ids)[0]
         self._until_push[ids] = self.rng.uniform(*self.config.randomisation.push_every_s, len(ids))
         for times in (self._air, self._contact, self._last_air, self._last_contact):
             times[ids] = 0.0
@@ -368,24 +454,52 @@ class PupperEnv:
 
     # ------------------------------------------------------------------------- what is seen
 
-    def _privileged(self) -> NDArray[np.float32]:
-        """The truth: what a critic in the simulator may know."""
-        robots = self.robots
-        x, y, z = robots.qpos[:, :3].T
-        left = 1 - self.episode_step / self.config.episode_steps
-        return np.concatenate(
-            [
-                robots.velocity, robots.joints - self.default, 0.1 * robots.joint_velocity,
-                (z - self.ground.height(x, y))[:, None] * 10, self._air,
-                self._contact.clip(0, 1), robots.friction[:, None],
-                robots.drawn["dead_time_s"] * 10, left[:, None],
-            ],
-            axis=1, dtype=np.float32,
-        )  # fmt: skip
+    def _look(
+        self,
+        rows: slice | NDArray[np.intp],
+        noise: NDArray[np.float32] | None,
+        observation: NDArray[np.float32] | None = None,
+        privileged: NDArray[np.float32] | None = None,
+        state: tuple[Array, Array, Array, Array] | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Write the observation of some robots, and the truth: what a critic may know.
 
-    def _read(self) -> Array:
+        `state` is qpos, qvel, gravity and velocity, where they are known.
+        """
+        if state is None:
+            qpos, qvel = self.robots.qpos[rows], self.robots.qvel[rows]
+            state = qpos, qvel, gravity_direction(qpos), own_velocity(qpos, qvel)
+        qpos, qvel, gravity, velocity = state
+        true, newest = self.config.observation.base_velocity == "true", self.steps % len(self._seen)
+        angle = self._seen[newest, rows]
+        moved = angle - self._seen[(newest + 1) % len(self._seen), rows]
+        moved /= VELOCITY_STEPS * self.config.control_step_s
+        observation = observed(
+            [
+                velocity if true else np.zeros((len(qpos), 3)), qvel[:, 3:6], gravity,
+                self.command[rows], angle - self.default, moved, self._readings.load[rows],
+                self.action[rows],
+            ],
+            noise, observation,
+        )  # fmt: skip
+        x, y, z = qpos[:, :3].T
+        left = 1 - self.episode_step[rows] / self.config.episode_steps
+        if privileged is None:
+            privileged = np.empty((len(qpos), _PRIVILEGED), np.float32)
+        np.concatenate(
+            [
+                velocity, qpos[:, 7:] - self.default, 0.1 * qvel[:, 6:],
+                (z - self.ground.height(x, y))[:, None] * 10, self._air[rows],
+                self._contact[rows].clip(0, 1), self.robots.friction[rows, None],
+                self.robots.drawn["dead_time_s"][rows] * 10, left[:, None],
+            ],
+            axis=1, out=privileged,
+        )  # fmt: skip
+        return observation, privileged
+
+    def _read(self, rows: slice | NDArray[np.intp]) -> Array:
         """Joint angles as the controller reads them."""
-        return self.robots.from_servo(self._readings.position)
+        return self.robots.from_servo(self._readings.position[rows])
 
     def _scale(self) -> float:
         share = self.config.curriculum.action_scale

@@ -30,6 +30,8 @@ class HeldReadings:
     physics_step_s : float
         Time between the positions that `advance` is given [s].
     rng : numpy.random.Generator
+    linked : sequence of int
+        Servos that turn their joint and the one before it, so that they read the sum of both.
 
     Attributes
     ----------
@@ -47,12 +49,17 @@ class HeldReadings:
         environments: int,
         physics_step_s: float,
         rng: np.random.Generator,
+        linked: Sequence[int] = (),
     ):
         self._period = np.array([f.poll_period_s for f in feedback])
         self._loss = np.array([f.loss for f in feedback])
-        self._quantum = np.array([f.quantum_rad for f in feedback])
+        quantum = np.array([f.quantum_rad for f in feedback])
+        # readings without quantisation step are left as they are
+        self._quantum, self._exact = np.where(quantum > 0, quantum, 1.0), quantum <= 0
         self._offset = np.array([f.offset_rad for f in feedback])
-        self._step, self.rng = physics_step_s, rng
+        self._step, self.rng, self._linked = physics_step_s, rng, np.array(linked, int)
+        self._direct = self._period <= 0
+        self._servos = np.arange(len(feedback))
         shape = (environments, len(feedback))
         self._lattice = np.ones(shape)  # period of each robot's rounds
         self._next = np.zeros(shape)  # time until the next poll
@@ -78,50 +85,93 @@ class HeldReadings:
         self.load[ids] = 0.0
         self.age_s[ids] = self._lattice[ids] - self._next[ids]
 
-    def advance(self, position: NDArray[np.float64], load: NDArray[np.float64]) -> None:
-        """Let one control step pass.
+    def chances(self, steps: int) -> NDArray[np.float64]:
+        """Draw what decides losses and jitters of a control step of so many physics steps.
+
+        Shape (environments, rounds, 2, servos): for all robots at once and for all servos, due or
+        not, so that neither the order in which robots are advanced nor their number at a time
+        changes their readings, and twins (`shared_draws`) have the same.
+        """
+        rounds = 0
+        if not self._direct.all():
+            shortest = self._period[~self._direct].min() * (1 - 6 * _DRIFT)
+            rounds = int(steps * self._step / shortest) + 1
+        return self.rng.random((len(self.position), rounds, 2, len(self._period)))
+
+    def advance(
+        self,
+        start: NDArray[np.float64],
+        position: NDArray[np.float64],
+        load: NDArray[np.float64],
+        chances: NDArray[np.float64],
+        rows: slice = slice(None),
+    ) -> None:
+        """Let one control step pass for the robots `rows`, n of them.
 
         Parameters
         ----------
-        position, load : ndarray, shape (environments, physics steps + 1, servos)
-            Angle [rad] and torque [N·m] at the start and after each physics step.
+        start : ndarray, shape (n, servos)
+            Joint angles [rad] before.
+        position : ndarray, shape (n, physics steps, servos or more)
+            After each physics step; the last columns are the joint angles. C-contiguous, as `load`.
+        load : ndarray, shape (n, physics steps, servos)
+            Servo torque [N·m] in each physics step.
+        chances : ndarray, shape (environments, rounds, 2, servos)
+            See `chances`.
+        rows : slice
         """
-        steps = position.shape[1] - 1
-        span = steps * self._step
-        direct = self._period <= 0
+        count, steps, width = position.shape
+        span, servos = steps * self._step, len(self._period)
+        held, torque, age = self.position[rows], self.load[rows], self.age_s[rows]
+        next_, lattice, direct = self._next[rows], self._lattice[rows], self._direct
+        age += span
         if direct.any():
-            self.position[:, direct] = self._reported(position[:, -1])[:, direct]
-            self.load[:, direct], self.age_s[:, direct] = load[:, -1][:, direct], 0.0
-        polled = ~direct
-        self.age_s[:, polled] += span
-        while True:
-            due = polled & (self._next <= span)
-            if not due.any():
-                break
-            row, servo = np.nonzero(due)
-            # for all servos, due or not, so that twins (`shared_draws`) have the same numbers
-            chance = self.rng.random((len(due), 2, due.shape[1]))[row, :, servo].T
-            succeeded = chance[0] >= self._loss[servo]
-            at = self._next[row, servo]
+            now = position[:, -1, width - servos :].copy()
+            now[:, self._linked] += now[:, self._linked - 1]
+            held[:, direct] = self._reported(now)[:, direct]
+            torque[:, direct], age[:, direct] = load[:, -1][:, direct], 0.0
+        # places in the flat arrays, of each robot's and servo's first value
+        first = np.arange(count)[:, None] * steps
+        at, at_load = first * width + (width - servos + self._servos), first * servos + self._servos
+        flat, flat_load = position.reshape(-1), load.reshape(-1)
+        for lost, shifted in chances[rows].transpose(1, 2, 0, 3):
+            due = next_ <= span
+            due &= ~direct
             # a uniform jitter of the same variance stays within bounds
-            jittered = np.clip(at + _JITTER_S * np.sqrt(12) * (chance[1] - 0.5), 0.0, span)
-            row_, servo_, jittered = row[succeeded], servo[succeeded], jittered[succeeded]
-            place = jittered / self._step
-            before = np.minimum(place.astype(int), steps - 1)
+            instant = np.clip(next_ + _JITTER_S * np.sqrt(12) * (shifted - 0.5), 0.0, span)
+            place = instant / self._step
+            before = np.minimum(place.astype(np.intp), steps - 1)
             share = place - before
-            angle = (1 - share) * position[row_, before, servo_]
-            angle += share * position[row_, before + 1, servo_]
-            self.position[row_, servo_] = self._reported(angle, servo_)
-            self.load[row_, servo_] = load[row_, before + 1, servo_]
-            self.age_s[row_, servo_] = span - jittered
-            self._next[row, servo] = at + self._lattice[row, servo]
-        self._next[:, polled] -= span
+            angle = _between(flat, at + before * width, width, start, before, share)
+            own = self._linked
+            if len(own):
+                angle[:, own] += _between(
+                    flat, at[:, own - 1] + before[:, own] * width, width, start[:, own - 1],
+                    before[:, own], share[:, own],
+                )  # fmt: skip
+            read = due & (lost >= self._loss)
+            np.copyto(held, self._reported(angle), where=read)
+            np.copyto(torque, flat_load.take(at_load + before * servos), where=read)
+            np.copyto(age, span - instant, where=read)
+            np.add(next_, lattice, out=next_, where=due)
+        next_ -= span
 
-    def _reported(
-        self, angle: NDArray[np.float64], servo: NDArray[np.intp] | slice = slice(None)
-    ) -> NDArray[np.float64]:
+    def _reported(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """`angle` as the encoder reports it: with its offset, in whole quantisation steps."""
-        quantum = self._quantum[servo]
-        shifted = angle + self._offset[servo]
-        whole = np.round(shifted / np.where(quantum > 0, quantum, 1.0)) * quantum
-        return np.where(quantum > 0, whole, shifted)
+        shifted = angle + self._offset
+        whole = np.rint(shifted / self._quantum) * self._quantum
+        return np.where(self._exact, shifted, whole) if self._exact.any() else whole
+
+
+def _between(
+    flat: NDArray[np.float64],
+    at: NDArray[np.intp],
+    width: int,
+    start: NDArray[np.float64],
+    before: NDArray[np.intp],
+    share: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Values a `share` of a step after step `before`, which end at `at`; `start` is before all."""
+    ends = flat.take(at)
+    begins = np.where(before > 0, flat.take(at - width, mode="clip"), start)
+    return begins + share * (ends - begins)

@@ -42,23 +42,38 @@ VELOCITY_STEPS = 4
 for less."""
 
 
+def noise_of(
+    config: Observation, count: int, rng: np.random.Generator
+) -> NDArray[np.float32] | None:
+    """Draw the noise of `count` observations, shape (count, 60); None if it is off."""
+    if not config.noise:
+        return None
+    noise = rng.random((count, OBSERVATION_SIZE), np.float32)
+    noise *= 2
+    noise -= 1
+    noise *= _NOISE if config.base_velocity == "true" else _NOISE_BLIND
+    return noise
+
+
 def observed(
-    config: Observation, parts: Sequence[NDArray[np.floating]], rng: np.random.Generator
+    parts: Sequence[NDArray[np.floating]],
+    noise: NDArray[np.float32] | None,
+    out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Observations of n robots, shape (n, 60), with noise if it is on.
+    """Observations of n robots, shape (n, 60).
 
     Parameters
     ----------
-    config : Observation
     parts : sequence of ndarray
         True values in the order of `OBSERVATION`, each of shape (n, size of the part).
-    rng : numpy.random.Generator
-        Draws the noise.
+    noise : ndarray of float32, shape (n, 60), or None
+        See `noise_of`.
+    out : ndarray of float32, shape (n, 60), optional
+        Where to write them.
     """
-    whole = np.concatenate(parts, axis=1, dtype=np.float32)
-    if config.noise:
-        noise = rng.random(whole.shape, np.float32)
-        noise *= 2
-        noise -= 1
-        whole += noise * (_NOISE if config.base_velocity == "true" else _NOISE_BLIND)
+    if out is None:
+        out = np.empty((len(parts[0]), OBSERVATION_SIZE), np.float32)
+    whole = np.concatenate(parts, axis=1, out=out)
+    if noise is not None:
+        whole += noise
     return whole

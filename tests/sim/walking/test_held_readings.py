@@ -14,6 +14,12 @@ MEASURED = HeldFeedback(poll_period_s=0.0268, loss=0.42)
 JITTER_S = 0.0008 * np.sqrt(3)  # half width of a uniform jitter of 0.8 ms standard deviation
 
 
+def advance(readings: HeldReadings, position: np.ndarray, load: np.ndarray) -> None:
+    """Positions and loads at the start and after each physics step."""
+    chances = readings.chances(position.shape[1] - 1)
+    readings.advance(position[:, 0], position[:, 1:].copy(), load[:, 1:].copy(), chances)
+
+
 class Bus:
     """`HeldReadings` whose robots move at one constant speed, so that a reading gives its time."""
 
@@ -26,10 +32,9 @@ class Bus:
 
     def step(self) -> None:
         times = self.time + H * np.arange(SUBSTEPS + 1)
-        position = np.broadcast_to(
-            (self.speed * times)[None, :, None], (self.shape[0], SUBSTEPS + 1, self.shape[1])
-        )
-        self.readings.advance(position, 10 * position)
+        robots, servos = self.shape
+        position = np.tile((self.speed * times)[None, :, None], (robots, 1, servos))
+        advance(self.readings, position, 10 * position)
         self.time = times[-1]
 
 
@@ -128,7 +133,7 @@ def test_readings_are_whole_counts_of_the_offset_position():
     readings = HeldReadings((feedback,), 1, H, np.random.default_rng(0))
     readings.reset(np.array([0]), np.array([[0.0]]))
     for position, expected in ((0.0, 0.0), (0.0019, 0.0), (0.0021, 0.01), (-0.0081, -0.01)):
-        readings.advance(np.full((1, 2, 1), position), np.zeros((1, 2, 1)))
+        advance(readings, np.full((1, 2, 1), position), np.zeros((1, 2, 1)))
         assert readings.position[0, 0] == pytest.approx(expected, abs=1e-12)
     readings.reset(np.array([0]), np.array([[0.052]]))
     assert readings.position[0, 0] == pytest.approx(0.06)  # 0.055 rounds to the even count
@@ -138,7 +143,7 @@ def test_each_servo_has_its_own_feedback():
     direct, slow = HeldFeedback(offset_rad=0.5), HeldFeedback(poll_period_s=10.0)
     readings = HeldReadings((direct, slow), 50, H, np.random.default_rng(0))
     readings.reset(np.arange(50), np.zeros((50, 2)))
-    readings.advance(np.full((50, SUBSTEPS + 1, 2), 1.0), np.zeros((50, SUBSTEPS + 1, 2)))
+    advance(readings, np.full((50, SUBSTEPS + 1, 2), 1.0), np.zeros((50, SUBSTEPS + 1, 2)))
     np.testing.assert_allclose(readings.position[:, 0], 1.5)
     # of 50 robots polled every 10 s, hardly any in 20 ms
     assert (readings.position[:, 1] == 0.0).mean() > 0.9
@@ -182,3 +187,35 @@ def test_a_copied_state_reads_on_as_the_original():
     bus.readings.rng.bit_generator.state, bus.time = random, time
     bus.step()
     np.testing.assert_array_equal(bus.readings.position, first)
+
+
+def test_a_linked_servo_reads_the_sum_of_its_joint_and_the_one_before():
+    feedback, rng = HeldFeedback(poll_period_s=0.006), np.random.default_rng(0)
+    for each in (feedback, HeldFeedback()):
+        servos = HeldReadings((each,) * 3, 20, H, np.random.default_rng(0))
+        joints = HeldReadings((each,) * 3, 20, H, np.random.default_rng(0), linked=(2,))
+        for readings in (servos, joints):
+            readings.reset(np.arange(20), np.zeros((20, 3)))
+        for _ in range(5):
+            joint = rng.standard_normal((20, SUBSTEPS + 1, 3))
+            servo = joint.copy()
+            servo[..., 2] += joint[..., 1]
+            advance(servos, servo, servo)
+            advance(joints, joint, servo)
+        np.testing.assert_allclose(joints.position, servos.position, atol=1e-12)
+
+
+def test_robots_that_are_advanced_one_after_the_other_read_as_those_advanced_at_once():
+    rng, found = np.random.default_rng(0), []
+    position, load = rng.standard_normal((2, 3, 9, SUBSTEPS, 12))
+    for parts in ([slice(None)], [slice(0, 5), slice(5, 9)], [slice(5, 9), slice(0, 5)]):
+        readings = HeldReadings((MEASURED,) * 12, 9, H, np.random.default_rng(1))
+        for i in range(3):
+            chances, start = readings.chances(SUBSTEPS), position[i - 1][:, -1]
+            for part in parts:
+                own = (start[part], position[i][part], load[i][part])
+                readings.advance(*own, chances, part)
+        found.append({k: v.copy() for k, v in readings.state.items()})
+    for other in found[1:]:
+        for name, value in found[0].items():
+            np.testing.assert_array_equal(other[name], value)

@@ -1,0 +1,58 @@
+"""What the physics did in one control step, and quantities of the trunk in its own frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """One control step of some robots, k of them. Arrays are overwritten by the next step.
+
+    Attributes
+    ----------
+    rows : slice
+        Which robots.
+    start : ndarray, shape (k, 12)
+        Joint angles before [rad].
+    qpos : ndarray, shape (k, physics steps, 19)
+        MuJoCo's, after each physics step; joint angles last.
+    load : ndarray, shape (k, physics steps, 12)
+        Servo torques in each physics step [N·m].
+    touch : ndarray, shape (k, 4)
+        Largest force on each foot in the last 6 ms [N].
+    """
+
+    rows: slice
+    start: Array
+    qpos: Array
+    load: Array
+    touch: Array
+
+
+def gravity_direction(qpos: Array) -> Array:
+    """Direction of gravity in the trunk's frame, shape (n, 3), from MuJoCo's positions."""
+    w, x, y, z = qpos[:, 3:7].T.copy()
+    found = np.empty((len(qpos), 3))
+    found[:, 0] = 2 * (w * y - x * z)
+    found[:, 1] = -2 * (y * z + w * x)
+    found[:, 2] = 2 * (x * x + y * y) - 1
+    return found
+
+
+def own_velocity(qpos: Array, qvel: Array) -> Array:
+    """Velocity of the trunk in its own frame [m/s], shape (n, 3), from MuJoCo's state."""
+    w, x, y, z = qpos[:, 3:7].T.copy()
+    a, b, c = qvel[:, :3].T.copy()
+    # rotate by the inverse: v + w t + t × q with t = 2 (v × q), by hand: np.cross is slow
+    t, u, v = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    found = np.empty((len(qpos), 3))
+    found[:, 0] = a + w * t + u * z - v * y
+    found[:, 1] = b + w * u + v * x - t * z
+    found[:, 2] = c + w * v + t * y - u * x
+    return found
