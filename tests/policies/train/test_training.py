@@ -207,6 +207,37 @@ def test_a_termination_signal_saves_too_and_handlers_are_put_back(tmp_path):
     load_policy(tmp_path / "policy_last")
 
 
+HANGS = """
+import signal, sys, time
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from support.tiny_training import tiny_run
+from pupper_sysid.policies.train.training import train
+
+def watch(now):
+    if now.phase == "ppo":
+        print("terminated", flush=True)
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(60)  # an update that takes long
+
+train(Path(sys.argv[1]), tiny_run(), watch)
+"""
+
+
+def test_a_termination_signal_ends_a_long_update_within_a_second(tmp_path):
+    tests = Path(__file__).resolve().parents[2]
+    process = subprocess.Popen(
+        [sys.executable, "-c", HANGS, str(tmp_path / "run"), str(tests)], cwd=tests.parent,
+        stdout=subprocess.PIPE,
+    )  # fmt: skip
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == b"terminated"
+        assert process.wait(timeout=1.0) == -signal.SIGTERM
+    assert read_checkpoint(tmp_path / "run" / LAST)["iteration"] == 0  # the last one is whole
+    train(tmp_path / "run", None)
+
+
 def test_time_that_is_up_ends_a_run_with_everything_saved(tmp_path):
     train(tmp_path, tiny_run(minutes=1e-9))
     found = read_checkpoint(tmp_path / LAST)
