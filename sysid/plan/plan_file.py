@@ -64,13 +64,6 @@ class TrialEntry(Part):
     purpose: str = ""
     """What it is for."""
 
-    @field_validator("joint")
-    @classmethod
-    def _check_joint(cls, name: str) -> str:
-        if strange := strange_joint([name]):
-            raise ValueError(f"{strange[0]} is no joint; {strange[1].rstrip('.?')}")
-        return name
-
 
 class IntervalEntry(Part):
     """A value with its 90 % interval."""
@@ -125,6 +118,13 @@ class PlanFile(Part):
     """Intervals now and after the sweep."""
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """What no trial within the limits can show."""
+
+    @field_validator("trials")
+    @classmethod
+    def _check_joints(cls, trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
+        if strange := strange_joint(t.joint for t in trials):
+            raise ValueError(f"{strange[0]} is no joint; {strange[1].rstrip('.?')}")
+        return trials
 
 
 def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:

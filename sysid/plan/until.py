@@ -44,7 +44,7 @@ class Goal:
 
     def reached(self, interval: Interval) -> bool:
         """Whether an interval is narrow enough."""
-        return half_width(interval) <= self.half_width_s
+        return half_width(interval) <= self.half_width_s + 1e-9  # a nanosecond, for rounding
 
 
 @dataclass(frozen=True, kw_only=True)

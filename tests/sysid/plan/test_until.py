@@ -1,0 +1,154 @@
+"""Rounds of recording: until every joint is narrow enough, or it is said why one cannot be."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.servo_models.delayed_pd import DelayedPD
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult, fit_joint
+from pupper_sysid.sysid.plan.planner import LEAST_HALF_WIDTH_S
+from pupper_sysid.sysid.plan.until import Goal, half_width, parse_goal, record_until
+from pupper_sysid.sysid.recordings.recording import Recording
+from support.servo_parameters import MEASURED
+
+SECONDS = 3.0
+"""Recorded of each joint in each round."""
+
+
+@cache
+def _recording() -> Recording:
+    """Two joints at 2 and 5 Hz, read live."""
+    time = np.arange(0.0, SECONDS / 2, 0.01)
+    servo = DelayedPD(MEASURED)
+    parts: dict[str, list] = {"time": [], "command": [], "position": [], "trial": [], "f": []}
+    for number, frequency in enumerate((2.0, 5.0)):
+        command = 0.2 * np.sin(2 * np.pi * frequency * time)
+        servo.reset(0.0)
+        held = np.repeat(command, 5)
+        position = np.interp(time + 0.001, 0.002 * np.arange(1, len(held) + 1), servo.rollout(held))
+        for key, column in (
+            ("time", time + 10.0 * number), ("command", command),
+            ("position", np.round(position / 0.0015) * 0.0015),
+            ("trial", np.full(len(time), number)), ("f", np.full(len(time), frequency)),
+        ):  # fmt: skip
+            parts[key].append(column)
+    whole = {k: np.concatenate(v) for k, v in parts.items()}
+    joints = ("LF_hip", "LF_thigh")
+    return Recording.from_arrays(
+        whole["time"], dict.fromkeys(joints, whole["command"]),
+        dict.fromkeys(joints, whole["position"]), trial=whole["trial"], frequency_hz=whole["f"],
+        metadata={"readings": "live"},
+    )  # fmt: skip
+
+
+@cache
+def _fit() -> JointCalibrationResult:
+    return fit_joint("LF_hip", tuple(_recording().trials("LF_hip")))
+
+
+class Robot:
+    """Writes the same recording for every round, and fits dead times of given half widths."""
+
+    def __init__(self, folder: Path, half_widths_ms: dict[str, list[float]]):
+        self.folder, self._widths = folder, {j: list(w) for j, w in half_widths_ms.items()}
+        self.plans = []
+        self.first = self._write(1, list(half_widths_ms))
+
+    def fit(self, recordings, joints):
+        found = {}
+        for joint in joints:
+            half = 1e-3 * self._widths[joint].pop(0)
+            fit, dead = _fit(), Interval(0.025, 0.025 - half, 0.025 + half)
+            candidates = {
+                name: replace(c, parameters=c.parameters | {"dead_time_s": dead})
+                for name, c in fit.candidate_models.items()
+            }
+            lag = replace(fit.lag, joint=joint, dead_time_s=dead)
+            found[joint] = replace(fit, joint=joint, lag=lag, candidate_models=candidates)
+        return found
+
+    def record_next(self, plan, number):
+        self.plans.append(plan)
+        return self._write(number, plan.joints)
+
+    def _write(self, number, joints):
+        path = self.folder / f"sweep_{number}.csv"
+        table = _recording().table
+        Recording.from_frame(
+            table[table["joint"].isin(joints)], metadata={"readings": "live"}
+        ).save(path)
+        return path
+
+    def run(self, goal_ms: float, most_seconds: float = 1000.0, report=None):
+        return record_until(
+            Goal("dead_time", 1e-3 * goal_ms), [self.first], list(self._widths), self.fit,
+            self.record_next, most_seconds=most_seconds, report=report,
+        )  # fmt: skip
+
+
+def test_a_sweep_that_is_narrow_enough_is_not_extended(tmp_path):
+    robot = Robot(tmp_path, {"LF_hip": [2.0]})
+    outcome = robot.run(2.0)
+    assert outcome.reached and outcome.recordings == (robot.first,) and robot.plans == []
+    assert outcome.to_dict()["joints"]["LF_hip"]["reached"] is True
+
+
+def test_only_joints_that_are_still_wide_are_recorded_again(tmp_path):
+    robot = Robot(tmp_path, {"LF_hip": [5.0, 2.5, 1.9], "LF_thigh": [1.8]})
+    reports = []
+    outcome = robot.run(2.0, report=lambda found: reports.append(dict(found)))
+    assert outcome.reached and [p.joints for p in robot.plans] == [["LF_hip"], ["LF_hip"]]
+    assert len(outcome.recordings) == 3 and len(reports) == 3
+    hip, thigh = outcome.joints["LF_hip"], outcome.joints["LF_thigh"]
+    assert (hip.rounds, thigh.rounds) == (3, 1)
+    assert hip.recorded_s == pytest.approx(3 * SECONDS, abs=0.2)
+    assert reports[0]["LF_hip"].why == "more is to be recorded"
+
+
+def test_the_limit_of_seconds_is_kept_and_named(tmp_path):
+    robot = Robot(tmp_path, {"LF_hip": [5.0, 4.0]})
+    outcome = robot.run(2.0, most_seconds=8.0)
+    assert not outcome.reached and len(robot.plans) == 1
+    # 5 s were left, one planned trial of which fits
+    planned = sum(t.duration_s + 0.2 for t in robot.plans[0].trials)
+    assert planned <= 8.0 - SECONDS + 0.1
+    assert "`most_seconds` is 8" in outcome.joints["LF_hip"].why
+
+
+def test_rounds_end_when_two_of_them_did_not_help(tmp_path):
+    robot = Robot(tmp_path, {"LF_hip": [5.0, 5.1, 4.95, 1.0]})
+    outcome = robot.run(2.0)
+    assert len(robot.plans) == 2 and "did not narrow it" in outcome.joints["LF_hip"].why
+
+
+def test_rounds_end_where_a_plan_promises_nothing(tmp_path):
+    robot = Robot(tmp_path, {"LF_hip": [1.66]})
+    outcome = robot.run(1.65)
+    assert robot.plans == [] and "no trial within the limits" in outcome.joints["LF_hip"].why
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("dead_time:2ms", 0.002), ("dead_time:0.003s", 0.003)]
+)
+def test_a_goal_is_half_of_an_interval(text, seconds):
+    goal = parse_goal(text)
+    assert goal.half_width_s == pytest.approx(seconds)
+    assert goal.reached(Interval(0.02, 0.02 - seconds, 0.02 + 0.999 * seconds))
+    assert not goal.reached(Interval(0.02, 0.02 - seconds, 0.02 + 1.01 * seconds))
+    assert half_width(Interval(0.0, 1.0, 4.0)) == 1.5
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "dead_time", "dead_time:2", "dead_time:ms", "dead_time:-2ms", "dead_time:2h",
+     "friction:2ms", "dead_time:1e3s", "dead_time:.ms", "dead_time:nanms",
+     f"dead_time:{999 * LEAST_HALF_WIDTH_S:.6f}ms"],
+)  # fmt: skip
+def test_a_goal_that_is_none_is_refused(text):
+    with pytest.raises(InputError, match="`until`"):
+        parse_goal(text)
