@@ -14,7 +14,6 @@ import numpy as np
 
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
 from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
-from pupper_sysid.sysid.identify.search import PREFERRED
 
 _FEW_FREQUENCIES = 4
 _FAST_HZ = 5.0  # below it a servo of 20 ms dynamics looks like 20 ms more of dead time
@@ -57,7 +56,7 @@ def advice(
 
 def _gaps(result: JointCalibrationResult) -> list[str]:
     """Sentences for one joint, without its name."""
-    pd, lattice = result.candidate_models[PREFERRED], result.lag.feedback
+    pd, lattice = result.delayed_pd, result.lag.feedback
     tones = sorted({round(t.frequency_hz, 2) for t in result.trials if t.frequency_hz > 0})
     fresh = sum(len(t.sample_step) for t in result.trials)
     width = 1e3 * (result.dead_time_s.high - result.dead_time_s.low)

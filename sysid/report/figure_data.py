@@ -18,7 +18,6 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
 from pupper_sysid.sysid.identify.models import candidate_model
-from pupper_sysid.sysid.identify.search import PREFERRED
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
@@ -60,17 +59,18 @@ class Track:
     row_speed_rad_s: NDArray[np.float64]
 
 
-def tracks(result: JointCalibrationResult, model: str = PREFERRED) -> list[Track]:
+def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Track]:
     """Free run of a fitted model on every trial of its joint.
 
     Parameters
     ----------
     result : JointCalibrationResult
-    model : str
-        Name of a candidate model.
+    model : str, optional
+        Name of a candidate model; by default the one that simulators run.
     """
     if not result.trials:
         return []
+    model = model or result.simulated_model
     fitted = candidate_model(model)
     values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
     simulated = free_run(fitted, values, result.trials)

@@ -23,6 +23,7 @@ MODEL_NAMES = {
     "sopdt": "second order + delay",
     "dc_servo": "DC servo",
     "delayed_pd": "DelayedPD",
+    "delayed_pd_back_emf": "DelayedPD, back-EMF",
     "delayed_pd_backlash": "DelayedPD + backlash",
 }
 
