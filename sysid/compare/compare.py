@@ -34,7 +34,14 @@ from pupper_sysid.sysid.compare.readings import (
     shown,
     with_ages,
 )
-from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, chosen_joints
+from pupper_sysid.sysid.doctor.checks import cautions
+from pupper_sysid.sysid.recordings.joints import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    usable_trials,
+)
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
@@ -179,9 +186,10 @@ def compare(
         If a model cannot be read, or is for another rate or other joints.
     """
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
+    trials = usable_trials(recordings, names)
     data = merged_groups(servo_data(recordings, names, readings, seed))
     opened: dict[str, _Opened] = {}
-    notes = []
+    notes = [text for joint in names for text in cautions(joint, trials[joint])]
     inputs = {r.sha256: r.name for r in recordings}
     for given in models:
         found = _open(given, data)

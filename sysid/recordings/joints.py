@@ -48,6 +48,25 @@ def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
     return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
 
 
+def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tuple[Trial, ...]]:
+    """All trials by joint, in joint order.
+
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+    joints : str or sequence of str, optional
+        Which joints; by default all that were recorded.
+
+    Raises
+    ------
+    InputError
+        If a joint is not recorded, or the doctor's verdict on it is "do not use".
+    """
+    trials = {j: joint_trials(recordings, j) for j in chosen_joints(recordings, joints)}
+    refuse_unusable(trials)
+    return trials
+
+
 def joint_rng(seed: int, joint: str) -> np.random.Generator:
     """Generator of one joint: repeatable whatever other joints are computed."""
     place = JOINT_NAMES.index(joint) if joint in JOINT_NAMES else crc32(joint.encode())
@@ -80,9 +99,7 @@ def each_joint(
     InputError
         If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
-    tasks = {j: joint_trials(recordings, j) for j in chosen_joints(recordings, joints)}
-    refuse_unusable(tasks)
-    return map_joints(work, tasks, workers, progress)
+    return map_joints(work, usable_trials(recordings, joints), workers, progress)
 
 
 Task = TypeVar("Task")

@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.doctor.checks import refuse_unusable
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
@@ -157,9 +156,8 @@ def servo_data(
     Raises
     ------
     InputError
-        If recordings differ in rate, or the doctor's verdict on a joint is "do not use".
+        If recordings differ in rate, or a joint has no readings.
     """
-    refuse_unusable({joint: joint_trials(recordings, joint) for joint in joints})
     period = _common_period(recordings)
     labels: dict[str, int] = {}
     runs: dict[str, tuple[Run, ...]] = {}

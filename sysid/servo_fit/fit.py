@@ -25,7 +25,7 @@ from pupper_sysid.sysid.recordings.joints import (
     Recordings,
     as_sequence,
     chosen_joints,
-    joint_trials,
+    usable_trials,
 )
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
@@ -167,9 +167,10 @@ def fit_servo(
             f"`preset='paper'` is for the joints of a Mini Pupper; {other[0]} is none. "
             "Leave it out."
         )
+    trials = usable_trials(recordings, joints)
     data = servo_data(recordings, joints, readings, seed)
     recorded = ", ".join(data.groups)
-    notes = [text for j in joints for text in cautions(j, joint_trials(recordings, j))]
+    notes = [text for j in joints for text in cautions(j, trials[j])]
     whole = split.train or everything
     data, note = grouped(data, whole)
     notes += [note] if note else []
