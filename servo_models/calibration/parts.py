@@ -209,6 +209,10 @@ class Actuator(Part):
         _NO_BACK_EMF
     )
     """Torque lost per velocity outside of the effort limit [N·m·s/rad]."""
+    command_jitter_s: Annotated[Quantity, _TIME] = Quantity(
+        value=0.0, identified="no", why="not measured"
+    )
+    """Standard deviation of the latency of commands [s]; exponential, its mean in the dead time."""
     delay_steps_min: Annotated[Whole, Field(ge=0)]
     """Smallest dead time to train with, in whole physics steps."""
     delay_steps_max: Annotated[Whole, Field(ge=0)]

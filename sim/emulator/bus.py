@@ -66,7 +66,8 @@ class EmulatedBus:
         self.robot, self._keep_log = robot, keep_log
         self.joint_names = robot.joint_names
         spec = robot.spec
-        polls, self._noise, clock = rng.spawn(3)
+        polls, self._noise, clock, self._latency = rng.spawn(4)
+        self._arrival_s = 0.0
         self._clock = RealClock() if real_time else VirtualClock(spec.sleep_overshoot_s, clock)
         self._plant = plant or FreeAirServos(robot)
         self._schedule = None
@@ -127,8 +128,11 @@ class EmulatedBus:
         self._refuse_closed()
         asked = finite_angles(position_rad, len(self.joint_names), self.name)
         sent, (goal, _) = self._clock.now(), self._quantised(asked, whole=np.trunc)
+        jitter = self.robot.spec.command_jitter_s
+        late = jitter * self._latency.exponential() if jitter else 0.0
+        self._arrival_s = max(self._arrival_s, sent + late)  # none overtakes another
         for i in np.flatnonzero(goal != self._goal).tolist():
-            self._plant.command(i, sent, goal[i])
+            self._plant.command(i, self._arrival_s, goal[i])
             if self._keep_log:
                 self._changes[i].append(sent)
         self._goal = goal

@@ -48,6 +48,9 @@ class RobotSpec:
     """Standard deviation of the logarithm of each of the four ratios to inertia, per joint."""
     velocity_spread: float = 0.05
     """The same for the velocity limit."""
+    command_jitter_s: float = 0.0
+    """Standard deviation and mean of the (exponential) latency of each command, a part of the dead
+    time: a goal frame that is lost and sent again."""
     dead_time_sd_s: float = 0.0015
     """Standard deviation of the dead time from joint to joint."""
     offset_sd_rad: float = 0.005
@@ -90,7 +93,7 @@ class EmulatedServo:
     ----------
     joint : str
     actuator : DelayedPDParameters
-        Scalars.
+        Scalars. Its dead time is without the latency of commands (`command_jitter_s`).
     feedback : HeldFeedback
     poll_phase_s : float
         One poll instant of its lattice, before jitter and drift [s].
@@ -131,7 +134,12 @@ class EmulatedRobot:
         joints = {}
         for servo in self.servos:
             joints[servo.joint] = {
-                "actuator": {k: float(v) for k, v in asdict(servo.actuator).items()},
+                "actuator": {k: float(v) for k, v in asdict(servo.actuator).items()}
+                | {
+                    "dead_time_s": float(np.asarray(servo.actuator.dead_time_s))
+                    + self.spec.command_jitter_s,
+                    "command_jitter_s": self.spec.command_jitter_s,
+                },
                 "feedback": {k: float(v) for k, v in asdict(servo.feedback).items()}
                 | {
                     "mean_age_s": float(servo.feedback.mean_age_s),
@@ -174,7 +182,7 @@ def draw_robot(
             armature=float(armature),
             effort_limit=spec.stall_torque_nm,
             velocity_limit=float(spec.velocity_limit_rad_s * speed),
-            dead_time_s=float(max(delay, SHORTEST_DELAY_S)),
+            dead_time_s=float(max(delay - spec.command_jitter_s, SHORTEST_DELAY_S)),
         )
         feedback = HeldFeedback(
             poll_period_s=spec.poll_period_s,

@@ -111,6 +111,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
         back_emf_nm_s_per_rad=torque["back_emf"],
         dead_time_s=_known(result.dead_time_s, pd.undecided.get("dead_time_s")),
+        command_jitter_s=_jitter(result),
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
@@ -242,6 +243,16 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
 def _quantity(interval: Interval) -> Quantity:
     """An interval as an identified quantity, its ends never inside of its value."""
     return _known(interval, None)
+
+
+def _jitter(result: JointCalibrationResult) -> Quantity:
+    found = result.command_jitter_s
+    if not np.isfinite(found.value):
+        return Quantity(value=0.0, identified="no", why="it takes several tones to see it")
+    why = "it cannot be told from none" if found.low <= 0 else None
+    if result.lag.feedback.kind == "unresolved":
+        why = "readings are dated to half a loop only"
+    return _known(found, why)
 
 
 def _known(interval: Interval, why: str | None) -> Quantity:

@@ -113,8 +113,8 @@ def test_a_calibration_cannot_be_changed():
 
 # Numbers of the paper's text and of its authors' released training configuration.
 PUBLISHED = {
-    "paper": [70.0, 1.2, 0.03, 0.005, 5.0, 10.5, 0.076, 0.0],
-    "release": [80.0, 2.5, 0.03, 0.005, 0.7, 15.0, 0.057, 0.0],
+    "paper": [70.0, 1.2, 0.03, 0.005, 5.0, 10.5, 0.076, 0.0, 0.0],
+    "release": [80.0, 2.5, 0.03, 0.005, 0.7, 15.0, 0.057, 0.0, 0.0],
 }
 PUBLISHED_STEPS = {"paper": (33, 43), "release": (26, 31)}
 
