@@ -11,7 +11,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import tyro
 
-from pupper_sysid.cli.terminal import need_positive
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 
@@ -57,7 +56,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: Options) -> None:
-    need_positive("--seconds", options.seconds)
     if not options.policies:
         raise InputError("No policy was named: python -m reproduction runs/<name>.")
     import torch
@@ -66,7 +64,7 @@ def _run(options: Options) -> None:
     from reproduction.page import write_claims
 
     torch.set_num_threads(1)
-    write_claims(options, tries_of(options, options.command))
+    write_claims(options, tries_of(options, options.command, options.robots, options.seconds))
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def compliance(policy: Policy, trial: Trial) -> list[DirectionWalk]:
     walks = trial.walks(policy, [trial.condition(command=c) for c in moving.values()])
     return [
         DirectionWalk(
-            direction=name, command=walked.command, survival=float(walked.alive[-1].mean()),
+            direction=name, command=walked.command, survival=1.0 - float(walked.fell.mean()),
             **_measured(walked),
         )
         for name, walked in zip(moving, walks, strict=True)

@@ -106,7 +106,7 @@ class Outcome(Result):
     """Survival, tracking errors and gait of a walk; NaN where there is none."""
 
     survival: float = NAN
-    """Share of robots that are up at the end."""
+    """Share of robots that did not fall."""
     mae_vx_m_s: float = NAN
     mae_vy_m_s: float = NAN
     mae_yaw_rad_s: float = NAN
@@ -130,7 +130,7 @@ def outcome(rollout: Rollout) -> dict[str, float]:
     ]
     means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [NAN] * 3
     return {
-        "survival": float(alive[-1].mean()),
+        "survival": 1.0 - float(rollout.fell.mean()),
         **pooled_errors(rollout.velocity, np.array(rollout.command), alive),
         **dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True)),
     }

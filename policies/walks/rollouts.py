@@ -68,6 +68,8 @@ class Rollout:
     """Trunk's x and y [m] and heading [rad, continuous] in the world; shape (steps, n, 3)."""
     alive: NDArray[np.bool_]
     """Whether the robot has neither fallen nor left the ground's edge so far; shape (steps, n)."""
+    fell: NDArray[np.bool_]
+    """Whether it fell; one that left the ground's edge did not; shape (n,)."""
 
     @property
     def action_rad(self) -> Array:
@@ -124,6 +126,7 @@ class _Recorder:
         self._env = env
         whole = [not (lean and (c.change or c.disturb)) for c in conditions]
         self._whole = np.flatnonzero(np.repeat(whole, [c.robots for c in conditions]))
+        self._fell = np.zeros(env.environments, bool)
         self._steps: list[dict[str, NDArray]] = []
         self._inside: list[dict[str, NDArray]] = []
         self._hidden: list[NDArray[np.float32]] = []
@@ -131,6 +134,7 @@ class _Recorder:
 
     def keep(self, now: Moment) -> None:
         qpos = self._env.robots.qpos
+        self._fell |= now.fell
         seen = now.observation[self._whole].astype(np.float32)
         self._inside.append({"observation": seen, "hidden": self._hidden.pop()})
         self._steps.append(
@@ -149,6 +153,7 @@ class _Recorder:
         found |= _stacked(self._inside[:steps], inside)
         task, command = condition.task, condition.command
         assert command is not None
+        found["fell"] = self._fell[robots]
         return Rollout(task.control_step_s, command, task.action_scale, **found)
 
 

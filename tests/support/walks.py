@@ -28,5 +28,5 @@ def walked(command, forward, left, turn, seconds=6.0, robots=3, action=None) -> 
         STEP, command, 0.5, np.zeros((*shape, 60), np.float32),
         np.zeros((*shape, 12), np.float32) if action is None else action,
         np.zeros((*shape, 4), np.float32), np.zeros((*shape, 12)), np.ones((*shape, 4), bool),
-        np.zeros((*shape, 3)), np.array(path), np.ones(shape, bool),
+        np.zeros((*shape, 3)), np.array(path), np.ones(shape, bool), np.zeros(robots, bool),
     )  # fmt: skip

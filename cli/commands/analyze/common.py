@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     Found = tuple[Mapping[str, Any], Figure, Table]
     """Results for --json, figure, and table."""
 
+_FULL, _QUICK = (16, 10.0), (5, 8.0)  # robots, seconds each
+
 
 @dataclass(frozen=True)
 class Analysis:
@@ -34,8 +37,6 @@ class Analysis:
 
     policies: tyro.conf.Positional[tuple[Path, ...]]
     """Runs (`runs/<name>`) or policy folders."""
-    seconds: float = 10.0
-    """Duration; a gait needs 7 s."""
     actuator: str | None = None
     """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
     out: Path = Path("analysis")
@@ -53,7 +54,6 @@ class Analysis:
 
         from pupper_sysid.common.figure_style import save
 
-        need_positive("--seconds", self.seconds)
         name = type(self).__name__.lower()
         if not self.policies:
             raise InputError(f"No policy was named: pupper-analyze {name} runs/<name>.")
@@ -63,7 +63,7 @@ class Analysis:
         found, figure, table = self.analyse()
         save(figure, picture, self.force)
         if self.json:
-            print_json({**found, "picture": picture})
+            print_json({**self.about(), **found, "picture": picture})
             return
         out.print(table)
         err.print(f"Picture: {picture}", soft_wrap=True)
@@ -72,19 +72,61 @@ class Analysis:
         """Results, figure and table."""
         raise NotImplementedError
 
+    def about(self) -> dict[str, Any]:
+        """What else stands in the JSON object."""
+        return {}
+
 
 @dataclass(frozen=True)
 class OfPolicies(Analysis):
     """Options of the analyses of walks in the simulator."""
 
-    robots: int = 16
-    """Number of robots that walk, each with its own servos."""
+    quick: bool = False
+    """Fewer robots and shorter walks: 5 of 8 s. A first look, not for publication."""
+    robots: int | None = None
+    """Number of robots that walk, each with its own servos (16, --quick 5)."""
+    seconds: float | None = None
+    """Duration of a walk (10, --quick 8); a gait needs 7 s."""
     feedback: str | None = None
     """`held`, `ideal` or a calibration instead of what it was trained with."""
+    threads: int = 0
+    """Of the physics; 0 for all cores."""
 
-    def tries(self, command: tuple[float, float, float] = (0.15, 0.0, 0.0)) -> Tries:
-        """Policies by their short names, and how each is tried."""
-        return tries_of(self, command)
+    def each(
+        self,
+        analyse: Callable[[Policy, Trial], Any],
+        command: tuple[float, float, float] = (0.15, 0.0, 0.0),
+    ) -> dict[str, Any]:
+        """An analysis of every policy, by its short name, with a progress bar over all of them."""
+        robots, seconds = self.size
+        tries = tries_of(self, command, robots, seconds)
+        found = {}
+        with terminal.share_progress("walking") as advance:
+            for name, (policy, trial) in tries.items():
+                watch = partial(_share_of_all, advance, name, len(found), len(tries))
+                threads = self.threads
+                found[name] = analyse(policy, replace(trial, threads=threads, progress=watch))
+        return found
+
+    @property
+    def size(self) -> tuple[int, float]:
+        """Robots, and seconds of a walk."""
+        robots, seconds = _QUICK if self.quick else _FULL
+        return (
+            robots if self.robots is None else self.robots,
+            seconds if self.seconds is None else self.seconds,
+        )
+
+    def about(self) -> dict[str, Any]:
+        """Size of the walks."""
+        robots, seconds = self.size
+        return {"quick": self.quick, "robots": robots, "seconds": seconds}
+
+    def title(self, title: str) -> str:
+        """Title of the table, with what it is made of."""
+        robots, seconds = self.size
+        look = "; a quick look" if self.quick else ""
+        return f"{title} ({robots} robots, {seconds:g} s each{look})"
 
 
 @dataclass(frozen=True)
@@ -94,12 +136,14 @@ class Commanded(OfPolicies):
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
     """Forward and sideways speed [m/s], turn rate [rad/s]."""
 
-    def each(self, analyse: Callable[[Policy, Trial], Any]) -> dict[str, Any]:
-        """An analysis of every policy, by name."""
-        return {name: analyse(*one) for name, one in self.tries(self.command).items()}
+
+def _share_of_all(advance: Any, name: str, before: int, count: int, share: float) -> None:
+    advance(name, (before + share) / count)
 
 
-def tries_of(options: Any, command: tuple[float, float, float]) -> Tries:
+def tries_of(
+    options: Any, command: tuple[float, float, float], robots: int, seconds: float
+) -> Tries:
     """Policies by the names of their runs, and how each is tried.
 
     Raises
@@ -110,8 +154,9 @@ def tries_of(options: Any, command: tuple[float, float, float]) -> Tries:
     from pupper_sysid.cli.policy_choice import policy_at, run_folder, simulator, warn_of_fallbacks
     from pupper_sysid.policies.analysis.trial import Trial
 
-    if options.robots < 1:
-        raise InputError(f"--robots is {options.robots}; it must be at least 1.")
+    if robots < 1:
+        raise InputError(f"--robots is {robots}; it must be at least 1.")
+    need_positive("--seconds", seconds)
     names = [run_folder(path).name for path in options.policies]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
@@ -123,9 +168,7 @@ def tries_of(options: Any, command: tuple[float, float, float]) -> Tries:
     for name, path in zip(names, options.policies, strict=True):
         policy, run = policy_at(path)
         task, servos = simulator(path, policy, run, options.actuator, options.feedback)
-        tries[name] = policy, Trial(
-            task, servos, command, options.robots, options.seconds, options.seed
-        )  # fmt: skip
+        tries[name] = policy, Trial(task, servos, command, robots, seconds, options.seed)
     warn_of_fallbacks(trial.servos for _, trial in tries.values())
     return tries
 

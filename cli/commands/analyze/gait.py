@@ -29,19 +29,18 @@ class Gait(Commanded):
         from pupper_sysid.policies.analysis.gait import describe
 
         rng = np.random.default_rng(self.seed)
-        tries = self.tries(self.command)
-        walks = {name: trial.walk(policy) for name, (policy, trial) in tries.items()}
+        walks = self.each(lambda policy, trial: trial.walk(policy), self.command)
         found = {name: describe(walked, rng) for name, walked in walks.items()}
         table = terminal.table(
-            "Gait (90 % intervals over robots)", "policy", "Hz", "sine R² actions", "of noise",
-            "diagonal", "duty", "jitter rad", "robots",
+            self.title("Gait, 90 % intervals over robots"), "policy", "Hz", "sine R² actions",
+            "of noise", "diagonal", "duty", "jitter rad", "robots",
         )  # fmt: skip
         for name, gait in found.items():
             table.add_row(
                 name, interval(gait.frequency_hz, 2), interval(gait.action_r2, 2),
                 number(gait.null_r2, 2), interval(gait.diagonal, 2),
                 number(float(np.mean([d.value for d in gait.duty])), 2),
-                number(gait.jitter_rad.value, 3), f"{gait.robots} of {self.robots}",
+                number(gait.jitter_rad.value, 3), f"{gait.robots} of {self.size[0]}",
             )  # fmt: skip
         return {"gaits": found}, gait_figure(next(iter(walks.values()))), table
 
@@ -60,14 +59,14 @@ class Attractor(Commanded):
         from pupper_sysid.policies.analysis.gait import SETTLE_S
         from pupper_sysid.policies.analysis.rhythm import SHORTEST_S
 
-        found = {name: one for name, one in self.each(orbits).items() if one}
+        found = {name: one for name, one in self.each(orbits, self.command).items() if one}
         if not found:
             raise InputError(
                 f"No robot walked for {SETTLE_S + SHORTEST_S:g} s and moved: there is no orbit to "
                 "analyse. Give a policy that walks, or more --seconds."
             )
         table = terminal.table(
-            "Orbits at more delay of the joints (replay, as published)", "states",
+            self.title("Orbits at more delay of the joints, in replay, as published"), "states",
             "variance in 3 PCs", "dimensions", *(f"closure +{d:g} ms" for d in DELAYS_MS),
             *(f"area +{d:g} ms" for d in DELAYS_MS[1:]),
         )  # fmt: skip

@@ -25,11 +25,11 @@ class Delay(Commanded):
         from pupper_sysid.policies.analysis.figures import delay_figure
         from pupper_sysid.policies.analysis.robustness import delay_curve
 
-        found = self.each(delay_curve)
+        found = self.each(delay_curve, self.command)
         columns = (
             "extra_delay_ms", "mode", "survival", "frequency_hz", "amplitude_rad", "mae_vx_m_s",
         )  # fmt: skip
-        table = table_of("Against more delay", found, columns)
+        table = table_of(self.title("Against more delay"), found, columns)
         return {"curves": found}, delay_figure(found), table
 
 
@@ -45,9 +45,9 @@ class Ablation(Commanded):
         from pupper_sysid.policies.analysis.figures import ablation_figure
         from pupper_sysid.policies.analysis.robustness import ablation
 
-        found = self.each(ablation)
+        found = self.each(ablation, self.command)
         columns = ("channel", "kind", "level", "sigma", "correlation", "survival", "mae_vx_m_s")
-        table = table_of("Altered observations", found, columns)
+        table = table_of(self.title("Altered observations"), found, columns)
         return {"ablations": found}, ablation_figure(found), table
 
 
@@ -63,9 +63,9 @@ class Autonomy(Commanded):
         from pupper_sysid.policies.analysis.autonomy import autonomy
         from pupper_sysid.policies.analysis.figures import autonomy_figure
 
-        found = self.each(autonomy)
+        found = self.each(autonomy, self.command)
         table = terminal.table(
-            "Autonomy of the rhythm", "policy", "test", "gait Hz", "share of amplitude",
+            self.title("Autonomy of the rhythm"), "policy", "test", "gait Hz", "share of amplitude",
             "still up", "phase shift", "of it kept",
         )  # fmt: skip
         for name, tests in found.items():
@@ -98,13 +98,12 @@ class Terrain(Commanded):
         from pupper_sysid.policies.analysis.figures import terrain_figure
         from pupper_sysid.policies.analysis.robustness import terrain
 
-        found = self.each(terrain)
+        found = self.each(terrain, self.command)
         columns = (
             "ground", "survival", "frequency_hz", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s",
         )  # fmt: skip
-        return (
-            {"terrain": found}, terrain_figure(found), table_of("On other ground", found, columns),
-        )  # fmt: skip
+        table = table_of(self.title("On other ground"), found, columns)
+        return {"terrain": found}, terrain_figure(found), table
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,10 @@ class Compliance(OfPolicies):
         from pupper_sysid.policies.analysis.figures import compliance_figure
         from pupper_sysid.policies.analysis.paths import compliance
 
-        found = {name: compliance(*one) for name, one in self.tries().items()}
+        found = self.each(compliance)
         table = terminal.table(
-            "Walks by direction (90 % intervals over robots)", "policy", "direction", "still up",
-            "share of speed", "drift m/m", "arc rad/m", "wander m/turn",
+            self.title("Walks by direction, 90 % intervals over robots"), "policy", "direction",
+            "still up", "share of speed", "drift m/m", "arc rad/m", "wander m/turn",
         )  # fmt: skip
         for name, rows in found.items():
             for row in rows:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.commands.analyze.common import Analysis
+from pupper_sysid.cli.terminal import need_positive
 from pupper_sysid.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ class Servo(Analysis):
 
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
     """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    seconds: float = 10.0
+    """Duration of a policy's walk."""
 
     def analyse(self) -> Found:
         """Fit and compare the models."""
@@ -33,6 +36,7 @@ class Servo(Analysis):
 
         from pupper_sysid.sysid.compare.four_way import four_way
 
+        need_positive("--seconds", self.seconds)
         if len(self.policies) != 1:
             raise InputError("Servo models are compared on one recording or policy at a time.")
         (path,) = self.policies

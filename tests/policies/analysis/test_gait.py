@@ -271,7 +271,7 @@ def rollout(rates: list[float], seconds: float = 12.0, fell_at: dict[int, float]
     return Rollout(
         STEP_S, (0.15, 0.0, 0.0), 0.5, np.zeros((steps, n, 60), np.float32), action,
         np.zeros((steps, n, 8), np.float32), joints, np.stack([c for _, c in found], axis=1),
-        empty, empty, alive,
+        empty, empty, alive, ~alive[-1],
     )  # fmt: skip
 
 

@@ -119,9 +119,10 @@ def fallen(rollout: Rollout, robots: list[int], after_s: float) -> Rollout:
     end = len(alive) if alive[-1].any() else at + 1  # a rollout ends when nobody is up
     parts = {
         f.name: getattr(rollout, f.name)[:end] for f in fields(rollout)
-        if isinstance(getattr(rollout, f.name), np.ndarray)
+        if isinstance(getattr(rollout, f.name), np.ndarray) and f.name != "fell"
     }  # fmt: skip
-    return replace(rollout, **parts | {"alive": alive[:end], "observation": seen[:end]})
+    changed = {"alive": alive[:end], "observation": seen[:end], "fell": ~alive[-1]}
+    return replace(rollout, **parts | changed)
 
 
 def test_replay_is_of_the_robots_that_walked_and_only_while_they_did(walker):
@@ -142,9 +143,9 @@ def replace_robots(rollout: Rollout, robots: list[int]) -> Rollout:
     """The same walk of some of its robots."""
     parts = {
         f.name: getattr(rollout, f.name)[:, robots] for f in fields(rollout)
-        if isinstance(getattr(rollout, f.name), np.ndarray)
+        if isinstance(getattr(rollout, f.name), np.ndarray) and f.name != "fell"
     }  # fmt: skip
-    return replace(rollout, **parts)
+    return replace(rollout, **parts, fell=rollout.fell[robots])
 
 
 @pytest.mark.parametrize("after_s", [0.5, 3.0])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.analysis.evaluation import walk
+from pupper_sysid.policies.analysis.trial import outcome
 from pupper_sysid.policies.network.hyperparameters import Architecture
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import Policy, load_policy
@@ -180,6 +183,30 @@ def test_robots_that_fell_stay_fallen_and_a_rollout_ends_with_the_last(policies)
     short = run(own, robots=4, seconds=2.0)
     assert len(short.alive) == len(short.hidden) == len(short.position) < 100
     assert not short.alive[-1].any() and short.alive[-2].any()
+
+
+def test_a_robot_that_leaves_the_ground_has_not_fallen(policies):
+    def leave(step, env, robots):
+        if step == 5:
+            env.robots.qpos[robots[0], 0] = env.ground.half_size_m - 0.4
+
+    task = evaluation_task(replace(TASK, terrain="rough"))
+    own, servos = Condition(task, 2, COMMAND, disturb=leave), servo_ranges(CALIBRATION)
+    (found,) = collect(policies["mlp"], servos, [own], 0.2, seed=3, threads=1)
+    assert found.alive.sum(axis=0).tolist() == [5, 10] and not found.fell.any()
+    assert outcome(found)["survival"] == 1.0
+
+
+def test_observations_of_altered_walks_are_left_out_of_lean_rollouts(policies):
+    plain = Condition(evaluation_task(TASK), 2, COMMAND)
+    given, servos = [plain, replace(plain, change=lambda _, seen: seen)], servo_ranges(CALIBRATION)
+    whole = collect(policies["lstm"], servos, given, 0.1, seed=3, threads=1)
+    lean = collect(policies["lstm"], servos, given, 0.1, seed=3, threads=1, lean=True)
+    assert [r.hidden.shape for r in whole] == [(5, 2, 24)] * 2
+    assert [r.hidden.shape for r in lean] == [(5, 2, 24), (5, 0, 24)]
+    assert lean[1].observation.shape == (5, 0, 60)
+    np.testing.assert_array_equal(lean[0].hidden, whole[0].hidden)
+    np.testing.assert_array_equal(lean[1].action, whole[1].action)
 
 
 def test_a_rollout_of_no_time_is_refused(policies):
