@@ -9,7 +9,7 @@ fresh reading. The checks of times and signals, which those commands make as wel
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     moving_rows,
     quantum,
 )
-from pupper_sysid.sysid.lag.lag_budget import lag_budget
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -70,7 +70,7 @@ class JointExamination(Result):
         Share of the raw lag that stale readings add.
     quantum_rad : float
         Quantisation step; 0 if there is none.
-    offset_rad : float
+    reading_minus_command_rad : float
         Mean of the fresh readings minus mean of the command, over the tones if there are any.
     missing_fraction : float
     bad_time_stamps : int
@@ -94,7 +94,7 @@ class JointExamination(Result):
     hit_rate: float = math.nan
     hold_share: float = math.nan
     quantum_rad: float = math.nan
-    offset_rad: float = math.nan
+    reading_minus_command_rad: float = math.nan
     missing_fraction: float = math.nan
     bad_time_stamps: int = 0
     amplitude_ratio: float = math.nan
@@ -141,7 +141,10 @@ class Examination(JointResults[JointExamination]):
 
 
 def examine(
-    recordings: Recordings, joints: Joints = None, seed: int | np.random.Generator = 0
+    recordings: Recordings,
+    joints: Joints = None,
+    seed: int | np.random.Generator = 0,
+    lags: Mapping[str, LagBudget] | None = None,
 ) -> Examination:
     """Examine every joint of a recording.
 
@@ -153,6 +156,8 @@ def examine(
         Which joints; by default all that were recorded.
     seed : int or numpy.random.Generator
         Shuffles rows for the poll's z-score.
+    lags : mapping of joint to LagBudget, optional
+        Of the same recordings, if they have been measured already: the poll and the lag are theirs.
 
     Returns
     -------
@@ -171,7 +176,7 @@ def examine(
     recorded = {joint: joint_trials(given, joint) for joint in chosen_joints(given, joints)}
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
     found = {
-        joint: _examine_joint(joint, trials, mixed.get(joint), limit, rng)
+        joint: _examine_joint(joint, trials, mixed.get(joint), limit, rng, (lags or {}).get(joint))
         for joint, trials in recorded.items()
     }
     held = any(j.feedback and j.feedback.kind == "lattice" for j in found.values())
@@ -201,6 +206,7 @@ def _examine_joint(
     mixed: Finding | None,
     limit_rad_s: float,
     rng: np.random.Generator,
+    lag: LagBudget | None,
 ) -> JointExamination:
     found = [*findings(recorded), *([mixed] if mixed else [])]
     trials = long_enough(recorded)
@@ -214,8 +220,8 @@ def _examine_joint(
     hold_share = math.nan
     speed = peak_speed(trials)
     if usable:
-        lattice = find_poll_lattice(trials, rng)
-        hold_share = _hold_share(joint, trials, lattice, rng)
+        lattice = lag.feedback if lag else find_poll_lattice(trials, rng)
+        hold_share = _hold_share(joint, trials, lattice, rng, lag)
         found += [*_held(lattice, hold_share), *_coverage(trials, speed, limit_rad_s)]
     found = sorted(found, key=lambda f: VERDICTS.index(f.verdict))
     return JointExamination(
@@ -231,7 +237,7 @@ def _examine_joint(
         hit_rate=lattice.hit_rate,
         hold_share=hold_share,
         quantum_rad=quantum(trials),
-        offset_rad=offset(trials),
+        reading_minus_command_rad=offset(trials),
         missing_fraction=float(1 - seen.mean()),
         bad_time_stamps=sum(disorder(t) for t in trials),
         amplitude_ratio=amplitude_ratio(trials),
@@ -243,10 +249,14 @@ def _examine_joint(
 
 
 def _hold_share(
-    joint: str, trials: Sequence[Trial], lattice: PollLattice, rng: np.random.Generator
+    joint: str,
+    trials: Sequence[Trial],
+    lattice: PollLattice,
+    rng: np.random.Generator,
+    lag: LagBudget | None,
 ) -> float:
     try:
-        budget = lag_budget(joint, trials, rng, lattice)
+        budget = lag or lag_budget(joint, trials, rng, lattice)
     except InputError:  # too few fresh readings: reported elsewhere
         return math.nan
     raw = budget.raw_lag_s.value
@@ -286,7 +296,8 @@ def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Findi
                                    "and are left out of phases and gains. Record 3 s or more "
                                    "each."))  # fmt: skip
     if speed < 0.9 * limit:
-        found.append(Finding(USE, f"speed limit not excited: commands reach {speed:.1f} of about "
-                                  f"{limit:.1f} rad/s ({100 * speed / limit:.0f} %), so the limit "
-                                  "cannot be identified. Record steps as well."))  # fmt: skip
+        found.append(Finding(USE, f"commands reach {speed:.1f} of about {limit:.1f} rad/s "
+                                  f"({100 * speed / limit:.0f} %), which may not show the servo's "
+                                  "speed limit: `calibrate` says whether it is identified. Steps "
+                                  "would show it."))  # fmt: skip
     return found

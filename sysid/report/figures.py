@@ -262,7 +262,8 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     def gathered(name: str) -> NDArray:
         return np.concatenate([getattr(t, name) for t in found])
 
-    age = 1e3 * result.lag.stale_lag_s
+    lattice = result.lag.feedback
+    age = 1e3 * (lattice.mean_age_s if np.isfinite(lattice.mean_age_s) else result.lag.stale_lag_s)
     over_speed.plot(
         gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
         label=f"all rows at their own time (dashed: speed × {age:.0f} ms)",

@@ -132,7 +132,7 @@ def write_report(
     if calibration is not None:
         _refuse_foreign(calibration, recordings, names)
         seed = seed if calibration.seed is None else calibration.seed
-    steps, done = 2 * len(names) + len(recordings), 0
+    steps, done = 2 * len(names), 0
 
     def advance(what: str) -> None:
         nonlocal done
@@ -142,9 +142,9 @@ def write_report(
 
     results = calibrate(recordings, names, seed, workers=workers, progress=advance)
     examinations, responses = [], {}
-    for recording in recordings:
-        examinations.append((recording.name, examine(recording, seed=seed)))
-        advance(recording.name)
+    lags = {joint: result.lag for joint, result in results.items()}
+    examined = examine(recordings, names, seed=seed, lags=lags)
+    examinations.append((examined.recording, examined))
     for joint, result in results.items():
         if result.lag.by_frequency:
             trials, rng = joint_trials(recordings, joint), joint_rng(seed, joint)
@@ -227,11 +227,11 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
 
 def _doctor(found: Findings) -> Section:
     texts = []
-    for recording, examination in found.examinations:
+    for _, examination in found.examinations:
         for name, joint in examination.joints.items():
             if name in found.results:
                 sentences = (t[:1].upper() + t[1:] for t in (f"{joint.verdict}.", *joint.reasons))
-                texts.append((f"{recording}, {name}", " ".join(sentences)))
+                texts.append((name, " ".join(sentences)))
     table = tables.doctor_table(found.examinations, list(found.results))
     return Section("doctor", "Are the recordings usable?", findings=texts, tables=[table])
 
@@ -253,8 +253,8 @@ def _free_runs(results: Mapping[str, JointCalibrationResult]) -> tuple[Section, 
             Picture(
                 f"residuals_{joint}",
                 f"{joint}: above, the error of rows at their own time is proportional to speed: "
-                "that is the feedback age; fresh rows have no such error. Below, the residuals of "
-                "fresh rows.",
+                "that is the age of stale readings; fresh rows have no such error. Below, the "
+                "residuals of fresh rows.",
                 figures.residual_figure(result, runs),
             )
         )

@@ -24,7 +24,7 @@ def servo_section(found: Comparison) -> Section:
         text("model", "model"),
         number("free run, mrad", "rmse_free_run_rad", 1, 1e3),
         number("held", "rmse_held_rad", 1, 1e3),
-        number("raw", "rmse_raw_rad", 1, 1e3),
+        number("raw, predicted readings", "rmse_raw_rad", 1, 1e3),
         number("one step", "rmse_one_step_rad", 1, 1e3),
         number("persistence", "persistence_rmse_rad", 1, 1e3),
         number("repeatability", "repeatability_rad", 1, 1e3),
@@ -64,7 +64,7 @@ def servo_section(found: Comparison) -> Section:
             Table("servo_models", "Error of the servo models", columns, rows),
             _curve_table(curve),
         ],
-        notes=found.notes,
+        notes=[*found.reading_notes(), *found.notes],
     )
 
 

@@ -134,7 +134,7 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         number("held, mrad", "rmse_held_rad", 1, 1e3),
         number("one step, mrad", "rmse_one_step_rad", 1, 1e3),
         number("fit, %", "fit_percent"),
-        number("raw, mrad (misleads)", "rmse_raw_rad", 1, 1e3),
+        number("positions against rows as logged, mrad (misleads)", "rmse_raw_rad", 1, 1e3),
     )
     title = "Candidate models, simplest first"
     return Table("candidate_models", title, columns, tuple(rows), "is_chosen")
@@ -215,13 +215,11 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
         KEY,
         text("verdict", "verdict"),
         number("loop, ms", "loop_period_s", 2, _MS),
-        number("jitter, ms", "jitter_s", 2, _MS),
+        number("loop jitter, ms", "jitter_s", 2, _MS),
         number("fresh rows, %", "fresh_fraction", 0, 100.0),
-        number("poll, ms", "poll_period_s", 2, _MS),
-        number("lost polls, %", "loss", 0, 100.0),
-        number("quantisation step, mrad", "quantum_rad", 3, 1e3),
-        number("offset, mrad", "offset_rad", 1, 1e3),
-        text("recording", "recording"),
+        number("missing rows, %", "missing_fraction", 0, 100.0),
+        number("reading − command, mrad", "reading_minus_command_rad", 1, 1e3),
+        number("fastest command, rad/s", "peak_command_rad_s", 1),
     )
     return Table("doctor", "The recordings' health", columns, rows)
 

@@ -74,7 +74,7 @@ def test_doctor_json_has_the_documented_keys(capsys):
     assert code == 0 and joint["verdict"] == "use"
     assert {
         "verdict", "reasons", "loop_period_s", "jitter_s", "fresh_fraction", "poll_period_s",
-        "loss", "quantum_rad", "offset_rad",
+        "loss", "quantum_rad", "reading_minus_command_rad",
     } <= set(joint)  # fmt: skip
     assert joint["poll_period_s"] == pytest.approx(0.02685, abs=1.5e-4)
     assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)

@@ -37,13 +37,14 @@ class Doctor:
             return
         shown = terminal.table(
             recording.name, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
-            "loss", "step mrad", "offset mrad",
+            "loss", "step mrad", "reading − command mrad",
         )  # fmt: skip
         for name, j in found.items():
             shown.add_row(
                 name, j.verdict, terminal.ms(j.loop_period_s, 2), terminal.ms(j.jitter_s, 2),
                 terminal.number(100 * j.fresh_fraction, 0), terminal.ms(j.poll_period_s, 2),
-                terminal.number(j.loss), terminal.ms(j.quantum_rad, 3), terminal.ms(j.offset_rad),
+                terminal.number(j.loss), terminal.ms(j.quantum_rad, 3),
+                terminal.ms(j.reading_minus_command_rad),
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print()

@@ -139,7 +139,7 @@ def examined_joint() -> JointExamination:
     return JointExamination(
         verdict="use with care", reasons=("two frequencies only.",), loop_period_s=0.02,
         jitter_s=1e-4, fresh_fraction=2 / 3, poll_period_s=0.03, loss=0.0, z_score=20.0,
-        hit_rate=1.0, quantum_rad=0.0057, offset_rad=0.01, missing_fraction=0.0,
+        hit_rate=1.0, quantum_rad=0.0057, reading_minus_command_rad=0.01, missing_fraction=0.0,
         peak_command_rad_s=2.5, hold_histogram=(50, 50),
     )  # fmt: skip
 
