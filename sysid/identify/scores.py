@@ -64,7 +64,8 @@ def score(
         fresh.append(model - t.sample_rad)
         one_step.append(np.diff(model) - np.diff(t.sample_rad))
         seen = np.isfinite(t.row_rad)
-        held.append((look_up(track, t.held_step) - t.row_rad)[seen])
+        dated = seen & np.isfinite(t.held_step)
+        held.append(look_up(track, t.held_step[dated]) - t.row_rad[dated])
         raw.append((look_up(track, t.row_step) - t.row_rad)[seen])
         spread.append(t.sample_rad - t.sample_rad.mean())
     return Scores(

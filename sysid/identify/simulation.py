@@ -36,7 +36,8 @@ class TrialData:
     sample_step, sample_rad : ndarray, shape (samples,)
         Fresh readings: time in physics steps from the start, and position relative to rest.
     held_step, row_step : ndarray, shape (rows,)
-        Per row: when the value it shows was measured, and when it was sent.
+        Per row: when the value it shows was measured (NaN if before the trial or not known), and
+        when it was sent.
     row_rad : ndarray, shape (rows,)
         Position of each row relative to rest [rad], NaN where missing.
     step_s : float
@@ -83,7 +84,7 @@ def prepare(trial: Trial, reading: Readings) -> TrialData:
     return TrialData(
         trial.frequency_hz, rest, average,
         to_step(reading.time_s[inside]), reading.position_rad[inside] - rest,
-        to_step(np.where(np.isfinite(reading.held_time_s), reading.held_time_s, start)),
+        to_step(np.where(reading.held_time_s >= start, reading.held_time_s, np.nan)),
         to_step(trial.send_time_s), trial.position_rad - rest,
     )  # fmt: skip
 

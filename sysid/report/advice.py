@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import Actuator
 from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
 
 _FEW_FREQUENCIES = 4
@@ -23,13 +25,17 @@ _LONG_S = 30.0
 
 
 def advice(
-    results: Mapping[str, JointCalibrationResult], examinations: Sequence[tuple[str, Any]] = ()
+    results: Mapping[str, JointCalibrationResult],
+    calibration: Calibration,
+    examinations: Sequence[tuple[str, Any]] = (),
 ) -> list[str]:
     """What to record next, most useful first; one sentence each.
 
     Parameters
     ----------
     results : dict of joint to JointCalibrationResult
+    calibration : Calibration
+        Of those; it says what was identified.
     examinations : sequence of (str, pupper_sysid.sysid.doctor.examination.Examination)
         Name of the recording and what the doctor found.
     """
@@ -41,7 +47,9 @@ def advice(
                     f"record {recording} again: the doctor's verdict is not to use it "
                     f"({' '.join(examined.reasons).rstrip('.')})."
                 )
-    gaps = {joint: _gaps(result) for joint, result in results.items()}
+    gaps = {
+        joint: _gaps(result, calibration.joint(joint).actuator) for joint, result in results.items()
+    }
     found = [f"{j}: {text}" for own in (again, gaps) for j, text in share_sentences(own)]
     found.append(
         "Torques rest on an assumed stall torque, because a joint that swings in free air shows "
@@ -54,20 +62,26 @@ def advice(
     return found
 
 
-def _gaps(result: JointCalibrationResult) -> list[str]:
+def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
     """Sentences for one joint, without its name."""
     pd, lattice = result.delayed_pd, result.lag.feedback
     tones = sorted({round(t.frequency_hz, 2) for t in result.trials if t.frequency_hz > 0})
     fresh = sum(len(t.sample_step) for t in result.trials)
     width = 1e3 * (result.dead_time_s.high - result.dead_time_s.low)
     found = []
-    limits = {"velocity_limit_rad_s": "speed", "effort_rad_s2": "torque"}
-    if unknown := [name for key, name in limits.items() if key in pd.undecided]:
+    ratios = actuator.ratios_to_armature
+    limits = {
+        "speed": (actuator.velocity_limit_rad_s, ratios.back_emf), "torque": (ratios.effort_limit,)
+    }  # fmt: skip
+    unknown = [
+        name for name, own in limits.items() if all(quantity.identified == "no" for quantity in own)
+    ]
+    if unknown:
         found.append(
-            f"the limit of its {' and '.join(unknown)} was not reached. Record steps, or tones "
+            f"the limit of its {' and '.join(unknown)} is not identified. Record steps, or tones "
             "whose peak speed 2π·f·A comes close to the servo's no-load speed."
         )
-    if "friction_rad_s2" in pd.undecided:
+    if ratios.friction_loss.identified == "no":
         found.append(
             "friction is not identified. Record a slow tone (0.2–0.5 Hz): the joint sticks at its "
             "turning points."

@@ -187,7 +187,7 @@ def sections(found: Findings) -> list[Section]:
         from pupper_sysid.sysid.report.servo_section import servo_section
 
         made.append(servo_section(found.comparison))
-    next_steps = advice(results, found.examinations)
+    next_steps = advice(results, found.calibration, found.examinations)
     made += [
         Section("next", "What to record next", findings=[("", text) for text in next_steps]),
         _provenance(found),
@@ -300,6 +300,10 @@ def _bode(found: Findings) -> Section:
             (joint, f"−3 dB bandwidth {response.bandwidth_text}.")
             for joint, response in found.responses.items()
         ],
+        notes=[
+            "A transfer function has neither friction nor limits, so the delay of its form is not "
+            "the dead time of the servo, which stands under Parameters.",
+        ] if found.responses else [],
     )  # fmt: skip
 
 

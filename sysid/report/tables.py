@@ -101,12 +101,18 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
     columns = (
         KEY,
         text("form", "transfer_function"),
-        Column("parameter", lambda row: _readable(row["parameter"], ""), "words"),
+        Column("parameter", _of_form, "words"),
         Column(f"value {_LEVEL}", _value_cell),
         Column("unit", lambda row: unit_of(row["parameter"]), "words"),
         number("misfit, χ²/dof", "chi2_per_dof"),
     )
     return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))
+
+
+def _of_form(row: Row) -> str:
+    """A transfer function's parameter; its delay is not the servo's dead time."""
+    name = _readable(row["parameter"], "")
+    return "delay of the form" if name == "dead time" else name
 
 
 def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:

@@ -308,11 +308,15 @@ def test_nothing_is_overwritten_without_force(tmp_path):
     assert victim.read_text() != "mine"
 
 
+def advised(results: dict[str, JointCalibrationResult]) -> list[str]:
+    return advice(results, to_calibration(results, [recording_of()], 0))
+
+
 def test_advice_asks_for_steps_only_if_a_limit_was_not_reached():
     open_limit = fitted("delayed_pd", result_of().candidate_models["delayed_pd"].scores,
                         {"velocity_limit_rad_s": "never reached"})  # fmt: skip
-    without = advice({"LF_thigh": result_of()})
-    with_limit = advice(
+    without = advised({"LF_thigh": result_of()})
+    with_limit = advised(
         {
             "LF_thigh": result_of(
                 candidate_models={**result_of().candidate_models, "delayed_pd": open_limit}
@@ -325,13 +329,13 @@ def test_advice_asks_for_steps_only_if_a_limit_was_not_reached():
 
 def test_advice_names_joints_with_the_same_gap_in_one_sentence():
     same = {j: result_of(j) for j in ("LF_hip", "LF_thigh")}
-    said = advice(same)
+    said = advised(same)
     assert sum("only 2 frequencies" in s for s in said) == 1
     assert any(s.startswith("LF_hip, LF_thigh: only 2 frequencies (1, 2 Hz)") for s in said)
 
 
 def test_advice_names_the_joints_that_nothing_is_known_of():
-    (missing,) = [s for s in advice({"LF_thigh": result_of()}) if "Not recorded yet" in s]
+    (missing,) = [s for s in advised({"LF_thigh": result_of()}) if "Not recorded yet" in s]
     assert "LF_hip" in missing and "LF_thigh" not in missing
 
 
