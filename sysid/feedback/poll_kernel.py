@@ -78,3 +78,113 @@ def log_likelihood(begin, end, periods, phases, blur, inside, outside):
                 else:
                     total[i, j] += np.log(inside * share + outside[n])
     return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def summed_scores(
+    begin, end, changed, value, stops, periods, phases, blur, outliers, success, track,
+    track_start, track_step, scale,
+):  # fmt: skip
+    """Scores of every lattice, summed over the rows before each stop.
+
+    A changed row scores `log((1 - outliers) * w + outliers * chance)`, w as in `log_likelihood`,
+    less the soft-L1 cost of its value against the track at the instant it is dated to. A row that
+    stayed the same scores `log(1 - (1 - outliers) * success * w)`.
+
+    Parameters
+    ----------
+    begin, end : ndarray, shape (rows,)
+        Previous read and read of each row [s], relative to the instant of phase 0.
+    changed : ndarray of bool, shape (rows,)
+    value : ndarray, shape (rows,)
+        Reading of each changed row [rad].
+    stops : ndarray of int, shape (stops,)
+        Increasing, from 0 to the number of rows.
+    periods : ndarray, shape (periods,)
+        In seconds.
+    phases : ndarray, shape (phases,)
+        In periods.
+    blur : float
+        In seconds.
+    outliers, success : float
+        Share of changed rows that may contradict the lattice; probability that a poll succeeds.
+    track : ndarray, shape (times,)
+        Expected motion [rad] at `track_start + n * track_step` [s]; empty if there is none.
+    track_start, track_step : float
+    scale : float
+        Of the residuals [rad].
+
+    Returns
+    -------
+    ndarray, shape (stops, periods * phases)
+    """
+    count = len(periods) * len(phases)
+    found, total = np.zeros((len(stops), count)), np.zeros(count)
+    at = 1
+    for n in range(len(begin)):
+        half = 0.5 * (end[n] - begin[n]) / blur + 0.5
+        for i in range(len(periods)):
+            period = periods[i]
+            middle = 0.5 * (begin[n] + end[n])
+            turns, width = middle / period + 0.5, period / blur
+            chance = outliers * min((end[n] - begin[n]) / period, 1.0)
+            none, whole = np.log(chance), np.log(1.0 - outliers + chance)
+            lost = np.log(1.0 - (1.0 - outliers) * success)
+            for j in range(len(phases)):
+                away = turns - phases[j]
+                away -= np.floor(away) + 0.5
+                share = half - abs(away) * width
+                g = i * len(phases) + j
+                if not changed[n]:
+                    if share >= 1.0:
+                        total[g] += lost
+                    elif share > 0.0:
+                        total[g] += np.log(1.0 - (1.0 - outliers) * success * share)
+                    continue
+                if share <= 0.0:
+                    total[g] += none
+                elif share >= 1.0:
+                    total[g] += whole
+                else:
+                    total[g] += np.log((1.0 - outliers) * share + chance)
+                if len(track):
+                    time = min(max(middle - away * period, begin[n]), end[n])
+                    step = min(max((time - track_start) / track_step, 0.0), len(track) - 1.001)
+                    low = int(step)
+                    model = track[low] + (step - low) * (track[low + 1] - track[low])
+                    residual = (value[n] - model) / scale
+                    total[g] -= np.sqrt(1.0 + residual * residual) - 1.0
+        while at < len(stops) and stops[at] == n + 1:
+            found[at] = total
+            at += 1
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def best_segments(summed, prior, least):
+    """Best score of every segment between two stops, and the lattice that has it.
+
+    Parameters
+    ----------
+    summed : ndarray, shape (stops, lattices)
+        From `summed_scores`.
+    prior : ndarray, shape (lattices,)
+        Log-prior, counted once per segment.
+    least : int
+        Stops between the ends of a segment, at least.
+
+    Returns
+    -------
+    score : ndarray, shape (stops, stops)
+        From stop to stop; -inf where a segment is too short.
+    lattice : ndarray of int, shape (stops, stops)
+    """
+    count = len(summed)
+    score, lattice = np.full((count, count), -np.inf), np.zeros((count, count), np.int64)
+    for a in range(count):
+        for b in range(a + least, count):
+            for g in range(summed.shape[1]):
+                here = summed[b, g] - summed[a, g] + prior[g]
+                if here > score[a, b]:
+                    score[a, b], lattice[a, b] = here, g
+    return score, lattice

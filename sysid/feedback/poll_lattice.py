@@ -15,35 +15,57 @@ counts the failed polls; `readings` dates fresh rows.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.special import betaincinv, ndtri
 
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
 from pupper_sysid.sysid.feedback.poll_search import (
     BLUR_S,
     BLURS_S,
+    DRIFT,
     Phase,
     Stretch,
     best_blur,
-    best_period,
+    best_periods,
     contains,
     refine,
     shuffled,
 )
 from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.slips import (
+    SMALLEST_JUMP,
+    Motion,
+    Segment,
+    Slip,
+    evidence,
+    find_segments,
+    robust_scale,
+)
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e-4
 _LONGEST_S = 0.12
+_Z = float(ndtri((1 + LEVEL) / 2))
+_RIVAL = 5.0  # nats: a period that explains the readings by less worse is not ruled out
+_MOVING_STEPS = 3.0  # quantisation steps per poll: so much motion must change the reading
+_OF_TOP_SPEED = 0.5  # below it a joint with friction may stand
+_GRID_S, _SMOOTHING_S, _LONGEST_LAG_S = 0.002, 0.015, 0.3
+# of the period from segment to segment: usual size, and the segments that this is worth
+_USUAL_DRIFT, _USUAL_SEGMENTS = 0.002, 3.0
+_MEMORY = 2.0  # a wandering period is alike in neighbouring trials: half as many count
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
 _NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
+_ALTERNATIVES = 4  # periods of the search that are compared in full
 _SHUFFLES = 12
 # each costs as much as the search: where the first few leave no doubt there are no more
 _FEWEST_SHUFFLES, _CLEAR = 4, 20.0
@@ -75,8 +97,17 @@ class PollLattice(Result):
         Share of changed rows with a lattice instant between the previous read and this one.
     fresh_fraction : float
         Share of rows with a new value, among all rows.
+    slips : tuple of Slip
+        Jumps of the poll's phase within a trial.
+    polls : int
+        Polls from which the loss was counted.
+    rivals_s : tuple of float
+        Periods that explain the readings about as well [s]: reads meet their instants in the same
+        rows.
+    blur_s : float
+        Full width of the uncertainty of one poll instant.
     phases : tuple of Phase
-        Lattice of each stretch.
+        Lattice of each stretch, in time order within a trial.
     """
 
     kind: str
@@ -89,12 +120,46 @@ class PollLattice(Result):
     z_score: float = math.nan
     hit_rate: float = math.nan
     fresh_fraction: float
+    slips: tuple[Slip, ...] = ()
+    polls: int = internal(default=0)
+    rivals_s: tuple[float, ...] = internal(default=())
+    blur_s: float = internal(default=BLUR_S)
     phases: tuple[Phase, ...] = internal(default=())
 
     @derived
     def mean_age_s(self) -> float:
         """Mean age of a reading implied by period and loss [s]."""
+        if self.loss >= 1:
+            return math.inf
+        if not self.loss < 1:
+            return math.nan  # no poll succeeded while the servo moved
         return self.poll_period_s * (0.5 + self.loss / (1 - self.loss))
+
+    @property
+    def poll_period_interval(self) -> Interval:
+        """Poll period with its 90 % interval [s]."""
+        reach = _Z * self.poll_period_sd_s
+        near = [self.poll_period_s, *self.rivals_s]
+        return Interval(self.poll_period_s, min(near) - reach, max(near) + reach)
+
+    @property
+    def loss_interval(self) -> Interval:
+        """Loss with its 90 % interval."""
+        failed = self.loss * self.polls
+        tail = (1 - LEVEL) / 2
+        low, high = (  # Jeffreys' interval of a share
+            betaincinv(failed + 0.5, self.polls - failed + 0.5, q) for q in (tail, 1 - tail)
+        )
+        return Interval(self.loss, min(float(low), self.loss), max(float(high), self.loss))
+
+    @property
+    def mean_age_interval(self) -> Interval:
+        """Mean age with its 90 % interval [s]; the period's share of it is small."""
+        loss = self.loss_interval
+        low, high = (
+            self.poll_period_s * (0.5 + p / (1 - p)) for p in (loss.low, min(loss.high, 0.999))
+        )
+        return Interval(self.mean_age_s, low, high)
 
 
 @dataclass(frozen=True)
@@ -180,45 +245,199 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     # ln T, spaced so that the last poll of a stretch moves by half of the blur
     grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * BLUR_S / _STRETCH_S))
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
-    period, score = best_period(informative, grid)
+    periods = best_periods(informative, grid)
+    score = periods[0][1]
     null: list[float] = []
     z_score = 0.0
     for _ in range(_SHUFFLES):
-        null.append(best_period([shuffled(s, rng) for s in informative], grid)[1])
+        null.append(best_periods([shuffled(s, rng) for s in informative], grid)[0][1])
         if len(null) >= _FEWEST_SHUFFLES:
             z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
             if not 0 <= z_score <= _CLEAR:
                 break
 
+    likely = _likeliest(trials, informative, [p for p, _ in periods], loop, step)
+    period = likely[0]
     phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
-    loss, _ = _loss(trials, phases)
+    loss = _loss(trials, phases)[0]
+    blur = BLUR_S
     if np.isfinite(loss):
         # second pass: rows that did not change count, too, and the blur is what fits best
-        loss = float(np.clip(loss, 0.02, 0.98))
-        blur = best_blur(informative, period, loss)
-        phases = tuple(refine(s, period, blur, loss) for s in stretches)
-    weights = np.array([len(s.begin) for s in stretches], float)
+        blur = best_blur(informative, period, _possible(loss))
+        phases = tuple(refine(s, period, blur, _possible(loss)) for s in stretches)
+    found = replace(
+        nothing, kind="lattice", readings="polled", time_doubt_s=0.0, poll_period_s=period,
+        rivals_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
+    )  # fmt: skip
+    found = _with_segments(trials, stretches, replace(found, z_score=z_score), None)
+    sure = told == "stale" and period > _NEAR_LOOP * loop
+    if found.hit_rate < 0.9 or z_score < (_SIGNIFICANT if sure else _SIGNIFICANT_ALONE):
+        return replace(nothing, z_score=z_score, hit_rate=found.hit_rate)
+    return found
+
+
+def _likeliest(
+    trials: Sequence[Trial],
+    stretches: Sequence[Stretch],
+    periods: Sequence[float],
+    loop: float,
+    step: float,
+) -> tuple[float, ...]:
+    """The period that explains best which rows changed and which did not [s], and its rivals.
+
+    Of the best ones of the search and of their aliases, at which the reads meet instants of
+    another lattice in the same rows.
+    """
+    best = periods[0]
+    if not np.isfinite(best):
+        return (best,)
+    tried = [*periods[:_ALTERNATIVES], 2 * best, best / 2]
+    tried += [1 / abs(1 / loop - 1 / p) for p in tried if abs(p / loop - 1) > 0.01]
+    moving = [moving_rows(t, step) for t in trials]
+    changed = sum(int(np.sum(m[fresh_rows(t)])) for t, m in zip(trials, moving, strict=True))
+    rows = max(sum(int(m.sum()) for m in moving), 1)
+    found = {}
+    for period in tried:
+        if not 1.02 * loop < period < _LONGEST_S:
+            continue
+        loss = 1.0 - changed / rows * period / loop
+        if changed and loss < -0.1:
+            continue  # more changes than polls
+        loss = float(np.clip(loss, 0.02, 0.98)) if changed else 0.5
+        found[period] = sum(evidence(s, period, BLUR_S, loss) for s in stretches)
+    if not found:
+        return (best,)
+    order = sorted(found, key=lambda p: -found[p])
+    close = [p for p in order if found[order[0]] - found[p] < _RIVAL]
+    return (order[0], *(p for p in close[1:] if abs(p / order[0] - 1) > 2 * DRIFT))
+
+
+def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Motion]) -> PollLattice:
+    """Find slips of a lattice again, now that the motion of the joint is known.
+
+    The motion settles where a slip is, and which of two phases is right; within an eighth of a
+    period the times of changes alone settle the phase, so that an error of the model's dead time
+    does not enter the dates.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        Those of `find_poll_lattice`.
+    lattice : PollLattice
+    motions : sequence of callable, one per trial
+        Position that a reading is expected to show [rad, offset included] at times [s] on the
+        recording's clock, from a first fit.
+
+    Returns
+    -------
+    PollLattice
+        `lattice` itself where its kind is not "lattice".
+
+    Examples
+    --------
+    >>> data = find_poll_lattice([], np.random.default_rng(0))
+    >>> redate([], data, []).kind
+    'every read'
+    """
+    if lattice.kind != "lattice":
+        return lattice
+    polled = [(t, m) for t, m in zip(trials, motions, strict=True) if t.readings != "live"]
+    own = [t for t, _ in polled]
+    step = max(quantum(own), 1e-6)
+    stretches = [s for t in own if len(t.read_time_s) > 3 for s in _stretches(t, step)]
+    return _with_segments(own, stretches, lattice, {t.number: m for t, m in polled})
+
+
+def _with_segments(
+    trials: Sequence[Trial],
+    stretches: Sequence[Stretch],
+    lattice: PollLattice,
+    motions: Mapping[int, Motion] | None,
+) -> PollLattice:
+    """The lattice with a phase of its own for each segment between slips, and all its numbers."""
+    by_number = {t.number: t for t in trials}
+    step = quantum(trials)
+    loss = _possible(lattice.loss)
+    parts: list[Stretch] = []
+    phases: list[Phase] = []
+    slips: list[Slip] = []
+    for stretch in stretches:
+        trial = by_number[stretch.trial]
+        value = trial.position_rad[np.searchsorted(trial.read_time_s, stretch.end)]
+        old = [
+            p for p in lattice.phases
+            if p.trial == trial.number and p.start_s < stretch.stop_s and p.stop_s > stretch.start_s
+        ]  # fmt: skip
+        motion, scale = None, 1.0
+        if motions is not None:
+            motion = motions[trial.number]
+            scale = robust_scale(value - motion(_instants(stretch, old)), step)
+        segments = find_segments(
+            stretch, value, lattice.poll_period_s, lattice.blur_s, lattice.loss, motion, scale,
+            old[0].phase_s if len(old) == 1 else None,
+        )  # fmt: skip
+        for n, segment in enumerate(segments):
+            part = stretch.between(segment.start_s, segment.stop_s)
+            near = segment.phase_s if motion is not None or len(segments) > 1 else None
+            phase = refine(part, lattice.poll_period_s, lattice.blur_s, loss, near)
+            if n:
+                slip = _slip(trial, phases[-1], phase, segment)
+                # less is drift: the segments follow it, but nothing slipped
+                if abs(slip.jump_s) > max(SMALLEST_JUMP * phase.period_s, lattice.blur_s):
+                    slips.append(slip)
+            parts.append(part)
+            phases.append(phase)
+    hits = np.concatenate([contains(s, p) for s, p in zip(parts, phases, strict=True)])
+    period, error = _common_period(parts, phases)
+    loss, polls = _loss(trials, phases)
+    return replace(
+        lattice, poll_period_s=period, poll_period_sd_s=error, loss=loss,
+        loss_sd=math.sqrt(max(loss * (1 - loss), 1.0 / polls) / polls) if polls else math.nan,
+        polls=polls, hit_rate=float(np.mean(hits)), slips=tuple(slips), phases=tuple(phases),
+    )  # fmt: skip
+
+
+def _common_period(parts: Sequence[Stretch], phases: Sequence[Phase]) -> tuple[float, float]:
+    """Mean period over the segments of a lattice, and its standard error [s]."""
+    weights = np.array([len(s.begin) for s in parts], float)
     periods = np.array([p.period_s for p in phases])
     period = float(np.average(periods, weights=weights))
-    spread = float(np.sqrt(np.average((periods - period) ** 2, weights=weights)))
-    effective = weights.sum() ** 2 / np.sum(weights**2)
-    hits = [contains(s, p) for s, p in zip(stretches, phases, strict=True)]
-    hit_rate = float(np.mean(np.concatenate(hits)))
-    loss, loss_sd = _loss(trials, phases)
-    nothing = replace(nothing, z_score=z_score, hit_rate=hit_rate)
-    sure = told == "stale" and period > _NEAR_LOOP * loop
-    if hit_rate < 0.9 or z_score < (_SIGNIFICANT if sure else _SIGNIFICANT_ALONE):
-        return nothing
-    return replace(
-        nothing,
-        kind="lattice",
-        readings="polled",
-        time_doubt_s=0.0,
-        poll_period_s=period,
-        poll_period_sd_s=spread / np.sqrt(max(effective - 1, 1)),
-        loss=loss,
-        loss_sd=loss_sd,
-        phases=phases,
+    effective = max(weights.sum() ** 2 / np.sum(weights**2), 1.0)
+    # periods of few segments: their scatter is shrunk towards that of other recordings
+    scatter = np.average((periods - period) ** 2, weights=weights) * effective
+    usual = _USUAL_SEGMENTS * (_USUAL_DRIFT * period) ** 2
+    variance = (scatter + usual) / (effective - 1 + _USUAL_SEGMENTS)
+    return period, float(np.sqrt(_MEMORY * variance / effective))
+
+
+def _possible(loss: float) -> float | None:
+    """A loss that makes no row impossible; None if unknown."""
+    return float(np.clip(loss, 0.02, 0.98)) if np.isfinite(loss) else None
+
+
+def _instants(stretch: Stretch, phases: Sequence[Phase]) -> NDArray[np.float64]:
+    """When each changed row of a stretch was measured [s]."""
+    middle = 0.5 * (stretch.begin + stretch.end)
+    time = middle
+    for p in phases:
+        near = p.phase_s + p.period_s * np.round((middle - p.phase_s) / p.period_s)
+        own = (stretch.end >= p.start_s) & (stretch.end <= p.stop_s)
+        time = np.where(own, np.clip(near, stretch.begin, stretch.end), time)
+    return time
+
+
+def _slip(trial: Trial, before: Phase, after: Phase, segment: Segment) -> Slip:
+    """The jump from one phase to the next, at the border between the two."""
+    at = segment.start_s
+    here, there = (
+        p.phase_s + p.period_s * np.round((at - p.phase_s) / p.period_s) for p in (before, after)
+    )
+    period = after.period_s
+    return Slip(
+        trial=trial.number,
+        time_s=float(at - trial.read_time_s[0]),
+        jump_s=float((there - here + period / 2) % period - period / 2),
+        nats=segment.nats,
     )
 
 
@@ -299,24 +518,56 @@ def _speed(trial: Trial) -> NDArray[np.float64]:
     return windows.min(axis=1)
 
 
-def _loss(trials: Sequence[Trial], phases: Sequence[Phase]) -> tuple[float, float]:
-    """Share of polls that left the value as it was while the servo must have been moving."""
-    step = max(quantum(trials), 1e-6)
+def _loss(trials: Sequence[Trial], phases: Sequence[Phase]) -> tuple[float, int]:
+    """Share of failed polls, and the number of polls it was counted from.
+
+    Counted where the joint moves fast enough that a new reading must differ from the last.
+    """
+    step = quantum(trials)
     polls = successes = 0
     for trial in trials:
-        rows, read, speed = fresh_rows(trial), trial.read_time_s, _speed(trial)
-        middle = 0.5 * (_read_before(trial)[rows] + read[rows])
+        rows, read, before = fresh_rows(trial), trial.read_time_s, _read_before(trial)
+        middle = 0.5 * (before[rows] + read[rows])
+        speed = _expected_speed(trial, middle, trial.position_rad[rows])
         for phase in (p for p in phases if p.trial == trial.number):
-            first = int(np.ceil((phase.start_s - phase.phase_s) / phase.period_s))
-            last = int(np.floor((phase.stop_s - phase.phase_s) / phase.period_s))
-            counts = np.arange(first, last + 1)
-            row = np.searchsorted(read, phase.phase_s + phase.period_s * counts)
-            sure = speed[np.minimum(row, len(read) - 1)] * phase.period_s > _MOVING_QUANTA * step
-            # each fresh row is the success of the one poll nearest to it
-            seen = np.round((middle - phase.phase_s) / phase.period_s).astype(int)
-            polls += int(sure.sum())
-            successes += len(np.intersect1d(counts[sure], seen))
-    if not polls:
-        return float("nan"), float("nan")
-    loss = 1.0 - successes / polls
-    return loss, float(np.sqrt(max(loss * (1 - loss), 1.0 / polls) / polls))
+            least = max(_MOVING_STEPS * step / phase.period_s, _OF_TOP_SPEED * speed.max())
+            first = np.ceil((phase.start_s - phase.phase_s) / phase.period_s)
+            last = np.floor((phase.stop_s - phase.phase_s) / phase.period_s)
+            instants = phase.phase_s + phase.period_s * np.arange(first, last + 1)
+            own = (read[rows] > phase.start_s) & (read[rows] <= phase.stop_s)
+            dated = middle[own] - phase.phase_s
+            dated = phase.phase_s + phase.period_s * np.round(dated / phase.period_s)
+            for times, success in ((instants, False), (dated, True)):
+                row = np.clip(np.searchsorted(read, times), 0, len(read) - 1)
+                count = int(np.sum(speed[row] > least))
+                successes, polls = (
+                    (successes + count, polls) if success else (successes, polls + count)
+                )
+    return (max(1.0 - successes / polls, 0.0), polls) if polls else (math.nan, 0)
+
+
+def _expected_speed(
+    trial: Trial, time: NDArray[np.float64], position: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Speed of the joint at each read [rad/s], as if it followed its command after one lag.
+
+    Zero where position and command have little in common.
+    """
+    sent = trial.send_time_s
+    grid = np.arange(sent[0], max(sent[-1], trial.read_time_s[-1]) + _GRID_S, _GRID_S)
+    row = np.maximum(np.searchsorted(sent, grid, side="right") - 1, 0)
+    smooth = gaussian_filter1d(trial.command_rad[row], _SMOOTHING_S / _GRID_S, mode="nearest")
+    none = np.zeros(len(trial.read_time_s))
+    if len(time) < 8 or np.ptp(smooth) == 0:
+        return none
+    lags = np.arange(0.0, _LONGEST_LAG_S, 2 * _GRID_S)
+    late = np.interp(time[None] - lags[:, None], grid, smooth)
+    late -= late.mean(axis=1, keepdims=True)
+    centred = position - position.mean()
+    both, own = late @ centred, np.maximum(np.sum(late**2, axis=1), 1e-12)
+    match = np.sign(both) * both**2 / own
+    best = int(np.argmax(match))
+    if match[best] < 0.5 * np.sum(centred**2):
+        return none
+    speed = np.abs(np.gradient(smooth, _GRID_S)) * both[best] / own[best]
+    return np.interp(trial.read_time_s - lags[best], grid, speed)

@@ -6,7 +6,7 @@ row that stayed the same although the servo must have moved brackets none. A lat
 latter. For a trial period T, count for every phase how many changed rows' intervals contain an
 instant; the log-likelihood of the count, against intervals placed at random, is the score. Real
 polls drift by some 0.4 % from stretch to stretch, so stretches share T only through a Gaussian of
-that width (`best_period`). The score is compared with that of rows whose gaps were shuffled
+that width (`best_periods`). The score is compared with that of rows whose gaps were shuffled
 (`shuffled`). `best_blur` and `refine` then estimate the width and the phase of the instants in each
 stretch.
 """
@@ -30,9 +30,15 @@ BLURS_S = (0.0012, 0.0025, 0.005)
 BLUR_S = BLURS_S[1]
 """The width before it is estimated [s]."""
 
-_DRIFT = 0.0045  # relative sd of the period between stretches, measured on a Mini Pupper 2
+DRIFT = 0.0045
+"""Relative standard deviation of the period between stretches, measured on a Mini Pupper 2."""
+
 _BINS = 64
-_PEAKS = 12
+LOCK = 0.125
+"""How far a phase may be from the one that it refines, in periods."""
+
+_PEAKS, _APART = 12, 0.02  # best periods of the search, and how far apart
+_MOST_OUTLIERS = 0.4
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,14 @@ class Stretch:
     same_begin: NDArray[np.float64]
     same_end: NDArray[np.float64]
 
+    def between(self, start_s: float, stop_s: float) -> Stretch:
+        """Rows read within a part of the stretch."""
+        own, same = ((e > start_s) & (e <= stop_s) for e in (self.end, self.same_end))
+        return Stretch(
+            self.trial, start_s, stop_s, self.begin[own], self.end[own], self.same_begin[same],
+            self.same_end[same],
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Phase:
@@ -81,8 +95,10 @@ class Phase:
     phase_sd_s: float
 
 
-def best_period(stretches: Sequence[Stretch], grid: NDArray[np.float64]) -> tuple[float, float]:
-    """The common period and its score: a quick search, its best peaks scored with care.
+def best_periods(
+    stretches: Sequence[Stretch], grid: NDArray[np.float64]
+) -> list[tuple[float, float]]:
+    """Common periods and their scores: a quick search, its best peaks scored with care.
 
     Parameters
     ----------
@@ -92,24 +108,19 @@ def best_period(stretches: Sequence[Stretch], grid: NDArray[np.float64]) -> tupl
 
     Returns
     -------
-    period_s : float
-        NaN if no period is possible.
-    score : float
-        Log-likelihood against intervals placed at random.
+    list of tuple of float
+        Period [s] and log-likelihood against intervals placed at random; the best first. NaN if
+        no period is possible.
     """
     pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
-    best = (float("nan"), -np.inf)
+    found = []
     for _ in range(_PEAKS):
         peak = int(np.argmax(pooled))
         if not np.isfinite(pooled[peak]):
             break
-        best = max(
-            best,
-            (float(grid[peak]), _evidence(stretches, grid[peak], BLUR_S, None)),
-            key=lambda pair: pair[1],
-        )
-        pooled[np.abs(np.log(grid / grid[peak])) < 2 * _DRIFT] = -np.inf
-    return best
+        found.append((float(grid[peak]), _evidence(stretches, grid[peak], BLUR_S, None)))
+        pooled[np.abs(np.log(grid / grid[peak])) < _APART] = -np.inf
+    return sorted(found, key=lambda pair: -pair[1]) or [(float("nan"), -np.inf)]
 
 
 def shuffled(stretch: Stretch, rng: np.random.Generator) -> Stretch:
@@ -134,7 +145,13 @@ def best_blur(stretches: Sequence[Stretch], period_s: float, loss: float) -> flo
     return BLURS_S[int(np.argmax(evidence))]
 
 
-def refine(stretch: Stretch, period_s: float, blur_s: float, loss: float | None) -> Phase:
+def refine(
+    stretch: Stretch,
+    period_s: float,
+    blur_s: float,
+    loss: float | None,
+    near_s: float | None = None,
+) -> Phase:
     """Posterior mean of a stretch's period and phase near the common period.
 
     Parameters
@@ -146,9 +163,14 @@ def refine(stretch: Stretch, period_s: float, blur_s: float, loss: float | None)
         Full width of the uncertainty of one poll instant.
     loss : float or None
         Probability that a poll fails; with None only rows that changed count.
+    near_s : float, optional
+        An instant of the lattice, to within an eighth of a period.
     """
     posterior, periods, steps, _ = _posterior(stretch, period_s, blur_s, loss, 61, 128)
     reference = 0.5 * (stretch.start_s + stretch.stop_s)
+    if near_s is not None:
+        away = (steps - (near_s - reference) / period_s + 0.5) % 1.0 - 0.5
+        posterior = np.where(np.abs(away) <= LOCK, posterior, -np.inf)
     weight = np.exp(posterior - posterior.max())
     weight /= weight.sum()
     best_period = float(np.sum(weight.sum(axis=1) * periods))
@@ -181,16 +203,19 @@ def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64
     # every row at periods of two loops. Polls that jitter over an edge count as outliers.
     chance = np.minimum(np.median(end - begin) / periods, 1.0)  # for an interval at random
     hits = most_hits(begin, end, periods, _BINS)
-    hit = np.log((1 - OUTLIERS) + OUTLIERS * chance) - np.log(chance)
-    return hits * hit + (len(begin) - hits) * np.log(OUTLIERS)
+    share = (hits / len(begin) - chance) / np.maximum(1 - chance, 1e-3)
+    # polls that jitter by much of a loop miss more often
+    outliers = np.clip(1 - share, OUTLIERS, _MOST_OUTLIERS)
+    hit = np.log((1 - outliers) + outliers * chance) - np.log(chance)
+    return hits * hit + (len(begin) - hits) * np.log(outliers)
 
 
 def _pool(profiles: list[NDArray], grid: NDArray) -> NDArray[np.float64]:
     """Sum of the profiles, each free to sit a little beside the common period."""
     log_period = np.log(grid)
-    reach = int(np.ceil(3 * _DRIFT / (log_period[1] - log_period[0])))
+    reach = int(np.ceil(3 * DRIFT / (log_period[1] - log_period[0])))
     offsets = np.arange(-reach, reach + 1)
-    penalty = -0.5 * (offsets * (log_period[1] - log_period[0]) / _DRIFT) ** 2
+    penalty = -0.5 * (offsets * (log_period[1] - log_period[0]) / DRIFT) ** 2
     total = np.zeros(len(grid))
     for profile in profiles:
         padded = np.pad(profile, reach, constant_values=-np.inf)
@@ -220,7 +245,7 @@ def _posterior(
     the servo moved says that no poll, or a failed one, lies in its interval.
     """
     reference = 0.5 * (stretch.start_s + stretch.stop_s)
-    periods = period * np.exp(np.linspace(-2.5 * _DRIFT, 2.5 * _DRIFT, period_count))
+    periods = period * np.exp(np.linspace(-2.5 * DRIFT, 2.5 * DRIFT, period_count))
     steps = np.linspace(-0.5, 0.5, phase_count, endpoint=False)
 
     chance = np.minimum((stretch.end - stretch.begin) / period, 1.0)
@@ -233,5 +258,5 @@ def _posterior(
             stretch.same_begin - reference, stretch.same_end - reference, periods, steps, blur,
             -(1 - OUTLIERS) * (1 - loss), np.ones(len(stretch.same_end)),
         )  # fmt: skip
-    total -= 0.5 * (np.log(periods / period) / _DRIFT)[:, None] ** 2
+    total -= 0.5 * (np.log(periods / period) / DRIFT)[:, None] ** 2
     return total, periods, steps, float(total.max() - np.log(chance).sum())
