@@ -21,7 +21,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _LOOSE = 0.25, 0.6  # share of the position's variance that the command explains
 _ECHO_ROWS, _ECHO_STEPS, _ECHO_SHARE = 30, 5.0, 0.99
-_DELAYED_STEPS = 20.0  # per row: then a gain or lag that changes by a twentieth of a row shows
+_DELAYED_STEPS = 10.0  # per row: then a lag that changes by a tenth of a row shows
 _LONGEST_ECHO_S, _MOST_SHIFTS = 0.6, 60
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.5, 0.1
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3

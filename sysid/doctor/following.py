@@ -50,7 +50,7 @@ class Following:
     lag_s : float
         Shift of the command as it was held that explains most, low-passed by nothing.
     early_lag_s : float
-        The best shift to before zero; negative.
+        Shift of that command; negative.
     gain : ndarray, shape (trials,)
         Position per command of each trial in the best causal servo; NaN where nothing moves.
     residual_rad : tuple of ndarray
@@ -103,7 +103,7 @@ def following(trials: Sequence[Trial], step: float) -> Following | None:
         None if no trial has enough motion of both.
     """
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
-    grid = max(min(loop, _GRID_S), _FINEST_S)
+    grid = max(min(loop / 4, _GRID_S), _FINEST_S)
     lags = grid * np.arange(round(EARLIEST_S / grid), round(LATEST_S / grid) + 1)
     live = staleness(trials).kind == "live"
     maps = [_correlations(t, live, grid, len(lags)) for t in trials]
@@ -136,7 +136,7 @@ def following(trials: Sequence[Trial], step: float) -> Following | None:
         inverted_score=float(np.where(causal, inverted, 0.0).max()),
         early_score=float(early.max()),
         lag_s=_peak(right[0], lags),
-        early_lag_s=float(total[first]),
+        early_lag_s=float(lags[first[1]]),
         gain=np.array(gains),
         residual_rad=residuals,
         rows=rows / _CORRELATED_ROWS,

@@ -25,6 +25,7 @@ _ENCODER_BITS = range(10, 17)
 _SAME_STEP = 0.002
 _PINNED = (0.10, 0.20)  # share of readings at an extreme, beyond the command's own
 _NOTED_RAD, _FAR_RAD, _TURNED_RAD = 0.1, 1.3, 2.9  # of an offset; the last is nearly half a turn
+_ENOUGH_TRIALS = 3
 _WRAP_RAD, _UNUSUAL = 2.5, 8.0
 _FEW_STEPS = 8
 _FROZEN_S, _LATE_S, _FROZEN_SHARE = 1.0, 0.5, 0.5
@@ -161,7 +162,8 @@ def stop_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     # friction flattens the tops of a slow tone; a stop does it in every trial, or by more
     excess = [_pinned(t, step) for t in trials]
     pinned = [e for e in excess if e > _PINNED[0]]
-    if max(excess) < _PINNED[1] and 2 * len(pinned) <= len(trials):
+    often = 2 * len(pinned) > len(trials) >= _ENOUGH_TRIALS
+    if not pinned or (max(excess) < _PINNED[1] and not often):
         return []
     return [Finding(CARE, f"readings stay at their highest or lowest value in {len(pinned)} of "
                           f"{len(trials)} trials, up to {100 * max(pinned):.0f} % of the time more "
