@@ -39,8 +39,8 @@ from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, draw_robot
-from pupper_sysid.sysid.identify.joint_fit import joint_lag
-from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_recordings
+from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
+from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_fits
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -145,7 +145,8 @@ def measure(seed: int, twin_world: bool, tones: tuple[float, ...]) -> Result:
     structure, truth, recorder = (twin if twin_world else emulated)(seed)
     standard = plan("sine", [JOINT], tones)
     first = recorder(standard)
-    proposal = plan_from_recordings([first], [JOINT])
+    fit = fit_joint(JOINT, joint_trials(first, JOINT))
+    proposal = plan_from_fits([first], {JOINT: fit})
     second = {"repeated": recorder(standard), "planned": recorder(executable(proposal))}
 
     def dead_time(*recordings: Recording) -> Interval:
@@ -154,7 +155,7 @@ def measure(seed: int, twin_world: bool, tones: tuple[float, ...]) -> Result:
         return found
 
     return Result(
-        structure, truth, dead_time(first), dead_time(first, second["repeated"]),
+        structure, truth, fit.dead_time_s, dead_time(first, second["repeated"]),
         dead_time(first, second["planned"]), proposal.predictions[0].after,
     )  # fmt: skip
 

@@ -70,12 +70,15 @@ class Servo:
     inflation : float
         Variance of the fit's own interval over that of the information; at least 1. New trials
         are counted with it.
+    doubt_s : float
+        By how much all readings may be dated wrong: no trial reduces it.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     noise: Noise
     nats: tuple[float, ...] = (0.0,)
     inflation: float = 1.0
+    doubt_s: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +227,8 @@ class _World:
                 rival = self.interval(which, 0, chosen)
                 low = min(low, own.low + share * (rival.low - own.low))
                 high = max(high, own.high + share * (rival.high - own.high))
-        return Interval(own.value, low, high)
+        doubt = self.servo.doubt_s
+        return Interval(own.value, max(low - doubt, 0.0), high + doubt)
 
     def interval(self, which: int, coordinate: int, chosen: Sequence[int]) -> Interval:
         """Expected interval of one parameter under one hypothesis, in its own unit."""
@@ -262,7 +266,7 @@ def _criterion(worlds: Sequence[_World], chosen: Sequence[int]) -> float:
     total = 0.0
     for world in worlds:
         dead = world.dead_time_s(chosen, smooth=True)
-        floor = 2 * LEAST_HALF_WIDTH_S
+        floor = 2 * (LEAST_HALF_WIDTH_S + world.servo.doubt_s)
         # without the part that no reading reduces, or nothing would seem to help near it
         width = np.sqrt(max((dead.high - dead.low) ** 2 - floor**2, 1e-12))
         variance = np.diag(world.covariance(0, chosen))[1:-1]
@@ -345,6 +349,12 @@ def _notes(
                 f"({nats:.1f} nats apart, {CLEAR_NATS:g} would tell): the dead time's interval "
                 "covers both."
             )
+    if world.servo.doubt_s > 0:
+        found.append(
+            f"{joint}: the dates of the readings are in doubt by ± "
+            f"{1e3 * world.servo.doubt_s:.1f} ms, and so is the dead time, whatever is recorded. "
+            "A longer trial may show the poll; a header line `# readings` settles live readings."
+        )
     now, after = world.dead_time_s([]), world.dead_time_s(chosen)
     if (after.high - after.low) > (1 - _HELPS) * (now.high - now.low):
         found.append(

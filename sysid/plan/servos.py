@@ -55,7 +55,10 @@ def fitted_servo(result: JointCalibrationResult) -> Servo:
         hypothesis, inflation = _fitted(result.candidate_models[name], trials, noise)
         hypotheses.append(hypothesis)
         inflations.append(inflation)
-    return Servo(tuple(hypotheses), noise, tuple(nats[n] for n in names), max(inflations))
+    return Servo(
+        tuple(hypotheses), noise, tuple(nats[n] for n in names), max(inflations),
+        result.lag.feedback.time_doubt_s,
+    )  # fmt: skip
 
 
 def _fitted(

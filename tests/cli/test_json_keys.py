@@ -16,6 +16,7 @@ DOCUMENTED = {command: keys for commands, keys in ROWS for command in commands.s
 SAMPLE = ROOT / "data/samples/sweep.csv"
 COMMANDS = {
     "sweep": ("--freqs", "4", "--joints", "LF_hip"),
+    "plan": (SAMPLE.with_name("calibrated.yaml"), "--joints", "LF_hip"),
     "doctor": (SAMPLE,),
     "delay": (SAMPLE, "--joints", "LF_hip"),
     "bode": (SAMPLE, "--joints", "LF_hip"),

@@ -1,11 +1,15 @@
-"""Servos and trials for the tests of planning: known hypotheses, no fits."""
+"""Servos, trials and fits for the tests of planning."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.servo_models.delayed_pd import DelayedPD
+from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult, fit_joint
 from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.plan.candidates import Setup, recorded
@@ -17,9 +21,14 @@ from pupper_sysid.sysid.plan.information import (
     respond,
 )
 from pupper_sysid.sysid.plan.planner import Servo
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
+from support.servo_parameters import MEASURED
 
 NOISE = Noise(0.004, 0.001)
+SECONDS = 3.0
+"""Recorded of each joint by `two_joints`."""
+
 PD = (0.025, 12000.0, 100.0, 200.0, 430.0)
 
 
@@ -55,3 +64,46 @@ def with_readings(
     speed = look_up(np.gradient(track) / trial.step_s, trial.sample_step)
     error = rng.standard_normal(len(speed)) / np.sqrt(noise.weights(speed))
     return replace(trial, sample_rad=look_up(track, trial.sample_step) + error)
+
+
+@cache
+def two_joints() -> Recording:
+    """A recording of two joints at 2 and 5 Hz, read live."""
+    time = np.arange(0.0, SECONDS / 2, 0.01)
+    servo = DelayedPD(MEASURED)
+    parts: dict[str, list] = {"time": [], "command": [], "position": [], "trial": [], "f": []}
+    for number, frequency in enumerate((2.0, 5.0)):
+        command = 0.2 * np.sin(2 * np.pi * frequency * time)
+        servo.reset(0.0)
+        held = np.repeat(command, 5)
+        position = np.interp(time + 0.001, 0.002 * np.arange(1, len(held) + 1), servo.rollout(held))
+        for key, column in (
+            ("time", time + 10.0 * number), ("command", command),
+            ("position", np.round(position / 0.0015) * 0.0015),
+            ("trial", np.full(len(time), number)), ("f", np.full(len(time), frequency)),
+        ):  # fmt: skip
+            parts[key].append(column)
+    whole = {k: np.concatenate(v) for k, v in parts.items()}
+    joints = ("LF_hip", "LF_thigh")
+    return Recording.from_arrays(
+        whole["time"], dict.fromkeys(joints, whole["command"]),
+        dict.fromkeys(joints, whole["position"]), trial=whole["trial"], frequency_hz=whole["f"],
+        metadata={"readings": "live"},
+    )  # fmt: skip
+
+
+@cache
+def _fit() -> JointCalibrationResult:
+    return fit_joint("LF_hip", tuple(two_joints().trials("LF_hip")))
+
+
+def fit_of_half_width(joint: str, half_width_ms: float) -> JointCalibrationResult:
+    """A fit whose dead time is 25 ms, known as well as that."""
+    half, fit = 1e-3 * half_width_ms, _fit()
+    dead = Interval(0.025, 0.025 - half, 0.025 + half)
+    candidates = {
+        name: replace(c, parameters=c.parameters | {"dead_time_s": dead})
+        for name, c in fit.candidate_models.items()
+    }
+    lag = replace(fit.lag, joint=joint, dead_time_s=dead)
+    return replace(fit, joint=joint, lag=lag, candidate_models=candidates)

@@ -1,54 +1,15 @@
 """Rounds of recording: until every joint is narrow enough, or it is said why one cannot be."""
 
-from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult, fit_joint
 from pupper_sysid.sysid.plan.planner import LEAST_HALF_WIDTH_S
 from pupper_sysid.sysid.plan.until import Goal, half_width, parse_goal, record_until
 from pupper_sysid.sysid.recordings.recording import Recording
-from support.servo_parameters import MEASURED
-
-SECONDS = 3.0
-"""Recorded of each joint in each round."""
-
-
-@cache
-def _recording() -> Recording:
-    """Two joints at 2 and 5 Hz, read live."""
-    time = np.arange(0.0, SECONDS / 2, 0.01)
-    servo = DelayedPD(MEASURED)
-    parts: dict[str, list] = {"time": [], "command": [], "position": [], "trial": [], "f": []}
-    for number, frequency in enumerate((2.0, 5.0)):
-        command = 0.2 * np.sin(2 * np.pi * frequency * time)
-        servo.reset(0.0)
-        held = np.repeat(command, 5)
-        position = np.interp(time + 0.001, 0.002 * np.arange(1, len(held) + 1), servo.rollout(held))
-        for key, column in (
-            ("time", time + 10.0 * number), ("command", command),
-            ("position", np.round(position / 0.0015) * 0.0015),
-            ("trial", np.full(len(time), number)), ("f", np.full(len(time), frequency)),
-        ):  # fmt: skip
-            parts[key].append(column)
-    whole = {k: np.concatenate(v) for k, v in parts.items()}
-    joints = ("LF_hip", "LF_thigh")
-    return Recording.from_arrays(
-        whole["time"], dict.fromkeys(joints, whole["command"]),
-        dict.fromkeys(joints, whole["position"]), trial=whole["trial"], frequency_hz=whole["f"],
-        metadata={"readings": "live"},
-    )  # fmt: skip
-
-
-@cache
-def _fit() -> JointCalibrationResult:
-    return fit_joint("LF_hip", tuple(_recording().trials("LF_hip")))
+from support.planned_servos import SECONDS, fit_of_half_width, two_joints
 
 
 class Robot:
@@ -62,14 +23,7 @@ class Robot:
     def fit(self, recordings, joints):
         found = {}
         for joint in joints:
-            half = 1e-3 * self._widths[joint].pop(0)
-            fit, dead = _fit(), Interval(0.025, 0.025 - half, 0.025 + half)
-            candidates = {
-                name: replace(c, parameters=c.parameters | {"dead_time_s": dead})
-                for name, c in fit.candidate_models.items()
-            }
-            lag = replace(fit.lag, joint=joint, dead_time_s=dead)
-            found[joint] = replace(fit, joint=joint, lag=lag, candidate_models=candidates)
+            found[joint] = fit_of_half_width(joint, self._widths[joint].pop(0))
         return found
 
     def record_next(self, plan, number):
@@ -78,7 +32,7 @@ class Robot:
 
     def _write(self, number, joints):
         path = self.folder / f"sweep_{number}.csv"
-        table = _recording().table
+        table = two_joints().table
         Recording.from_frame(
             table[table["joint"].isin(joints)], metadata={"readings": "live"}
         ).save(path)

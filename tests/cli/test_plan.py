@@ -1,0 +1,156 @@
+"""`plan`, `sweep --plan` and `sweep --until`, as typed."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from pupper_sysid.sysid.identify import joint_fit
+from pupper_sysid.sysid.plan.plan_file import load_plan
+from pupper_sysid.sysid.recordings.files import load
+from support.command_line import run
+from support.json_keys import key_line
+from support.package import ROOT
+from support.planned_servos import fit_of_half_width
+
+FORMATS = (ROOT / "docs/formats.md").read_text()
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def widths(monkeypatch):
+    """Half widths [ms] of the dead times of the fits to come, by joint; no fit is computed."""
+    given: dict[str, list[float]] = {}
+
+    def fit(joint, trials, seed=0, presets=None):
+        return fit_of_half_width(joint, given[joint].pop(0))
+
+    monkeypatch.setattr(joint_fit, "fit_joint", fit)
+    return given
+
+
+def documented(command: str) -> str:
+    """Keys of a command's object in docs/formats.md."""
+    (keys,) = re.findall(rf"^\| `{re.escape(command)}` \| `([^`]+)` \|$", FORMATS, re.M)
+    return keys
+
+
+def planned(capsys, *arguments) -> None:
+    code, _, err = run(
+        capsys, "plan", "--joints", "LF_hip,LF_thigh", "--seconds", "6.4", "--out", "plan.yaml",
+        *arguments,
+    )  # fmt: skip
+    assert code == 0, err
+
+
+def cut(path: Path, share: float) -> None:
+    """Leave that share of a recording's rows, and no footer."""
+    lines = path.read_text().splitlines(keepends=True)
+    rows = [n for n, line in enumerate(lines) if line[0].isdigit()]
+    path.write_text("".join(lines[: rows[int(share * len(rows))]]))
+
+
+def test_a_first_sweep_is_planned_and_executed_trial_by_trial(capsys):
+    planned(capsys)
+    plan = load_plan(Path("plan.yaml"))
+    assert plan.joints == ["LF_hip", "LF_thigh"] and plan.made_from == ()
+    code, out, err = run(capsys, "sweep", "--plan", "plan.yaml", "--out", "a.csv", "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert found["trials"] == len(plan.trials) and found["joints"] == plan.joints
+    recording = load("a.csv")
+    assert recording.metadata["excitation"]["kind"] == "plan"
+    assert recording.metadata["excitation"]["file"] == "plan.yaml"
+    tones = [t.frequency_hz for t in plan.trials if t.joint == "LF_hip" and t.kind == "sine"]
+    assert [t.frequency_hz for t in recording.trials("LF_hip")][: len(tones)] == tones
+
+
+def test_a_planned_sweep_that_was_cut_short_is_continued(capsys):
+    planned(capsys)
+    run(capsys, "sweep", "--plan", "plan.yaml", "--out", "a.csv")
+    whole = load("a.csv").table.groupby(["joint", "trial"]).size()
+    cut(Path("a.csv"), 0.6)
+    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
+    assert code == 0, err
+    again = load("a.csv")
+    assert (again.table.groupby(["joint", "trial"]).size() - whole).abs().max() <= 1
+    assert "completed" in again.metadata
+
+
+def test_a_plan_that_has_changed_since_is_not_continued(capsys):
+    planned(capsys)
+    run(capsys, "sweep", "--plan", "plan.yaml", "--out", "a.csv")
+    cut(Path("a.csv"), 0.6)
+    planned(capsys, "--seed", "5", "--force")
+    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
+    assert code == 2 and "another plan" in err
+
+
+def test_the_emulated_robot_does_not_repeat_its_noise_in_a_planned_sweep(capsys):
+    planned(capsys)
+    run(capsys, "sweep", "--plan", "plan.yaml", "--joints", "LF_hip", "--out", "a.csv")
+    planned(capsys, "--force", "--seed", "1")
+    run(capsys, "sweep", "--plan", "plan.yaml", "--joints", "LF_hip", "--out", "b.csv")
+    a, b = (load(name).table["position_rad"][:10].to_numpy() for name in ("a.csv", "b.csv"))
+    assert (a != b).any()  # both still at rest
+
+
+def test_what_cannot_be_planned_or_executed_is_refused(capsys):
+    planned(capsys)
+    Path("other.yaml").write_text("schema: other\n")
+    for arguments, sentence in (
+        (("plan", "--seconds", "-1"), "--seconds"),
+        (("plan", "--seconds", "1e6"), "--seconds"),
+        (("plan", "--joints", "LF_knee"), "LF_knee"),
+        (("plan", "missing.csv"), "does not exist"),
+        (("plan", "--out", "plan.yaml"), "--force"),
+        (("sweep", "--plan", "missing.yaml"), "does not exist"),
+        (("sweep", "--plan", "other.yaml"), "is not a plan"),
+        (("sweep", "--plan", "plan.yaml", "--joints", "RF_hip"), "RF_hip"),
+        (("sweep", "--plan", "plan.yaml", "--playback", "x.csv"), "one of the two"),
+        (("sweep", "--until", "dead_time:1us"), "--until"),
+        (("sweep", "--until", "dead_time:3ms", "--most-seconds", "0"), "--most-seconds"),
+    ):
+        code, _, err = run(capsys, *arguments)
+        assert code == 2 and sentence in err, (arguments, err)
+    assert not Path("recordings").exists()
+
+
+SHORT = ("--joints", "LF_hip,LF_thigh", "--freqs", "4", "--duration", "2", "--out", "a.csv")
+
+
+def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
+    widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
+    code, out, err = run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert key_line(found) == documented("sweep --until")
+    assert found["reached"] and found["recordings"] == ["a.csv", "a_2.csv"]
+    assert load("a_2.csv").joints == ["LF_thigh"]
+    assert load_plan(Path("a_2.plan.yaml")).joints == ["LF_thigh"]
+    assert "5.0 (dead_time:2ms): more is to be recorded" in err
+
+
+def test_rounds_that_were_cut_short_are_continued(capsys, widths):
+    widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
+    run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms")
+    first = Path("a.csv").read_bytes()
+    cut(Path("a_2.csv"), 0.5)
+    widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
+    code, out, err = run(capsys, "sweep", "--resume", "a.csv", "--json")
+    assert code == 0, err
+    # the second round is finished, and both joints are fitted to both: one more round
+    assert json.loads(out)["recordings"] == ["a.csv", "a_2.csv", "a_3.csv"]
+    assert "completed" in load("a_2.csv").metadata and Path("a.csv").read_bytes() == first
+
+
+def test_a_goal_out_of_reach_is_said_with_its_reason(capsys, widths):
+    widths |= {"LF_hip": [1.9], "LF_thigh": [5.0]}
+    code, out, err = run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--most-seconds", "4")
+    assert code == 0 and "not reached" in out
+    assert "LF_thigh: the goal was not reached: 2 s are recorded and --most-seconds is 4" in err
