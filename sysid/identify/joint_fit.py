@@ -362,6 +362,7 @@ def _why_unidentified(
     if limit and speed < 0.8 * value:
         return f"commands reach {speed:.1f} rad/s only, so the limit was never reached"
     for bound, end in ((p.low, min(value, interval.low)), (p.high, max(value, interval.high))):
+        end = max(end, p.low)
         on = float(abs(p.encode(end) - p.encode(bound))) < _AT_BOUND
         if on and (p.logarithmic or abs(value - bound) < _AT_BOUND):
             return f"on its bound, {bound:g}: the recording does not limit it on that side"
@@ -394,10 +395,10 @@ def _warnings(
             f"({max(simulated.nats.values()):.1f} nats); dead time and gains cover both. Faster "
             "tones at a smaller amplitude would tell (`pupper-sysid plan`)."
         )
-    if "velocity_limit_rad_s" in pd.undecided:
+    for limit in {"velocity_limit_rad_s", "no_load_speed_rad_s"} & pd.undecided.keys():
         found.append(
-            f"{joint}: the speed limit was not excited: "
-            f"{pd.undecided['velocity_limit_rad_s']}. Record a faster tone or a step."
+            f"{joint}: the speed limit was not excited: {pd.undecided[limit]}. Record a faster "
+            "tone or a step."
         )
     for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
         if name in pd.undecided:

@@ -13,9 +13,9 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sysid.fleet import calibration as fleet
 from pupper_sysid.sysid.fleet.calibration import OUTLIER, QUANTITIES, _outliers
 from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
-from pupper_sysid.sysid.identify import fleet
 from support.command_line import refused, run
 
 NAMES = tuple(QUANTITIES)

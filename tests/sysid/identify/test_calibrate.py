@@ -9,7 +9,7 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, Delayed
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
-from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
+from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag, plausible
 from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
 from pupper_sysid.sysid.identify.output_error import Problem, fit
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
@@ -64,7 +64,8 @@ def test_the_truth_is_inside_the_dead_time_interval(result):
 def test_the_interval_of_a_fast_servo_ends_at_zero():
     trials = tone_trials(0.002, np.random.default_rng(2), (1.0, 3.0), period_s=0.0)
     found = joint_lag("LF_hip", tuple(trials)).dead_time_s
-    assert found is not None and found.low == 0.0 < found.high
+    # the shortest dead time that is fitted is 1 ms; the position is ahead of the held command
+    assert found is not None and found.low < 0.002 < found.high
 
 
 def test_the_fit_is_as_good_as_the_readings_allow(result):
@@ -94,7 +95,9 @@ def test_ratios_are_identified_and_torques_only_by_the_anchor(result, tmp_path):
     small, large = (to_calibration({"LF_hip": result}, [], 0, torque) for torque in (0.2, 0.4))
     a, b = small.joint("LF_hip").actuator, large.joint("LF_hip").actuator
     assert b.armature_kg_m2.value == pytest.approx(2 * a.armature_kg_m2.value)
-    assert a.armature_kg_m2.identified == "ratio only" and a.effort_limit_nm.identified == "no"
+    assert a.stiffness_nm_per_rad.identified == "ratio only"
+    # the tones' accelerations, friction included, stay below the effort limit
+    assert a.armature_kg_m2.identified == "no" and a.effort_limit_nm.identified == "no"
     assert a.ratios_to_armature == b.ratios_to_armature
     # either moves alike: the scale cannot be seen in free air
     command = 0.3 * np.sin(np.arange(500) * 0.02)
@@ -107,6 +110,7 @@ def test_a_speed_limit_that_was_never_reached_is_not_claimed():
     slow = servo_trials(rng, (0.5, 1.0, 1.5))  # 2.8 rad/s at most
     found = fit_joint("LF_hip", slow, 0)
     assert "velocity_limit_rad_s" in found.candidate_models["delayed_pd"].undecided
+    assert "no_load_speed_rad_s" in found.candidate_models["delayed_pd_back_emf"].undecided
     assert any("speed limit was not excited" in w for w in found.warnings)
 
 
@@ -182,7 +186,9 @@ def test_the_real_sweeps_reach_the_best_published_figures(real, joint, lag, held
     assert found.lag.quantum_rad == pytest.approx(5.712e-3, abs=1e-6)
     assert 1e3 * found.lag.lag_s.value == pytest.approx(lag, abs=1.5)
     assert 1e3 * (found.lag.lag_s.high - found.lag.lag_s.low) / 2 <= 1.5
-    assert 0.013 <= found.dead_time_s.low < found.dead_time_s.high <= 0.032
+    # either limit on the speed explains these tones: 18 to 20 ms with slew, 26 to 29 with back-EMF
+    assert len(plausible(found.structure_nats)) == 2
+    assert 0.013 <= found.dead_time_s.low <= 0.020 < 0.027 <= found.dead_time_s.high <= 0.038
     assert 0.97 <= found.lag.by_frequency[-1].gain <= 1.06
     assert pd.rmse_held_rad <= held
     assert found.candidate_models[found.model].scores.rmse_leave_one_frequency_out_rad <= unseen

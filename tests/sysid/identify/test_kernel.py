@@ -53,7 +53,7 @@ def candidates(model, count: int = 37) -> np.ndarray:
 def reference(model, values: np.ndarray, trial: TrialData) -> np.ndarray:
     """Positions at step edges by NumPy, shape (steps + 1, candidates)."""
     steps = len(trial.command)
-    history = np.concatenate([np.zeros(70), trial.command])[:, None]
+    history = np.concatenate([np.zeros(210), trial.command])[:, None]
     track = np.zeros((steps + 1, len(values)))
     track[1:] = fractional_shift(
         history, steps, values[:, 0] / TIME_STEP_S, np.zeros(len(values), int)
