@@ -8,7 +8,7 @@ note names models that were fitted to a recording they are compared on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,6 +35,7 @@ from pupper_sysid.sysid.compare.readings import (
     with_ages,
 )
 from pupper_sysid.sysid.doctor.checks import cautions
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -158,6 +159,7 @@ def compare(
     joints: Joints = None,
     readings: str = "auto",
     seed: int = 0,
+    lattices: Mapping[str, PollLattice] | None = None,
 ) -> Comparison:
     """Run servo models over recordings and score them on the same readings.
 
@@ -174,6 +176,8 @@ def compare(
         Which readings count, see `sysid.servo_fit.data`.
     seed : int
         Of the bootstrap.
+    lattices : mapping of joint to PollLattice, optional
+        Poll of the same recordings, if it has been found already.
 
     Returns
     -------
@@ -187,7 +191,7 @@ def compare(
     """
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
     trials = usable_trials(recordings, names)
-    data = merged_groups(servo_data(recordings, names, readings, seed))
+    data = merged_groups(servo_data(recordings, names, readings, seed, lattices))
     opened: dict[str, _Opened] = {}
     notes = [text for joint in names for text in cautions(joint, trials[joint])]
     inputs = {r.sha256: r.name for r in recordings}

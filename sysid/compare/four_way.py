@@ -24,6 +24,7 @@ from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 PUBLISHED, FITTED = "DelayedPD, published", "DelayedPD, fitted here"
 _TRAIN_SHARE = 2 / 3  # of a recording without loops
+_PARTS = {"lstm": (0.0, 0.8), "mlp": (0.8, 1.0)}  # of the time that both fits take
 
 
 def four_way(
@@ -54,12 +55,16 @@ def four_way(
     ------
     InputError
         If the recording cannot support a fit.
+    KeyboardInterrupt
+        On Ctrl-C: of networks trained to different ends there is no comparison.
     """
     split = _split(recording)
-    fits: dict[str, ServoFit] = {
-        arch: fit_servo(recording, joints, arch, split=split, seed=seed, progress=progress)
-        for arch in ("lstm", "mlp")
-    }
+    fits: dict[str, ServoFit] = {}
+    for arch, part in _PARTS.items():
+        say = _part_of(progress, part) if progress else None
+        fits[arch] = fit_servo(recording, joints, arch, split=split, seed=seed, progress=say)
+        if fits[arch].interrupted:
+            raise KeyboardInterrupt
     mlp = fits["mlp"]
     assert split.train is not None and split.test is not None
     rules = reading_rules(
@@ -85,6 +90,21 @@ def four_way(
         | {arch.upper(): fit.tracks for arch, fit in fits.items()},
         bands={},
     )
+
+
+def _part_of(
+    progress: Callable[[str, float], None], part: tuple[float, float]
+) -> Callable[[str, float], None]:
+    """Progress of one fit as a part of the whole; never backwards."""
+    start, end = part
+    furthest = start
+
+    def say(what: str, share: float) -> None:
+        nonlocal furthest
+        furthest = max(furthest, start + share * (end - start))
+        progress(what, furthest)
+
+    return say
 
 
 def _split(recording: Recording) -> Split:

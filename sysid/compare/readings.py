@@ -330,6 +330,9 @@ def age_spread_rad(tracks: Tracks, data: ServoData) -> dict[str, float]:
     for joint, runs in data.runs.items():
         variance = []
         for track, run in zip(tracks[joint], runs, strict=True):
+            if run.reading_tick.shape[1] == 1:
+                variance.append(np.zeros(len(run.reading_tick)))
+                continue
             mean = predicted(track, run, run.reading_tick)
             square = predicted(track**2, run, run.reading_tick)
             variance.append(np.maximum(square - mean**2, 0.0))

@@ -154,7 +154,8 @@ def write_report(
     if models:
         from pupper_sysid.sysid.compare.compare import compare  # brings torch
 
-        comparison = compare(recordings, models, names, seed=seed)
+        lattices = {joint: lag.feedback for joint, lag in lags.items()}
+        comparison = compare(recordings, models, names, seed=seed, lattices=lattices)
     found = Findings(
         recordings=recordings, results=results, examinations=examinations, responses=responses,
         calibration=calibration or results.calibration, comparison=comparison,

@@ -19,7 +19,7 @@ can be held out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,7 +140,11 @@ class ServoData:
 
 
 def servo_data(
-    recordings: Sequence[Recording], joints: Sequence[str], mode: str = "auto", seed: int = 0
+    recordings: Sequence[Recording],
+    joints: Sequence[str],
+    mode: str = "auto",
+    seed: int = 0,
+    lattices: Mapping[str, PollLattice] | None = None,
 ) -> ServoData:
     """Arrange recordings for fitting or scoring servo models.
 
@@ -152,6 +156,8 @@ def servo_data(
         Which readings count; `auto` decides per joint, as the module's text describes.
     seed : int
         Of the search for the poll.
+    lattices : mapping of joint to PollLattice, optional
+        Of the joints whose poll has been found already.
 
     Raises
     ------
@@ -162,15 +168,16 @@ def servo_data(
     labels: dict[str, int] = {}
     runs: dict[str, tuple[Run, ...]] = {}
     modes: dict[str, str] = {}
-    lattices: dict[str, PollLattice] = {}
+    polls: dict[str, PollLattice] = {}
     for joint in joints:
-        found, modes[joint], lattices[joint] = _joint_runs(
-            recordings, joint, mode, period, labels, seed
+        known = (lattices or {}).get(joint)
+        found, modes[joint], polls[joint] = _joint_runs(
+            recordings, joint, mode, period, labels, seed, known
         )
         if not sum(len(r.tick) for r in found):
             raise InputError(f"{joint}: no reading changed; a model cannot be fitted.")
         runs[joint] = tuple(found)
-    return ServoData(tuple(joints), period, runs, tuple(labels), modes, lattices)
+    return ServoData(tuple(joints), period, runs, tuple(labels), modes, polls)
 
 
 def look_up_weights(
@@ -228,11 +235,12 @@ def _joint_runs(
     period: float,
     labels: dict[str, int],
     seed: int,
+    known: PollLattice | None,
 ) -> tuple[list[Run], str, PollLattice]:
     trials = joint_trials(recordings, joint)
     if not trials:
         raise InputError(f"{joint} was not recorded. Leave it out of `joints`.")
-    lattice = find_poll_lattice(trials, joint_rng(seed, joint))
+    lattice = known or find_poll_lattice(trials, joint_rng(seed, joint))
     if mode == "auto":
         held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION
         mode = "fresh" if held and lattice.kind != "every read" else "all"

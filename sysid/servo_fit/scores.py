@@ -134,9 +134,11 @@ def tracks(model: ServoModel, data: ServoData, start: NDArray | None = None) -> 
     commands, recorded, _ = stacked(data)
     start = recorded if start is None else start
     model.reset(start)
+    rest = np.asarray(model.step(start), float)  # where the model is, with its own offset
+    model.reset(start)
     if isinstance(model, AtControlRate):  # all of its steps: it moves a lot within a slow tick
-        return by_run(data, start, model.every_step(commands), model.count)
-    return by_run(data, start, model.rollout(commands))
+        return by_run(data, rest, model.every_step(commands), model.count)
+    return by_run(data, rest, model.rollout(commands))
 
 
 def by_run(data: ServoData, start: NDArray, positions: ArrayLike, per_tick: int = 1) -> Tracks:
