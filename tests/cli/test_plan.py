@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pupper_sysid.sysid.identify import joint_fit
 from pupper_sysid.sysid.plan.plan_file import load_plan
+from pupper_sysid.sysid.recordings import joints
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.json_keys import key_line
@@ -27,10 +27,10 @@ def widths(monkeypatch):
     """Half widths [ms] of the dead times of the fits to come, by joint; no fit is computed."""
     given: dict[str, list[float]] = {}
 
-    def fit(joint, trials, seed=0, presets=None):
-        return fit_of_half_width(joint, given[joint].pop(0))
+    def fits(work, recordings, chosen, workers, progress):
+        return {joint: fit_of_half_width(joint, given[joint].pop(0)) for joint in chosen}
 
-    monkeypatch.setattr(joint_fit, "fit_joint", fit)
+    monkeypatch.setattr(joints, "each_joint", fits)
     return given
 
 
