@@ -33,6 +33,7 @@ _UNITS = {
 }  # fmt: skip
 _SAME_SCALE = 0.35  # of the logarithm
 _NO_ONE_LAG = 0.3
+_TURNS, _TURN_SHARE = 4, 0.2
 _MUCH_BETTER = 0.5
 _NO_PERIOD_S = 0.1  # no tone of a sweep repeats within it
 _AMBIGUOUS = 0.01  # a tone may be late by a half or whole period as well
@@ -194,7 +195,7 @@ def _not_a_servo(trials: Sequence[Trial], how: Following) -> Finding | None:
             "have nothing to do with each other. Check that both are of the same joint and on the "
             "same clock."
         )
-    elif how.early_lag_s < -0.2 * loop - 1e-3 and how.better(
+    elif how.early_lag_s < -0.2 * loop - 1e-3 and _turns(trials) >= _TURNS and how.better(
         how.early_score, 0.0 if how.early_lag_s > -_NO_PERIOD_S else _AMBIGUOUS
     ):
         text = (
@@ -208,6 +209,25 @@ def _not_a_servo(trials: Sequence[Trial], how: Following) -> Finding | None:
             "in the joint map, or multiply one column by -1."
         )
     return None if text is None else Finding(REFUSE, text)
+
+
+def _turns(trials: Sequence[Trial]) -> int:
+    """How often commands turn round, by a fifth of their range or more.
+
+    On a single way a bend, such as that of a load's sag, looks like a shift in time; on the way
+    back it does not.
+    """
+    count = 0
+    for t in trials:
+        least, extreme, way = _TURN_SHARE * float(np.ptp(t.command_rad)), t.command_rad[0], 0
+        for value in t.command_rad if least > 0 else ():
+            if way >= 0 and value < extreme - least:
+                count, way, extreme = count + (way > 0), -1, value
+            elif way <= 0 and value > extreme + least:
+                count, way, extreme = count + (way < 0), 1, value
+            elif (value - extreme) * (way or 1) > 0:
+                extreme = value
+    return count
 
 
 def _loose(how: Following) -> list[Finding]:

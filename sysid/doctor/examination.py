@@ -27,9 +27,9 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
     fresh_rows,
-    moving_rows,
     quantum,
 )
+from pupper_sysid.sysid.feedback.rows import moving_rows
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
