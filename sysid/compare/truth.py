@@ -143,6 +143,7 @@ QUANTITIES: dict[
     "effort_limit": (lambda j: j.actuator.ratios_to_armature.effort_limit, _ratio("effort_limit")),
     "back_emf": (lambda j: j.actuator.ratios_to_armature.back_emf, _ratio("back_emf")),
     "velocity_limit_rad_s": (lambda j: j.actuator.velocity_limit_rad_s, _of("velocity_limit", 0)),
+    "command_jitter_s": (lambda j: j.actuator.command_jitter_s, _of("command_jitter_s", 0)),
     "poll_period_s": (lambda j: j.feedback.poll_period_s, _of("poll_period_s", 1)),
     "loss": (lambda j: j.feedback.loss, _of("loss", 1)),
     "mean_age_s": (lambda j: j.feedback.mean_age_s, _of("mean_age_s", 1)),
@@ -276,7 +277,8 @@ def _true_motion(trial: Trial, truth: Mapping[str, Any]) -> Trial:
     """The trial as a host would log it that reads the true position every millisecond."""
     step = truth.get("physics_step_s", _EMULATOR_STEP_S)
     per_row = max(round(_GRID_S / step), 1)
-    start = trial.send_time_s[0]
+    # on the emulator's own steps: another grid would move it by a fraction of one
+    start = float(np.floor(trial.send_time_s[0] / step) * step)
     count = int((trial.send_time_s[-1] - start) / step)
     edges = start + step * np.arange(count + 1)
     sent = np.append(trial.send_time_s, edges[-1] + 1.0)

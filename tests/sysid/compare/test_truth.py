@@ -1,0 +1,174 @@
+"""Calibrations beside the truth of an emulated robot."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.calibration.parts import Quantity
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
+from pupper_sysid.sysid.compare import truth as module
+from pupper_sysid.sysid.compare.truth import (
+    QUANTITIES,
+    compared_with_truth,
+    read_truth,
+    true_lag_s,
+    truth_table,
+)
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
+from support.command_line import run
+from support.json_keys import key_line
+from support.package import ROOT
+
+JOINT = "LF_hip"
+SAMPLE = ROOT / "data/samples/calibrated.yaml"
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory) -> tuple[EmulatedRobot, EmulatedBus, Recording]:
+    """A robot without reading errors, its sweep and what its bus remembers of it."""
+    rng = np.random.default_rng(5)
+    robot = draw_robot(rng, RobotSpec(reading_noise_rad=0.0, offset_sd_rad=0.0))
+    bus = EmulatedBus(robot, rng)
+    path = tmp_path_factory.mktemp("truth") / "sweep.csv"
+    record(bus, plan("sine", [JOINT], (2.0, 4.0), duration_s=2.0), path)
+    bus.write_truth(path.with_suffix(""))
+    return robot, bus, load(path)
+
+
+def with_numbers(**numbers: Quantity):
+    """The sample calibration, one joint, with other quantities of its ratios and feedback."""
+    made = load_calibration(SAMPLE)
+    own = made.joint(JOINT)
+    ratios = own.actuator.ratios_to_armature
+    parts = {
+        "ratios": {k: v for k, v in numbers.items() if k in type(ratios).model_fields},
+        "feedback": {k: v for k, v in numbers.items() if k in type(own.feedback).model_fields},
+        "actuator": {k: v for k, v in numbers.items() if k in type(own.actuator).model_fields},
+    }
+    ratios = ratios.model_copy(update=parts["ratios"])
+    actuator = own.actuator.model_copy(update={"ratios_to_armature": ratios} | parts["actuator"])
+    feedback = own.feedback.model_copy(update=parts["feedback"])
+    joint = own.model_copy(update={"actuator": actuator, "feedback": feedback})
+    return made.model_copy(update={"joints": {JOINT: joint}})
+
+
+def truth_of(**changes: float) -> dict:
+    """Truth of one joint: stiffness over armature 12,000, loss 0.4, …"""
+    actuator = {
+        "stiffness": 12.0, "damping": 0.1, "friction_loss": 0.2, "armature": 1e-3,
+        "effort_limit": 0.4, "velocity_limit": 7.5, "dead_time_s": 0.025,
+    }  # fmt: skip
+    feedback = {
+        "poll_period_s": 0.027, "loss": 0.4, "mean_age_s": 0.0315, "quantum_rad": math.pi / 550,
+        "offset_rad": 0.003,
+    }  # fmt: skip
+    parts = {"actuator": actuator, "feedback": feedback}
+    for part in parts.values():
+        part |= {k: v for k, v in changes.items() if k in part}
+    if "back_emf" in changes:
+        actuator["back_emf"] = changes["back_emf"]
+    return {"joints": {JOINT: parts}}
+
+
+def quantity(value, low=None, high=None, identified="yes") -> Quantity:
+    return Quantity(value=value, low=low, high=high, identified=identified, why="a test")
+
+
+def test_an_interval_holds_the_truth_or_it_does_not_and_without_one_nothing_is_said():
+    made = with_numbers(
+        stiffness=quantity(12500.0, 11500.0, 13500.0),  # 12 / 0.001
+        damping=quantity(90.0, 80.0, 99.0),  # 0.1 / 0.001 = 100
+        loss=quantity(0.5, identified="no"),
+        quantum_rad=quantity(0.0057119866, 0.0057119866, 0.0057119866),  # rounded by a file
+    )
+    rows = {row.quantity: row for row in truth_table(made, truth_of())}
+    assert rows["stiffness"].truth == pytest.approx(12000.0) and rows["stiffness"].held is True
+    assert rows["damping"].truth == pytest.approx(100.0) and rows["damping"].held is False
+    assert rows["loss"].held is None and rows["loss"].identified == "no"
+    assert math.isnan(rows["loss"].found.low)
+    assert rows["quantum_rad"].held is True
+    assert set(rows) == {*QUANTITIES} - {"back_emf", "command_jitter_s"}  # neither has one
+
+
+def test_a_servo_with_back_emf_instead_of_a_speed_limit_is_compared_by_that():
+    truth = truth_of(back_emf=0.05, velocity_limit=math.inf)
+    made = with_numbers(back_emf=quantity(48.0, 40.0, 56.0))
+    rows = {row.quantity: row for row in truth_table(made, truth)}
+    assert rows["back_emf"].truth == pytest.approx(50.0) and rows["back_emf"].held is True
+    assert "velocity_limit_rad_s" not in rows
+
+
+def test_the_true_dead_time_is_that_of_the_calibrations_physics_steps():
+    (row,) = [r for r in truth_table(with_numbers(), truth_of()) if r.quantity == "dead_time_s"]
+    # the emulator steps 1 ms, the calibration 2 ms: about half of the difference earlier
+    assert 0.0 < row.truth - 0.025 < 0.002
+
+
+def test_the_motion_behind_the_true_lag_is_that_of_the_emulated_servo(swept):
+    robot, bus, recording = swept
+    truth = robot.truth()["joints"][JOINT]
+    rows = [(t, true) for t, joint, true, _ in bus.truth_rows() if joint == JOINT]
+    time, position = np.array(rows).T
+    for trial in recording.trials(JOINT):
+        moved = module._true_motion(trial, truth)
+        # friction lets a servo rest beside its command; the first swing takes it along
+        inside = (time > trial.send_time_s[0] + 0.5) & (time < moved.read_time_s[-1])
+        found = np.interp(time[inside], moved.read_time_s, moved.position_rad)
+        assert np.ptp(found) > 0.3
+        np.testing.assert_allclose(found, position[inside], atol=1e-5)
+
+
+def test_the_true_lag_is_the_dead_time_and_the_dynamics(swept):
+    robot, _, recording = swept
+    truth = robot.truth()["joints"][JOINT]
+    lag = true_lag_s(recording.trials(JOINT), truth)
+    assert truth["actuator"]["dead_time_s"] + 0.008 < lag < 0.07
+    later = {**truth, "actuator": truth["actuator"] | {
+        "dead_time_s": truth["actuator"]["dead_time_s"] + 0.01
+    }}  # fmt: skip
+    assert true_lag_s(recording.trials(JOINT), later) - lag == pytest.approx(0.01, abs=5e-4)
+
+
+def test_the_lag_is_compared_on_the_calibrations_own_recording_only(swept):
+    robot, _, recording = swept
+    found = compared_with_truth(recording, robot.truth(), load_calibration(SAMPLE))
+    assert not any(row.quantity == "lag_s" for row in found)
+    assert "was made from" in found.notes[0]
+    rows = truth_table(load_calibration(SAMPLE), robot.truth(), recording, joints=[JOINT])
+    assert next(iter(rows)).quantity == "lag_s"
+
+
+def test_the_truth_is_read_beside_its_recording_and_refused_in_a_sentence(swept, tmp_path):
+    robot, _, recording = swept
+    assert recording.path is not None
+    assert read_truth(recording.path)["joints"].keys() == robot.truth()["joints"].keys()
+    with pytest.raises(InputError, match=r"a\.truth\.yaml does not exist.*sweep --truth"):
+        read_truth(tmp_path / "a.csv")
+    (tmp_path / "b.truth.yaml").write_text(yaml.safe_dump({"joints": {JOINT: {"actuator": 3}}}))
+    with pytest.raises(InputError, match=r"b\.truth\.yaml.*actuator"):
+        read_truth(tmp_path / "b.csv")
+    with pytest.raises(InputError, match="no joint in common"):
+        truth_table(with_numbers(), {"joints": {"RB_calf": {}}})
+
+
+def test_compare_truth_prints_a_table_and_its_keys_are_the_documented_ones(swept, capsys, tmp_path):
+    recording = swept[2].path
+    made = tmp_path / "calibrated.yaml"
+    with_numbers().save(made)
+    code, out, err = run(capsys, "compare-truth", recording, made)
+    assert code == 0, err
+    assert "dead time, ms" in out and "hold the truth" in out and "not compared" in err
+    code, out, err = run(capsys, "compare-truth", recording, made, "--json")
+    keys = key_line(json.loads(out))
+    assert f"| `compare-truth` | `{keys}` |" in (ROOT / "docs/formats.md").read_text()
