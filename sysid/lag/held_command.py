@@ -57,6 +57,13 @@ class HeldCommand:
         area = self.area[at] + self.command_rad[at] * (time_s - self.time_s[at])
         return np.where(row < 0, 0.0, area)
 
+    def levels(
+        self, start_s: float, stop_s: float, step_s: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Middle of each step of time, and the staircase's mean in it."""
+        edges = np.arange(start_s, stop_s, step_s)
+        return 0.5 * (edges[1:] + edges[:-1]), np.diff(self.integral(edges)) / step_s
+
     def means(
         self, time_s: NDArray[np.float64], edges_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
@@ -185,8 +192,7 @@ class Stretch:
         """
         span = float(self.time_s[-1] - self.time_s[0])
         step = max(_GRID_S, span / _MOST_POINTS)
-        grid = np.arange(self.time_s[0], self.time_s[-1], step)
-        level = np.diff(self.held.integral(grid)) / step
+        _, level = self.held.levels(self.time_s[0], self.time_s[-1], step)
         level = level - level.mean()
         most = int(np.ceil(longest_s / step))
         padded = np.pad(level, most)

@@ -21,7 +21,7 @@ from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
 from pupper_sysid.sysid.lag.multisine import multisine_responses
 from pupper_sysid.sysid.lag.phase_slope import tone_lags
-from pupper_sysid.sysid.lag.step_response import joint_impulse_response
+from pupper_sysid.sysid.lag.ripple import without_ripple
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction, fit_transfer_functions
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -170,19 +170,20 @@ def joint_response(
     lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     tones: list[ToneResponse] = []
     read = [readings(trial, lattice) for trial in trials]
-    impulse = joint_impulse_response(joint, trials, read, rng)
     for trial, reading in zip(trials, read, strict=True):
         if trial.frequency_hz > 0:
-            tone = tone_response(trial, reading, rng, impulse=impulse)
+            tone = tone_response(trial, reading, rng)
             tones += [] if tone is None else [tone]
         else:
-            tones += multisine_responses(trial, reading, rng, impulse=impulse)
+            tones += multisine_responses(trial, reading, rng)
     if not tones:
         raise InputError(
             f"{joint}: this recording has no tone of two periods or more, and no multisine, so "
             "there is no frequency response. Was the joint moving? Record tones of 1 to 10 Hz with "
             "`pupper-sysid sweep`."
         )
+    if lattice.kind != "lattice":
+        tones = without_ripple(trials, read, tones, rng)
     tones.sort(key=lambda t: t.frequency_hz)
     draws = np.stack([t.response_draws for t in tones])
     return FrequencyResponse(

@@ -38,7 +38,14 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.lag.estimators import estimators
 from pupper_sysid.sysid.lag.phase_slope import lag_near, slope, tone_lags, tone_weights
-from pupper_sysid.sysid.lag.step_response import LONGEST_S, ImpulseResponse, joint_impulse_response
+from pupper_sysid.sysid.lag.ripple import without_ripple
+from pupper_sysid.sysid.lag.step_response import (
+    LONGEST_S,
+    ImpulseResponse,
+    joint_impulse_response,
+    joint_stretches,
+    rough_lag,
+)
 from pupper_sysid.sysid.lag.time_shift import EARLIEST_S, command_hold, row_shift, shift_draws
 from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -47,6 +54,7 @@ _MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
 _USUAL_AGE_S = 0.03  # of feedback: where to look for the raw lag of a tone
 _EXPLAINED = 0.1  # share of the motion, below which it is no answer to the command
 _NEAR_END_S = 0.02
+_ALONE_HZ = 1.3  # up to there the lowest tone's own period is longer than any lag
 _USUAL_SHIFT_S = 0.15  # about the lag, where rows' own correlation is looked for
 
 
@@ -91,8 +99,8 @@ class LagBudget(Result):
         this recording. Of tones the phase delay, of other motion as in `sysid.lag.time_shift`.
     stale_lag_s, command_hold_s : float
         What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`. Stale readings add
-        less to the lag of a fast tone than their mean age (`feedback.mean_age_s`). The hold is half a
-        loop, and with tones what readings at one phase of the loop see of the staircase's ripple.
+        less to the lag of a fast tone than their mean age (`feedback.mean_age_s`). The hold is
+        half a loop, and with tones what readings at one phase of the loop see of the ripple.
     dead_time_s : Interval or None
         Part of `lag_s` before the servo moves; None if no model was fitted.
     feedback : PollLattice
@@ -199,7 +207,7 @@ def lag_budget(
             "too few to measure a lag. Was the joint moving and its torque on? See "
             "`pupper-sysid doctor`."
         )
-    seen = _seen(joint, trials, read, rng)
+    seen = _seen(joint, trials, read, rng, lattice.kind == "lattice")
     tones, raw, fresh, lag = seen.tones, seen.raw, seen.fresh, seen.lag
     by_frequency = seen.by_frequency()
     warnings = [*cautions(joint, trials), *_warnings(joint, seen)]
@@ -216,7 +224,7 @@ def lag_budget(
     if lattice.readings == "cannot tell":
         # they may be live after all: dated to their reads, with all rows of a joint that stands
         live = replace(lattice, kind="every read", readings="live")
-        other = _seen(joint, trials, [readings(t, live) for t in trials], rng)
+        other = _seen(joint, trials, [readings(t, live) for t in trials], rng, False)
         fresh, lag = _hull(fresh, other.fresh), _hull(lag, other.lag)
         if len(other.tones) == len(tones):
             by_frequency = tuple(
@@ -246,7 +254,7 @@ class _Seen:
     """What readings dated in one way show."""
 
     tones: list[ToneResponse]
-    near_s: float
+    near_s: float | None
     raw: Interval
     fresh: Interval
     lag: Interval
@@ -261,13 +269,12 @@ class _Seen:
 
 
 def _seen(
-    joint: str, trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator
-) -> _Seen:
+    joint: str, trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator,
+    polled: bool,
+) -> _Seen:  # fmt: skip
     """Measure the lag with readings dated as in `read`."""
-    impulse = joint_impulse_response(joint, trials, read, rng)
-    drawn = shift_draws(impulse, rng)
-    near = float(np.median(drawn))
-    tones = [tone_response(t, r, rng, impulse=impulse) for t, r in zip(trials, read, strict=True)]
+    frequency = [t.frequency_hz for t in trials if t.frequency_hz > 0]
+    tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
     tones = [t for t in tones if t is not None]
     if tones:
         moved = max(abs(t.response) for t in tones)
@@ -276,9 +283,17 @@ def _seen(
                 f"{joint}: it moved by at most {100 * moved:.0f} % of its command, so there is no "
                 "lag to measure. Was its torque on, and does it turn freely?"
             )
+        near = None
+        if min(frequency) > _ALONE_HZ:
+            near = rough_lag(joint_stretches(joint, trials, read))
+        if not polled:  # polls meet all phases of the loop, so there is no ripple to take out
+            tones = without_ripple(trials, read, tones, rng, near)
         raw, fresh, lag = (slope(tones, p, near) for p in ("raw_rows", "fresh_rows", "fresh_held"))
         return _Seen(tones, near, raw, fresh, lag)
+    impulse = joint_impulse_response(joint, trials, read, rng)
     _check(joint, impulse)
+    drawn = shift_draws(impulse, rng)
+    near = float(np.median(drawn))
     sd = max(r.time_sd_s for r in read)
     lag = Interval.of_draws(near, drawn + sd * rng.standard_normal(len(drawn)))
     fresh = _later(lag, command_hold(trials))

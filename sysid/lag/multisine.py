@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.lag.step_response import ImpulseResponse
-from pupper_sysid.sysid.lag.tone import ToneResponse, ripples
+from pupper_sysid.sysid.lag.held_command import HeldCommand
+from pupper_sysid.sysid.lag.tone import ToneResponse
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_LINES = 24
@@ -21,14 +21,11 @@ _LEFT_OVER = 0.005  # of the command's variance: quantisation, no signal
 _SETTLE_S = 0.5  # past the soft start: several times the servo's slowest pole
 _ROWS_PER_UNKNOWN = 3
 _BLOCK_S = 0.5
+_GRID_S = 1e-3
 
 
 def multisine_responses(
-    trial: Trial,
-    reading: Readings,
-    rng: np.random.Generator,
-    draws: int = 400,
-    impulse: ImpulseResponse | None = None,
+    trial: Trial, reading: Readings, rng: np.random.Generator, draws: int = 400
 ) -> list[ToneResponse]:
     """Response at each line of the command of `trial`; empty if it is no multisine.
 
@@ -40,8 +37,6 @@ def multisine_responses(
     rng : numpy.random.Generator
         Weights stretches of half a second for the draws.
     draws : int
-    impulse : ImpulseResponse, optional
-        Of the same joint, to remove the staircase's ripple; by default it stays.
     """
     send = trial.send_time_s
     if len(send) < 100 or np.ptp(trial.command_rad) < 1e-3:
@@ -56,25 +51,17 @@ def multisine_responses(
     unknown = 1 + 2 * len(lines)
     if min(fresh.sum(), rows.sum()) < _ROWS_PER_UNKNOWN * unknown:
         return []
-    grid = np.arange(start, send[-1], 1e-3)
-    held = trial.command_rad[np.searchsorted(send, grid, side="right") - 1]
-    command_held = _phasors(grid, held, lines)
+    command_held = _phasors(*HeldCommand.of(trial).levels(start, send[-1], _GRID_S), lines)
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
     raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, draws)
     measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
-    seen = np.zeros((1, len(lines)), np.complex128)
-    if impulse is not None:
-        time = reading.time_s[fresh]
-        seen = ripples(trial, time, _design(time, lines), lines, command_held, first, impulse)
-    drawn = seen[rng.integers(len(seen), size=draws)]
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     return [
         ToneResponse(
             trial.number, float(f), complex(command_rows[k]), complex(command_held[k]),
             complex(raw[0][k]), complex(measured[0][k]), raw[1][:, k],
             measured[1][:, k] * np.exp(2j * np.pi * f * shift),
-            complex(np.mean(seen[:, k])), drawn[:, k],
-            int(fresh.sum()), measured[2], reading.time_sd_s,
+            int(fresh.sum()), measured[2], reading.time_sd_s, start, send[-1], first,
         )
         for k, f in enumerate(lines)
     ]  # fmt: skip

@@ -23,10 +23,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
+from pupper_sysid.sysid.feedback.quantisation import quantum
 from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, Sums
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -37,7 +39,7 @@ _BLOCKS = 16
 _FEWEST_BLOCKS = 8
 _PER_LOOP = 8  # bins in a loop period
 _FINEST_S, _COARSEST_S = 0.001, 0.005
-_MOST_FINE = 60
+_MOST_FINE, _ROUGHLY_FINE = 60, 40
 _GROWTH = 1.12  # of bins beyond the lag
 _BEYOND_S = 0.03
 _DECAYS_S = (0.006, 0.012, 0.025, 0.05, 0.1, 0.2)
@@ -78,24 +80,19 @@ class ImpulseResponse:
 
 @dataclass(frozen=True)
 class _Prior:
-    """One dead time and kernel: the posterior for every size of the response."""
+    """One dead time and kernel: how likely it is for every size of the response."""
 
     dead_time_s: float
     bins: NDArray[np.int64]
     root: NDArray[np.float64]
-    strength: NDArray[np.float64]
-    turn: NDArray[np.float64]
+    gram: NDArray[np.float64]
     moment: NDArray[np.float64]
     variance: NDArray[np.float64]
     complexity: NDArray[np.float64]
 
-    def mean(self, k: int) -> NDArray[np.float64]:
-        """Posterior mean of the masses at the k-th size."""
-        return self.root @ (self.turn @ (self.moment * self.shrink(k)))
-
-    def shrink(self, k: int) -> NDArray[np.float64]:
-        """Posterior variance of the whitened coordinates over that of the noise."""
-        return _SIZES[k] / (1.0 + _SIZES[k] * self.strength)
+    def inverse(self, k: int) -> NDArray[np.float64]:
+        """Posterior covariance over the noise's variance, whitened, at the k-th size."""
+        return np.linalg.inv(self.gram + np.eye(len(self.gram)) / _SIZES[k])
 
     def score(self, count: float) -> NDArray[np.float64]:
         """Logarithm of the marginal likelihood of `count` effective readings, per size."""
@@ -103,7 +100,11 @@ class _Prior:
 
 
 def joint_impulse_response(
-    joint: str, trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator
+    joint: str,
+    trials: Sequence[Trial],
+    read: Sequence[Readings],
+    rng: np.random.Generator,
+    rough: bool = False,
 ) -> ImpulseResponse:
     """Impulse response of a joint, from all of its trials.
 
@@ -114,13 +115,36 @@ def joint_impulse_response(
     read : sequence of Readings
         Of each trial.
     rng : numpy.random.Generator
+    rough : bool
+        As in `impulse_response`.
 
     Raises
     ------
     InputError
         If the command does not move, or nothing is read where it does.
     """
-    parts = []
+    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    return impulse_response(joint_stretches(joint, trials, read), loop, rng, rough=rough)
+
+
+def joint_stretches(
+    joint: str, trials: Sequence[Trial], read: Sequence[Readings]
+) -> tuple[Stretch, ...]:
+    """Staircases and readings of a joint, in blocks: some sixteen in all, at least one per trial.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+    read : sequence of Readings
+        Of each trial.
+
+    Raises
+    ------
+    InputError
+        If the command does not move, or nothing is read where it does.
+    """
+    parts, step = [], quantum(trials)
     for trial, reading in zip(trials, read, strict=True):
         send, order = trial.send_time_s, np.argsort(reading.time_s, kind="stable")
         tone = trial.frequency_hz > 0 or send[-1] - send[0] < _LONG_ENOUGH_S
@@ -128,29 +152,43 @@ def joint_impulse_response(
         used = time > send[0] + (0.0 if tone else _STARTS_S)
         still = np.ptp(trial.command_rad) == 0 and trial.command_rad[0] == trial.initial_command_rad
         if np.sum(used) >= 8 and np.ptp(time[used]) > 0 and not still:
-            value = reading.position_rad[order]
+            value = _inside_counts(trial, reading, step)[order]
             parts.append((HeldCommand.of(trial), time[used], value[used]))
     if not parts or not any(np.ptp(value) > 0 for _, _, value in parts):
         raise InputError(
             f"{joint}: its command does not move, or its position does not, so there is no lag to "
             "measure. Record a sweep with `pupper-sysid sweep`."
         )
-    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
-    return impulse_response(_stretches(parts), loop, rng)
-
-
-def _stretches(
-    parts: Sequence[tuple[HeldCommand, NDArray[np.float64], NDArray[np.float64]]],
-) -> tuple[Stretch, ...]:
-    """Cut trials into blocks: some sixteen in all, at least one per trial."""
     spans = np.array([time[-1] - time[0] for _, time, _ in parts])
     shares = np.maximum(1, np.round(_BLOCKS * spans / spans.sum())).astype(int)
     shares = np.maximum(shares, int(np.ceil(_FEWEST_BLOCKS / len(parts))))
     return tuple(Stretch(*part, int(k)) for part, k in zip(parts, shares, strict=True))
 
 
+def _inside_counts(trial: Trial, reading: Readings, step_rad: float) -> NDArray[np.float64]:
+    """Readings that are fresh because they changed, moved to where the joint was.
+
+    A joint that moves less than a count between polls changes its reading at the edge of a count,
+    not in its middle; taken as they are, such readings run ahead of the motion.
+    """
+    value, rows = reading.position_rad, reading.rows
+    if len(rows) < 3 or len(rows) == np.isfinite(trial.position_rad).sum():
+        return value
+    before = trial.position_rad[: rows[0]][np.isfinite(trial.position_rad[: rows[0]])]
+    moved = np.diff(value, prepend=before[-1] if len(before) else value[0])
+    first = 2 * reading.time_s[0] - reading.time_s[1]
+    passed = np.maximum(np.diff(reading.time_s, prepend=first), 1e-6)
+    poll = float(np.quantile(passed, 0.1))
+    between = np.minimum(step_rad, np.abs(moved) / passed * poll)
+    return value - 0.5 * np.sign(moved) * (step_rad - between)
+
+
 def impulse_response(
-    parts: Sequence[Stretch], loop_s: float, rng: np.random.Generator, draws: int = 300
+    parts: Sequence[Stretch],
+    loop_s: float,
+    rng: np.random.Generator,
+    draws: int = 300,
+    rough: bool = False,
 ) -> ImpulseResponse:
     """Draw impulse responses that the readings allow.
 
@@ -162,26 +200,28 @@ def impulse_response(
         Loop period.
     rng : numpy.random.Generator
     draws : int
+    rough : bool
+        Try few kernels: a fifth of the time.
     """
-    edges = _edges(_rough_lag(parts), loop_s)
+    edges = _edges(rough_lag(parts), loop_s, rough)
     sums = _pooled([part.sums(edges) for part in parts])
     gram, moment = sums.gram.sum(axis=0), sums.moment.sum(axis=0)
     square, count = float(sums.square.sum()), float(sums.count.sum())
-    bins = np.flatnonzero(edges[1:] <= edges[1] * _MOST_FINE * 1.01)
-    dead_times = edges[bins]
+    fine = np.flatnonzero(edges[1:] <= edges[1] * (_ROUGHLY_FINE if rough else _MOST_FINE) * 1.01)
+    dead_times, decays = edges[fine], _DECAYS_S[1::2] if rough else _DECAYS_S
 
     def fit(chosen: NDArray) -> list[_Prior]:
+        kernels = [(d, decay, smooth) for d in chosen for decay in decays for smooth in (0, 1)]
         return [
             prior
-            for d in chosen
-            for decay in _DECAYS_S
-            for smooth in (False, True)
-            if (prior := _fit(gram, moment, square, count, edges, d, decay, smooth)) is not None
+            for kernel in kernels
+            if (prior := _fit(gram, moment, square, count, edges, *kernel)) is not None
         ]
 
     priors = fit(dead_times[::3])
-    inflation = _inflation(sums, *_best(priors, count))
-    for _ in range(2):
+    best = _best(priors, count)
+    inflation = _inflation(sums, *best)
+    for _ in range(1 if rough else 2):
         # dead times between the tried ones, where they are likely
         score = np.array([p.score(count / inflation).max() for p in priors])
         tried = np.array([p.dead_time_s for p in priors])
@@ -197,23 +237,25 @@ def impulse_response(
     )
 
 
-def _rough_lag(parts: Sequence[Stretch]) -> float:
-    """Where bins must be fine: the shift at which command and readings correlate best [s]."""
+def rough_lag(parts: Sequence[Stretch]) -> float:
+    """The lag to a bin of 15 ms, without an interval [s]."""
     edges = np.linspace(0.0, LONGEST_S, 81)
     sums = _pooled([part.sums(edges) for part in parts])
     gram, moment = sums.gram.sum(axis=0), sums.moment.sum(axis=0)
     square, count = float(sums.square.sum()), float(sums.count.sum())
     decays = 0.05, 0.1, 0.2, 0.4
-    priors = [_fit(gram, moment, square, count, edges, 0.0, d, False) for d in decays]
+    priors = [_fit(gram, moment, square, count, edges, 0.0, d, 0) for d in decays]
     prior, k = _best([p for p in priors if p is not None], count)
+    mean = prior.root @ (prior.inverse(k) @ prior.moment)
     # the readings' own correlation with the command would see one phase of the staircase only
-    return float(edges[int(np.argmax(np.abs(gram @ prior.mean(k))))] + edges[1] / 2)
+    return float(edges[int(np.argmax(np.abs(gram @ mean)))] + edges[1] / 2)
 
 
-def _edges(lag_s: float, loop_s: float) -> NDArray[np.float64]:
+def _edges(lag_s: float, loop_s: float, rough: bool) -> NDArray[np.float64]:
     """Bins: fine up to beyond the lag, then growing."""
     top = lag_s + loop_s + _BEYOND_S
-    fine = max(np.clip(loop_s / _PER_LOOP, _FINEST_S, _COARSEST_S), top / _MOST_FINE)
+    fine = np.clip(loop_s / _PER_LOOP, _FINEST_S, _COARSEST_S)
+    fine = max(fine, top / (_ROUGHLY_FINE if rough else _MOST_FINE))
     edges = list(np.arange(0.0, top, fine))
     width = fine
     while edges[-1] < LONGEST_S:
@@ -236,17 +278,16 @@ def _pooled(sums: Sequence[Sums]) -> Sums:
 
 def _fit(
     gram: NDArray, moment: NDArray, square: float, count: float, edges: NDArray,
-    dead_time_s: float, decay_s: float, smooth: bool,
+    dead_time_s: float, decay_s: float, smooth: int,
 ) -> _Prior | None:  # fmt: skip
-    """Posteriors under one kernel, for all sizes at once; None if it has no square root."""
+    """Likelihood under one kernel, for all sizes at once; None if it has no square root."""
     middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     bins = np.flatnonzero(middle > dead_time_s)
     past = middle[bins] - dead_time_s
     later = np.maximum(past[:, None], past)
     if smooth:
-        total = 0.5 / decay_s * (past[:, None] + past)
-        later *= 0.5 / decay_s
-        kernel = np.exp(-total - later) / 2 - np.exp(-3 * later) / 6
+        rate = 0.5 / decay_s
+        kernel = np.exp(-rate * (past[:, None] + past + later)) / 2 - np.exp(-3 * rate * later) / 6
     else:
         kernel = np.exp(-later / decay_s)
     kernel *= width[bins, None] * width[bins]
@@ -257,14 +298,64 @@ def _fit(
         root = np.linalg.cholesky(kernel)
     except np.linalg.LinAlgError:
         return None
-    strength, turn = np.linalg.eigh(root.T @ gram[np.ix_(bins, bins)] @ root)
-    strength = np.maximum(strength, 0.0)
-    own = turn.T @ (root.T @ moment[bins])
-    grown = _SIZES[:, None] * strength
-    left = square - np.sum(own**2 * _SIZES[:, None] / (1 + grown), axis=1)
-    variance = np.maximum(left, _TINY * square) / count
-    complexity = np.log1p(grown).sum(axis=1)
-    return _Prior(dead_time_s, bins, root, strength, turn, own, variance, complexity)
+    whitened = root.T @ gram[bins[0] :, bins[0] :] @ root
+    own = root.T @ moment[bins]
+    fitted, complexity = _evidence(whitened.copy(), own.copy(), _SIZES)
+    variance = np.maximum(square - fitted, _TINY * square) / count
+    return _Prior(dead_time_s, bins, root, whitened, own, variance, complexity)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _evidence(a, b, sizes):
+    """b' (a + I / size)^-1 b and log det(I + size a) per size; `a` and `b` are overwritten.
+
+    Householder reflections make `a` tridiagonal once for all sizes. Compiled, because a thousand
+    small eigenvalue problems in threads of BLAS take a hundred times as long on a busy machine.
+    """
+    n = len(b)
+    diagonal, side = np.zeros(n), np.zeros(n)
+    v, w = np.zeros(n), np.zeros(n)
+    for k in range(n - 2):
+        norm = 0.0
+        for i in range(k + 1, n):
+            v[i] = a[k, i]
+            norm += v[i] * v[i]
+        head = -np.sqrt(norm) if v[k + 1] > 0 else np.sqrt(norm)
+        side[k] = head
+        if norm == 0.0:
+            continue
+        v[k + 1] -= head
+        scale = 2.0 / (norm + v[k + 1] * v[k + 1] - (v[k + 1] + head) ** 2)
+        along, inside = 0.0, 0.0
+        for i in range(k + 1, n):
+            total = 0.0
+            for j in range(k + 1, n):
+                total += a[i, j] * v[j]
+            w[i] = scale * total
+            along += w[i] * v[i]
+            inside += b[i] * v[i]
+        for i in range(k + 1, n):
+            w[i] -= 0.5 * scale * along * v[i]
+            b[i] -= scale * inside * v[i]
+        for i in range(k + 1, n):
+            vi, wi = v[i], w[i]
+            for j in range(k + 1, n):
+                a[i, j] -= vi * w[j] + wi * v[j]
+    for k in range(n):
+        diagonal[k] = max(a[k, k], 0.0)
+    if n > 1:
+        side[n - 2] = a[n - 2, n - 1]
+    fitted, logarithm = np.zeros(len(sizes)), np.zeros(len(sizes))
+    for s in range(len(sizes)):
+        pivot, carried = 1.0, 0.0
+        for k in range(n):
+            across = sizes[s] * side[k - 1] if k > 0 else 0.0
+            share = across / pivot if k > 0 else 0.0
+            pivot = max(1.0 + sizes[s] * diagonal[k] - share * across, 1e-12)
+            carried = b[k] - share * carried
+            fitted[s] += sizes[s] * carried * carried / pivot
+            logarithm[s] += np.log(pivot)
+    return fitted, logarithm
 
 
 def _best(priors: Sequence[_Prior], count: float) -> tuple[_Prior, int]:
@@ -273,19 +364,24 @@ def _best(priors: Sequence[_Prior], count: float) -> tuple[_Prior, int]:
     return priors[int(i)], int(k)
 
 
-def _scores(sums: Sums, prior: _Prior, k: int) -> NDArray[np.float64]:
+def _scores(sums: Sums, prior: _Prior, inverse: NDArray) -> NDArray[np.float64]:
     """Gradient of the fit in every block, in the prior's coordinates."""
-    mean, bins = prior.mean(k), prior.bins
-    left = sums.moment[:, bins] - sums.gram[:, bins][:, :, bins] @ mean
-    return left @ prior.root @ prior.turn
+    mean, bins = prior.root @ (inverse @ prior.moment), prior.bins
+    left = sums.moment[:, bins] - sums.gram[:, bins[0] :, bins[0] :] @ mean
+    return left @ prior.root
 
 
 def _inflation(sums: Sums, prior: _Prior, k: int) -> float:
     """Readings per effective reading, from how much the blocks differ; at least 1."""
-    used = prior.shrink(k) * prior.strength
-    spread = np.sum(_scores(sums, prior, k) ** 2, axis=0)
-    ratio = spread / np.maximum(prior.strength * prior.variance[k], 1e-300)
-    return max(1.0, float(np.sum(used * ratio) / np.sum(used)))
+    inverse = prior.inverse(k)
+    scores = _scores(sums, prior, inverse)
+    spread = float(np.sum((scores @ inverse) * scores)) / float(prior.variance[k])
+    return max(1.0, spread / max(_used(inverse, k), 1e-9))
+
+
+def _used(inverse: NDArray, k: int) -> float:
+    """Effective number of parameters."""
+    return len(inverse) - float(np.trace(inverse)) / _SIZES[k]
 
 
 def _draw(
@@ -302,12 +398,12 @@ def _draw(
     for flat in np.unique(picked):
         i, k = divmod(int(flat), len(_SIZES))
         prior, own = priors[i], np.flatnonzero(picked == flat)
-        used = float(np.sum(prior.shrink(k) * prior.strength))
+        inverse = prior.inverse(k)
         # what was fitted away from the blocks is missing from their spread
-        lost = np.sqrt(count / max(count - inflation * used, count / 4) * blocks / (blocks - 1))
-        noise = (weights[own] - 1.0) @ _scores(sums, prior, k) * lost
+        left = max(count - inflation * _used(inverse, k), count / 4)
+        lost = np.sqrt(count / left * blocks / (blocks - 1))
+        noise = (weights[own] - 1.0) @ _scores(sums, prior, inverse) * lost
         free = np.sqrt(inflation * prior.variance[k] / _SIZES[k])
         noise += free * rng.standard_normal((len(own), len(prior.bins)))
-        whitened = (prior.moment + noise) * prior.shrink(k)
-        masses[np.ix_(own, prior.bins)] = whitened @ prior.turn.T @ prior.root.T
+        masses[own[:, None], prior.bins] = (prior.moment + noise) @ inverse @ prior.root.T
     return masses, weights

@@ -3,13 +3,6 @@
 A tone `offset + Re(P exp(2πj f t))`, with a third harmonic for the flat tops that friction makes,
 is fitted by least squares to readings at irregular times; a bootstrap over its periods gives the
 uncertainty (`common.tones`).
-
-Between two commands a servo moves in ripples of the loop's rate. Readings at one phase of the loop
-see the ripple as part of the tone: the staircase's images at multiples of the loop rate, plus and
-minus the tone, are sampled down onto it. At 30 Hz that is up to a millisecond of lag. The part is
-computed from the recording's own staircase and readings with the impulse response fitted to them
-(`sysid.lag.step_response`), subtracted, and its uncertainty added. Polled readings meet all phases
-of the loop, and nothing is left of it.
 """
 
 from __future__ import annotations
@@ -21,11 +14,11 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.lag.held_command import HeldCommand, past_tones
-from pupper_sysid.sysid.lag.step_response import ImpulseResponse
+from pupper_sysid.sysid.lag.held_command import HeldCommand
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _ALIASED = 30.0  # condition number beyond which a harmonic looks like the tone or the offset
+_GRID_S = 5e-4
 _SETTLE_S = 0.2  # after the tone is at full amplitude: several times the servo's slowest pole
 
 
@@ -46,15 +39,18 @@ class ToneResponse:
         Position of fresh rows at the times they were measured.
     raw_draws, fresh_draws : ndarray of complex, shape (draws,)
         The same under random weights of the periods.
-    ripple : complex
-        Part of `fresh` that is ripple of the staircase, seen at one phase of the loop.
-    ripple_draws : ndarray of complex, shape (draws,)
     fresh_count : int
         Fresh rows in the window.
     residual_rad : float
         RMS of the fresh rows about the fitted tone.
     time_sd_s : float
         Standard error of a shift common to all times of measurement.
+    start_s, stop_s, steady_s : float
+        Window of the fit, and since when the command is this tone.
+    ripple : complex
+        Part of `fresh` that is ripple of the staircase (`sysid.lag.ripple`); 0 if it was not
+        asked for.
+    ripple_draws : ndarray of complex, shape (draws,)
     """
 
     trial: int
@@ -65,11 +61,14 @@ class ToneResponse:
     fresh: complex
     raw_draws: NDArray[np.complex128]
     fresh_draws: NDArray[np.complex128]
-    ripple: complex
-    ripple_draws: NDArray[np.complex128]
     fresh_count: int
     residual_rad: float
     time_sd_s: float
+    start_s: float
+    stop_s: float
+    steady_s: float
+    ripple: complex = 0j
+    ripple_draws: NDArray[np.complex128] | complex = 0j
 
     @property
     def response(self) -> complex:
@@ -96,7 +95,6 @@ def tone_response(
     reading: Readings,
     rng: np.random.Generator,
     draws: int = 1000,
-    impulse: ImpulseResponse | None = None,
 ) -> ToneResponse | None:
     """Fit the tone of `trial`; None if it is no tone or has fewer than two steady periods.
 
@@ -108,8 +106,6 @@ def tone_response(
     rng : numpy.random.Generator
         Weights the periods.
     draws : int
-    impulse : ImpulseResponse, optional
-        Of the same joint, to remove the staircase's ripple; by default it stays.
     """
     if not trial.frequency_hz > 0 or len(reading.rows) < 8:
         return None
@@ -124,7 +120,7 @@ def tone_response(
     fresh = (reading.time_s >= start) & (reading.time_s <= stop)
     if rows.sum() < 8 or fresh.sum() < 8:
         return None
-    if np.linalg.cond(_design(send[rows], frequency)) > _ALIASED:  # two rows per period
+    if np.linalg.cond(tone_design(send[rows], frequency)) > _ALIASED:  # two rows per period
         return None
 
     def fitted(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
@@ -132,71 +128,26 @@ def tone_response(
 
     raw, raw_draws, _ = fitted(trial.read_time_s[rows], trial.position_rad[rows])
     result, fresh_draws, residual = fitted(reading.time_s[fresh], reading.position_rad[fresh])
-    grid = np.arange(start, stop, 5e-4)
-    row = np.clip(np.searchsorted(send, grid, side="right") - 1, 0, None)
-    held = _phasor(grid, trial.command_rad[row], frequency)
+    held = _phasor(*HeldCommand.of(trial).levels(start, stop, _GRID_S), frequency)
     sent = _phasor(send[window], trial.command_rad[window], frequency)
-    ripple, ripple_draws = 0j, np.zeros(draws, np.complex128)
-    if impulse is not None:
-        time = reading.time_s[fresh]
-        tone = np.array([frequency]), np.array([held])
-        design = _design(time, frequency)
-        seen = ripples(trial, time, design, *tone, start - _SETTLE_S, impulse)[:, 0]
-        ripple = complex(np.mean(seen))
-        ripple_draws = seen[rng.integers(len(seen), size=draws)]
     # an error of the poll's phase shifts all times of the trial together
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     fresh_draws = fresh_draws * np.exp(2j * np.pi * frequency * shift)
     return ToneResponse(
-        trial.number, frequency, sent, held, raw, result, raw_draws, fresh_draws, ripple,
-        ripple_draws, int(fresh.sum()), residual, reading.time_sd_s,
+        trial.number, frequency, sent, held, raw, result, raw_draws, fresh_draws,
+        int(fresh.sum()), residual, reading.time_sd_s, start, stop, start - _SETTLE_S,
     )  # fmt: skip
 
 
-def ripples(
-    trial: Trial,
-    time_s: NDArray[np.float64],
-    design: NDArray[np.float64],
-    frequency_hz: NDArray[np.float64],
-    held: NDArray[np.complex128],
-    start_s: float,
-    impulse: ImpulseResponse,
-) -> NDArray[np.complex128]:
-    """Phasors that a fit at the tones finds in the response to what is no tone: the images.
-
-    Parameters
-    ----------
-    trial : Trial
-    time_s : ndarray, shape (readings,)
-    design : ndarray, shape (readings, columns)
-        `common.tones.sine_design` of the fit, the tones first.
-    frequency_hz, held : ndarray, shape (tones,)
-        The tones, and their phasors in the held command.
-    start_s : float
-        From here on the command consists of these tones.
-    impulse : ImpulseResponse
-
-    Returns
-    -------
-    ndarray of complex, shape (draws, tones)
-    """
-    edges = impulse.edges_s
-    images = HeldCommand.of(trial).means(time_s, edges)
-    images -= past_tones(time_s, edges, frequency_hz, held)
-    images = np.where(time_s[:, None] - edges[1:] >= start_s, images, 0.0)
-    found = least_squares(design, images) @ impulse.masses.T
-    return phasors(found.T)[:, : len(frequency_hz)]
-
-
-def _design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:
-    """Offset, tone and, where the sampling tells it apart, its third harmonic."""
+def tone_design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:
+    """Columns for offset, tone and, where the sampling tells it apart, its third harmonic."""
     angle = 2 * np.pi * frequency_hz * time_s
     design = sine_design(angle, 3 * angle)
     return design if np.linalg.cond(design) < _ALIASED else design[:, :3]
 
 
 def _phasor(time_s: NDArray, value: NDArray, frequency_hz: float) -> complex:
-    return complex(phasors(least_squares(_design(time_s, frequency_hz), value))[0])
+    return complex(phasors(least_squares(tone_design(time_s, frequency_hz), value))[0])
 
 
 def _fit(
@@ -208,7 +159,7 @@ def _fit(
     draws: int,
 ) -> tuple[complex, NDArray[np.complex128], float]:
     """Phasor, its draws, and the RMS about the fit; blocks are periods."""
-    design = _design(time, frequency)
+    design = tone_design(time, frequency)
     period = np.floor((time - start) * frequency).astype(int)
     # rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
     fit = block_bootstrap(design, value, period, rng, draws, fewest=8)
@@ -238,7 +189,7 @@ def _steady_from(trial: Trial, frequency: float) -> float:
     """Time from which the command is the tone at full amplitude [s]."""
     time, value = trial.send_time_s, trial.command_rad
     half = len(time) // 2
-    design = _design(time, frequency)[:, :3]
+    design = tone_design(time, frequency)[:, :3]
     solution = least_squares(design[half:], value[half:])
     wrong = np.abs(design @ solution - value) > 0.05 * np.hypot(solution[1], solution[2])
     last = np.flatnonzero(wrong[:half])
