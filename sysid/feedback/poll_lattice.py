@@ -17,19 +17,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 from scipy.special import betaincinv, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
+from pupper_sysid.sysid.feedback.poll_loss import count_loss
+from pupper_sysid.sysid.feedback.poll_period import LONGEST_S, common_period, likeliest_periods
 from pupper_sysid.sysid.feedback.poll_search import (
     BLUR_S,
     BLURS_S,
-    DRIFT,
     Phase,
     Stretch,
     best_blur,
@@ -39,33 +38,28 @@ from pupper_sysid.sysid.feedback.poll_search import (
     shuffled,
 )
 from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.rows import (
+    STRETCH_S,
+    fresh_rows,
+    loop_period,
+    read_before,
+    stretches_of,
+)
 from pupper_sysid.sysid.feedback.slips import (
     SMALLEST_JUMP,
     Motion,
     Segment,
     Slip,
-    evidence,
     find_segments,
     robust_scale,
 )
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_STRETCH_S = 4.0  # longer stretches would need the poll to keep its phase to 1e-4
-_LONGEST_S = 0.12
 _Z = float(ndtri((1 + LEVEL) / 2))
-_RIVAL = 5.0  # nats: a period that explains the readings by less worse is not ruled out
-_MOVING_STEPS = 3.0  # quantisation steps per poll: so much motion must change the reading
-_OF_TOP_SPEED = 0.5  # below it a joint with friction may stand
-_GRID_S, _SMOOTHING_S, _LONGEST_LAG_S = 0.002, 0.015, 0.3
-# of the period from segment to segment: usual size, and the segments that this is worth
-_USUAL_DRIFT, _USUAL_SEGMENTS = 0.002, 3.0
-_MEMORY = 2.0  # a wandering period is alike in neighbouring trials: half as many count
-_MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
 _NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
-_ALTERNATIVES = 4  # periods of the search that are compared in full
 _SHUFFLES = 12
 # each costs as much as the search: where the first few leave no doubt there are no more
 _FEWEST_SHUFFLES, _CLEAR = 4, 20.0
@@ -187,26 +181,6 @@ class Readings:
     time_sd_s: float
 
 
-def fresh_rows(trial: Trial) -> NDArray[np.int64]:
-    """Indices of the rows whose value differs from the last value before them.
-
-    Where readings are known to be live, every row is fresh.
-    """
-    valid = np.flatnonzero(np.isfinite(trial.position_rad))
-    if trial.readings == "live":
-        return valid
-    changed = np.flatnonzero(np.diff(trial.position_rad[valid]) != 0) + 1
-    return valid[changed]
-
-
-def _read_before(trial: Trial) -> NDArray[np.float64]:
-    """For each row, when the last reading before it was read; NaN for the first one."""
-    here = np.isfinite(trial.position_rad)
-    at = np.where(here, np.arange(len(here)), -1)
-    last = np.concatenate([[-1], np.maximum.accumulate(at)[:-1]])
-    return np.where(last >= 0, trial.read_time_s[last], np.nan)
-
-
 def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> PollLattice:
     """Period, loss and phases of the poll behind one joint's readings.
 
@@ -230,7 +204,7 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     declared = any(t.readings == "polled" for t in trials)
     if told == "live" and not declared:
         return PollLattice(kind="every read", readings="live", fresh_fraction=fraction)
-    loop = _loop_period(trials)
+    loop = loop_period(trials)
     nothing = PollLattice(
         kind="unresolved", readings="polled" if declared or told == "stale" else "cannot tell",
         fresh_fraction=fraction, time_doubt_s=loop / 2 if np.isfinite(loop) else 0.0,
@@ -238,12 +212,12 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     if told == "live":  # a new value at each read: the poll is faster than the loop
         return nothing
     step = max(quantum(trials), 1e-6)
-    stretches = [s for t in trials if len(t.read_time_s) > 3 for s in _stretches(t, step)]
+    stretches = [s for t in trials if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
     if not stretches or not np.isfinite(loop):
         return nothing
 
     # ln T, spaced so that the last poll of a stretch moves by half of the blur
-    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(_LONGEST_S), 0.4 * BLUR_S / _STRETCH_S))
+    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(LONGEST_S), 0.4 * BLUR_S / STRETCH_S))
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
     periods = best_periods(informative, grid)
     score = periods[0][1]
@@ -256,15 +230,15 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
             if not 0 <= z_score <= _CLEAR:
                 break
 
-    likely = _likeliest(trials, informative, [p for p, _ in periods], loop, step)
+    likely = likeliest_periods(trials, informative, [p for p, _ in periods], loop, step)
     period = likely[0]
     phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
-    loss = _loss(trials, phases)[0]
-    blur = BLUR_S
-    if np.isfinite(loss):
+    loss = count_loss(trials, phases)[0]
+    blur, possible = BLUR_S, _possible(loss)
+    if possible is not None:
         # second pass: rows that did not change count, too, and the blur is what fits best
-        blur = best_blur(informative, period, _possible(loss))
-        phases = tuple(refine(s, period, blur, _possible(loss)) for s in stretches)
+        blur = best_blur(informative, period, possible)
+        phases = tuple(refine(s, period, blur, possible) for s in stretches)
     found = replace(
         nothing, kind="lattice", readings="polled", time_doubt_s=0.0, poll_period_s=period,
         rivals_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
@@ -274,42 +248,6 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     if found.hit_rate < 0.9 or z_score < (_SIGNIFICANT if sure else _SIGNIFICANT_ALONE):
         return replace(nothing, z_score=z_score, hit_rate=found.hit_rate)
     return found
-
-
-def _likeliest(
-    trials: Sequence[Trial],
-    stretches: Sequence[Stretch],
-    periods: Sequence[float],
-    loop: float,
-    step: float,
-) -> tuple[float, ...]:
-    """The period that explains best which rows changed and which did not [s], and its rivals.
-
-    Of the best ones of the search and of their aliases, at which the reads meet instants of
-    another lattice in the same rows.
-    """
-    best = periods[0]
-    if not np.isfinite(best):
-        return (best,)
-    tried = [*periods[:_ALTERNATIVES], 2 * best, best / 2]
-    tried += [1 / abs(1 / loop - 1 / p) for p in tried if abs(p / loop - 1) > 0.01]
-    moving = [moving_rows(t, step) for t in trials]
-    changed = sum(int(np.sum(m[fresh_rows(t)])) for t, m in zip(trials, moving, strict=True))
-    rows = max(sum(int(m.sum()) for m in moving), 1)
-    found = {}
-    for period in tried:
-        if not 1.02 * loop < period < _LONGEST_S:
-            continue
-        loss = 1.0 - changed / rows * period / loop
-        if changed and loss < -0.1:
-            continue  # more changes than polls
-        loss = float(np.clip(loss, 0.02, 0.98)) if changed else 0.5
-        found[period] = sum(evidence(s, period, BLUR_S, loss) for s in stretches)
-    if not found:
-        return (best,)
-    order = sorted(found, key=lambda p: -found[p])
-    close = [p for p in order if found[order[0]] - found[p] < _RIVAL]
-    return (order[0], *(p for p in close[1:] if abs(p / order[0] - 1) > 2 * DRIFT))
 
 
 def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Motion]) -> PollLattice:
@@ -344,7 +282,7 @@ def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Moti
     polled = [(t, m) for t, m in zip(trials, motions, strict=True) if t.readings != "live"]
     own = [t for t, _ in polled]
     step = max(quantum(own), 1e-6)
-    stretches = [s for t in own if len(t.read_time_s) > 3 for s in _stretches(t, step)]
+    stretches = [s for t in own if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
     return _with_segments(own, stretches, lattice, {t.number: m for t, m in polled})
 
 
@@ -388,26 +326,13 @@ def _with_segments(
             parts.append(part)
             phases.append(phase)
     hits = np.concatenate([contains(s, p) for s, p in zip(parts, phases, strict=True)])
-    period, error = _common_period(parts, phases)
-    loss, polls = _loss(trials, phases)
+    period, error = common_period(parts, phases)
+    loss, polls = count_loss(trials, phases)
     return replace(
         lattice, poll_period_s=period, poll_period_sd_s=error, loss=loss,
         loss_sd=math.sqrt(max(loss * (1 - loss), 1.0 / polls) / polls) if polls else math.nan,
         polls=polls, hit_rate=float(np.mean(hits)), slips=tuple(slips), phases=tuple(phases),
     )  # fmt: skip
-
-
-def _common_period(parts: Sequence[Stretch], phases: Sequence[Phase]) -> tuple[float, float]:
-    """Mean period over the segments of a lattice, and its standard error [s]."""
-    weights = np.array([len(s.begin) for s in parts], float)
-    periods = np.array([p.period_s for p in phases])
-    period = float(np.average(periods, weights=weights))
-    effective = max(weights.sum() ** 2 / np.sum(weights**2), 1.0)
-    # periods of few segments: their scatter is shrunk towards that of other recordings
-    scatter = np.average((periods - period) ** 2, weights=weights) * effective
-    usual = _USUAL_SEGMENTS * (_USUAL_DRIFT * period) ** 2
-    variance = (scatter + usual) / (effective - 1 + _USUAL_SEGMENTS)
-    return period, float(np.sqrt(_MEMORY * variance / effective))
 
 
 def _possible(loss: float) -> float | None:
@@ -449,7 +374,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
     """
     rows = fresh_rows(trial)
     read = trial.read_time_s
-    before = _read_before(trial)[rows]
+    before = read_before(trial)[rows]
     if "live" in (lattice.readings, trial.readings):
         rows = np.flatnonzero(np.isfinite(trial.position_rad))
         return Readings(rows, read[rows], trial.position_rad[rows], read.copy(), 0.0)
@@ -470,104 +395,3 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
     last = np.maximum.accumulate(np.where(np.isfinite(held), np.arange(len(read)), -1))
     held = np.where(last >= 0, held[np.maximum(last, 0)], np.nan)
     return Readings(rows, time, trial.position_rad[rows], held, sd)
-
-
-# ---------------------------------------------------------------- stretches of a trial
-
-
-def _stretches(trial: Trial, step: float) -> list[Stretch]:
-    """Cut a trial into stretches short enough for one strict lattice each."""
-    read, rows, before = trial.read_time_s, fresh_rows(trial), _read_before(trial)
-    moving = np.flatnonzero(moving_rows(trial, step))
-    known = np.isfinite(trial.position_rad) & np.isfinite(before)
-    same = np.setdiff1d(moving[known[moving]], rows)
-    parts = max(1, int(np.ceil((read[-1] - read[0]) / _STRETCH_S)))
-    edges = np.linspace(read[0], read[-1], parts + 1)
-    found = []
-    for start, stop in pairwise(edges):
-        own, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
-        if len(own) >= 8:
-            found.append(
-                Stretch(trial.number, start, stop, before[own], read[own], before[held], read[held])
-            )
-    return found
-
-
-def _loop_period(trials: Sequence[Trial]) -> float:
-    gaps = [np.diff(t.read_time_s) for t in trials if len(t.read_time_s) > 1]
-    return float(np.median(np.concatenate(gaps))) if gaps else float("nan")
-
-
-# ------------------------------------------------------------------ where the servo must move
-
-
-def moving_rows(trial: Trial, step: float) -> NDArray[np.bool_]:
-    """Rows by which the servo must have moved by a count of `step` [rad] since the row before."""
-    gap = float(np.median(np.diff(trial.read_time_s)))
-    return _speed(trial) * gap > _MOVING_QUANTA * step
-
-
-def _speed(trial: Trial) -> NDArray[np.float64]:
-    """|command rate| around each row [rad/s], the largest over the past 0.1 s to allow for lag."""
-    rate = np.abs(np.gradient(trial.command_rad, trial.send_time_s))
-    loop = max(float(np.median(np.diff(trial.send_time_s))), 1e-4)
-    reach = max(1, round(0.1 / loop))
-    padded = np.concatenate([np.full(reach, rate[0]), rate])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, reach + 1)
-    # the slowest command in reach: the servo moves even if the lag is unknown
-    return windows.min(axis=1)
-
-
-def _loss(trials: Sequence[Trial], phases: Sequence[Phase]) -> tuple[float, int]:
-    """Share of failed polls, and the number of polls it was counted from.
-
-    Counted where the joint moves fast enough that a new reading must differ from the last.
-    """
-    step = quantum(trials)
-    polls = successes = 0
-    for trial in trials:
-        rows, read, before = fresh_rows(trial), trial.read_time_s, _read_before(trial)
-        middle = 0.5 * (before[rows] + read[rows])
-        speed = _expected_speed(trial, middle, trial.position_rad[rows])
-        for phase in (p for p in phases if p.trial == trial.number):
-            least = max(_MOVING_STEPS * step / phase.period_s, _OF_TOP_SPEED * speed.max())
-            first = np.ceil((phase.start_s - phase.phase_s) / phase.period_s)
-            last = np.floor((phase.stop_s - phase.phase_s) / phase.period_s)
-            instants = phase.phase_s + phase.period_s * np.arange(first, last + 1)
-            own = (read[rows] > phase.start_s) & (read[rows] <= phase.stop_s)
-            dated = middle[own] - phase.phase_s
-            dated = phase.phase_s + phase.period_s * np.round(dated / phase.period_s)
-            for times, success in ((instants, False), (dated, True)):
-                row = np.clip(np.searchsorted(read, times), 0, len(read) - 1)
-                count = int(np.sum(speed[row] > least))
-                successes, polls = (
-                    (successes + count, polls) if success else (successes, polls + count)
-                )
-    return (max(1.0 - successes / polls, 0.0), polls) if polls else (math.nan, 0)
-
-
-def _expected_speed(
-    trial: Trial, time: NDArray[np.float64], position: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Speed of the joint at each read [rad/s], as if it followed its command after one lag.
-
-    Zero where position and command have little in common.
-    """
-    sent = trial.send_time_s
-    grid = np.arange(sent[0], max(sent[-1], trial.read_time_s[-1]) + _GRID_S, _GRID_S)
-    row = np.maximum(np.searchsorted(sent, grid, side="right") - 1, 0)
-    smooth = gaussian_filter1d(trial.command_rad[row], _SMOOTHING_S / _GRID_S, mode="nearest")
-    none = np.zeros(len(trial.read_time_s))
-    if len(time) < 8 or np.ptp(smooth) == 0:
-        return none
-    lags = np.arange(0.0, _LONGEST_LAG_S, 2 * _GRID_S)
-    late = np.interp(time[None] - lags[:, None], grid, smooth)
-    late -= late.mean(axis=1, keepdims=True)
-    centred = position - position.mean()
-    both, own = late @ centred, np.maximum(np.sum(late**2, axis=1), 1e-12)
-    match = np.sign(both) * both**2 / own
-    best = int(np.argmax(match))
-    if match[best] < 0.5 * np.sum(centred**2):
-        return none
-    speed = np.abs(np.gradient(smooth, _GRID_S)) * both[best] / own[best]
-    return np.interp(trial.read_time_s - lags[best], grid, speed)

@@ -26,7 +26,7 @@ Motion = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 NATS = 10.0
 """Gain in log-likelihood that a change point needs."""
 
-SMALLEST_JUMP = 0.125
+SMALLEST_JUMP = 0.2
 """In periods; smaller jumps are within a wandering period's reach and not called slips."""
 
 _EVERY = 2  # changed rows between possible change points
