@@ -10,6 +10,7 @@ import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.doctor import causality
 from pupper_sysid.sysid.doctor.checks import cautions, findings, refuse_unusable
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.preparation import prepare_joint
@@ -156,3 +157,15 @@ def test_numbers_that_are_counted_with_are_checked(column, value, expected):
 def test_a_bus_that_lost_every_read_has_a_mean_age_without_end():
     lattice = PollLattice(kind="lattice", poll_period_s=0.02, loss=1.0, fresh_fraction=0.1)
     assert lattice.mean_age_s == np.inf
+
+
+def test_the_bend_of_a_loaded_joint_on_a_single_way_is_no_motion_before_the_command(monkeypatch):
+    time = 0.01 * np.arange(300)
+    command = 0.75 * (1 - np.cos(np.pi * time / 3.0))  # a lift, from rest to rest
+    late = np.interp(time - 0.05, time, command)
+    sagging = 0.9 * late - 0.25 * late**2  # the load pulls more, the higher the arm
+    rows = pd.DataFrame({"send_time_s": time, "command_rad": command, "position_rad": sagging})
+    trials = made(rows).trials(JOINT)
+    assert [f for f in findings(trials) if f.verdict == "do not use"] == []
+    monkeypatch.setattr(causality, "_TURNS", 0)
+    assert any("before the command" in f.text for f in findings(trials))
