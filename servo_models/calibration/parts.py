@@ -231,6 +231,12 @@ class Actuator(Part):
         return DelayedPDParameters(**values)
 
     @property
+    def top_speed_rad_s(self) -> float:
+        """No-load speed, or the largest rate of the set-point where there is no back-EMF [rad/s]."""
+        brake = self.back_emf_nm_s_per_rad.value
+        return self.effort_limit_nm.value / brake if brake else self.velocity_limit_rad_s.value
+
+    @property
     def dead_time_interval_s(self) -> tuple[float, float]:
         """Dead times to train with [s]: the interval, or whole steps, as presets publish."""
         if self.dead_time_s.low is not None and self.dead_time_s.high is not None:

@@ -48,7 +48,7 @@ QUANTITIES = {
     "stiffness_per_s2": lambda joint: joint.actuator.ratios_to_armature.stiffness.value,
     "damping_per_s": lambda joint: joint.actuator.ratios_to_armature.damping.value,
     "friction_rad_s2": lambda joint: joint.actuator.ratios_to_armature.friction_loss.value,
-    "speed_rad_s": lambda joint: joint.actuator.velocity_limit_rad_s.value,
+    "speed_rad_s": lambda joint: joint.actuator.top_speed_rad_s,
     "poll_period_ms": lambda joint: _ms(joint.feedback.poll_period_s),
     "loss": lambda joint: joint.feedback.loss.value,
     "offset_rad": lambda joint: joint.feedback.offset_rad.value,

@@ -395,7 +395,8 @@ def _warnings(
             f"({max(simulated.nats.values()):.1f} nats); dead time and gains cover both. Faster "
             "tones at a smaller amplitude would tell (`pupper-sysid plan`)."
         )
-    for limit in {"velocity_limit_rad_s", "no_load_speed_rad_s"} & pd.undecided.keys():
+    limits = {"velocity_limit_rad_s", "no_load_speed_rad_s"} & pd.undecided.keys()
+    for limit in limits if len(plausible(simulated.nats)) == 1 else ():
         found.append(
             f"{joint}: the speed limit was not excited: {pd.undecided[limit]}. Record a faster "
             "tone or a step."

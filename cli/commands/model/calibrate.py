@@ -15,6 +15,7 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 
 if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.parts import Quantity
     from pupper_sysid.sysid.identify.calibrate import CalibrationResult
 
 _SHOWN = {
@@ -109,27 +110,29 @@ class Calibrate:
 
     def _print(self, made: CalibrationResult) -> None:
         shown = terminal.table(
-            "DelayedPD per joint", "joint", "dead time ms", "steps @500 Hz", "Kp", "Kd",
-            "fric. N·m", "J 1e-4 kg·m²", "speed rad/s", "error mrad", "unseen Hz mrad",
-            "paper mrad",
+            "DelayedPD per joint", "joint", "dead time ms (90 %)", "Kp", "Kd", "fric. N·m",
+            "J 1e-4 kg·m²", "speed rad/s", "limit", "error mrad", "unseen Hz mrad", "paper mrad",
         )  # fmt: skip
         for name, r in made.items():
             a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
             paper = r.presets.get("paper")
+            brakes = a.back_emf_nm_s_per_rad.value > 0
+            limit = a.back_emf_nm_s_per_rad if brakes else a.velocity_limit_rad_s
             shown.add_row(
-                name, terminal.ms(a.dead_time_s.value), "{}–{}".format(*r.delay_steps),
-                terminal.number(a.stiffness_nm_per_rad.value),
-                terminal.number(a.damping_nm_s_per_rad.value, 3),
-                terminal.number(a.friction_loss_nm.value, 3),
-                terminal.number(1e4 * a.armature_kg_m2.value, 2),
-                terminal.number(a.velocity_limit_rad_s.value), terminal.ms(s.rmse_fresh_rad),
-                terminal.ms(s.rmse_leave_one_frequency_out_rad),
+                name,
+                f"{_number(a.dead_time_s, 1, 1e3)} ({1e3 * r.dead_time_s.low:.1f}–"
+                f"{1e3 * r.dead_time_s.high:.1f})",
+                _number(a.stiffness_nm_per_rad, 1), _number(a.damping_nm_s_per_rad, 3),
+                _number(a.friction_loss_nm, 3), _number(a.armature_kg_m2, 2, 1e4),
+                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}", "back-EMF" if brakes else "slew",
+                terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_leave_one_frequency_out_rad),
                 terminal.ms(paper.rmse_fresh_rad if paper else None),
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print(
             f"\nTorques assume a stall torque of {self.stall_torque:g} N·m; free-air recordings "
-            "give only their ratios. Errors are free-run, on fresh readings.",
+            "give only their ratios. ? is not identified; limit: what limits the speed, the "
+            "set-point's slew or back-EMF. Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
         for r in made.values():
@@ -141,3 +144,11 @@ class Calibrate:
                     "Give --stall-torque from your servo's data sheet: all torques scale with it."
                 ]
             )
+
+
+def _mark(quantity: Quantity) -> str:
+    return "?" if quantity.identified == "no" else ""
+
+
+def _number(quantity: Quantity, decimals: int, factor: float = 1.0) -> str:
+    return f"{terminal.number(factor * quantity.value, decimals)}{_mark(quantity)}"
