@@ -1,0 +1,127 @@
+"""One quantity has one number: the report's tables, sentences and JSON objects agree."""
+
+from __future__ import annotations
+
+import csv
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.results import plain
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
+from pupper_sysid.sysid.identify.dead_time import lag
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.report import report
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
+
+JOINT = "LF_thigh"
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory) -> Recording:
+    rng = np.random.default_rng(3)
+    path = tmp_path_factory.mktemp("one") / "sweep.csv"
+    bus = EmulatedBus(draw_robot(rng), rng)
+    record(bus, plan("sine", [JOINT], (2.0, 4.0), duration_s=2.5), path)
+    return load(path)
+
+
+@pytest.fixture(scope="module")
+def made(swept) -> CalibrationResult:
+    return calibrate(swept)
+
+
+@pytest.fixture(scope="module")
+def folder(swept, made, tmp_path_factory) -> Path:
+    """A report that compares the calibration and a preset, too; calibrated once."""
+    out = tmp_path_factory.mktemp("report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "calibrate", lambda *given, **more: made)
+        report.write_report(
+            swept, out, calibration=made.calibration, models=[made.calibration, "paper"]
+        )
+    return out
+
+
+def table(folder: Path, name: str) -> list[dict[str, str]]:
+    with (folder / "tables" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def text(folder: Path) -> str:
+    html = re.sub(r"<(style|img)[^>]*>(.*?</style>)?", "", (folder / "report.html").read_text())
+    return unescape(re.sub(r"<[^>]+>", " ", html))
+
+
+def parameters(folder: Path) -> dict[str, dict[str, str]]:
+    return {f"{r['part']} {r['parameter']}": r for r in table(folder, "parameters")}
+
+
+def test_poll_loss_and_age_are_those_of_the_calibration_wherever_they_stand(folder, made):
+    (budget,), (doctor,) = table(folder, "lag_budget"), table(folder, "doctor")
+    known = parameters(folder)
+    for name, elsewhere in (
+        ("poll_period_s", (budget["feedback_poll_period_s"], doctor["poll_period_s"])),
+        ("loss", (budget["feedback_loss"], doctor["loss"])),
+        ("mean_age_s", (budget["feedback_mean_age_s"],)),
+        ("quantum_rad", (budget["quantum_rad"], doctor["quantum_rad"])),
+        ("offset_rad", (budget["offset_rad"],)),
+    ):
+        own = float(known[f"feedback {name}"]["value"])
+        assert [float(x) for x in elsewhere] == pytest.approx([own] * len(elsewhere)), name
+    assert "offset_rad" not in doctor  # reading minus command is another quantity
+    age = made.calibration.joint(JOINT).feedback.mean_age_s.value
+    said = re.findall(r"(\d+) ms old on average", text(folder))
+    assert said and set(said) == {f"{1e3 * age:.0f}"}
+    said = re.findall(r"mean age (\S+) ms", text(folder))
+    assert said and set(said) == {f"{1e3 * age:.1f}"}
+    assert not re.search(r"\d ms feedback age", text(folder))
+
+
+def test_lag_and_dead_time_stand_once(folder, swept, made):
+    (budget,) = table(folder, "lag_budget")
+    dead_time = parameters(folder)["actuator dead_time_s"]
+    assert [float(budget[f"dead_time_s{end}"]) for end in ("", "_low", "_high")] == pytest.approx(
+        [float(dead_time[end]) for end in ("value", "low", "high")]
+    )
+    by_estimator = {r["estimator"]: r for r in table(folder, "estimators")}
+    default = float(by_estimator["hold-aware (default)"][f"{JOINT}_lag_s"])
+    assert float(budget["lag_s"]) == pytest.approx(default)
+    assert "dead time" not in " ".join(re.findall(r"(?:FOPDT|SOPDT)\s+([a-z ]+)", text(folder))), (
+        "a transfer function's delay is not the servo's dead time"
+    )
+    # what `delay` prints is what `calibrate` prints
+    assert plain(lag(swept)[JOINT]) == plain(made[JOINT].lag)
+
+
+def test_errors_of_one_model_on_one_recording_are_one_number(folder):
+    candidates = {r["model"]: r for r in table(folder, "candidate_models")}
+    compared = {r["model"]: r for r in table(folder, "servo_models")}
+    carried = next(n for n, r in candidates.items() if r["is_chosen"] == "True")
+    pairs = [("DelayedPD (paper)", "paper")]
+    if carried.startswith("delayed_pd") and "backlash" not in carried:
+        pairs.append(("DelayedPD", carried))
+    for there, here in pairs:
+        for name, own in (("rmse_free_run_rad", "rmse_fresh_rad"), ("rmse_held_rad",) * 2):
+            assert float(compared[there][name]) == pytest.approx(
+                float(candidates[here][own]), rel=0.01
+            ), (there, name)
+
+
+def test_what_is_identified_is_not_called_unidentified(folder, made):
+    own = made.calibration.joint(JOINT).actuator
+    speed = (own.velocity_limit_rad_s, own.ratios_to_armature.back_emf)
+    known = any(q.identified != "no" for q in speed)
+    page = text(folder)
+    assert ("limit of its speed" in page) == (not known)
+    assert ("friction is not identified. Record" in page) == (
+        own.ratios_to_armature.friction_loss.identified == "no"
+    )
+    assert "cannot be identified" not in page and "cannot be seen" not in page
