@@ -1,0 +1,69 @@
+"""Lost commands are found from the readings behind them; slips of the model are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from pupper_sysid.sysid.feedback.upsets import find_upsets, without_commands
+from pupper_sysid.sysid.recordings.recording import Trial
+
+LOOP, NOISE = 0.02, 0.005
+TIME = LOOP * np.arange(150)
+COMMAND = 0.3 * np.sin(2 * np.pi * 4 * TIME)
+
+
+def servo(command):
+    """First-order lag of 30 ms behind two rows of dead time."""
+    late = np.concatenate([np.zeros(2), command[:-2]])
+    return lfilter([0.5], [1, -0.5], late)
+
+
+def trial(command=COMMAND):
+    return Trial("LF_hip", 3, 4.0, TIME + 7, TIME + 7, command, np.zeros(150), None, 0.0)
+
+
+def search(position, scale=NOISE):
+    """Upsets of readings of every row."""
+    return find_upsets(trial(), TIME + 7, scale, lambda command: servo(command) - position)
+
+
+@pytest.mark.parametrize(("row", "rows"), [(62, 1), (75, 2), (87, 3)])
+def test_lost_commands_are_found_with_their_time_and_number(row, rows):
+    rng = np.random.default_rng(row)
+    lost = servo(without_commands(trial(), row, rows))
+    position = lost + NOISE * rng.standard_normal(150)
+    (found,) = search(position)
+    assert (found.trial, found.rows) == (3, rows)
+    assert found.time_s == pytest.approx(LOOP * row) and found.nats > 10
+    # the readings it moves, and no others, are left out
+    moved = np.flatnonzero(np.abs(lost - servo(COMMAND)) > NOISE / 2)
+    assert found.readings == tuple(moved)
+
+
+def test_two_upsets_of_a_trial_are_told_apart():
+    command = without_commands(trial(), 50, 2)
+    command = without_commands(trial(command), 100, 2)
+    found = search(servo(command))
+    assert [(u.time_s, u.rows) for u in found] == [
+        (pytest.approx(1.0), 2), (pytest.approx(2.0), 2)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ordinary_noise_is_no_upset(seed):
+    noise = NOISE * np.random.default_rng(seed).standard_t(4, 150)
+    assert search(servo(COMMAND) + noise) == []
+
+
+def test_what_lost_commands_do_not_explain_is_no_upset():
+    position = servo(COMMAND)
+    position[70:74] += 0.2 * np.array([1, -1, 1, -1])  # somebody knocked on the leg
+    assert search(position) == []
+
+
+def test_a_single_wild_reading_is_no_upset():
+    position = servo(COMMAND)
+    position[70] += 0.3
+    assert search(position) == []
