@@ -26,8 +26,10 @@ NATS = 10.0
 
 _FAR = 5.0  # standard deviations
 _IN_A_ROW = 2
+_EXPLAINED = 0.5  # share of the cost of the readings far off that lost commands must explain
 _MOST_LOST = 3
 _LONGEST_S = 0.3  # from a lost command to the first reading far off
+_LEAST_BULK = 0.3  # of the tone's noise
 _TOUCHED = 0.5  # standard deviations by which lost commands move a reading
 _MOST_UPSETS = 3  # of a trial: more are no upsets but a wrong model
 
@@ -42,7 +44,7 @@ class Upset(Result):
         Number of the trial.
     time_s : float
         When the first of them was sent, from the trial's first command.
-    rows : int
+    commands : int
         How many were lost.
     nats : float
         Log-likelihood that this gains.
@@ -52,7 +54,7 @@ class Upset(Result):
 
     trial: int
     time_s: float
-    rows: int
+    commands: int
     nats: float
     readings: tuple[int, ...] = internal(default=())
 
@@ -75,7 +77,7 @@ def find_upsets(
     time_s : ndarray, shape (fresh,)
         When each fresh reading was measured, on the recording's clock.
     scale_rad : float
-        Size of ordinary residuals on this trial.
+        Noise of the trial's tone; where the bulk of the residuals is smaller, that counts.
     simulate : callable
         See `Simulate`; its residuals are those of `time_s`.
 
@@ -86,7 +88,11 @@ def find_upsets(
     """
     found: list[Upset] = []
     given = trial.command_rad
-    rest = simulate(given) / scale_rad
+    rest = simulate(given)
+    # an upset is part of the tone's noise, unless that is taken from the bulk
+    bulk = 1.4826 * float(np.median(np.abs(rest))) if len(rest) else 0.0
+    scale_rad = float(np.clip(bulk, _LEAST_BULK * scale_rad, scale_rad))
+    rest = rest / scale_rad
     left = np.ones(len(rest), bool)
     for _ in range(_MOST_UPSETS):
         first = _first_far(np.abs(rest), left)
@@ -100,18 +106,18 @@ def find_upsets(
                 gain = float(np.sum((_cost(rest) - _cost(without))[left]))
                 if best is None or gain > best[0]:
                     best = gain, int(row), rows, without
-        if best is None or best[0] < NATS:
-            left[first] = False  # something else: look on behind it
-            while first + 1 < len(left) and abs(rest[first + 1]) > _FAR:
-                first += 1
-                left[first] = False
+        run = [first]
+        while run[-1] + 1 < len(rest) and abs(rest[run[-1] + 1]) > _FAR:
+            run.append(run[-1] + 1)
+        if best is None or best[0] < max(NATS, _EXPLAINED * float(np.sum(_cost(rest[run])))):
+            left[run] = False  # something else: look on behind it
             continue
         gain, row, rows, without = best
         touched = left & (np.abs(without - rest) > _TOUCHED)
         left &= ~touched
         found.append(
             Upset(
-                trial=trial.number, time_s=float(sent[row] - sent[0]), rows=rows, nats=gain,
+                trial=trial.number, time_s=float(sent[row] - sent[0]), commands=rows, nats=gain,
                 readings=tuple(int(k) for k in np.flatnonzero(touched)),
             )
         )  # fmt: skip

@@ -35,7 +35,7 @@ def test_lost_commands_are_found_with_their_time_and_number(row, rows):
     lost = servo(without_commands(trial(), row, rows))
     position = lost + NOISE * rng.standard_normal(150)
     (found,) = search(position)
-    assert (found.trial, found.rows) == (3, rows)
+    assert (found.trial, found.commands) == (3, rows)
     assert found.time_s == pytest.approx(LOOP * row) and found.nats > 10
     # the readings it moves, and no others, are left out
     moved = np.flatnonzero(np.abs(lost - servo(COMMAND)) > NOISE / 2)
@@ -46,7 +46,7 @@ def test_two_upsets_of_a_trial_are_told_apart():
     command = without_commands(trial(), 50, 2)
     command = without_commands(trial(command), 100, 2)
     found = search(servo(command))
-    assert [(u.time_s, u.rows) for u in found] == [
+    assert [(u.time_s, u.commands) for u in found] == [
         (pytest.approx(1.0), 2), (pytest.approx(2.0), 2)
     ]  # fmt: skip
 
