@@ -201,7 +201,8 @@ class _World:
         """Expected covariance of a hypothesis' fitted coordinates after `chosen`."""
         hypothesis = self.servo.hypotheses[which]
         said = pooled((self.tones[k], self.information[which][k]) for k in chosen)
-        return np.linalg.inv(hypothesis.known + said / self.servo.inflation)
+        known = hypothesis.known + said / self.servo.inflation
+        return np.asarray(np.linalg.inv(known), float)
 
     def nats(self, which: int, chosen: Sequence[int]) -> float:
         """Expected preference for the first hypothesis to `which` after `chosen`."""
@@ -258,7 +259,7 @@ def _followed(worlds: Sequence[_World], candidate: Candidate, number: int) -> bo
             for own in world.responses)
         for world in worlds
     ]  # fmt: skip
-    return float(np.median(moved)) > _FOLLOWED * commanded
+    return bool(np.median(moved) > _FOLLOWED * commanded)
 
 
 def _criterion(worlds: Sequence[_World], chosen: Sequence[int]) -> float:

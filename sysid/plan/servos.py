@@ -101,12 +101,16 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
     """
     named = {c.model: c.parameters for c in joint.selection.candidate_models}
     floor = max(joint.feedback.quantum_rad.value / math.sqrt(12), _LEAST_NOISE_RAD)
-    noise = replace(_USUAL_NOISE, floor_rad=max(joint.scores.rmse_free_run_fresh_rad or 0, floor))
+    jitter = joint.actuator.command_jitter_s
+    noise = Noise(
+        max(joint.scores.rmse_free_run_fresh_rad or 0.0, floor),
+        _USUAL_NOISE.jitter_s if jitter.identified == "no" else jitter.value,
+    )
     found = []
     for name in SIMULATED:
         model = candidate_model(name)
         values = named.get(name) or (_preset(joint.actuator) if name == SIMULATED[0] else None)
-        if values is not None and set(values) == set(model.names):
+        if values is not None and set(model.names) <= set(values):
             known = prior_information(model) + _interval_information(model, joint.actuator)
             found.append(Hypothesis(model, np.array([values[n] for n in model.names]), known))
     chosen = joint.selection.model
@@ -204,5 +208,5 @@ def _interval_information(model: CandidateModel, actuator: Actuator) -> NDArray[
             quantity: Quantity = _QUANTITIES[p.name](actuator)
             low, high = quantity.low, quantity.high
             if quantity.identified != "no" and low and high and high > low > 0:
-                precision[k] = (2 * _Z / math.log(high / low)) ** 2
+                precision[k] = _sd(p, Interval(quantity.value, low, high)) ** -2
     return np.diag(precision)

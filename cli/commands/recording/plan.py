@@ -53,9 +53,9 @@ class Plan:
 
     def run(self) -> None:
         """Plan, print, write."""
-        if self.out is not None:
-            from pupper_sysid.sysid.plan.plan_file import save_plan
+        from pupper_sysid.sysid.plan.plan_file import save_plan
 
+        if self.out is not None:
             refuse_overwrite(self.out, self.force)  # before the work, not after it
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
@@ -78,8 +78,11 @@ class Plan:
     def _made(self) -> SweepPlan:
         if not self.source:
             return self._first_sweep()
-        if self.source[0].suffix in (".yaml", ".yml"):
-            return self._from_calibration()
+        first, *more = self.source
+        if first.suffix in (".yaml", ".yml"):
+            if more:
+                raise InputError(f"{first} and {more[0]}: give recordings, or one calibration.")
+            return self._from_calibration(first)
         return self._from_recordings()
 
     def _first_sweep(self) -> SweepPlan:
@@ -101,16 +104,11 @@ class Plan:
             margins=margins(joint_map), seed=self.seed,
         )  # fmt: skip
 
-    def _from_calibration(self) -> SweepPlan:
+    def _from_calibration(self, path: Path) -> SweepPlan:
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
         from pupper_sysid.sysid.plan.proposal import SECONDS, Source, plan_from_calibration
         from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S
 
-        if len(self.source) > 1:
-            raise InputError(
-                f"{self.source[0]} and {self.source[1]}: give recordings, or one calibration."
-            )
-        (path,) = self.source
         calibration = load_calibration(path)
         joints = select_joints(self.joints, calibration.joint_names)
         return plan_from_calibration(

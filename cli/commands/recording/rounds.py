@@ -3,63 +3,78 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.recording.sweep import record_one, say_how_to_resume
+from pupper_sysid.cli.commands.recording.sweep import say_how_to_resume
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 
 if TYPE_CHECKING:
-    from pupper_sysid.cli.commands.recording.sweep import Sweep
     from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
     from pupper_sysid.sysid.plan.proposal import SweepPlan
     from pupper_sysid.sysid.plan.until import JointOutcome, Outcome
     from pupper_sysid.sysid.recordings.recording import Recording
 
 
+Record = Callable[[Path, dict[str, Any], bool], list[Path]]
+"""Records a request, or with True the rest of it, to a file; returns the files written."""
+
+
 def run_rounds(
-    options: Sweep, path: Path, request: dict[str, Any], whole: bool, started: float
+    record: Record,
+    path: Path,
+    request: dict[str, Any],
+    *,
+    resume: bool,
+    whole: bool,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Record the first sweep, or what is left of the last round, and go on to the goal.
 
     Parameters
     ----------
-    options : Sweep
+    record : callable
+        See `Record`.
     path : Path
         The first recording, or the one that is continued.
     request : dict
         Of that recording.
+    resume : bool
+        Whether it is continued.
     whole : bool
         Whether it was recorded to its end already.
-    started : float
-        `time.perf_counter()` at the start.
+    force : bool
+        Replace the rounds of an earlier sweep.
+    as_json : bool
+        Print one JSON object.
     """
+    started = time.perf_counter()
     from pupper_sysid.sysid.identify.joint_fit import fit_joint
     from pupper_sysid.sysid.plan.plan_file import save_plan
     from pupper_sysid.sysid.plan.until import parse_goal, record_until
-    from pupper_sysid.sysid.recordings.files import load
     from pupper_sysid.sysid.recordings.joints import each_joint
-    from pupper_sysid.sysid.sweep.resume import footer
+    from pupper_sysid.sysid.sweep.resume import footer, header_of
 
     series = request["until"]
     first = path.with_name(series["first"])
-    if options.resume:
+    if resume:
         paths = _recorded(first)
-        path = paths[-1]
-        whole = whole if path == options.resume else bool(footer(path))
-        request = dict(load(path).metadata["sweep"]) if path != options.resume else request
+        if paths[-1] != path:
+            path = paths[-1]
+            whole, request = bool(footer(path)), dict(header_of(path)["sweep"])
     else:
         paths = [path]
-        if options.force:  # rounds of an earlier sweep of this name are not this one's
+        if force:  # rounds of an earlier sweep of this name are not this one's
             for old in _recorded(first)[1:]:
                 old.unlink()
     written = list(paths)
     if not whole:
-        written += record_one(options, path, request, options.resume is not None)[1][1:]
+        written += record(path, request, resume)[1:]
 
     def record_next(plan: SweepPlan, number: int) -> Path:
         file = _of_round(first, number)
@@ -70,7 +85,7 @@ def run_rounds(
             "plan": str(plan_file), "joints": plan.joints, "loop_period_s": plan.loop_period_s,
             "until": series | {"number": number},
         }  # fmt: skip
-        written.extend([*record_one(options, file, again, False)[1], plan_file])
+        written.extend([*record(file, again, False), plan_file])
         return file
 
     def fit(
@@ -90,7 +105,11 @@ def run_rounds(
     except KeyboardInterrupt:
         say_how_to_resume(first)
         raise
-    _print(options, outcome, written, series["goal"], time.perf_counter() - started)
+    if as_json:
+        elapsed = time.perf_counter() - started
+        terminal.print_json(outcome.to_dict() | {"written": written, "elapsed_s": elapsed})
+    else:
+        _print(outcome, written, series["goal"])
 
 
 def _of_round(first: Path, number: int) -> Path:
@@ -122,12 +141,7 @@ def _report(found: dict[str, JointOutcome], goal: str) -> None:
         )
 
 
-def _print(
-    options: Sweep, outcome: Outcome, written: list[Path], goal: str, elapsed: float
-) -> None:
-    if options.json:
-        terminal.print_json(outcome.to_dict() | {"written": written, "elapsed_s": elapsed})
-        return
+def _print(outcome: Outcome, written: list[Path], goal: str) -> None:
     shown = terminal.table(
         f"Until {goal}", "joint", "rounds", "seconds", "dead time ms", "90 % interval", "goal"
     )

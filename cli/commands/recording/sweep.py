@@ -108,10 +108,52 @@ class Sweep:
         if request.get("until"):
             from pupper_sysid.cli.commands.recording.rounds import run_rounds
 
-            run_rounds(self, path, request, whole, started)
+            run_rounds(
+                lambda *asked: self._record(*asked)[1], path, request,
+                resume=self.resume is not None, whole=whole, force=self.force, as_json=self.json,
+            )  # fmt: skip
             return
-        chosen, written = record_one(self, path, request, self.resume is not None)
+        chosen, written = self._record(path, request, self.resume is not None)
         self._print(request["joints"], chosen, written, time.perf_counter() - started)
+
+    def _record(self, path: Path, request: dict[str, Any], resume: bool) -> tuple[Plan, list[Path]]:
+        """Record a request, or the rest of it; returns what was executed, and the files written."""
+        from pupper_sysid.sim.emulator.bus import EmulatedBus
+        from pupper_sysid.sysid.sweep.recorder import record
+        from pupper_sysid.sysid.sweep.resume import resume_point
+
+        bus = _open(request)
+        try:
+            chosen = _plan(request, bus)
+            point = resume_point(path, chosen, request["loop_period_s"]) if resume else None
+        except BaseException:
+            bus.close()
+            raise
+        terminal.warn(chosen.warnings)
+        if point:
+            terminal.err.print(
+                f"Continuing {path} at trial {point.next_trial + 1} of {len(chosen.trials)}."
+            )
+        existed = path.exists()
+        try:
+            with (
+                _priority(request) as priority,
+                terminal.seconds_progress("recording", chosen.duration_s) as advance,
+            ):
+                record(
+                    bus, chosen, path, loop_period_s=request["loop_period_s"],
+                    metadata={"seed": request["seed"], "sweep": request, "priority": priority},
+                    force=self.force, resume=point, progress=advance,
+                )  # fmt: skip
+        except (BusError, KeyboardInterrupt):
+            if path.exists() and (point or not existed or self.force):
+                say_how_to_resume(path)
+            raise
+        terminal.warn(_guard_warnings(path))
+        written = [path]
+        if self.truth and isinstance(bus, EmulatedBus):
+            written += bus.write_truth(path.with_suffix(""), self.force)
+        return chosen, written
 
     def _request(self) -> dict[str, Any]:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
@@ -192,48 +234,6 @@ class Sweep:
             f"  pupper-sysid calibrate {path} --out calibrated.yaml",
             soft_wrap=True,
         )
-
-
-def record_one(
-    options: Sweep, path: Path, request: dict[str, Any], resume: bool
-) -> tuple[Plan, list[Path]]:
-    """Record a request, or the rest of it; returns what was executed, and the files written."""
-    from pupper_sysid.sim.emulator.bus import EmulatedBus
-    from pupper_sysid.sysid.sweep.recorder import record
-    from pupper_sysid.sysid.sweep.resume import resume_point
-
-    bus = _open(request)
-    try:
-        chosen = _plan(request, bus)
-        point = resume_point(path, chosen, request["loop_period_s"]) if resume else None
-    except BaseException:
-        bus.close()
-        raise
-    terminal.warn(chosen.warnings)
-    if point:
-        terminal.err.print(
-            f"Continuing {path} at trial {point.next_trial + 1} of {len(chosen.trials)}."
-        )
-    existed = path.exists()
-    try:
-        with (
-            _priority(request) as priority,
-            terminal.seconds_progress("recording", chosen.duration_s) as advance,
-        ):
-            record(
-                bus, chosen, path, loop_period_s=request["loop_period_s"],
-                metadata={"seed": request["seed"], "sweep": request, "priority": priority},
-                force=options.force, resume=point, progress=advance,
-            )  # fmt: skip
-    except (BusError, KeyboardInterrupt):
-        if path.exists() and (point or not existed or options.force):
-            say_how_to_resume(path)
-        raise
-    terminal.warn(_guard_warnings(path))
-    written = [path]
-    if options.truth and isinstance(bus, EmulatedBus):
-        written += bus.write_truth(path.with_suffix(""), options.force)
-    return chosen, written
 
 
 def say_how_to_resume(path: Path) -> None:
