@@ -2,9 +2,10 @@
 
     .venv/bin/python benchmarks/training_speed.py --threads 2
 
-Prints three tables: the environment against a bare `Batch.step` on the same model, threads and
-substeps, for 64 to 8,192 environments; what delay, feedback model and terrain cost; PPO end to end
-for each architecture, and the Transformer's update on sequences against one window per sample.
+Prints three tables: the environment against a bare `Batch.step` on the same model, threads, states
+and controls, in turns in slices of 0.2 s, for 20 to 8,192 environments; what delay, feedback model,
+terrain and physics cost; PPO end to end for each architecture, and the Transformer's update on
+sequences against one window per sample. `--only environments` leaves the others out.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 
+from pupper_sysid.common.memory import keep_freed_memory
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.transformer import CONTEXT, CausalAttention
 from pupper_sysid.policies.train.run_file import preset
-from pupper_sysid.policies.train.speed import environment_rates, measure
+from pupper_sysid.policies.train.speed import Paces, load, measure, ratios
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 ACTUATOR = "data/samples/calibrated.yaml"
-SIZES = (64, 256, 1024, 4096, 8192)
+SIZES = (20, 100, 512, 2048, 8192)
 PAPER = {"mlp": "30,000", "lstm": "15,000–20,000", "transformer": "5,500"}
 
 
@@ -43,32 +45,51 @@ def resident_kb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1024
 
 
-def environment(size: int, threads: int) -> tuple[float, float, float]:
-    """Rates of the bare simulator and the environment, and what a robot takes [kB]."""
+def environment(size: int, threads: int) -> tuple[dict[str, float], float]:
+    """Rates and ratios of the environment, and what a robot takes [kB]."""
+    keep_freed_memory()
     servos = servo_ranges(ACTUATOR)
-    environment_rates(PupperEnv(Walking(), servos, 1, 0, threads))  # what is loaded only once
+    Paces(PupperEnv(Walking(), servos, 1, 0, threads))  # what is loaded only once
     before = resident_kb()
     env = PupperEnv(Walking(), servos, size, 0, threads)
-    rates = environment_rates(env)
-    return *rates, (resident_kb() - before) / size
+    taken = (resident_kb() - before) / size
+    return ratios(Paces(env).slices()), taken
+
+
+def row(found: dict[str, float]) -> str:
+    """Cells of a table."""
+    low, high = found["env_ratio_low"], found["env_ratio_high"]
+    return (
+        f"{found['bare_env_steps_per_s']:,.0f} | {found['env_steps_per_s']:,.0f} | "
+        f"{found['env_ratio']:.3f} ({low:.3f}–{high:.3f}) | {found['env_processor_ratio']:.3f}"
+    )
 
 
 def environments(threads: int) -> None:
     """Cost against number of environments, and memory."""
-    print("| environments | bare Batch.step, steps/s | PupperEnv, steps/s | ratio | kB per robot |")
-    print("|---|---|---|---|---|")
+    print(
+        f"Threads {threads}, load {load():.1f}; median of slices of 0.2 s, and their middle half.\n"
+    )
+    print(
+        "| environments | bare Batch.step, steps/s | PupperEnv, steps/s | ratio | "
+        "of processor time | kB per robot |"
+    )
+    print("|---|---|---|---|---|---|")
     for size in SIZES:
         # a process of its own: freed memory is kept, and would hide what the next one takes
         with ProcessPoolExecutor(1, get_context("spawn")) as own_process:
-            bare, own, kb = own_process.submit(environment, size, threads).result()
+            found, kb = own_process.submit(environment, size, threads).result()
         memory = f"{kb:.0f}" if size >= 1024 else "–"
-        print(f"| {size:,} | {bare:,.0f} | {own:,.0f} | {own / bare:.2f} | {memory} |", flush=True)
+        print(f"| {size:,} | {row(found)} | {memory} |", flush=True)
 
 
 def parts(threads: int) -> None:
-    """What delay, feedback and terrain cost."""
-    print("\n| 512 environments | PupperEnv, steps/s | bare Batch.step, steps/s |")
-    print("|---|---|---|")
+    """What delay, feedback, terrain and physics cost."""
+    print(
+        "\n| 512 environments | bare Batch.step, steps/s | PupperEnv, steps/s | ratio | "
+        "of processor time |"
+    )
+    print("|---|---|---|---|---|")
     late = servo_ranges(ACTUATOR)
     at_once = replace(
         late,
@@ -81,10 +102,12 @@ def parts(threads: int) -> None:
         "rough ground": (Walking(terrain="rough"), late),
         "slopes": (Walking(terrain="slopes"), late),
         "serial knee": (Walking(knee="serial"), late),
+        "physics in steps of 4 ms": (Walking(physics_step_s=0.004), late),
+        "physics of evaluation": (Walking(physics="evaluation"), late),
     }
     for name, (task, servos) in cases.items():
-        bare, own = environment_rates(PupperEnv(task, servos, 512, 0, threads))
-        print(f"| {name} | {own:,.0f} | {bare:,.0f} |", flush=True)
+        found = ratios(Paces(PupperEnv(task, servos, 512, 0, threads)).slices())
+        print(f"| {name} | {row(found)} |", flush=True)
 
 
 def end_to_end(threads: int) -> None:
@@ -147,12 +170,15 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--only", choices=("environments",), default=None)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    attention()
+    keep_freed_memory()
     environments(options.threads)
-    parts(options.threads)
-    end_to_end(options.threads)
+    if options.only is None:
+        parts(options.threads)
+        attention()
+        end_to_end(options.threads)
 
 
 if __name__ == "__main__":

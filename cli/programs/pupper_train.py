@@ -87,7 +87,7 @@ def _run(options: Options, given: list[str]) -> None:
     if options.print_config:
         print(yaml.safe_dump(plain(run), sort_keys=False), end="")
         return
-    if options.resume is None:
+    if options.resume is None and not options.benchmark:
         check_actuator(run.actuator)
     # torch and rsl_rl take seconds to import: only after the settings were checked
     warnings.filterwarnings("ignore", category=UserWarning, module="torch")
@@ -95,15 +95,19 @@ def _run(options: Options, given: list[str]) -> None:
     from pupper_sysid.policies.train.training import train
 
     if options.benchmark:
-        from pupper_sysid.policies.train.speed import measure
+        from pupper_sysid.policies.train.speed import measure, with_sample
 
-        found = measure(run)
+        here = with_sample(run)
+        check_actuator(here.actuator)
+        if here is not run:
+            warn([f"There is no {run.actuator} here; measuring with {here.actuator}."])
+        found = measure(here)
         if options.json:
             print_json(found)
         else:
             for name, value in found.items():
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
-                out.print(f"{name:28} {text}")
+                out.print(f"{name:28} {text}", soft_wrap=True)
         return
     ranks = Ranks.join()
     folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))

@@ -1,98 +1,174 @@
 """How fast training is here: the environment against the bare simulator, and PPO end to end.
 
-Everything is measured in one run, so that the ratios hardly depend on the machine's load:
-`env_ratio` is the rate of `PupperEnv.step` over that of a bare `Batch.step` on the same model,
-threads and substeps; `end_to_end_ratio` is the rate of whole updates over that of environment and
-update one after the other.
+Both sides of a ratio take turns in slices of 0.2 s, from the same states under the same controls,
+so that the load of the machine meets both alike; a ratio is the median over slices, with the
+middle half of them beside it. Processor time stands beside wall time: what another program takes
+from this one shows in the latter only.
+
+`env_ratio` is the time of a bare `Batch.step` over that of `PupperEnv.step`, with the same model,
+threads and substeps, and nothing recorded; `end_to_end_ratio` is the rate of whole updates over
+that of environment and update one after the other.
 """
 
 from __future__ import annotations
 
+import os
 import time
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.sim.walking.env import PupperEnv
 
-_ROUNDS = 5
-_STEPS = range(5, 101)  # few of many robots, many of few
-_ROBOT_STEPS = 20_000
+SLICE_S = 0.2
+_SLICES, _ROUNDS = 25, 3
+_STRIDE = 100  # steps of the trot after which its actions are used again
+_SAMPLE = Path(__file__).resolve().parents[2] / "data" / "samples" / "calibrated.yaml"
 
 
-class _Paces:
-    """Timed stretches of one environment: its own steps, and the same physics without it."""
+class Paces:
+    """The steps of an environment, and the same physics without it, in turns.
+
+    Parameters
+    ----------
+    env : PupperEnv
+        It trots on, as it is timed.
+    """
 
     def __init__(self, env: PupperEnv):
         self.env, n = env, env.environments
-        steps = int(np.clip(_ROBOT_STEPS // n, _STEPS[0], _STEPS[-1]))
-        self.robot_steps = n * steps
         rng = np.random.default_rng(0)
         # a trot with noise: robots at rest would have other contacts
-        phase = 2 * np.pi * env.trot.frequency_hz * env.config.control_step_s * np.arange(steps)
-        self._actions = [
-            (env.trot.joints(np.full(n, p), env.command) - env.default) / env.config.action_scale
-            + 0.05 * rng.standard_normal((n, 12))
-            for p in phase
-        ]
-        self.own()
-
-    def own(self) -> float:
-        """Seconds of `PupperEnv.step`s."""
-        self._controls = []
+        step = 2 * np.pi * env.trot.frequency_hz * env.config.control_step_s
+        self._phases = step * np.arange(_STRIDE)
+        self._noise = 0.05 * rng.standard_normal((_STRIDE, n, 12))
+        self._at = 0
+        self._own(self._actions(5))
         begun = time.perf_counter()
-        for action in self._actions:
+        self._own(self._actions(3))
+        self._count = max(round(3 * SLICE_S / (time.perf_counter() - begun)), 1)
+
+    def slice(self, bare_first: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Wall and processor time per robot and step [s] of the environment, and of bare physics.
+
+        Both start from the same state, and take the same steps.
+        """
+        batch, actions = self.env.robots.batch, self._actions(self._count)
+        controls = [self.env.robots.to_servo(self.env.set_points(a)) for a in actions]
+        before, bare = batch.state.copy(), np.zeros(2)
+        if bare_first:
+            bare = self._bare(controls)
+            batch.state[:] = before
+        own = self._own(actions)
+        if not bare_first:
+            after = batch.state.copy()
+            batch.state[:] = before
+            bare = self._bare(controls)
+            batch.state[:] = after
+        share = 1 / (self._count * self.env.environments)
+        return own * share, bare * share
+
+    def slices(self, count: int = _SLICES) -> NDArray[np.float64]:
+        """Times of slices, shape (count, 2, 2): environment and bare, wall and processor."""
+        return np.array([self.slice(bool(i % 2)) for i in range(count)])
+
+    def _own(self, actions: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        begun = _now()
+        for action in actions:
             self.env.step(action)
-            self._controls.append(self.env.robots.batch.bind("ctrl").copy())
-        return time.perf_counter() - begun
+        return _now() - begun
 
-    def bare(self) -> float:
-        """Seconds of `Batch.step`s under the controls of the last `own`, from its end."""
-        batch, begun = self.env.robots.batch, time.perf_counter()
-        for control in self._controls:
+    def _bare(self, controls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        batch, substeps, begun = self.env.robots.batch, self.env.config.substeps, _now()
+        for control in controls:
             batch.bind("ctrl")[:] = control
-            batch.step(nstep=self.env.config.substeps)
-        return time.perf_counter() - begun
+            batch.step(nstep=substeps)
+        return _now() - begun
+
+    def _actions(self, count: int) -> list[NDArray[np.float64]]:
+        env, found = self.env, []
+        for _ in range(count):
+            phase = np.full(env.environments, self._phases[self._at % _STRIDE])
+            target = env.trot.joints(phase, env.command)
+            noise = self._noise[self._at % _STRIDE]
+            found.append((target - env.default) / env.config.action_scale + noise)
+            self._at += 1
+        return found
 
 
-def environment_rates(env: PupperEnv) -> tuple[float, float]:
-    """Steps per second of a bare `Batch.step` and of the environment: medians of rounds."""
-    paces = _Paces(env)
-    times = [(paces.own(), paces.bare()) for _ in range(_ROUNDS)]
-    own, bare = np.median(times, axis=0).tolist()
-    return paces.robot_steps / bare, paces.robot_steps / own
+def ratios(times: NDArray[np.float64]) -> dict[str, float]:
+    """Rates and ratios of `Paces.slices`, by their keys in `measure`."""
+    own, bare = times[:, 0], times[:, 1]
+    wall, processor = (bare / own).T
+    low, middle, high = np.quantile(wall, [0.25, 0.5, 0.75])
+    return {
+        "bare_env_steps_per_s": float(1 / np.median(bare[:, 0])),
+        "env_steps_per_s": float(1 / np.median(own[:, 0])),
+        "env_ratio": float(middle),
+        "env_ratio_low": float(low),
+        "env_ratio_high": float(high),
+        "env_processor_ratio": float(np.median(processor)),
+    }
+
+
+def with_sample(run: Run) -> Run:
+    """The run, with the shipped calibration in place of its own if that is not here.
+
+    A sample of the repository, or the preset `paper`.
+    """
+    if run.actuator != Run.actuator or Path(run.actuator).exists():
+        return run
+    return replace(run, actuator=str(_SAMPLE) if _SAMPLE.is_file() else "paper")
 
 
 def measure(run: Run) -> dict[str, Any]:
     """Object of `pupper-train --benchmark --json`."""
     ranks = Ranks()
-    paces = _Paces(make_env(run, ranks))
+    paces = Paces(make_env(run, ranks))
     learner = make_learner(run, ranks)
     samples = learner.env.num_envs * learner.hyper.steps_per_environment
     learner.rollout()
     learner.update()
-    rounds = []
+    times, rounds = [], []
     for _ in range(_ROUNDS):
-        own, bare, begun = paces.own(), paces.bare(), time.perf_counter()
+        times.append(paces.slices(_SLICES // _ROUNDS))
+        begun = time.perf_counter()
         learner.rollout()
         between = time.perf_counter()
         learner.update()
         ended = time.perf_counter()
-        rounds.append((own, bare, ended - between, ended - begun))
-    own, bare, update, whole = np.median(rounds, axis=0).tolist()
-    own_rate, update_rate = paces.robot_steps / own, samples / update
+        rounds.append((ended - between, ended - begun))
+    update, whole = np.median(rounds, axis=0).tolist()
+    found, update_rate = ratios(np.concatenate(times)), samples / update
+    one_after_the_other = 1 / found["env_steps_per_s"] + 1 / update_rate
     return {
         "policy": run.architecture.kind,
         "num_envs": learner.env.num_envs,
         "threads": torch.get_num_threads(),
-        "bare_env_steps_per_s": paces.robot_steps / bare,
-        "env_steps_per_s": own_rate,
-        "env_ratio": bare / own,
+        "actuator": run.actuator,
+        "physics": run.task.physics,
+        "physics_step_s": run.task.physics_step_s,
+        **found,
         "update_samples_per_s": update_rate,
         "end_to_end_samples_per_s": samples / whole,
-        "end_to_end_ratio": samples / whole * (1 / own_rate + 1 / update_rate),
+        "end_to_end_ratio": samples / whole * one_after_the_other,
+        "load": load(),
+        "cores": os.cpu_count(),
     }
+
+
+def load() -> float:
+    """How many programs wanted to run in the last minute, this one included."""
+    return os.getloadavg()[0]
+
+
+def _now() -> NDArray[np.float64]:
+    """Wall and processor time [s]."""
+    return np.array([time.perf_counter(), time.process_time()])

@@ -241,11 +241,8 @@ class PupperEnv:
         self.steps += 1
         self.earlier_action, self.last_action = self.last_action, self.action
         self.action = np.array(action, float)
-        target = self.action * self._scale()
-        target += self.default
-        np.clip(target, self._low, self._high, out=target)
         before = self.robots.joint_velocity.copy()
-        moving = self.robots.step(target)
+        moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)
         for moved in moving:
@@ -276,6 +273,12 @@ class PupperEnv:
         return StepResult(
             now.observation, now.privileged, reward, done, timed_out, now.terms, terminal, facts
         )
+
+    def set_points(self, action: Array) -> Array:
+        """Joint set-points [rad] of actions, shape (n, 12), within the joint limits."""
+        target = action * self._scale()
+        target += self.default
+        return np.clip(target, self._low, self._high, out=target)
 
     def set_command(self, command: NDArray[np.floating]) -> None:
         """Give all robots a command, shape (3,) or (n, 3), until the end of their episodes."""
