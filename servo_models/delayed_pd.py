@@ -7,11 +7,11 @@ its set-point moves at `velocity_limit` at most, and the torque
           - back_emf * velocity
 
 works against a dry friction of `friction_loss`. A limit on the speed is one of two things: the
-set-point slews (`velocity_limit`), or the motor's voltage runs out (`back_emf`: with
-`effort_limit / back_emf` the no-load speed); a servo may have both. This module is the same arithmetic as MuJoCo's
+set-point slews (`velocity_limit`), or the motor's voltage runs out (`back_emf`; the no-load speed
+is `effort_limit / back_emf`). A servo may have both. This module is the same arithmetic as MuJoCo's
 native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with `armature`,
-`frictionloss` and `damping`, integrated with `implicitfast`; `tests/servo_models/test_delayed_pd.py` holds the
-two together:
+`frictionloss` and `damping`, integrated with `implicitfast`;
+`tests/servo_models/test_delayed_pd.py` holds the two together:
 
 * dead time: the command of the past, linearly interpolated between time steps. For a command that
   changes on time steps this is the mean of the held command over the step, so the trajectory is a

@@ -232,7 +232,7 @@ class Actuator(Part):
 
     @property
     def top_speed_rad_s(self) -> float:
-        """No-load speed, or the largest rate of the set-point where there is no back-EMF [rad/s]."""
+        """No-load speed, or without back-EMF the largest rate of the set-point [rad/s]."""
         brake = self.back_emf_nm_s_per_rad.value
         return self.effort_limit_nm.value / brake if brake else self.velocity_limit_rad_s.value
 

@@ -124,7 +124,8 @@ class Calibrate:
                 f"{1e3 * r.dead_time_s.high:.1f})",
                 _number(a.stiffness_nm_per_rad, 1), _number(a.damping_nm_s_per_rad, 3),
                 _number(a.friction_loss_nm, 3), _number(a.armature_kg_m2, 2, 1e4),
-                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}", "back-EMF" if brakes else "slew",
+                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
+                "back-EMF" if brakes else "slew",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_leave_one_frequency_out_rad),
                 terminal.ms(paper.rmse_fresh_rad if paper else None),
             )  # fmt: skip
