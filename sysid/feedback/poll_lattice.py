@@ -122,11 +122,9 @@ class PollLattice(Result):
 
     @derived
     def mean_age_s(self) -> float:
-        """Mean age of a reading implied by period and loss [s]."""
+        """Mean age of a reading implied by period and loss [s]; inf where every poll failed."""
         if self.loss >= 1:
             return math.inf
-        if not self.loss < 1:
-            return math.nan  # no poll succeeded while the servo moved
         return self.poll_period_s * (0.5 + self.loss / (1 - self.loss))
 
     @property
