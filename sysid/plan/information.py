@@ -85,7 +85,7 @@ class Response:
     sensitivity: NDArray[np.float64]
 
     def inner(self, a: NDArray, b: NDArray) -> NDArray[np.float64]:
-        """aᵀWb, shape (columns of a, columns of b)."""
+        """Weighted inner product aᵀWb, shape (columns of a, columns of b)."""
         return (a.T * self.weights) @ b
 
     @property
