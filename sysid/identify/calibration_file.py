@@ -211,20 +211,12 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
     if step == 0:
         quantum = Quantity(value=0.0, identified="no", why="readings show no common step")
     if lattice.kind == "lattice":
-        z90 = 1.645
-        spread = z90 * lattice.poll_period_sd_s
-        period = _quantity(
-            Interval(
-                lattice.poll_period_s,
-                max(lattice.poll_period_s - spread, 0.0),
-                lattice.poll_period_s + spread,
+        period, loss, age = (
+            _quantity(interval)
+            for interval in (
+                lattice.poll_period_interval, lattice.loss_interval, lattice.mean_age_interval
             )
-        )
-        # the age grows with the loss; the period's share of its uncertainty is nothing beside it
-        losses = np.clip(lattice.loss + z90 * lattice.loss_sd * np.array([-1.0, 1.0]), 0, 0.99)
-        low, high = lattice.poll_period_s * (0.5 + losses / (1 - losses))
-        loss = _quantity(Interval(lattice.loss, *map(float, losses)))
-        age = _quantity(Interval(lattice.mean_age_s, float(low), float(high)))
+        )  # fmt: skip
     else:
         why = (
             "readings are live: no poll slower than the loop"

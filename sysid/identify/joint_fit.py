@@ -208,7 +208,11 @@ def fit_joint(
             for name, by_joint in (presets or {}).items()
             if joint in by_joint
         },
-        warnings=(*pd.lag.warnings, *_warnings(joint, fitted, chosen, pd)),
+        warnings=(
+            *pd.lag.warnings,
+            *ready.warnings(joint),
+            *_warnings(joint, fitted, chosen, pd),
+        ),
         trials=data,
     )
 
