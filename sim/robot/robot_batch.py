@@ -16,6 +16,7 @@ import hashlib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -150,7 +151,8 @@ class RobotBatch:
         self.linked: tuple[int, ...] = tuple(on_tendons)
         cut = round(_FIRST_PART * environments)
         whole = self.batch.nthread == 1 or environments < _MANY
-        self._parts = [slice(0, environments)] if whole else [slice(0, cut), slice(cut, environments)]
+        ends = (0, environments) if whole else (0, cut, environments)
+        self._parts = [slice(*pair) for pair in pairwise(ends)]
         everyone = np.arange(environments, dtype=np.int32)
         self._ids = [None if whole else everyone[part] for part in self._parts]
         self._records: list[dict[Any, Array]] = [{} for _ in self._parts]

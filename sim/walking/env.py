@@ -9,7 +9,6 @@ The joint angles that a policy sees have passed through the measured feedback
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,17 +23,21 @@ from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking import rewards as walking_rewards
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.draws import draw_commands, draw_pose
 from pupper_sysid.sim.walking.held_readings import HeldReadings
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
     OBSERVATION_SIZE,
+    PRIVILEGED_SIZE,
     VELOCITY_STEPS,
     noise_of,
     observed,
+    privileged_of,
 )
 from pupper_sysid.sim.walking.older_states import of_today
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
+from pupper_sysid.sim.walking.step import StepResult, Unfinished, empty_facts
 
 Array = NDArray[np.float64]
 
@@ -46,62 +49,6 @@ _ARRAYS = (
     "_until_push", "_air", "_contact", "_last_air", "_last_contact", "_foot_at", "_seen",
     "_average",
 )  # fmt: skip
-
-
-_PRIVILEGED = 50
-_FACTS = {
-    "linear_velocity": 3, "angular_velocity": 3, "gravity": 3, "position_relative": 12,
-    "velocity": 12, "acceleration": 12, "torque": 12, "air_s": FEET, "contact_s": FEET,
-    "last_air_s": FEET, "last_contact_s": FEET, "foot_height_m": FEET, "foot_speed_m_s": FEET,
-    "stride_velocity": 3,
-}  # fmt: skip
-"""Columns of what `_take` fills in."""
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """What one step gave.
-
-    Attributes
-    ----------
-    observation : ndarray of float32, shape (n, 60)
-    privileged : ndarray of float32, shape (n, k)
-        The truth, for a critic.
-    reward : ndarray, shape (n,)
-    done, timed_out : ndarray of bool, shape (n,)
-        Episode over; over because its time was up.
-    terms : dict of str to ndarray, shape (n,)
-        Each reward term, weighted and times the control period.
-    terminal : dict of str to ndarray
-        `ids` of environments whose time was up, and their last `observation` and `privileged`.
-    facts : Step
-        What happened, before any new episode.
-    """
-
-    observation: NDArray[np.float32]
-    privileged: NDArray[np.float32]
-    reward: Array
-    done: NDArray[np.bool_]
-    timed_out: NDArray[np.bool_]
-    terms: dict[str, Array]
-    terminal: dict[str, NDArray]
-    facts: walking_rewards.Step
-
-
-@dataclass(frozen=True)
-class _Now:
-    """A step that is going on: what was drawn for it, and what its parts fill in."""
-
-    velocity_before: Array
-    chances: Array
-    noise: NDArray[np.float32] | None
-    pushed: NDArray[np.intp]
-    push: Array
-    facts: dict[str, Any]
-    terms: dict[str, Array]
-    observation: NDArray[np.float32]
-    privileged: NDArray[np.float32]
-    fallen: NDArray[np.bool_]
 
 
 class PupperEnv:
@@ -224,7 +171,7 @@ class PupperEnv:
         """
         n = self.environments
         observation = np.empty((n, OBSERVATION_SIZE), np.float32)
-        privileged = np.empty((n, _PRIVILEGED), np.float32)
+        privileged = np.empty((n, PRIVILEGED_SIZE), np.float32)
         noise = noise_of(self.config.observation, n, self.rng)
         self._look(slice(None), noise, observation, privileged)
         return observation, privileged
@@ -323,16 +270,12 @@ class PupperEnv:
 
     # ------------------------------------------------------------------------- one step
 
-    def _begin(self, velocity_before: Array) -> _Now:
+    def _begin(self, velocity_before: Array) -> Unfinished:
         """All of a step that its physics does not decide."""
         n, config, span = self.environments, self.config, self.config.control_step_s
         chances = self._readings.chances(config.substeps)
-        facts: dict[str, Any] = {
-            "command": self.command.copy(), "action": self.action.copy(),
-            "last_action": self.last_action.copy(), "earlier_action": self.earlier_action.copy(),
-        }  # fmt: skip
-        facts |= {name: np.empty((n, size)) for name, size in _FACTS.items()}
-        facts["contact"] = np.empty((n, FEET), bool)
+        actions = (self.action, self.last_action, self.earlier_action)
+        facts = empty_facts(self.command, *actions)
         self.episode_step += 1
         self._until_command -= span
         due = np.flatnonzero(self._until_command <= 0)
@@ -346,13 +289,13 @@ class PupperEnv:
             pause = self.rng.uniform(*config.randomisation.push_every_s, len(pushed))
             self._until_push[pushed] = pause
         noise = noise_of(config.observation, n, self.rng)
-        return _Now(
+        return Unfinished(
             velocity_before, chances, noise, pushed if most > 0 else pushed[:0], push, facts, {},
-            np.empty((n, OBSERVATION_SIZE), np.float32), np.empty((n, _PRIVILEGED), np.float32),
+            np.empty((n, OBSERVATION_SIZE), np.float32), np.empty((n, PRIVILEGED_SIZE), np.float32),
             np.empty(n, bool),
         )  # fmt: skip
 
-    def _take(self, moved: Moved, now: _Now) -> None:
+    def _take(self, moved: Moved, now: Unfinished) -> None:
         """What follows from the physics, for the robots that have moved."""
         robots, rows, span = self.robots, moved.rows, self.config.control_step_s
         qpos, qvel = robots.qpos[rows].copy(), robots.qvel[rows].copy()
@@ -419,7 +362,7 @@ class PupperEnv:
     def _restart(self, ids: NDArray[np.intp]) -> None:
         self.robots.draw(ids, self._easy(self.level), self.rng)
         self._draw_commands(ids)
-        start, speed = self._draw_pose(ids)
+        start, speed = draw_pose(self.config.randomisation, self.trot, self.command[ids], self.rng)
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
         self._readings.reset(ids, self.robots.to_servo(start))
         self._seen[:, ids] = self._read(ids)
@@ -436,24 +379,9 @@ class PupperEnv:
             action[ids] = relative
 
     def _draw_commands(self, ids: NDArray[np.intp]) -> None:
-        given, n = self.config.commands, len(ids)
-        ranges = np.array([given.forward_m_s, given.sideways_m_s, given.yaw_rad_s])
-        command = self.rng.uniform(ranges[:, 0], ranges[:, 1], (n, 3)) * self._easy(self.level)
-        alone = self.rng.random(n) < given.single
-        command[alone] *= np.eye(3)[self.rng.integers(0, 3, n)][alone]
-        command[self.rng.random(n) < given.standing] = 0.0
-        self.command[ids] = command
-        self._until_command[ids] = self.rng.exponential(given.every_s, n)
-
-    def _draw_pose(self, ids: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Joint angles and velocities at the start, each (len(ids), 12)."""
-        random, n = self.config.randomisation, len(ids)
-        start = self.default + self.rng.uniform(-random.joint_rad, random.joint_rad, (n, 12))
-        speed = self.rng.uniform(-random.joint_rad_s, random.joint_rad_s, (n, 12))
-        trotting = self.rng.random(n) < random.on_the_move
-        phase = self.rng.uniform(0.0, 2 * np.pi, n)
-        start[trotting] = self.trot.joints(phase, self.command[ids])[trotting]
-        return np.clip(start, self._low, self._high), speed * ~trotting[:, None]
+        commands, n = self.config.commands, len(ids)
+        self.command[ids] = draw_commands(commands, n, self._easy(self.level), self.rng)
+        self._until_command[ids] = self.rng.exponential(commands.every_s, n)
 
     # ------------------------------------------------------------------------- what is seen
 
@@ -485,18 +413,15 @@ class PupperEnv:
             ],
             noise, observation,
         )  # fmt: skip
-        x, y, z = qpos[:, :3].T
+        height = qpos[:, 2] - self.ground.height(qpos[:, 0], qpos[:, 1])
         left = 1 - self.episode_step[rows] / self.config.episode_steps
-        if privileged is None:
-            privileged = np.empty((len(qpos), _PRIVILEGED), np.float32)
-        np.concatenate(
+        privileged = privileged_of(
             [
-                velocity, qpos[:, 7:] - self.default, 0.1 * qvel[:, 6:],
-                (z - self.ground.height(x, y))[:, None] * 10, self._air[rows],
-                self._contact[rows].clip(0, 1), self.robots.friction[rows, None],
-                self.robots.drawn["dead_time_s"][rows] * 10, left[:, None],
+                velocity, qpos[:, 7:] - self.default, qvel[:, 6:], height[:, None],
+                self._air[rows], self._contact[rows], self.robots.friction[rows, None],
+                self.robots.drawn["dead_time_s"][rows], left[:, None],
             ],
-            axis=1, out=privileged,
+            privileged,
         )  # fmt: skip
         return observation, privileged
 

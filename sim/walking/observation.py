@@ -77,3 +77,27 @@ def observed(
     if noise is not None:
         whole += noise
     return whole
+
+
+PRIVILEGED_SIZE = 50
+
+
+def privileged_of(
+    parts: Sequence[NDArray[np.floating]], out: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """What a critic in the simulator may know of n robots, shape (n, 50).
+
+    Parameters
+    ----------
+    parts : sequence of ndarray, each of shape (n, k)
+        Velocity of the trunk in its own frame [m/s], joint angles from the default pose [rad] and
+        velocities [rad/s], height above the ground [m], times of each foot in the air and on the
+        ground [s], friction, dead times [s], share of the episode that is left.
+    out : ndarray of float32, shape (n, 50), optional
+        Where to write it.
+    """
+    velocity, angle, speed, height, air, stance, friction, dead_time, left = parts
+    if out is None:
+        out = np.empty((len(velocity), PRIVILEGED_SIZE), np.float32)
+    scaled = [velocity, angle, 0.1 * speed, 10 * height, air, stance.clip(0, 1), friction]
+    return np.concatenate([*scaled, 10 * dead_time, left], axis=1, out=out)

@@ -1,0 +1,35 @@
+"""What an episode draws: the commanded motion, and the pose in which a robot starts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.config import Commands, Randomisation
+
+Array = NDArray[np.float64]
+
+
+def draw_commands(commands: Commands, count: int, share: float, rng: np.random.Generator) -> Array:
+    """Commanded motions [m/s, m/s, rad/s], shape (count, 3), from a `share` of the ranges."""
+    ranges = np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s])
+    found = rng.uniform(ranges[:, 0], ranges[:, 1], (count, 3)) * share
+    alone = rng.random(count) < commands.single
+    found[alone] *= np.eye(3)[rng.integers(0, 3, count)][alone]
+    found[rng.random(count) < commands.standing] = 0.0
+    return found
+
+
+def draw_pose(
+    random: Randomisation, trot: Trot, command: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Joint angles [rad] and velocities [rad/s] at the start, each (n, 12), of commands (n, 3)."""
+    n, default = len(command), default_pose()
+    start = default + rng.uniform(-random.joint_rad, random.joint_rad, (n, 12))
+    speed = rng.uniform(-random.joint_rad_s, random.joint_rad_s, (n, 12))
+    trotting = rng.random(n) < random.on_the_move
+    phase = rng.uniform(0.0, 2 * np.pi, n)
+    start[trotting] = trot.joints(phase, command)[trotting]
+    return np.clip(start, *limits()), speed * ~trotting[:, None]
