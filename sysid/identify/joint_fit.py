@@ -279,7 +279,7 @@ def _fit_simulated(ready: PreparedJoint) -> _Simulated:
     ).widened(ready.lag.feedback.time_doubt_s)
     dead_time = replace(dead_time, low=max(dead_time.low, 0.0))
     offset = fitted[carried].parameters["offset_rad"].value
-    lag = replace(ready.lag, dead_time_s=dead_time, offset_rad=offset)
+    lag = ready.lag.with_dead_time(dead_time, offset)
     return _Simulated(fits, fitted, nats, carried, lag, folds)
 
 

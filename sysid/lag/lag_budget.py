@@ -207,7 +207,17 @@ def lag_budget(
             "too few to measure a lag. Was the joint moving and its torque on? See "
             "`pupper-sysid doctor`."
         )
-    seen = _seen(joint, trials, read, rng, lattice.kind == "lattice")
+    other = None
+    if lattice.readings == "cannot tell":
+        # they may be live after all: dated to their reads, with all rows of a joint that stands
+        live = replace(lattice, kind="every read", readings="live")
+        other = _seen(joint, trials, [readings(t, live) for t in trials], rng, False)
+    try:
+        seen = _seen(joint, trials, read, rng, lattice.kind == "lattice")
+    except InputError:
+        if other is None:
+            raise
+        seen = other  # too few readings that changed, and nothing else is wrong with them
     tones, raw, fresh, lag = seen.tones, seen.raw, seen.fresh, seen.lag
     by_frequency = seen.by_frequency()
     warnings = [*cautions(joint, trials), *_warnings(joint, seen)]
@@ -221,10 +231,7 @@ def lag_budget(
         )
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
     by_frequency = tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency)
-    if lattice.readings == "cannot tell":
-        # they may be live after all: dated to their reads, with all rows of a joint that stands
-        live = replace(lattice, kind="every read", readings="live")
-        other = _seen(joint, trials, [readings(t, live) for t in trials], rng, False)
+    if other is not None:
         fresh, lag = _hull(fresh, other.fresh), _hull(lag, other.lag)
         if len(other.tones) == len(tones):
             by_frequency = tuple(

@@ -42,7 +42,7 @@ _FINEST_S, _COARSEST_S = 0.001, 0.005
 _MOST_FINE, _ROUGHLY_FINE = 60, 40
 _GROWTH = 1.12  # of bins beyond the lag
 _BEYOND_S = 0.03
-_DECAYS_S = (0.006, 0.012, 0.025, 0.05, 0.1, 0.2)
+_DECAYS_S = (0.0007, 0.0015, 0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2)
 _SIZES = 10.0 ** np.arange(-4, 8.1, 0.5)
 _UNLIKELY = 12.0  # nats
 _TINY = 1e-6  # of the motion's variance: no model of bins fits better
@@ -301,6 +301,9 @@ def _fit(
     whitened = root.T @ gram[bins[0] :, bins[0] :] @ root
     own = root.T @ moment[bins]
     fitted, complexity = _evidence(whitened.copy(), own.copy(), _SIZES)
+    # a fast response may begin late in a gap between readings; a slow one may not, and there are
+    # fewer ways to have it: all places of a jump are equally likely only with this prior
+    complexity = complexity + 2 * np.log(decay_s)
     variance = np.maximum(square - fitted, _TINY * square) / count
     return _Prior(dead_time_s, bins, root, whitened, own, variance, complexity)
 
