@@ -62,9 +62,9 @@ def four_way(
     fits: dict[str, ServoFit] = {}
     for arch, part in _PARTS.items():
         say = _part_of(progress, part) if progress else None
-        fits[arch] = fit_servo(recording, joints, arch, split=split, seed=seed, progress=say)
-        if fits[arch].interrupted:
-            raise KeyboardInterrupt
+        fits[arch] = fit_servo(
+            recording, joints, arch, split=split, seed=seed, progress=say, keep_unfinished=False
+        )
     mlp = fits["mlp"]
     assert split.train is not None and split.test is not None
     rules = reading_rules(

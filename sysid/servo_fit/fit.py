@@ -127,6 +127,7 @@ def fit_servo(
     readings: str = "auto",
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
+    keep_unfinished: bool = True,
 ) -> ServoFit:
     """Fit a servo model per joint and score it on readings it has not seen.
 
@@ -148,6 +149,8 @@ def fit_servo(
         Of the networks, of the physical models' starts and of the bootstrap.
     progress : callable, optional
         Called with the name of the present work and the share of it that is done.
+    keep_unfinished : bool
+        Whether Ctrl-C ends the training only, and keeps the best network so far.
 
     Returns
     -------
@@ -189,7 +192,7 @@ def fit_servo(
     ready = samples(data, whole, past_ticks(data.period_s))
     count = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
 
-    ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say)
+    ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say, keep_unfinished)
     linear = physics = ours.folds
     if arch != "fir":
         fir = fit_network("fir", joints, data.period_s, ready, seed)
@@ -292,6 +295,7 @@ def _fit(
     split: Split,
     seed: int,
     say: Callable[[str, float], None],
+    keep_unfinished: bool,
 ) -> _Fitted:
     if arch in ("delayed-pd", "sindy"):
         same = split.test is not None  # the one fold is the whole training part
@@ -312,6 +316,8 @@ def _fit(
         arch, data.joints, data.period_s, ready, seed, nested=split.test is None,
         progress=lambda done, steps: say(arch, done / steps),
     )  # fmt: skip
+    if fit.interrupted and not keep_unfinished:
+        raise KeyboardInterrupt
     held = [
         scores.errors(m, scores.tracks(m, data), data, _both(whole, only(g)))
         for g, m in fit.held_out.items()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -13,20 +12,35 @@ from pupper_sysid.sysid.recordings.files import load
 SAMPLE = Path(__file__).resolve().parents[3] / "data/samples/playback.csv"
 
 
-def test_networks_trained_to_different_ends_are_not_compared(monkeypatch):
-    """Ctrl-C ends the training of one network, and with it the comparison; the bar never returns."""
+def test_ctrl_c_ends_the_comparison_with_the_training_that_it_interrupts():
+    """Networks trained to different ends are not compared; `fit-servo` keeps the best so far."""
+    recording, said = load(SAMPLE), []
+
+    def interrupt(what, share):
+        said.append(what)
+        if share > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        module.four_way(recording, ["LF_thigh"], 0, interrupt)
+    assert set(said) == {"lstm"}
+
+
+def test_the_bar_of_both_fits_runs_once(monkeypatch):
     fitted, shares = [], []
 
-    def fit(recording, joints, arch, *, split, seed, progress):
+    def fit(recording, joints, arch, *, split, seed, progress, keep_unfinished):
         fitted.append(arch)
+        assert not keep_unfinished
         for share in (0.0, 0.5, 1.0):
             progress(arch, share)
         progress("DelayedPD", 0.0)
-        return SimpleNamespace(interrupted=arch == "mlp")
+        if arch == "mlp":
+            raise KeyboardInterrupt
 
     monkeypatch.setattr(module, "fit_servo", fit)
     recording = load(SAMPLE)
     with pytest.raises(KeyboardInterrupt):
-        module.four_way(recording, recording.joints, 0, lambda what, share: shares.append(share))
+        module.four_way(recording, ["LF_thigh"], 0, lambda what, share: shares.append(share))
     assert fitted == ["lstm", "mlp"]
     assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0
