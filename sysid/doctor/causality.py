@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.optimize import OptimizeResult, minimize_scalar
 
 from pupper_sysid.sysid.doctor.clock import clock_findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
@@ -35,6 +35,7 @@ _SAME_SCALE = 0.35  # of the logarithm
 _NO_ONE_LAG = 0.3
 _TURNS, _TURN_SHARE = 4, 0.2
 _MUCH_BETTER = 0.5
+_FASTEST_S = 0.001  # lag that no servo has
 _NO_PERIOD_S = 0.1  # no tone of a sweep repeats within it
 _AMBIGUOUS = 0.01  # a tone may be late by a half or whole period as well
 
@@ -135,11 +136,13 @@ def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | Non
         return float(np.mean(left(lag) ** 2))
 
     coarse = min(np.arange(-loop, _LONGEST_ECHO_S / 2, loop / 2), key=spread)
-    fine = minimize_scalar(spread, bounds=(coarse - loop / 2, coarse + loop / 2), method="bounded")
-    if np.mean(np.abs(left(float(fine.x))) <= near) < _ECHO_SHARE:
+    around = (coarse - loop / 2, coarse + loop / 2)
+    fine: OptimizeResult = minimize_scalar(spread, bounds=around, method="bounded")
+    late = float(fine["x"])
+    if np.mean(np.abs(left(late)) <= near) < _ECHO_SHARE:
         return None
     text = (
-        f"the position is the command itself, {1e3 * float(fine.x):.1f} ms late at every speed: an "
+        f"the position is the command itself, {1e3 * late:.1f} ms late at every speed: an "
         "echo or a computed value and no measurement. Read the servo's Present_Position, not its "
         "goal."
     )
@@ -195,13 +198,21 @@ def _not_a_servo(trials: Sequence[Trial], how: Following) -> Finding | None:
             "have nothing to do with each other. Check that both are of the same joint and on the "
             "same clock."
         )
-    elif how.early_lag_s < -0.2 * loop - 1e-3 and _turns(trials) >= _TURNS and how.better(
-        how.early_score, 0.0 if how.early_lag_s > -_NO_PERIOD_S else _AMBIGUOUS
+    elif (
+        how.early_lag_s < -0.2 * loop - 1e-3
+        and _turns(trials) >= _TURNS
+        and how.better(how.early_score, 0.0 if how.early_lag_s > -_NO_PERIOD_S else _AMBIGUOUS)
     ):
         text = (
             f"the position moves {-1e3 * how.early_lag_s:.0f} ms before the command does: the "
             "columns command_rad and position_rad look swapped, or a row holds the command of "
             "another time. Swap them back, or shift one."
+        )
+    elif how.lag_s < _FASTEST_S and how.at_once:
+        text = (
+            f"the position goes with the command ({1e3 * how.lag_s:.1f} ms after it, as it was "
+            "held): an echo with noise, or positions stamped too early. Read the servo's "
+            "Present_Position, and stamp it when it is read."
         )
     elif how.better(how.inverted_score, _AMBIGUOUS):
         text = (

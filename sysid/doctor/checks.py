@@ -25,8 +25,8 @@ from pupper_sysid.sysid.doctor.signals import (
     unit_findings,
     wrap_findings,
 )
-from pupper_sysid.sysid.feedback.poll_lattice import fresh_rows
 from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.rows import fresh_rows
 from pupper_sysid.sysid.recordings.recording import Trial
 
 LEAST_ROWS = 3

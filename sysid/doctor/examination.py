@@ -222,7 +222,8 @@ def _examine_joint(
     if usable:
         lattice = lag.feedback if lag else find_poll_lattice(trials, rng)
         hold_share = _hold_share(joint, trials, lattice, rng, lag)
-        found += [*_held(lattice, hold_share), *_coverage(trials, speed, limit_rad_s)]
+        found += [*_held(lattice, hold_share), *_slips(trials, lattice)]
+        found += _coverage(trials, speed, limit_rad_s)
     found = sorted(found, key=lambda f: VERDICTS.index(f.verdict))
     return JointExamination(
         verdict=found[0].verdict if found else USE,
@@ -267,10 +268,11 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
     if lattice.kind == "every read":
         return []
     if lattice.kind == "unresolved":
-        return [Finding(CARE, f"only {100 * lattice.fresh_fraction:.0f} % of the rows have a new "
-                              "reading, and no poll period explains when; fresh readings are dated "
-                              "to the middle between two reads. Record at least four tones of "
-                              "3 s, with a loop faster than the poll.")]  # fmt: skip
+        return [Finding(CARE, f"{100 * lattice.fresh_fraction:.0f} % of the rows have a new "
+                              "reading, and no poll period explains when they were taken: times "
+                              f"are in doubt by {1e3 * lattice.time_doubt_s:.0f} ms, which widens "
+                              "lags and dead times. Record at least four tones of 3 s, with a "
+                              "loop faster than the poll.")]  # fmt: skip
     text = f"the bus reads this servo every {1e3 * lattice.poll_period_s:.2f} ms"
     if math.isfinite(lattice.loss):
         text += (
@@ -280,6 +282,18 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
     if math.isfinite(hold_share):
         text += f", {100 * hold_share:.0f} % of the lag that all rows show"
     return [Finding(USE, f"{text}.")]
+
+
+def _slips(trials: Sequence[Trial], lattice: PollLattice) -> list[Finding]:
+    """Jumps of the poll's phase, which ask for no care: both sides are dated."""
+    found = []
+    for slip in lattice.slips:
+        tone = next(t.frequency_hz for t in trials if t.number == slip.trial)
+        where = f"at {tone:g} Hz" if tone > 0 else f"in trial {slip.trial}"
+        found.append(Finding(USE, f"{where} the poll slipped by {1e3 * slip.jump_s:.0f} ms at "
+                                  f"{slip.time_s:.2f} s ({slip.nats:.0f} nats); readings before "
+                                  "and after it are dated apart."))  # fmt: skip
+    return found
 
 
 def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Finding]:

@@ -18,17 +18,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sysid.feedback.poll_lattice import fresh_rows
+from pupper_sysid.sysid.feedback.rows import fresh_rows
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
 LATEST_S, EARLIEST_S = 0.8, -0.6
+LATE_S = 0.02
 
 _POLES_S = (0.0, 0.01, 0.02, 0.04, 0.08, 0.16)
 _GRID_S = 0.005
 _FINEST_S = 0.001
 _MOST_POINTS = 1 << 14
 _OVERLAP = 0.5  # of the readings must have a command at a lag
+_AT_ONCE_S, _SURELY = 0.02, 0.01
 _CLEAR_NATS, _BEYOND, _OF_THE_REST = 10.0, 4.0, 0.3
 _CORRELATED_ROWS = 4.0  # rows whose errors count as one
 
@@ -47,8 +49,11 @@ class Following:
     inverted_score, early_score : float
         The same of the best causal one of negative gain, and of the command itself moved, or
         low-passed and moved, to before it was sent.
-    lag_s : float
-        Shift of the command as it was held that explains most, low-passed by nothing.
+    lag_s, plain_score : float
+        Shift of the command as it was held that explains most, low-passed by nothing, and the
+        share that it explains.
+    late_score : float
+        Share that the best causal servo explains whose lag is `LATE_S` or more.
     early_lag_s : float
         Shift of that command; negative.
     gain : ndarray, shape (trials,)
@@ -64,10 +69,20 @@ class Following:
     inverted_score: float
     early_score: float
     lag_s: float
+    plain_score: float
+    late_score: float
     early_lag_s: float
     gain: NDArray[np.float64]
     residual_rad: tuple[NDArray[np.float64], ...]
     rows: float
+
+    @property
+    def at_once(self) -> bool:
+        """Whether the position goes with the command, beyond doubt: no servo is that fast."""
+        noise = 2 * _CLEAR_NATS * (1 - self.explained) / max(self.rows, 1.0)
+        rival = self.explained - self.plain_score
+        late = self.explained - self.late_score
+        return abs(self.lag_s) < _AT_ONCE_S and late > max(_BEYOND * rival + noise, _SURELY)
 
     def better(self, share: float, least: float = 0.0) -> bool:
         """Whether a rival that explains `share` beats the causal servo beyond doubt.
@@ -136,6 +151,8 @@ def following(trials: Sequence[Trial], step: float) -> Following | None:
         inverted_score=float(np.where(causal, inverted, 0.0).max()),
         early_score=float(early.max()),
         lag_s=_peak(right[0], lags),
+        plain_score=float(right[0].max()),
+        late_score=float(np.where(causal & (total >= LATE_S), right, 0.0).max()),
         early_lag_s=float(lags[first[1]]),
         gain=np.array(gains),
         residual_rad=residuals,
@@ -170,8 +187,9 @@ def _on_grid(
     place = np.round((time - begin) / grid).astype(np.int64)
     inside = (place >= 0) & (place < points)
     position = trial.position_rad[rows[inside]]
-    number = np.bincount(place[inside], minlength=points).astype(float)
-    return command, np.bincount(place[inside], position, points), number
+    number = np.bincount(place[inside], minlength=points).astype(np.float64)
+    total = np.bincount(place[inside], position, points).astype(np.float64)
+    return command.astype(np.float64), total, number
 
 
 def _rest(trial: Trial) -> float:

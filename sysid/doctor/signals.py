@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
-from pupper_sysid.sysid.feedback.poll_lattice import fresh_rows
+from pupper_sysid.sysid.feedback.rows import fresh_rows
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _COARSEST_RAD = 0.055  # no servo has a quantisation step of three degrees

@@ -176,7 +176,8 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
     numbers = table["trial"].to_numpy(float)
     if (np.abs(numbers) >= _LARGEST_COUNT).any() or (numbers % 1 != 0).any():
         raise InputError(f"{path}, column trial: trials are counted by whole numbers.")
-    if "position_count" in table and (table["position_count"].abs() >= _LARGEST_COUNT).any():
+    counts = np.abs(table["position_count"].to_numpy(float)) if "position_count" in table else []
+    if np.any(np.asarray(counts) >= _LARGEST_COUNT):
         raise InputError(f"{path}, column position_count: a value is larger than any encoder's.")
     position = table["position_rad"].to_numpy(float)
     missing = float(np.mean(np.isnan(position))) if len(position) else 1.0

@@ -119,8 +119,8 @@ def made(table: pd.DataFrame, joint: str = JOINT, **metadata) -> Recording:
 
 def _trial(setup: Setup, rng: np.random.Generator, f: float, seconds: float) -> pd.DataFrame:
     gaps = (1 + 0.02 * rng.standard_normal(int(1.3 * seconds * setup.rate_hz))) / setup.rate_hz
-    send = np.cumsum(np.maximum(gaps, 0.3 / setup.rate_hz))
-    send = np.round(send[send < seconds], 6)
+    every = np.cumsum(np.maximum(gaps, 0.3 / setup.rate_hz), dtype=np.float64)
+    send = np.asarray(np.round(every[every < seconds], 6), np.float64)
     command = np.round(commanded(setup, send, f, rng), 7)
     motion = _motion(setup, send, command, seconds)
     read = send + min(0.002, 0.2 / setup.rate_hz)
