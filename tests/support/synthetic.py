@@ -76,3 +76,34 @@ def tone_trials(
             )
         )
     return trials
+
+
+def first_order_trial(
+    command: Callable[[NDArray], NDArray],
+    dead_time_s: float,
+    time_constant_s: float,
+    *,
+    loop_s: float = 1 / 30,
+    duration_s: float = 20.0,
+    frequency_hz: float = float("nan"),
+    number: int = 0,
+    gain: float = 1.0,
+) -> Trial:
+    """A live trial of a first-order servo, solved exactly on the held command.
+
+    Each step of the command adds `gain (1 - exp(-(t - dead time) / time constant))` of itself.
+    """
+    send = np.arange(0.0, duration_s, loop_s)
+    read, sent = send + 0.0005, command(send)
+    past = read[:, None] - send - dead_time_s
+    step = np.where(past > 0, -np.expm1(-np.maximum(past, 0.0) / time_constant_s), 0.0)
+    position = sent[0] + gain * step @ np.diff(sent, prepend=sent[0])
+    return Trial(
+        "LF_hip", number, frequency_hz, send, read, sent, position, None, float(sent[0]), "live"
+    )  # fmt: skip
+
+
+def random_levels(rng: np.random.Generator, hold_s: float, amplitude: float = 0.3):
+    """A command that jumps to plus or minus `amplitude` every `hold_s`."""
+    level = rng.choice([-amplitude, amplitude], 1000)
+    return lambda t: level[(t / hold_s).astype(int)]

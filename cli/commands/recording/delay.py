@@ -56,6 +56,9 @@ class Delay:
                 terminal.ms(dead.value), _ends(dead),
             )  # fmt: skip
         terminal.out.print(budget)
+        terminal.out.print(
+            "Only the dead time is the servo's own; the lag moves with gain, amplitude and load."
+        )
         self._print_frequencies(found)
         first = next(iter(found.values()))
         shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")
