@@ -36,7 +36,11 @@ from pupper_sysid.servo_models.calibration.parts import (
     Selection,
 )
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.identify.joint_fit import (
+    UNTOLD,
+    CandidateFit,
+    JointCalibrationResult,
+)
 from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -159,7 +163,7 @@ def _covering(result: JointCalibrationResult) -> CandidateFit:
         if rival is not None:  # it may have none, or the other's
             other = rival.parameters.get(name, Interval(absent, absent, absent))
             mine = Interval(mine.value, min(mine.low, other.low), max(mine.high, other.high))
-            undecided[name] = "the data do not tell a set-point of limited rate from back-EMF"
+            undecided.setdefault(name, UNTOLD)
         elif name not in parameters:
             undecided[name] = "the chosen model has none"
         parameters[name] = mine

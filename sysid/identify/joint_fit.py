@@ -50,6 +50,7 @@ Presets = Mapping[str, Mapping[str, DelayedPDParameters]]
 _PREFERENCE = 1.05
 _TELLING_NATS = 5.0
 """Difference of the log-likelihoods of two structures that tells them apart."""
+UNTOLD = "the data do not tell a set-point of limited rate from back-EMF"
 _WIDE = 4.0
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
@@ -393,17 +394,16 @@ def _warnings(
     found = []
     if why := pd.undecided.get("dead_time_s"):
         found.append(f"{joint}: the dead time is not identified: {why}.")
-    if len(plausible(simulated.nats)) > 1:
-        found.append(
-            f"{joint}: the data do not tell a set-point of limited rate from back-EMF "
-            f"({max(simulated.nats.values()):.1f} nats); dead time and gains cover both. Faster "
-            "tones at a smaller amplitude would tell (`pupper-sysid plan`)."
-        )
     limits = {"velocity_limit_rad_s", "no_load_speed_rad_s"} & pd.undecided.keys()
-    for limit in limits if len(plausible(simulated.nats)) == 1 else ():
+    for limit in limits:
         found.append(
             f"{joint}: the speed limit was not excited: {pd.undecided[limit]}. Record a faster "
             "tone or a step."
+        )
+    if len(plausible(simulated.nats)) > 1 and not limits:
+        found.append(
+            f"{joint}: {UNTOLD} ({max(simulated.nats.values()):.1f} nats); dead time and gains "
+            "cover both. Faster tones at a smaller amplitude would tell (`pupper-sysid plan`)."
         )
     for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
         if name in pd.undecided:

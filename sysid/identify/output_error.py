@@ -3,7 +3,7 @@
 One cost serves the fit, the scores and the tests: the model is simulated under the zero-order-held,
 truncated commands, looked up at the measurement time of each fresh reading, and compared with it
 under a soft-L1 loss (a late poll must not steer the fit). Many fits run at once (joints, left-out
-frequencies, starts, points of a likelihood profile) with one simulation call per iteration, which
+frequencies, starts) with one simulation call per iteration, which
 makes pure NumPy fast enough.
 """
 

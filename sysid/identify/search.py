@@ -1,4 +1,4 @@
-"""Fit one candidate model to one joint: global starts, left-out frequencies, likelihood profile.
+"""Fit one candidate model to one joint: global starts, left-out frequencies.
 
 A servo's cost has many local optima (delay trades against damping, friction against effort), so
 every fit is the same search, `fit_problems`: many seeded starts are simulated once, the best are
