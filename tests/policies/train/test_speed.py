@@ -1,0 +1,74 @@
+"""Both sides of a speed ratio do the same work in turns, and need no calibration at hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.policies.train import speed
+from pupper_sysid.policies.train.learner import Ranks
+from pupper_sysid.policies.train.run_file import Run
+from pupper_sysid.policies.train.training import make_env
+from support.tiny_training import CALIBRATION, tiny_run
+
+
+@pytest.fixture
+def paces(monkeypatch):
+    monkeypatch.setattr(speed, "SLICE_S", 0.01)
+    return speed.Paces(make_env(tiny_run(), Ranks()))
+
+
+@pytest.mark.parametrize("bare_first", [False, True])
+def test_bare_physics_takes_the_steps_of_the_environment_and_leaves_it_where_it_was(
+    paces, bare_first
+):
+    batch = paces.env.robots.batch
+    ends, controls, own = [], [], paces._own
+    take = paces._bare
+
+    def bare(given):
+        found = take(given)
+        ends.append(batch.bind("qpos").copy())
+        controls.append(given[-1])
+        return found
+
+    def environment(actions):
+        found = own(actions)
+        ends.append(batch.bind("qpos").copy())
+        controls.append(batch.bind("ctrl").copy())
+        return found
+
+    paces._bare, paces._own = bare, environment
+    times = paces.slice(bare_first)
+    np.testing.assert_array_equal(controls[0], controls[1])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+    environment_end = ends[1 if bare_first else 0]
+    np.testing.assert_array_equal(batch.bind("qpos"), environment_end)
+    assert (np.array(times) > 0).all()
+
+
+def test_a_ratio_is_the_median_over_slices_with_their_middle_half():
+    own, bare = np.array([2.0, 4.0, 10.0, 4.0, 4.0]), np.array([1.0, 3.0, 5.0, 3.0, 3.0])
+    times = np.stack([np.stack([own, own], 1), np.stack([bare, 0.5 * bare], 1)], axis=1)
+    found = speed.ratios(times)
+    assert (found["env_ratio_low"], found["env_ratio"], found["env_ratio_high"]) == (
+        0.5,
+        0.75,
+        0.75,
+    )
+    assert found["env_processor_ratio"] == 0.375
+    assert found["env_steps_per_s"] == pytest.approx(1 / 4)
+
+
+def test_without_a_calibration_the_sample_is_measured_and_another_name_is_kept(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert Path(speed.with_sample(Run()).actuator) == Path(CALIBRATION)
+    assert speed.with_sample(Run(actuator="mine.yaml")).actuator == "mine.yaml"
+    monkeypatch.setattr(speed, "_SAMPLE", tmp_path / "none.yaml")
+    assert speed.with_sample(Run()).actuator == "paper"
+    Path("calibrated.yaml").write_text("")
+    assert speed.with_sample(Run()).actuator == "calibrated.yaml"
