@@ -19,7 +19,7 @@ differential evolution. Statistics and Computing 16: 239–249.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,9 @@ STEPPING_SD_S = 0.5 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
 standard deviation over random emulated servos with half that step
 (`benchmarks/dead_time_accuracy.py`)."""
-_CHAINS, _GENERATIONS = 48, 300
+_CHAINS = 48
+_SETTLING, _GENERATIONS = 140, 150
+_LEFT_OUT = 20  # generations after the change of steps
 _START_SD = 0.1  # of the logarithms about the fit that chains start from
 _OFFSET_START_SD_RAD = 5e-4
 _JUMP_EVERY = 10  # a jump by a whole difference lets chains change between optima
@@ -185,7 +187,10 @@ def posterior(
     sd = np.where([p.logarithmic for p in model.parameters], _START_SD, _OFFSET_START_SD_RAD)
     start = centre + sd * rng.standard_normal((_CHAINS, len(centre)))
     start[0] = centre
-    points, cost = sample(model, problem, start, temperature, _GENERATIONS, rng)
+    # the chains settle in the fit's steps, which cost half as much
+    coarse = replace(problem, trials=data)
+    settled, _ = sample(model, coarse, start, temperature, _SETTLING, rng, _SETTLING - 1)
+    points, cost = sample(model, problem, settled, temperature, _GENERATIONS, rng, _LEFT_OUT)
     lowest = int(np.argmin(cost))
     values = model.decode(points)
     return Posterior(model, values, values[lowest], float(cost[lowest]), temperature)
@@ -198,6 +203,7 @@ def sample(
     temperature: float,
     generations: int,
     rng: np.random.Generator,
+    left_out: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Draw parameters from their posterior.
 
@@ -211,8 +217,9 @@ def sample(
     temperature : float
         By which the cost is divided: at least 1, see `noise_ratio`.
     generations : int
-        The first half is left out.
     rng : numpy.random.Generator
+    left_out : int
+        Of the generations, from the first on.
 
     Returns
     -------
@@ -239,7 +246,7 @@ def sample(
         accepted = inside & (np.log(rng.random(chains)) < (cost - new) / temperature)
         z = np.where(accepted[:, None], proposal, z)
         cost = np.where(accepted, new, cost)
-        if generation >= generations // 2:
+        if generation >= left_out:
             kept.append(z)
             kept_cost.append(cost)
     return np.concatenate(kept), np.concatenate(kept_cost)

@@ -199,7 +199,7 @@ def sparse_equations(
 
 def fit_equations(
     trial_data: Mapping[str, tuple[TrialData, ...]],
-    noise_rad: Mapping[str, float],
+    noise_rad: Mapping[str, float | tuple[float, ...]],
     seed: int = 0,
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
@@ -210,8 +210,8 @@ def fit_equations(
     ----------
     trial_data : mapping of str to tuple of TrialData
         Per joint; only the fresh samples in it are fitted, so a caller may leave some out.
-    noise_rad : mapping of str to float
-        Per joint, the size of residuals beyond which one counts as an outlier [rad].
+    noise_rad : mapping of str to (float or tuple of float)
+        Per joint, the size of ordinary residuals [rad], of all trials or of each.
     seed : int
         A joint's result depends on the seed and its name alone.
     workers : int
@@ -226,7 +226,9 @@ def fit_equations(
 # ------------------------------------------------------------------------------- one joint
 
 
-def _fit_joint(joint: str, task: tuple[tuple[TrialData, ...], float], seed: int) -> EquationResult:
+def _fit_joint(
+    joint: str, task: tuple[tuple[TrialData, ...], float | tuple[float, ...]], seed: int
+) -> EquationResult:
     data, noise = task
     folds = leave_one_out_folds(data)
     pd = candidate_model(PREFERRED)
