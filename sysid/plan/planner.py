@@ -32,6 +32,9 @@ from pupper_sysid.sysid.plan.information import (
 CLEAR_NATS = 5.0
 """Difference in log-likelihood from which two models count as told apart."""
 
+SURE_NATS = 2 * CLEAR_NATS
+"""What a plan aims at: the nats of a fit change with the next recording."""
+
 DEAD_TIME = "dead_time_s"
 
 SHORTEST_S = 3.0
@@ -217,14 +220,14 @@ class _World:
         """Expected interval [s]: the hull over the hypotheses that are not told apart.
 
         With `smooth` its ends move from the hull to the first hypothesis' own interval as the nats
-        grow, so that a trial counts that tells two apart by less than `CLEAR_NATS`.
+        grow to `SURE_NATS`, so that every trial that tells the two apart counts.
         """
         own = self.interval(0, 0, chosen)
         low, high = own.low, own.high
         for which in range(1, len(self.servo.hypotheses)):
-            share = 1.0 - self.nats(which, chosen) / CLEAR_NATS
-            if share >= 0:
-                share = share if smooth else 1.0
+            nats = self.nats(which, chosen)
+            share = 1.0 - nats / SURE_NATS if smooth else float(nats <= CLEAR_NATS)
+            if share > 0:
                 rival = self.interval(which, 0, chosen)
                 low = min(low, own.low + share * (rival.low - own.low))
                 high = max(high, own.high + share * (rival.high - own.high))
