@@ -192,6 +192,19 @@ def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what):
     assert len(rows) == 6 and all(0 <= r["survival"] <= 1 for r in rows)
 
 
+def test_a_quick_look_is_smaller_and_says_so(capsys, here, monkeypatch):
+    from pupper_sysid.cli.commands.analyze import common
+
+    assert common._QUICK[0] < common._FULL[0] and common._QUICK[1] < common._FULL[1]
+    monkeypatch.setattr(common, "_QUICK", (1, 0.5))
+    arguments = ("terrain", POLICY, "--actuator", CALIBRATION, "--quick")
+    code, out, _ = run_program(capsys, pupper_analyze, *arguments, "--json")
+    found = json.loads(out)
+    assert code == 0 and (found["quick"], found["robots"], found["seconds"]) == (True, 1, 0.5)
+    code, out, _ = run_program(capsys, pupper_analyze, *arguments, "--force")
+    assert "On other ground (1 robots, 0.5 s each; a quick look)" in " ".join(out.split())
+
+
 def test_two_policies_of_one_name_are_not_merged(capsys, here):
     run = here / "runs/A"
     for name in ("policy_best", "policy_last"):

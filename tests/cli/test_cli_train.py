@@ -186,7 +186,7 @@ def test_ctrl_c_saves_and_ends_well(tmp_path):
 def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
     code, out, _ = run(
         capsys, pupper_eval, trained, "--json", "--episodes", "5", "--threads", "1",
-        "--terrain", "flat", "--extra-delay-ms", "0", "20",
+        "--seconds", "2", "--terrain", "flat", "--extra-delay-ms", "0", "20",
     )  # fmt: skip
     assert code == 0
     found = json.loads(out)
@@ -205,11 +205,29 @@ def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
     assert late["mae_vx_m_s"] == ground["mae_vx_m_s"] != found["by_extra_delay"][1]["mae_vx_m_s"]
 
 
+def test_a_quick_look_is_smaller_and_says_so(capsys, trained, monkeypatch):
+    arguments = (trained, "--quick", "--terrain", "flat", "--extra-delay-ms", "0")
+    assert pupper_eval._QUICK[0] < pupper_eval._FULL[0]
+    assert pupper_eval._QUICK[1] < pupper_eval._FULL[1]
+    monkeypatch.setattr(pupper_eval, "_QUICK", (2, 0.2))
+    code, out, _ = run(capsys, pupper_eval, *arguments, "--json")
+    found = json.loads(out)
+    assert code == 0 and found["quick"] and found["episodes"] == 2 and found["episode_s"] == 0.2
+    assert {row["episodes"] for row in found["by_command"]} == {1}
+    error = found["intervals"]["mae_vx_m_s"]
+    assert error["low"] < error["value"] == found["mae_vx_m_s"] < error["high"]
+    code, out, err = run(capsys, pupper_eval, *arguments, "--seconds", "0.1")
+    assert "Quick look: 2 episodes of 0.1 s" in out and "±" in out
+    assert "90 % interval 0–" in err and "episodes; episode k has the same robot" in err
+    said = refused(capsys, pupper_eval, trained, "--seconds", "0")
+    assert "--seconds is 0.0; it must be a positive number" in said
+
+
 def test_an_evaluation_elsewhere_says_where(capsys, trained):
     code, out, _ = run(
         capsys, pupper_eval, trained / "policy_last", "--json", "--episodes", "1",
         "--actuator", "ideal", "--feedback", "ideal", "--terrain", "flat", "--extra-delay-ms", "0",
-        "--threads", "1",
+        "--threads", "1", "--seconds", "2",
     )  # fmt: skip
     found = json.loads(out)
     assert code == 0 and (found["actuator"], found["feedback"]) == ("ideal", "ideal")
@@ -218,7 +236,7 @@ def test_an_evaluation_elsewhere_says_where(capsys, trained):
 def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
     arguments = (
         trained, "--episodes", "1", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
-        "--report", tmp_path / "report",
+        "--seconds", "2", "--report", tmp_path / "report",
     )  # fmt: skip
     code, out, err = run(capsys, pupper_eval, *arguments)
     assert code == 0, err
@@ -249,7 +267,7 @@ def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
     contract.write_text(contract.read_text().replace('"feedback": "held"', '"feedback": "ideal"'))
     code, out, _ = run(
         capsys, pupper_eval, alone, "--json", "--episodes", "1", "--actuator", CALIBRATION,
-        "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+        "--seconds", "2", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
     )  # fmt: skip
     assert code == 0 and json.loads(out)["feedback"] == "ideal"
 
