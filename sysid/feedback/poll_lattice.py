@@ -57,6 +57,9 @@ from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _Z = float(ndtri((1 + LEVEL) / 2))
+# of the loss's count: where motion starts and ends is not known to a poll; measured on random
+# servos (benchmarks/poll_intervals.py)
+_OVERDISPERSION = 1.6
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
 _NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
@@ -137,10 +140,11 @@ class PollLattice(Result):
     @property
     def loss_interval(self) -> Interval:
         """Loss with its 90 % interval."""
-        failed = self.loss * self.polls
+        polls = self.polls / _OVERDISPERSION
+        failed = self.loss * polls
         tail = (1 - LEVEL) / 2
         low, high = (  # Jeffreys' interval of a share
-            betaincinv(failed + 0.5, self.polls - failed + 0.5, q) for q in (tail, 1 - tail)
+            betaincinv(failed + 0.5, polls - failed + 0.5, q) for q in (tail, 1 - tail)
         )
         return Interval(self.loss, min(float(low), self.loss), max(float(high), self.loss))
 

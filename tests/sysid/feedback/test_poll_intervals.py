@@ -26,26 +26,26 @@ def test_a_reading_is_infinitely_old_where_every_poll_seems_lost():
     assert json.loads(json.dumps(found.to_dict()))["mean_age_s"] is None
 
 
-def test_the_interval_of_the_loss_is_jeffreys():
-    found = lattice(poll_period_s=0.02, loss=0.25, polls=80).loss_interval
+def test_the_interval_of_the_loss_is_jeffreys_for_five_eighths_of_the_polls():
+    found = lattice(poll_period_s=0.02, loss=0.25, polls=128).loss_interval
     assert (found.low, found.high) == pytest.approx(beta(20.5, 60.5).ppf([0.05, 0.95]))
     # without a lost poll the value stays inside
-    none = lattice(poll_period_s=0.02, loss=0.0, polls=80).loss_interval
+    none = lattice(poll_period_s=0.02, loss=0.0, polls=128).loss_interval
     assert none.low == none.value == 0.0 and none.high == pytest.approx(beta(0.5, 80.5).ppf(0.95))
 
 
 def test_the_interval_of_the_age_is_that_of_the_loss():
-    found = lattice(poll_period_s=0.02, loss=0.25, polls=80)
+    found = lattice(poll_period_s=0.02, loss=0.25, polls=128)
     low, high = beta(20.5, 60.5).ppf([0.05, 0.95])
     expected = [0.02 * (0.5 + p / (1 - p)) for p in (low, high)]
     assert [found.mean_age_interval.low, found.mean_age_interval.high] == pytest.approx(expected)
 
 
 def test_a_period_that_explains_as_much_is_inside_the_interval():
-    alone = lattice(poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=80)
+    alone = lattice(poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=128)
     assert alone.poll_period_interval.low == pytest.approx(0.0216 - 1.645e-5, abs=1e-8)
     both = lattice(
-        poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=80, rivals_s=(0.021,)
+        poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=128, rivals_s=(0.021,)
     )
     assert both.poll_period_interval.low < 0.021 < 0.0216 < both.poll_period_interval.high
 
