@@ -235,12 +235,12 @@ def _joint_runs(
     period: float,
     labels: dict[str, int],
     seed: int,
-    known: PollLattice | None,
+    poll: PollLattice | None,
 ) -> tuple[list[Run], str, PollLattice]:
     trials = joint_trials(recordings, joint)
     if not trials:
         raise InputError(f"{joint} was not recorded. Leave it out of `joints`.")
-    lattice = known or find_poll_lattice(trials, joint_rng(seed, joint))
+    lattice = poll or find_poll_lattice(trials, joint_rng(seed, joint))
     if mode == "auto":
         held = 1 - _fresh_while_moving(trials) > _HELD_FRACTION
         mode = "fresh" if held and lattice.kind != "every read" else "all"
