@@ -163,7 +163,7 @@ def five_joints() -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Lag of recordings without tones")
     parser.add_argument("--servos", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     parser.add_argument("--stale", action="store_true", help="polled readings instead of live ones")

@@ -59,7 +59,7 @@ def sweep(seed: int) -> tuple[float, list[Trial], list[Readings]]:
             command = amplitude * np.sin(2 * np.pi * frequency * send)
             motion = servo.motion(held(send, command, TRIAL_S))
             trial = recorded(bus, send, command, motion, rng, number, frequency)
-            time = STEP_S * np.arange(len(motion))[::EVERY]
+            time = np.asarray(STEP_S * np.arange(len(motion))[::EVERY], np.float64)
             rows = np.arange(len(time))
             trials.append(trial)
             motions.append(Readings(rows, time, motion[::EVERY], time, 0.0))
@@ -105,7 +105,7 @@ def row(name: str, found: list[tuple[Interval, float]]) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Lag of live tones")
     parser.add_argument("--servos", type=int, default=120)
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     parser.add_argument("--list", action="store_true", help="every servo")

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter
 
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -122,7 +121,8 @@ class Excitation:
         value, keep = rng.standard_normal(len(even) + 1000), np.exp(-0.02 * np.pi * self.cutoff_hz)
         for _ in range(3):
             value = lfilter([1 - keep], [1, -keep], value)
-        value = self.amplitude * value[1000:] / np.std(value[1000:])
+        value = np.asarray(value)[1000:]
+        value = self.amplitude * value / np.std(value)
         going = lfilter([0.1], [1, -0.9], np.sin(2 * np.pi * even / self.pause_s) > -0.3)
         value = np.cumsum(np.diff(value, prepend=value[0]) * going)
         return np.interp(time, even, value - lfilter([0.002], [1, -0.998], value))
@@ -183,11 +183,12 @@ def true_lag(held_rad: NDArray, motion_rad: NDArray, longest_s: float = 1.5) -> 
     window = np.zeros(count)
     window[first:last] = 1.0
     motion = np.where(window > 0, motion - motion[first:last].mean(), 0.0)
-    size = next_fast_len(2 * count, True)
+    size = 1 << (2 * count).bit_length()
     shift = np.arange(-int(earliest / step), int(longest_s / step))
 
     def products(one: NDArray, other: NDArray) -> NDArray:
-        return irfft(rfft(one, size) * np.conj(rfft(other, size)), size)[shift]
+        spectrum = np.fft.rfft(one, size) * np.conj(np.fft.rfft(other, size))
+        return np.fft.irfft(spectrum, size)[shift]
 
     total, square = products(window, command), products(window, command**2)
     spread = np.sqrt(np.maximum(square - total**2 / (last - first), 1e-12))

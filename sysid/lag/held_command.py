@@ -203,4 +203,5 @@ class Stretch:
             own = np.fft.rfft(level[first:last], size)
             near = np.fft.rfft(padded[first : last + 2 * most], size)
             product[k] = np.fft.irfft(near * np.conj(own), size)[: 2 * most + 1]
-        return step * np.arange(-most, most + 1), 0.5 * (product + product[:, ::-1])
+        shift = np.asarray(step * np.arange(-most, most + 1), np.float64)
+        return shift, 0.5 * (product + product[:, ::-1])

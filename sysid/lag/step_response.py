@@ -162,7 +162,10 @@ def joint_stretches(
     spans = np.array([time[-1] - time[0] for _, time, _ in parts])
     shares = np.maximum(1, np.round(_BLOCKS * spans / spans.sum())).astype(int)
     shares = np.maximum(shares, int(np.ceil(_FEWEST_BLOCKS / len(parts))))
-    return tuple(Stretch(*part, int(k)) for part, k in zip(parts, shares, strict=True))
+    return tuple(
+        Stretch(held, time, value, int(k))
+        for (held, time, value), k in zip(parts, shares, strict=True)
+    )
 
 
 def _inside_counts(trial: Trial, reading: Readings, step_rad: float) -> NDArray[np.float64]:

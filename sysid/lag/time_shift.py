@@ -50,7 +50,8 @@ def shift_draws(response: ImpulseResponse, rng: np.random.Generator) -> NDArray[
     gain = -1.0 if response.gain < 0 else 1.0
     products = [s.autocorrelation(LONGEST_S + edges[-1]) for s in response.stretches]
     everywhere = np.arange(EARLIEST_S, LONGEST_S, 2.5 * _STEP_S)
-    whole = np.median(masses, axis=0) @ _correlation(products, edges, everywhere).sum(axis=0)
+    # of the mean: draws differ in where they begin, and medians of single bins are no response
+    whole = masses.mean(axis=0) @ _correlation(products, edges, everywhere).sum(axis=0)
     centre = everywhere[int(np.argmax(gain * whole))]
     shift = np.arange(max(EARLIEST_S, centre - _NEAR_S), min(LONGEST_S, centre + _NEAR_S), _STEP_S)
     command = _correlation(products, edges, shift)

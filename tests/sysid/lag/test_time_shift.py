@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.lag.held_command import HeldCommand, past_tones
+from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, past_tones
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.lag.step_response import _SIZES, _evidence
-from pupper_sysid.sysid.lag.time_shift import command_hold
+from pupper_sysid.sysid.lag.step_response import _SIZES, ImpulseResponse, _evidence
+from pupper_sysid.sysid.lag.time_shift import command_hold, shift_draws
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import first_order_trial, held_trial, random_levels
 
@@ -150,6 +150,20 @@ def test_a_slow_servo_of_700_ms_is_measured():
     trial = first_order_trial(random_levels(rng, 0.8), 0.4, 0.35, loop_s=0.02, duration_s=40.0)
     b = lag_budget("LF_hip", [trial], rng)
     assert 0.5 < b.lag_s.low < b.lag_s.high < 0.8
+
+
+def test_draws_that_begin_at_different_times_do_not_lose_the_lag_they_share():
+    # each a jump with overshoot taken back; the median of every bin is another response
+    edges = 0.01 * np.arange(121)
+    masses = np.zeros((30, 120))
+    for k in range(30):
+        masses[k, 5 + k % 3], masses[k, 8 + k % 3] = 1.6, -0.6
+    rng = np.random.default_rng(7)
+    trial = first_order_trial(minimum_jerk(rng), 0.02, 0.05, loop_s=0.02)
+    stretch = Stretch(HeldCommand.of(trial), trial.read_time_s, trial.position_rad, 8)
+    response = ImpulseResponse(edges, masses, np.ones((30, 8)), (stretch,), 1.0)
+    # 1.6 · 65 - 0.6 · 95 ms in the middle of the three
+    assert np.median(shift_draws(response, rng)) == pytest.approx(0.047, abs=0.01)
 
 
 def test_dynamics_below_zero_are_said_to_be_so():
