@@ -87,6 +87,14 @@ def end_politely() -> None:
                 signal.signal(number, stop)
 
 
+def _stop_no_more() -> None:
+    """Give termination signals back to the system, for the next program of this process."""
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number and isinstance(signal.getsignal(number), _Stop):
+            signal.signal(number, signal.SIG_DFL)
+
+
 def _signalled() -> int:
     """Exit code for the termination signal that a polite program received; 0 for none."""
     handler = signal.getsignal(signal.SIGTERM)
@@ -125,6 +133,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         )
         sys.exit(1)
     finally:
+        _stop_no_more()
         forget()
 
 

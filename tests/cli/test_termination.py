@@ -91,13 +91,14 @@ def test_a_termination_signal_ends_commands_and_their_workers_within_a_second(tm
 
 def test_an_interrupted_calculation_does_not_wait_for_its_workers(tmp_path):
     process = subprocess.Popen(
-        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "delay", str(SWEEP)],
+        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "calibrate",
+         str(SWEEP)],
         cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
     )  # fmt: skip
     try:
         assert wait_until(lambda: len(children(process.pid)) >= 2, 60)
         process.send_signal(signal.SIGINT)  # to it alone, as no terminal does
-        _, err = process.communicate(timeout=3)
+        _, err = process.communicate(timeout=10)
         assert process.returncode == 1 and err.strip().endswith(b"Stopped.")
     finally:
         process.kill()
