@@ -143,7 +143,7 @@ def ablation(
         for rngs in (_generators(trial, len(known), k) for k in (0, 1))
     )
     walks = trial.walks(policy, [trial.condition(change) for change in walked], (0.02, 1.0))
-    outcomes = dict(zip(known, map(outcome, walks), strict=True))
+    outcomes: dict[int, dict[str, Any]] = dict(zip(known, map(outcome, walks), strict=True))
     agreements = dict(zip(known, _agreements(policy, plain, replayed), strict=True))
     return [
         AblationPoint(

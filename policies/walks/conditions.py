@@ -34,6 +34,7 @@ from pupper_sysid.sim.walking.shared_draws import Twins
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+Kept = TypeVar("Kept", covariant=True)
 
 DIRECTIONS = {
     "forward": (0.15, 0.0, 0.0),
@@ -94,14 +95,14 @@ class Moment:
     """Robots that fell in this step."""
 
 
-class Recorder(Protocol[T]):
+class Recorder(Protocol[Kept]):
     """Keeps what is wanted of the walks in an environment."""
 
     def keep(self, now: Moment) -> None:
         """Take the next control step."""
         ...
 
-    def of(self, condition: Condition, robots: slice, steps: int) -> T:
+    def of(self, condition: Condition, robots: slice, steps: int) -> Kept:
         """What was kept of the robots of a condition in the first `steps`."""
         ...
 
