@@ -51,6 +51,7 @@ FEET = len(LEGS)
 _TOUCH_S = 0.006  # a foot is down if it was so in the last milliseconds: contacts flicker
 _RECORD = ("qpos", "actuator_force", "sensordata")
 _MANY = 256  # robots from which parts are worth a second call of every NumPy function
+_LATEST = 4.0  # longest latency of a command, in means
 _FIRST_PART = 0.625  # while the rest moves, there is time for what follows on the first part
 
 _THIGHS, _CALVES = np.arange(1, 12, 3), np.arange(2, 12, 3)
@@ -108,6 +109,7 @@ class RobotBatch:
             servo_model.reset(np.zeros((environments, len(JOINT_NAMES))))
         self._extra_s = np.broadcast_to(extra_dead_time_s, environments)
         longest_s = servos.longest_dead_time_s + float(self._extra_s.max())
+        longest_s += _LATEST * servos.command_jitter_s
         # every buffer holds the longest delay that can be drawn
         longest = {
             name: replace(own, dead_time_s=np.array(longest_s))
@@ -193,6 +195,18 @@ class RobotBatch:
         return joints
 
     # ------------------------------------------------------------------------- stepping
+
+    def draw_latency(self, delay_share: float, rng: np.random.Generator) -> None:
+        """Draw how late each robot's next commands are; nothing is drawn without jitter.
+
+        One latency per robot: a frame carries the commands of all its servos. Its mean is in the
+        dead time.
+        """
+        jitter = self.servos.command_jitter_s * delay_share
+        if jitter > 0:
+            late = jitter * (np.minimum(rng.exponential(1.0, self.environments), _LATEST) - 1.0)
+            delay = np.maximum(self.drawn["dead_time_s"] + late[:, None], 0.0)
+            self._fields["actuator_delay"][:] = delay
 
     def step(self, target: Array) -> Iterator[Moved]:
         """Let one control step pass under joint set-points [rad], shape (n, 12).

@@ -189,6 +189,7 @@ class PupperEnv:
         self.earlier_action, self.last_action = self.last_action, self.action
         self.action = np.array(action, float)
         before = self.robots.joint_velocity.copy()
+        self.robots.draw_latency(self._easy(self.level), self.rng)
         moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)

@@ -47,6 +47,9 @@ class ServoRanges:
         Of each servo.
     fallbacks : dict of str to str
         Joints that were not calibrated, and the joint whose numbers they have.
+    command_jitter_s : float
+        Standard deviation of the (exponential) latency of a robot's commands, whose mean is in the
+        dead times [s]: the median of the joints that show one.
     """
 
     source: str
@@ -55,6 +58,7 @@ class ServoRanges:
     high: dict[str, NDArray[np.float64]]
     feedback: tuple[HeldFeedback, ...]
     fallbacks: dict[str, str]
+    command_jitter_s: float = 0.0
 
     @property
     def longest_dead_time_s(self) -> float:
@@ -164,7 +168,10 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
     feedback = tuple(calibration.held_feedback(fallbacks.get(n, n)) for n in JOINT_NAMES)
-    return ServoRanges(source, low, value, high, feedback, fallbacks)
+    jitters = [p.actuator.command_jitter_s for p in parts]
+    known = [q.value for q in jitters if q.identified == "yes"]
+    jitter = float(np.median(known)) if known else 0.0
+    return ServoRanges(source, low, value, high, feedback, fallbacks, jitter)
 
 
 def _nearest(name: str, calibration: Calibration) -> str:

@@ -780,3 +780,18 @@ def test_no_robots_are_refused():
 def test_the_joints_of_the_model_are_in_the_projects_order():
     env = make(count=1)
     assert [env.robots.model.joint(i + 1).name for i in range(12)] == list(JOINT_NAMES)
+
+
+def test_commands_come_late_at_random_where_the_calibration_has_jitter():
+    servos = replace(servo_ranges("paper"), command_jitter_s=0.003)
+    env = PupperEnv(Walking(), servos, 64, threads=1)
+    delays = []
+    for _ in range(40):
+        env.step(np.zeros((64, 12)))
+        own = env.robots._fields["actuator_delay"] - env.robots.drawn["dead_time_s"]
+        assert np.ptp(own, axis=1).max() < 1e-12  # one frame for all servos of a robot
+        delays.append(own[:, 0].copy())
+    late = np.array(delays)
+    assert late.min() >= -0.003 - 1e-12
+    assert late.mean() == pytest.approx(0.0, abs=3e-4)
+    assert late.std() == pytest.approx(0.003, rel=0.15)
