@@ -186,10 +186,17 @@ def fit_joint(
     pd = _fit_simulated(ready)
     best = dict(pd.fits)
     fitted = dict(pd.fitted)
+    unseen = [f.scores.rmse_leave_one_frequency_out_rad for f in pd.fitted.values()]
     for model in CANDIDATE_MODELS:
-        if model.name not in best:
-            best[model.name] = fit_with_folds(model, data, pd.folds, noise, ready.fit_rng(), best)
-            fitted[model.name] = _candidate_fit(model, best[model.name], ready, pd.folds)
+        if model.name in best:
+            continue
+        fits = fit_with_folds(model, data, {}, noise, ready.fit_rng(), best)
+        made = _candidate_fit(model, fits, ready, {})
+        # a model that errs more on what it was fitted to cannot be better on unseen tones
+        if made.scores.rmse_fresh_rad <= min(unseen):
+            fits = fit_with_folds(model, data, pd.folds, noise, ready.fit_rng(), best)
+            made = _candidate_fit(model, fits, ready, pd.folds)
+        best[model.name], fitted[model.name] = fits, made
     fitted = {model.name: fitted[model.name] for model in CANDIDATE_MODELS}
     chosen = _choose(fitted, pd.carried)
     carried = candidate_model(pd.carried)
@@ -381,7 +388,8 @@ def _why_unidentified(
 def _choose(fitted: dict[str, CandidateFit], carried: str) -> str:
     """The model with the smallest leave-one-out error; the one carried where it is as good."""
     errors = {n: f.scores.rmse_leave_one_frequency_out_rad for n, f in fitted.items()}
-    if not np.isfinite(list(errors.values())).all():
+    errors = {n: e for n, e in errors.items() if np.isfinite(e)}
+    if not errors:
         return carried  # one frequency: nothing to choose by
     best = min(errors, key=lambda name: errors[name])
     return carried if errors[carried] <= _PREFERENCE * errors[best] else best

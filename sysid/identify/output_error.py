@@ -24,6 +24,7 @@ from pupper_sysid.sysid.identify.simulation import TrialData, moments_if_later, 
 DIFFERENCE = 0.01  # relative step of the Jacobian; smaller ones drown in friction's stick-slip
 _WIDE_DIFFERENCE = 0.03  # for the covariance: the slope over a likely error, not of one kink
 _DELAY_GRID = 2.0  # steps between the delays tried for a start
+_DENSE_DELAYS, _LONG_DELAYS = 40.0, 34  # steps up to which they are dense; how many beyond
 
 
 @dataclass(frozen=True)
@@ -276,7 +277,12 @@ def global_starts(
     cloud[0] = [float(p.encode(p.nominal)) for p in par]
     values = np.stack([p.decode(c) for p, c in zip(par, cloud.T, strict=True)], axis=-1)
     values[:, 0] = par[0].low
-    later = np.arange(0.0, (par[0].high - par[0].low) / TIME_STEP_S, _DELAY_GRID)
+    longest = (par[0].high - par[0].low) / TIME_STEP_S
+    # as dense as a twentieth of the delay, and never denser than two steps
+    later = np.unique(np.concatenate([
+        np.arange(0.0, min(longest, _DENSE_DELAYS), _DELAY_GRID),
+        np.geomspace(_DENSE_DELAYS, max(longest, _DENSE_DELAYS), _LONG_DELAYS).round(),
+    ]))  # fmt: skip
     every = {id(trial): trial for problem in problems for trial in problem.trials}
     moments = {key: np.array(moments_if_later(model, values, t, later)) for key, t in every.items()}
     best = []

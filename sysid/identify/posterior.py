@@ -39,8 +39,8 @@ STEPPING_SD_S = 0.5 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
 standard deviation over random emulated servos with half that step
 (`benchmarks/dead_time_accuracy.py`)."""
-_CHAINS = 48
-_SETTLING, _GENERATIONS = 140, 150
+_CHAINS = 32
+_SETTLING, _GENERATIONS = 130, 140
 _LEFT_OUT = 20  # generations after the change of steps
 _START_SD = 0.1  # of the logarithms about the fit that chains start from
 _OFFSET_START_SD_RAD = 5e-4

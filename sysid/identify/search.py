@@ -39,7 +39,7 @@ _MOST_FOLDS = 6
 _CANDIDATES = 512
 _SHORT, _FINAL = 8, 20  # iterations: enough to rank the starts, enough to converge
 _SEARCH_DIFFERENCE = 0.05
-_POPULATION, _GENERATIONS = 64, 120
+_POPULATION, _GENERATIONS = 48, 50
 
 
 def leave_one_out_folds(data: Sequence[TrialData]) -> dict[float, tuple[bool, ...]]:
@@ -106,7 +106,7 @@ def fit_with_folds(
     if model.name == f"{PREFERRED}_backlash":  # contains DelayedPD: start from its solutions
         starts = [
             [np.insert(f.values, -1, gap) for gap in (0.002, 0.008, 0.025)]
-            for f in lower[PREFERRED]
+            for f in lower[PREFERRED][: len(problems)]
         ]
         return best_of(model, problems, np.array(starts), 15)
     # Few tones leave many local optima: start from more places. Counted in the data, not in
