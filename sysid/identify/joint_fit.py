@@ -20,6 +20,7 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, flat, internal
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.models import (
     CANDIDATE_MODELS,
     CandidateModel,
@@ -207,7 +208,13 @@ def fit_joint(
         simulated_model=pd.carried,
         structure_nats=pd.nats,
         command_jitter_s=command_jitter(
-            carried, values, ready.recorded, data, noise, ready.fit_rng()
+            carried,
+            values,
+            ready.recorded,
+            data,
+            noise,
+            _date_sd_s(ready.lag.feedback),
+            ready.fit_rng(),
         ),
         candidate_models=fitted,
         lag=pd.lag,
@@ -223,6 +230,11 @@ def fit_joint(
         ),
         trials=data,
     )
+
+
+def _date_sd_s(lattice: PollLattice) -> float:
+    """Standard deviation of the date of one reading [s]."""
+    return float(lattice.blur_s / np.sqrt(12)) if lattice.kind == "lattice" else 0.0
 
 
 def plausible(structure_nats: Mapping[str, float]) -> list[str]:

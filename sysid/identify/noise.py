@@ -22,6 +22,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 _OUTLIER_MAD = 4.0
 _PROBE_S = 0.002  # jitter at which its effect is simulated: small beside the servo's own times
 _PROBES, _DRAWS = 6, 200
+_DATES = (0.5, 1.5)  # of the standard deviation of dates
 _SAMPLES_PER_INDEPENDENT = 4.0  # a servo carries a late command on for about so many readings
 
 
@@ -65,6 +66,7 @@ def command_jitter(
     recorded: Sequence[Trial],
     trials: Sequence[TrialData],
     noise_rad: Sequence[float],
+    date_sd_s: float,
     rng: np.random.Generator,
 ) -> Interval:
     """Standard deviation of the latency of commands that explains the noise of fast tones [s].
@@ -81,6 +83,9 @@ def command_jitter(
     trials : sequence of TrialData
     noise_rad : sequence of float
         From `noise_by_trial`.
+    date_sd_s : float
+        Standard deviation of the dates of readings [s]: it grows with the speed, too, and is taken
+        off, half to one and a half of it.
     rng : numpy.random.Generator
 
     Returns
@@ -101,15 +106,22 @@ def command_jitter(
         for t, one, other in zip(trials, plain, free_run(model, values, late), strict=True):
             moved[label(t)].append(look_up(other, t.sample_step) - look_up(one, t.sample_step))
     gain = np.array([np.mean(np.concatenate(moved[t]) ** 2) for t in tones]) / _PROBE_S**2
+    speeds: dict[float, list[NDArray]] = {tone: [] for tone in tones}
+    for t, track in zip(trials, plain, strict=True):
+        speeds[label(t)].append(look_up(np.gradient(track) / t.step_s, t.sample_step))
+    dating = np.array([np.mean(np.concatenate(speeds[t]) ** 2) for t in tones]) * date_sd_s**2
     own = {label(t): n for t, n in zip(trials, noise_rad, strict=True)}
     square = np.array([own[t] ** 2 for t in tones])
     count = [sum(len(t.sample_step) for t in trials if label(t) == tone) for tone in tones]
     freedom = np.maximum(np.array(count) / _SAMPLES_PER_INDEPENDENT, 2.0)
 
-    def jitter(squares: NDArray) -> float:
+    def jitter(squares: NDArray, dates: float) -> float:
         design = np.column_stack([np.ones(len(tones)), gain]) / squares[:, None]
         scale = np.linalg.norm(design, axis=0)
-        return float(np.sqrt(nnls(design / scale, np.ones(len(tones)))[0][1] / scale[1]))
+        rest = np.maximum(1.0 - dates**2 * dating / squares, 0.0)
+        return float(np.sqrt(nnls(design / scale, rest)[0][1] / scale[1]))
 
     draws = square * rng.chisquare(freedom, (_DRAWS, len(tones))) / freedom
-    return Interval.of_draws(jitter(square), np.array([jitter(d) for d in draws]))
+    dates = rng.uniform(*_DATES, _DRAWS)
+    found = [jitter(s, d) for s, d in zip(draws, dates, strict=True)]
+    return Interval.of_draws(jitter(square, 1.0), np.array(found))
