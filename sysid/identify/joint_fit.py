@@ -53,6 +53,8 @@ _TELLING_NATS = 5.0
 """Difference of the log-likelihoods of two structures that tells them apart."""
 UNTOLD = "the data do not tell a set-point of limited rate from back-EMF"
 _WIDE = 4.0
+_POLL_SD_S = 1e-3
+"""Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
 
@@ -234,7 +236,7 @@ def fit_joint(
 
 def _date_sd_s(lattice: PollLattice) -> float:
     """Standard deviation of the date of one reading [s]."""
-    return float(lattice.blur_s / np.sqrt(12)) if lattice.kind == "lattice" else 0.0
+    return max(float(lattice.blur_s / np.sqrt(12)), _POLL_SD_S) if lattice.kind == "lattice" else 0.0
 
 
 def plausible(structure_nats: Mapping[str, float]) -> list[str]:
