@@ -236,7 +236,9 @@ def fit_joint(
 
 def _date_sd_s(lattice: PollLattice) -> float:
     """Standard deviation of the date of one reading [s]."""
-    return max(float(lattice.blur_s / np.sqrt(12)), _POLL_SD_S) if lattice.kind == "lattice" else 0.0
+    if lattice.kind != "lattice":
+        return 0.0
+    return max(float(lattice.blur_s / np.sqrt(12)), _POLL_SD_S)
 
 
 def plausible(structure_nats: Mapping[str, float]) -> list[str]:
