@@ -33,9 +33,9 @@ from pupper_sysid.servo_models.sparse_equation import (
     explain,
     integrate,
 )
-from pupper_sysid.sysid.identify.preparation import prepare_joint
 from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
 from pupper_sysid.sysid.identify.output_error import Fit, Problem
+from pupper_sysid.sysid.identify.preparation import prepare_joint
 from pupper_sysid.sysid.identify.scores import Scores, score
 from pupper_sysid.sysid.identify.search import (
     PREFERRED,
