@@ -167,10 +167,10 @@ def residuals(
     parts = [np.empty((len(values), 0))]
     for trial in trials:
         out = np.empty((len(values), len(trial.sample_step)))
-        command, *stepping = _stepped(trial)
+        command, rest, step_s, stop = _stepped(trial)
         kernel.residuals(
             *_candidates(model, values, trial), offset, command, trial.sample_step,
-            trial.sample_rad, *stepping, out,
+            trial.sample_rad, rest, step_s, stop, out,
         )  # fmt: skip
         parts.append(out)
     return np.concatenate(parts, axis=1)
@@ -201,10 +201,10 @@ def moments_if_later(
         In rad².
     """
     total, square = np.zeros((2, len(later), len(values)))
-    command, *stepping = _stepped(trial)
+    command, rest, step_s, stop = _stepped(trial)
     kernel.moments_if_later(
         *_candidates(model, values, trial), command, trial.sample_step, trial.sample_rad, later,
-        *stepping, total, square,
+        rest, step_s, stop, total, square,
     )  # fmt: skip
     return total, square
 

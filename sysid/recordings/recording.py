@@ -325,4 +325,5 @@ class Recording:
                     bus.get("read_time_doubt_s") or 0.0,
                 )
             )
-        return in_servo_coordinates(found, bus)
+        # Any: type checkers see this module under two names
+        return cast(Any, in_servo_coordinates)(found, bus)
