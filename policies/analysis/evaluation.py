@@ -87,8 +87,9 @@ class Standing(Result):
 
 @dataclass(frozen=True, kw_only=True)
 class Intervals(Result):
-    """90 % intervals over episodes: of the share that fell by Clopper and Pearson, of the mean
-    errors by Student's t.
+    """90 % intervals over episodes.
+
+    Of the share that fell by Clopper and Pearson, of the mean errors by Student's t.
     """
 
     fall_rate: Interval

@@ -30,6 +30,10 @@ STILL_RAD = 1e-3
 """Smaller deviations move no servo by a count [rad]."""
 
 
+def _silent(share: float) -> None:
+    """Show no progress."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """Task, servos, command, number of robots and duration in which a policy is tried."""
@@ -41,7 +45,7 @@ class Trial:
     seconds: float = 10.0
     seed: int = 0
     threads: int = 0
-    progress: Callable[[float], None] = field(default=lambda share: None, compare=False)
+    progress: Callable[[float], None] = field(default=_silent, compare=False)
     """Called with the share of an analysis that is done."""
     _plain: list[tuple[Policy, Rollout]] = field(
         init=False, repr=False, compare=False, default_factory=list
@@ -54,8 +58,9 @@ class Trial:
         extra_dead_time_s: float = 0.0,
         **different: Any,
     ) -> Condition:
-        """What these robots walk under, perhaps altered; `different` are fields of the task, and
-        `command`.
+        """What these robots walk under, perhaps altered.
+
+        `different` are fields of the task, and `command`.
         """
         command = different.pop("command", self.command)
         task = evaluation_task(replace(self.task, **different))

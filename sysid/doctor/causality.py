@@ -1,4 +1,4 @@
-"""Checks of cause and effect: is the position that of a servo that follows this command?
+"""Checks of cause and effect: the position is that of a servo that follows this command.
 
 An echo, noise, an unrelated or an inverted position, one that moves before its command, and a
 scale or zero that changes, by what `sysid.doctor.following` explains.

@@ -46,8 +46,9 @@ def long_enough(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def findings(recorded: Sequence[Trial]) -> list[Finding]:
-    """What is wrong with one joint's trials: all that asks for care, or the first fault that makes
-    every number wrong.
+    """Find what is wrong with one joint's trials.
+
+    All that asks for care, or the first fault that makes every number wrong.
 
     Parameters
     ----------

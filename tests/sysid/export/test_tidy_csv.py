@@ -17,7 +17,7 @@ from pupper_sysid.servo_models.calibration.parts import Quantity, Scores
 from pupper_sysid.sysid.export.tidy_csv import CALIBRATION_COLUMNS, to_csv
 from pupper_sysid.sysid.recordings.files import load
 
-QUANTITIES_PER_JOINT = 7 + 4 + 5
+QUANTITIES_PER_JOINT = 9 + 5 + 5
 """Of the actuator, of its ratios to the armature, of the feedback."""
 
 PLAIN_NUMBERS = {"delay_steps_min", "delay_steps_max", "physics_step_s", "value_nm"}

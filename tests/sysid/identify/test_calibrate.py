@@ -78,12 +78,13 @@ def test_the_fit_is_as_good_as_the_readings_allow(result):
     assert scores.rmse_fresh_rad < result.candidate_models["pure_delay"].scores.rmse_fresh_rad
 
 
-def test_simpler_models_are_worse_on_tones_they_have_not_seen(result):
-    errors = [
-        result.candidate_models[r.name].scores.rmse_leave_one_frequency_out_rad
-        for r in CANDIDATE_MODELS
-    ]
-    assert errors[0] > errors[2] > errors[4]
+def test_models_too_simple_to_win_are_not_tried_on_tones_they_have_not_seen(result):
+    scores = [result.candidate_models[m.name].scores for m in CANDIDATE_MODELS]
+    fresh = [s.rmse_fresh_rad for s in scores]
+    unseen = [s.rmse_leave_one_frequency_out_rad for s in scores]
+    assert fresh[0] > fresh[2] > fresh[4]
+    assert np.isnan(unseen[0]) and fresh[0] > min(unseen[4], unseen[5])
+    assert np.isfinite(unseen[4:6]).all()
 
 
 def test_friction_and_speed_limit_only_add_to_delay_and_linear_dynamics(result):
@@ -117,9 +118,9 @@ def test_a_speed_limit_that_was_never_reached_is_not_claimed():
 def test_results_repeat_under_a_seed():
     trials = servo_trials(np.random.default_rng(3), (1.0, 3.0))
     first, again = (fit_joint("LF_hip", trials, 5) for _ in range(2))
-    assert (
-        first.candidate_models == again.candidate_models and first.dead_time_s == again.dead_time_s
-    )
+    # as text: a score that was not found is NaN, which equals nothing
+    assert repr(first.candidate_models) == repr(again.candidate_models)
+    assert first.dead_time_s == again.dead_time_s
 
 
 def test_the_fit_follows_a_step_as_the_equations_of_a_speed_limited_pd_say():
