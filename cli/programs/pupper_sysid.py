@@ -34,7 +34,7 @@ _SUMMARIES = {
         "sindy": "Find a sparse equation of motion per joint.",
         "fit-servo": "Fit an MLP, LSTM, FIR or other model.",
         "compare": "Compare models on the same readings.",
-        "compare-truth": "Compare a calibration with an emulated robot's truth.",
+        "compare-truth": "Compare a calibration with the emulated truth.",
     },
     "use": {
         "report": "Write figures and tables as one HTML page.",
