@@ -53,14 +53,14 @@ def main() -> None:
         root = Path(name) / "robots"
         root.mkdir()
         write_robots(options.robots, root)
-        print("| workers | robots | s | s per robot | failed | named as unlike |")
+        print("| workers | robots | s | s per robot | failed | named as outliers |")
         print("|---|---|---|---|---|---|")
         for jobs in options.workers:
             begun = time.perf_counter()
             fleet = calibrate_fleet(root, Path(name) / f"out{jobs}", Settings(), jobs)
             took = time.perf_counter() - begun
-            odd = fleet.table.query("problem == '' and unlike != ''")
-            named = ", ".join(f"{r.robot} ({r.unlike})" for r in odd.itertuples()) or "nobody"
+            odd = fleet.table.query("problem == '' and outliers != ''")
+            named = ", ".join(f"{r.robot} ({r.outliers})" for r in odd.itertuples()) or "nobody"
             print(
                 f"| {jobs} | {options.robots} | {took:.0f} | {took / options.robots:.2f} | "
                 f"{len(fleet.failed)} | {named} |",

@@ -169,7 +169,7 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     low["armature"] = high["armature"] = value["armature"]
     feedback = tuple(calibration.held_feedback(fallbacks.get(n, n)) for n in JOINT_NAMES)
     jitters = [p.actuator.command_jitter_s for p in parts]
-    known = [q.value for q in jitters if q.identified == "yes"]
+    known = [q.value for q in jitters if q.low]  # seen, if only as an upper bound
     jitter = float(np.median(known)) if known else 0.0
     return ServoRanges(source, low, value, high, feedback, fallbacks, jitter)
 

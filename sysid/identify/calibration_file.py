@@ -245,7 +245,9 @@ def _jitter(result: JointCalibrationResult) -> Quantity:
     found = result.command_jitter_s
     if not np.isfinite(found.value):
         return Quantity(value=0.0, identified="no", why="it takes several tones to see it")
-    why = "it cannot be told from none" if found.low <= 0 else None
+    why = "an upper bound: friction that the model lacks grows with the tone, too"
+    if found.low <= 0:
+        why = "it cannot be told from none"
     if result.lag.feedback.kind == "unresolved":
         why = "readings are dated to half a loop only"
     return _known(found, why)
