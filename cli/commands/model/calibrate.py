@@ -110,8 +110,8 @@ class Calibrate:
 
     def _print(self, made: CalibrationResult) -> None:
         shown = terminal.table(
-            "DelayedPD per joint", "joint", "dead time ms (90 %)", "Kp", "Kd", "fric. N·m",
-            "J 1e-4 kg·m²", "speed rad/s", "limit", "error mrad", "unseen Hz mrad", "paper mrad",
+            "DelayedPD per joint", "joint", "dead time ms", "90 %", "Kp", "Kd", "fric. N·m",
+            "speed rad/s", "limit", "error mrad", "unseen Hz mrad", "paper mrad",
         )  # fmt: skip
         for name, r in made.items():
             a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
@@ -120,12 +120,12 @@ class Calibrate:
             limit = a.back_emf_nm_s_per_rad if brakes else a.velocity_limit_rad_s
             shown.add_row(
                 name,
-                f"{_number(a.dead_time_s, 1, 1e3)} ({1e3 * r.dead_time_s.low:.1f}–"
-                f"{1e3 * r.dead_time_s.high:.1f})",
+                _number(a.dead_time_s, 1, 1e3),
+                f"{1e3 * r.dead_time_s.low:.0f}–{1e3 * r.dead_time_s.high:.0f}",
                 _number(a.stiffness_nm_per_rad, 1), _number(a.damping_nm_s_per_rad, 3),
-                _number(a.friction_loss_nm, 3), _number(a.armature_kg_m2, 2, 1e4),
+                _number(a.friction_loss_nm, 3),
                 f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
-                "back-EMF" if brakes else "slew",
+                "EMF" if brakes else "slew",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_leave_one_frequency_out_rad),
                 terminal.ms(paper.rmse_fresh_rad if paper else None),
             )  # fmt: skip
@@ -133,7 +133,7 @@ class Calibrate:
         terminal.out.print(
             f"\nTorques assume a stall torque of {self.stall_torque:g} N·m; free-air recordings "
             "give only their ratios. ? is not identified; limit: what limits the speed, the "
-            "set-point's slew or back-EMF. Errors are free-run, on fresh readings.",
+            "set-point's slew or back-EMF (EMF). Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
         for r in made.values():
