@@ -60,7 +60,7 @@ def main() -> None:
             fleet = calibrate_fleet(root, Path(name) / f"out{jobs}", Settings(), jobs)
             took = time.perf_counter() - begun
             odd = fleet.table.query("problem == '' and outliers != ''")
-            named = ", ".join(f"{r.robot} ({r.outliers})" for r in odd.itertuples()) or "nobody"
+            named = ", ".join(f"{r.robot} ({r.outliers})" for r in odd.itertuples()) or "none"
             print(
                 f"| {jobs} | {options.robots} | {took:.0f} | {took / options.robots:.2f} | "
                 f"{len(fleet.failed)} | {named} |",
