@@ -68,5 +68,7 @@ def _joined(calf: Trial, thigh: Trial, neutral: float) -> Trial:
         command_rad=calf.command_rad[own] + thigh.command_rad[other] - neutral,
         position_rad=calf.position_rad[own] + thigh.position_rad[other] - neutral,
         position_count=None if count is None else count[own],
+        torque_enabled=None if calf.torque_enabled is None else calf.torque_enabled[own],
+        voltage_v=None if calf.voltage_v is None else calf.voltage_v[own],
         initial_command_rad=calf.initial_command_rad + thigh.initial_command_rad - neutral,
     )

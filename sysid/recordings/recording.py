@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -22,6 +22,7 @@ from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
 from pupper_sysid.sysid.recordings.layouts import READ_AFTER_SEND_S, convert
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.recordings.table import (
     OPTIONAL_COLUMNS,
     REQUIRED_COLUMNS,
@@ -80,6 +81,16 @@ class Trial:
         How the bus cut the commands.
     read_time_doubt_s : float
         By how much all readings may have been taken earlier or later than `read_time_s`.
+    p_gain : float
+        P gain of the servo's position loop, the register's value; NaN where it is unknown.
+    torque_enabled : ndarray of bool, or None
+        Whether the servo's torque was on at each row; None where it always was.
+    voltage_v : ndarray, or None
+        Supply voltage at each row [V]; NaN where missing.
+    servo : ServoSetup
+        What the header says of the servo.
+    load : PendulumLoad or None
+        What the joint carried; None where the header does not say.
     """
 
     joint: str
@@ -94,6 +105,11 @@ class Trial:
     readings: Literal["live", "polled"] | None = None
     truncation: Truncation = Truncation()
     read_time_doubt_s: float = 0.0
+    p_gain: float = float("nan")
+    torque_enabled: NDArray[np.bool_] | None = None
+    voltage_v: NDArray[np.float64] | None = None
+    servo: ServoSetup = field(default_factory=ServoSetup)
+    load: PendulumLoad | None = None
 
 
 @dataclass(frozen=True)
@@ -297,12 +313,17 @@ class Recording:
     def _trials(self) -> dict[str, list[Trial]]:
         rest = self.metadata.get("start_pose_rad") or {}
         bus = self.metadata.get("bus") or {}
+        servos = {j: ServoSetup(**s) for j, s in (self.metadata.get("servos") or {}).items()}
+        loads = {j: PendulumLoad(**s) for j, s in (self.metadata.get("loads") or {}).items()}
         quantum = bus.get("command_quantum_rad") or 0.0
         found: dict[str, list[Trial]] = {}
         for _, rows in self.table.groupby(["joint", "trial"], sort=True):
             columns = {c: rows[c].to_numpy() for c in rows.columns}
             joint, number = str(columns["joint"][0]), columns["trial"][0]
             count = columns.get("position_count")
+            servo = servos.get(joint, ServoSetup())
+            gain = columns.get("p_gain", [np.nan])[0]
+            torque = columns.get("torque_enabled")
             found.setdefault(joint, []).append(
                 Trial(
                     joint,
@@ -323,6 +344,11 @@ class Recording:
                         (bus.get("count_zero_rad") or {}).get(joint),
                     ),
                     bus.get("read_time_doubt_s") or 0.0,
+                    float(gain if np.isfinite(gain) or servo.p_gain is None else servo.p_gain),
+                    None if torque is None else torque != 0,
+                    columns.get("voltage_v"),
+                    servo,
+                    loads.get(joint),
                 )
             )
         # Any: type checkers see this module under two names

@@ -17,13 +17,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
 TITLE = "# pupper-sysid recording"
 REQUIRED_COLUMNS = (
     "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
 )  # fmt: skip
-OPTIONAL_COLUMNS = ("position_count", "voltage_v", "temperature_c", "load")
+OPTIONAL_COLUMNS = (
+    "position_count", "voltage_v", "temperature_c", "load", "p_gain", "torque_enabled",
+)  # fmt: skip
 
 _LEAST_ROWS = 20
 _MANY_REPEATED = 0.1  # of the rows
@@ -70,6 +73,8 @@ class Header(BaseModel):
     readings: Literal["live", "polled"] | None = None
     start_pose_rad: dict[str, _Angle] = {}
     read_after_send_s: Annotated[float, Field(ge=-1, le=1)] | None = None
+    servos: dict[str, ServoSetup] = {}
+    loads: dict[str, PendulumLoad] = {}
 
 
 @dataclass(frozen=True)
