@@ -158,7 +158,7 @@ class JointMap:
         ------
         InputError
             If a joint is not in the map, or a calf on a push rod comes without its thigh while
-            joint coordinates are asked for.
+            joint coordinates are requested.
         """
         missing = [j for j in joints if j not in self.file.joints]
         if missing:

@@ -147,7 +147,7 @@ def fractional_shift(
     series = history.shape[1]
     column = np.arange(series) if column is None else column
     whole = np.floor(delay_steps).astype(int)
-    # one row more than asked for: each row's successor is the other end of its interpolation
+    # one row more than requested: each row's successor is the other end of its interpolation
     row = np.arange(len(history) - steps - 1, len(history))[:, None]
     taken = np.take(history.reshape(-1), row * series + (column - whole * series))
     out = np.subtract(taken[:-1], taken[1:])

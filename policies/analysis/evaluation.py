@@ -3,7 +3,7 @@
 Every episode lasts 20 s (or until the robot falls), with its own servos, friction and payload,
 commands drawn anew every few seconds, and the measured feedback by default; no pushes. Errors are
 of the instantaneous velocity at each control step, start included. The error of a robot that stands
-still, the mean size of the command, stands beside the policy's.
+still, the mean size of the command, is given next to the policy's.
 
 Episodes under all conditions run together (`policies.walks.conditions`), and no condition runs
 twice: flat ground and no added dead time are episodes of the random commands. Episode k of every

@@ -1,7 +1,7 @@
 """Frequency of a rhythm, and the share of a signal that a sine explains.
 
 A frequency is estimated from at least five seconds, with an interval, not read off a spectrum of
-one second, whose bins are 1 Hz apart. A sine's R² stands beside that of noise (`null_r2`): the best
+one second, whose bins are 1 Hz apart. A sine's R² is given with that of noise (`null_r2`): the best
 of many sines explains a good part of any slow signal.
 """
 

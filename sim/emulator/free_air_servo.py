@@ -2,7 +2,7 @@
 
 Commands come at any instant, not only on physics steps: the actuator gets the mean of the held
 command over the step before (`sim.robot.servo_mjcf.for_commands_between_steps`). A position can be
-asked for at any instant. A servo at rest is not stepped until a command moves it.
+evaluated at any instant. A servo at rest is not stepped until a command moves it.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Its servos are those of `sim.emulator.free_air_servo`. MuJoCo steps it only as f
 robot at rest is not stepped until a command moves it. Commands come at any instant, not only on
 physics steps: each actuator gets the mean of its held command over the step before
 (`sim.robot.servo_mjcf.for_commands_between_steps`). The last two seconds are kept, because servos
-are polled one after the other, each a little before the last instant asked for. `trunk` gives the
+are polled one after the other, each a little before the latest evaluated instant. `trunk` gives the
 true motion, for scoring.
 """
 
@@ -171,7 +171,7 @@ class WalkingRobot:
             return self._sample
 
     def trunk(self, time_s: float) -> Trunk:
-        """True motion of the trunk at `time_s`, or at the latest instant asked for."""
+        """True motion of the trunk at `time_s`, or at the latest evaluated instant."""
         with self._lock:
             self._advance(self._steps(time_s))
             position, velocity = self._data.qpos[:3].copy(), self._data.qvel[:3]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +33,7 @@ _FULL, _QUICK = (16, 10.0), (5, 8.0)  # robots, seconds each
 
 
 @dataclass(frozen=True)
-class Analysis:
+class Analysis(ABC):
     """Options of every analysis."""
 
     policies: tyro.conf.Positional[tuple[Path, ...]]
@@ -68,9 +69,9 @@ class Analysis:
         out.print(table)
         err.print(f"Picture: {picture}", soft_wrap=True)
 
+    @abstractmethod
     def analyse(self) -> Found:
         """Results, figure and table."""
-        raise NotImplementedError
 
     def about(self) -> dict[str, Any]:
         """What else stands in the JSON object."""
