@@ -19,6 +19,12 @@ import numpy as np
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
+from pupper_sysid.sysid.recordings.importers.log import Log
+from pupper_sysid.sysid.recordings.importers.recognise import (
+    is_log_folder,
+    read_content,
+    read_folder,
+)
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.table import (
@@ -27,6 +33,7 @@ from pupper_sysid.sysid.recordings.table import (
     SCHEMA_VERSION,
     TITLE,
     check,
+    check_metadata,
     comment,
     parse,
 )
@@ -56,18 +63,32 @@ def load(path: Path | str) -> Recording:
         If it is not a recording or cannot be used; the message names the line and column.
     """
     path = Path(path)
+    if is_log_folder(path):
+        return _imported(path, read_folder(path))
     if path.name.endswith(".truth.csv"):
         raise InputError(
             f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
             "not a recording; load that file instead."
         )
     data = read_bytes(path)
+    log = read_content(path, data)
+    if log is not None:
+        return _imported(path, log)
     parsed = parse(path, as_text(path, data))
     table, metadata, warnings = convert(path, parsed)
     table, more = check(path, table)
     digest = hashlib.sha256(data).hexdigest()
     found = [*parsed.warnings, *warnings, *more]
     return Recording(table, metadata, path.stem, path, digest, tuple(found))
+
+
+def _imported(path: Path, log: Log) -> Recording:
+    """The recording of another project's log, checked like any other."""
+    check_metadata(path, log.metadata)
+    table, more = check(path, log.table)
+    return Recording(
+        table, log.metadata, path.stem, path, log.sha256, tuple([*log.warnings, *more])
+    )
 
 
 def newest_recording(folder: Path = FOLDER) -> Path:

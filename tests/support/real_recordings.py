@@ -67,3 +67,11 @@ def real_recording(name: str) -> Path:
     except OSError as error:  # no network
         pytest.skip(f"{name} is not in {FOLDER} and cannot be fetched ({type(error).__name__})")
     return Path(fetched)
+
+
+def real_folder(name: str) -> Path:
+    """Folder `name` of recordings of real servos; skips the test where it is absent."""
+    path = FOLDER / name
+    if not path.is_dir():
+        pytest.skip(f"{name} is not in {FOLDER} (set PUPPER_REAL_DATA)")
+    return path

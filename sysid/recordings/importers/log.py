@@ -1,0 +1,170 @@
+"""What importers share: the `Log` that each returns, names of joints, numbers and budgets."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from pupper_sysid.common import border
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.strict_yaml import printable
+
+LARGEST_BYTES = 500e6
+"""Largest log that is read, of all its files."""
+MOST_CELLS = 20_000_000
+"""Largest number of rows times columns of a log's table."""
+MOST_COLUMNS = 2_000
+MOST_JOINTS = 200
+
+_ENDINGS = re.compile(r"[._/](pos|position)$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log of another project as the rows of a recording.
+
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        Columns `sysid.recordings.table.REQUIRED_COLUMNS` and some of `OPTIONAL_COLUMNS`.
+    metadata : dict
+        Header entries; `imported_from` names the layout.
+    warnings : list of str
+        What the log does not say, and what was assumed instead.
+    sha256 : str
+        Of the bytes it was read from.
+    """
+
+    table: pd.DataFrame
+    metadata: dict[str, Any]
+    warnings: list[str] = field(default_factory=list)
+    sha256: str = ""
+
+
+def rows(
+    joint: str,
+    send_time_s: ArrayLike,
+    read_time_s: ArrayLike,
+    command_rad: ArrayLike,
+    position_rad: ArrayLike,
+    trial: ArrayLike = 0,
+    **optional: ArrayLike,
+) -> pd.DataFrame:
+    """Rows of one joint; `optional` are columns such as `p_gain`."""
+    columns = {
+        "send_time_s": send_time_s,
+        "read_time_s": read_time_s,
+        "trial": trial,
+        "joint": joint,
+        "frequency_hz": np.nan,
+        "command_rad": command_rad,
+        "position_rad": position_rad,
+    }
+    return pd.DataFrame(columns | optional)
+
+
+def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
+    """Joints' names as this project can use them: letters, digits and `_`.
+
+    Raises
+    ------
+    InputError
+        If there are too many, or two would be called the same.
+
+    Examples
+    --------
+    >>> joint_names("log", ["shoulder pan.pos", "2nd/wrist"])
+    ['shoulder_pan', 'joint_2nd_wrist']
+    """
+    if len(given) > MOST_JOINTS:
+        raise InputError(f"{path} has {len(given)} joints; at most {MOST_JOINTS} are read.")
+    found = []
+    for name in given:
+        text = re.sub(r"[^A-Za-z0-9]+", "_", _ENDINGS.sub("", str(name).strip())).strip("_")
+        found.append((text if text[:1].isalpha() else f"joint_{text}".rstrip("_"))[:64])
+    twice = [n for n in found if found.count(n) > 1]
+    if twice:
+        raise InputError(f"{path}: two joints would be called {twice[0]}. Rename one of them.")
+    return found
+
+
+def numbers(
+    path: Path | str, entries: Sequence[Any], key: str, where: str, missing: bool = False
+) -> NDArray[np.float64]:
+    """Numbers `entries[k][key]`; with `missing`, an absent or empty one is NaN.
+
+    Raises
+    ------
+    InputError
+        If one is no number; the message names its place.
+    """
+    found = np.full(len(entries), np.nan)
+    for k, entry in enumerate(entries):
+        value = entry.get(key) if isinstance(entry, Mapping) else None
+        if value is None and missing:
+            continue
+        found[k] = number(path, value, f"{where}[{k}].{key}")
+    return found
+
+
+def number(path: Path | str, value: Any, place: str) -> float:
+    """`value` as a float.
+
+    Raises
+    ------
+    InputError
+        If it is none; the message names `place`.
+    """
+    if isinstance(value, int | float):
+        try:
+            found = float(value)
+        except OverflowError:
+            found = float("inf")
+        if abs(found) != float("inf"):
+            return found
+    shown = "missing" if value is None else f"{printable(str(value))[:40]}, not a finite number"
+    raise InputError(f"{path}, {place} is {shown}. Mend the log, or leave the row out.")
+
+
+def read_files(root: Path, files: Iterable[Path]) -> tuple[dict[Path, bytes], str]:
+    """Content of a log's files within the budget of bytes, and the SHA-256 of names and content.
+
+    Raises
+    ------
+    InputError
+        If one cannot be read, or all together are too large.
+    """
+    found: dict[Path, bytes] = {}
+    left, digest = LARGEST_BYTES, hashlib.sha256()
+    for path in sorted(files):
+        found[path] = border.read_bytes(
+            path, left, "Give a part of the log, or split it by joint or by episode."
+        )
+        left -= len(found[path])
+        digest.update(f"{path.relative_to(root).as_posix()}\0{len(found[path])}\0".encode())
+        digest.update(found[path])
+    return found, digest.hexdigest()
+
+
+def text_of(path: Path, data: bytes) -> str:
+    """`data` as UTF-8 text without a byte order mark.
+
+    Raises
+    ------
+    InputError
+        If it is not text.
+    """
+    try:
+        if b"\0" in data:
+            raise ValueError
+        return data.decode("utf-8-sig")
+    except ValueError:
+        raise InputError(f"{path} is not a text file. Give the log as it was written.") from None

@@ -1,0 +1,170 @@
+"""SAGE folders (isaac-sim2real/sage): a robot's motion as `control.csv` and `state_motor.csv`.
+
+`control.csv` has `type, timestamp, positions`, `state_motor.csv` besides `velocities, torques`:
+times in µs, a list with a number per joint in each cell, joints named by the lines of
+`joint_list.txt`, angles in rad.
+
+The collector of the SO-101 arm stamps a whole turn with one time. It then writes six goals one by
+one, and reads position, speed and current joint after joint, so joint k is read some 2 ms after
+joint k−1. Where both files have the same stamps and an SO-101's joints, that order is restored.
+It also writes the servos' gains before each motion, which are not in the log.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.importers.held import held_commands
+from pupper_sysid.sysid.recordings.importers.log import (
+    MOST_CELLS,
+    Log,
+    joint_names,
+    read_files,
+    rows,
+    text_of,
+)
+from pupper_sysid.sysid.recordings.importers.units import scale_by_step
+
+LAYOUT = "SAGE folder"
+
+_CONTROL, _STATE, _JOINTS = "control.csv", "state_motor.csv", "joint_list.txt"
+_SO101 = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+_SETUP = {"model": "STS3215", "p_gain": 16, "i_gain": 0, "d_gain": 32}  # its collector writes these
+_TRANSACTION_S = 0.00075  # a write or read of one servo over USB: 24 of them fit into a turn
+_DOUBT_S = 0.0015  # of the time between a joint's write and its read
+_JAW = "Jaw"  # logged as a share of its range
+
+
+def is_sage(folder: Path) -> bool:
+    """Whether `folder` holds such a log."""
+    return (folder / _CONTROL).is_file() and (folder / _STATE).is_file()
+
+
+def read_sage(folder: Path) -> Log:
+    """The folder's motion as rows, one trial.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or a cell is not a list with a number per joint.
+    """
+    paths = [folder / name for name in (_CONTROL, _STATE, _JOINTS)]
+    contents, digest = read_files(folder, paths)
+    lines = text_of(paths[2], contents[paths[2]]).splitlines()
+    names = joint_names(paths[2], [line for line in lines if line.strip()])
+    if not names:
+        raise InputError(f"{paths[2]} names no joint. Write one per line.")
+    sent, commands = _table(paths[0], contents[paths[0]], len(names))
+    stamped, positions = _table(paths[1], contents[paths[1]], len(names))
+    metadata: dict[str, Any] = {"imported_from": LAYOUT, "joints": names, "readings": "live"}
+    warnings: list[str] = []
+    same = len(sent) == len(stamped) and bool(np.all(sent == stamped))
+    if same and tuple(names) == _SO101:
+        turns = _serial_turns(sent, len(names))
+        metadata["bus"] = {"read_time_doubt_s": _DOUBT_S}
+        metadata["servos"] = {name: dict(_SETUP) for name in names}
+    elif same:
+        turns = [(sent, sent)] * len(names)
+        doubt = float(np.median(np.diff(sent))) / 2 if len(sent) > 1 else 0.0
+        metadata["bus"] = {"read_time_doubt_s": min(max(doubt, 0.0), 1.0)}
+        warnings.append(
+            "commands and readings have the same time stamps, so it is not known when in a turn "
+            "each was sent or read: lag and dead time are in doubt by half a turn "
+            f"({1e3 * doubt:.0f} ms)."
+        )
+    else:
+        sent, commands, kept = held_commands(sent, commands, stamped)
+        stamped, positions = stamped[kept], positions[kept]
+        turns = [(sent, stamped)] * len(names)
+    parts = []
+    for k, name in enumerate(names):
+        scale = 1.0
+        if name == _JAW:
+            scale, text = scale_by_step(positions[:, k], nominal=np.pi / 2)
+            metadata["assumed_units"] = {name: text}
+            warnings.append(
+                f"{name} is logged as a share of its range, 0 … 1, not in rad: {text}. Lag and "
+                "dead time do not depend on it."
+            )
+        send, read = turns[k]
+        parts.append(rows(name, send, read, scale * commands[:, k], scale * positions[:, k]))
+    return Log(pd.concat(parts, ignore_index=True), metadata, warnings, digest)
+
+
+def _serial_turns(
+    stamp: NDArray[np.float64], joints: int
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """When each joint's goal was written and its position read: the middle of each transaction."""
+    middle = 0.5 * _TRANSACTION_S
+    return [
+        (
+            stamp + k * _TRANSACTION_S + middle,
+            stamp + (joints + 3 * k) * _TRANSACTION_S + middle,
+        )
+        for k in range(joints)
+    ]
+
+
+def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times [s] and positions, shape (rows, joints), of one of the two tables."""
+    text = text_of(path, data)
+    if text.count("\n") * joints > MOST_CELLS:
+        raise InputError(f"{path} has more than {MOST_CELLS:,} values. Split the log.")
+    reader = csv.reader(io.StringIO(text))
+    header = [cell.strip() for cell in next(reader, [])]
+    lacking = [c for c in ("timestamp", "positions") if c not in header]
+    if lacking:
+        raise InputError(
+            f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(header)[:200]}. "
+            "A SAGE table needs timestamp and positions."
+        )
+    at, where = header.index("timestamp"), header.index("positions")
+    times, values = [], []
+    while True:
+        try:
+            cells = next(reader)
+        except StopIteration:
+            break
+        except csv.Error as error:
+            raise InputError(f"{path}, line {reader.line_num}: {error}. Mend the line.") from error
+        if cells:
+            times.append(_value(path, reader.line_num, cells, at, float, "a time"))
+            wanted = f"a list of {joints} numbers, one per joint of {_JOINTS}"
+            values.append(
+                _value(path, reader.line_num, cells, where, lambda c: _list(c, joints), wanted)
+            )
+    if not times:
+        raise InputError(f"{path} has column names but no rows. Record it again.")
+    return 1e-6 * np.array(times), np.array(values)
+
+
+def _list(cell: str, count: int) -> list[float]:
+    found = json.loads(cell)
+    if not isinstance(found, list) or len(found) != count:
+        raise ValueError
+    return [float(value) for value in found]
+
+
+def _value(
+    path: Path, line: int, cells: list[str], at: int, kind: Callable[[str], Any], wanted: str
+) -> Any:
+    try:
+        found = kind(cells[at])
+        if not np.all(np.isfinite(found)):
+            raise ValueError
+    except (ValueError, TypeError, IndexError, RecursionError, OverflowError):
+        cell = cells[at][:40] if at < len(cells) else "nothing"
+        raise InputError(
+            f"{path}, line {line}: '{cell}' where {wanted} belongs. Mend or remove the line."
+        ) from None
+    return found
