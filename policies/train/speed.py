@@ -2,7 +2,7 @@
 
 Both sides of a ratio take turns in slices of 0.2 s, from the same states under the same controls,
 so that the load of the machine meets both alike; a ratio is the median over slices, with the
-middle half of them beside it. Processor time is printed next to wall time: what another program takes
+middle half of them. Processor time is printed next to wall time: what another program takes
 from this one shows in the latter only.
 
 `env_ratio` is the time of a bare `Batch.step` over that of `PupperEnv.step`, with the same model,
