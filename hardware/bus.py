@@ -98,6 +98,34 @@ class ServoBus(Protocol):
         ...
 
 
+class RegisterBus(ServoBus, Protocol):
+    """A bus whose servos' registers can be read and set (names: `hardware.feetech.registers`)."""
+
+    def servo_setups(self) -> dict[str, dict[str, Any]]:
+        """By joint, what a recording's header says of its servo."""
+        ...
+
+    def register(self, joint: str, name: str) -> int:
+        """Present value of a register.
+
+        Raises
+        ------
+        BusError
+            If it cannot be read.
+        """
+        ...
+
+    def set_register(self, joint: str, name: str, value: int) -> None:
+        """Set a register.
+
+        Raises
+        ------
+        BusError
+            If it is not read back with this value.
+        """
+        ...
+
+
 def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> NDArray[np.float64]:
     """`position_rad` as an array of shape (joints,).
 
@@ -113,7 +141,15 @@ def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> N
 
 
 def header_entries(bus: ServoBus) -> dict[str, Any]:
-    """Entries of a recording's header that describe its bus: `bus`, and `readings` if known."""
+    """Entries of a recording's header that describe its bus.
+
+    `bus`, and where they are known `readings` and `servos`.
+    """
     about = {"name": bus.name} | bus.metadata
     readings = about.pop("readings", None)
-    return {"bus": about} | ({} if readings is None else {"readings": readings})
+    setups = getattr(bus, "servo_setups", dict)()
+    return (
+        {"bus": about}
+        | ({} if readings is None else {"readings": readings})
+        | ({"servos": setups} if setups else {})
+    )

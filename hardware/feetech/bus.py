@@ -24,21 +24,21 @@ from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.feetech.line import FRAME_BYTES, FeetechLine, Reply, known_models
-from pupper_sysid.hardware.feetech.registers import RETURN_DELAY_UNIT_S, SCS0009, STS3215, Series
+from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
+from pupper_sysid.hardware.feetech.settings import (
+    VOLT_SCALE,
+    memory_of,
+    read_register,
+    return_delay_s,
+    setup_of,
+    write_register,
+)
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 
 AUTO_BAUDS = (1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400)
 """Baud rates tried, in this order, where none is given."""
 
-SETTINGS = (
-    "firmware_major", "firmware_minor", "return_delay", "p", "d", "i", "min_start_force",
-    "dead_zone_cw", "dead_zone_ccw", "max_torque", "max_temperature", "max_voltage",
-    "min_voltage", "min_angle", "max_angle", "acceleration", "goal_time", "goal_speed",
-)  # fmt: skip
-"""Registers that shape how a servo moves; a recording keeps them."""
-
 LOAD_SCALE = 1e-3
-VOLT_SCALE = 0.1
 
 SPEED_LIMIT_RAD_S = 7.5
 """Nominal speed of the servo [rad/s]."""
@@ -50,7 +50,6 @@ _TORQUE_ON_TRIES, _TORQUE_OFF_TRIES = 10, 3
 _GOAL_TRIES = 3
 _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
-_PIECES = (16, 15, 14, 13, 9)  # of registers 0 to 66; unequal: a late reply fits no later read
 _DOUBTS = 10  # exchanges from which the uncertainty of reading times is estimated
 
 
@@ -114,6 +113,10 @@ class FeetechBus(HostClock):
             self._doubts_s: list[float] = []
             self.joint_names = self._map.joint_names
             self.limits = self._map.position_limits()
+            self._setups = {
+                joint: setup_of(s.id, s.series, memory_of(self.line, s.id))
+                for joint, s in zip(self.joint_names, self._servos, strict=True)
+            }
             self.metadata: dict[str, Any] = self._describe(device)
         except BaseException:
             self.line.close()
@@ -182,9 +185,36 @@ class FeetechBus(HostClock):
                     break
         return self._map.to_angles(counts)
 
+    def servo_setups(self) -> dict[str, dict[str, Any]]:
+        """Model, firmware, gains and registers of each servo, as found when the bus was opened."""
+        return {joint: dict(setup) for joint, setup in self._setups.items()}
+
+    def register(self, joint: str, name: str) -> int:
+        """Present value of a register; see `hardware.bus.RegisterBus`."""
+        servo = self._servo(joint, name)
+        value = read_register(self.line, servo.id, servo.series, name)
+        if value is None:
+            raise BusError(f"{joint}: its register {name} could not be read. Check the cable.")
+        return value
+
+    def set_register(self, joint: str, name: str, value: int) -> None:
+        """Set a register and read it back; see `hardware.bus.RegisterBus`."""
+        servo = self._servo(joint, name)
+        if not write_register(self.line, servo.id, servo.series, name, value):
+            raise BusError(
+                f"{joint}: its register {name} did not take the value {value}. Check the cable, "
+                "and that no other program uses the line."
+            )
+
     def close(self) -> None:
         """Release the port; the servos keep their last command."""
         self.line.close()
+
+    def _servo(self, joint: str, register: str) -> _Servo:
+        servo = self._servos[self.joint_names.index(joint)]
+        if register not in servo.series.registers:
+            raise InputError(f"{joint}: a {servo.series.name} has no register {register}.")
+        return servo
 
     def _torque(self, servo: _Servo, on: bool) -> bool:
         """One try with one servo."""
@@ -233,7 +263,7 @@ class FeetechBus(HostClock):
         needed = 0.0
         for joint, servo in zip(self.joint_names, self._servos, strict=True):
             if servo.id in replies and servo.series.has_sync_read:
-                wait_s = RETURN_DELAY_UNIT_S * self.metadata["servos"][joint].get("return_delay", 0)
+                wait_s = return_delay_s(self._setups[joint])
                 needed += wait_s + 10.0 / self.line.baud * (size + FRAME_BYTES)
         longer = max(sum(turns) - needed, 0.0) if needed else 0.0
         return 0.5 * (float(np.median(turns)) + longer)
@@ -261,18 +291,10 @@ class FeetechBus(HostClock):
         return good
 
     def _describe(self, device: str) -> dict[str, Any]:
-        servos = {}
-        for joint, servo in zip(self.joint_names, self._servos, strict=True):
-            memory = memory_of(self.line, servo.id)
-            servos[joint] = {"id": servo.id, "model": servo.series.name} | {
-                name: servo.series.decode(name, memory)
-                for name in SETTINGS
-                if memory is not None and name in servo.series.registers
-            }
         supply = [
-            (s["min_voltage"] * VOLT_SCALE, s["max_voltage"] * VOLT_SCALE)
-            for s in servos.values()
-            if s.get("max_voltage")
+            (VOLT_SCALE * own["min_voltage"], VOLT_SCALE * own["max_voltage"])
+            for setup in self._setups.values()
+            if (own := setup.get("registers", {})).get("max_voltage")
         ]
         known: dict[str, Any] = {
             "kind": "feetech",
@@ -280,7 +302,6 @@ class FeetechBus(HostClock):
             "device": device,
             "baud": self.line.baud,
             "echo": self.line.echoes,
-            "servos": servos,
             "speed_limit_rad_s": SPEED_LIMIT_RAD_S,
             "poll_rate_hz": 0.0,
             "real_time": True,
@@ -319,17 +340,6 @@ def open_line(
 def rates_in_words(baud: int | None) -> str:
     """Baud rates that are tried, for a message."""
     return str(baud) if baud else ", ".join(map(str, AUTO_BAUDS))
-
-
-def memory_of(line: FeetechLine, servo: int) -> bytes | None:
-    """Registers 0 to 66 of a servo, read in pieces; None if a read failed."""
-    memory = b""
-    for size in _PIECES:
-        reply = line.read(servo, len(memory), size) or line.read(servo, len(memory), size)
-        if reply is None:
-            return None
-        memory += reply.frame.data
-    return memory
 
 
 def _known(found: dict[int, int | Series], device: str) -> dict[int, Series]:

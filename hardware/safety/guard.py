@@ -10,11 +10,15 @@ warm or short of voltage, a servo that reports an error, or a silent bus end in 
 `park` ends everything: stop, return to the pose in which the robot was found, torque off, each
 bounded in time; after a safety stop the way back is left out. Nothing on the robot notices that its
 host has died, so `hardware.safety.watchdog` does the same from another process.
+
+A servo's register can be set for as long as the guard exists (`set_register`); `close` sets it back
+to what was found, and the watchdog does if this process dies.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +26,7 @@ from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.moves import raised_cosine
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
+from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 _HEARTBEAT_S = 0.1
@@ -83,6 +88,7 @@ class GuardedBus:
         self._sent_s = -np.inf
         self._velocity = np.zeros(len(bus.joint_names))
         self._monitor = Monitor(bus, self.guard)
+        self.registers = ChangedRegisters(bus, watchdog)
 
     def now(self) -> float:
         """Time of the bus's clock [s]."""
@@ -178,6 +184,22 @@ class GuardedBus:
         self._monitor.reset(self.bus.now())
         return True
 
+    def servo_setups(self) -> dict[str, dict[str, Any]]:
+        """By joint, what a recording's header says of its servo; empty if the bus cannot tell."""
+        return getattr(self.bus, "servo_setups", dict)()
+
+    def set_register(self, joint: str, name: str, value: int) -> None:
+        """Set a register of a servo, until `close` sets it back.
+
+        Raises
+        ------
+        BusError
+            If the bus has no registers, or the register does not take the value.
+        """
+        self._beat()
+        self.registers.set(joint, name, value)
+        self._beat()
+
     def take_over(self) -> None:
         """Continue after a driver that left the torque on.
 
@@ -223,19 +245,23 @@ class GuardedBus:
             self._torque_off()
 
     def close(self) -> None:
-        """Park if that has not been done, and release the bus.
+        """Park if that has not been done, set registers back, and release the bus.
 
-        If torque-off was not confirmed (a robot that was unplugged), the watchdog keeps trying for
-        some seconds.
+        If torque-off or a register was not confirmed (a robot that was unplugged), the watchdog
+        keeps trying for some seconds.
         """
+        restored = False
         try:
             self.park()
         finally:
-            self.bus.close()
-            if self._watchdog and self._left_on:
-                self._watchdog.take_over()
-            elif self._watchdog:
-                self._watchdog.close()
+            try:
+                restored = self.registers.restore()
+            finally:
+                self.bus.close()
+                if self._watchdog and (self._left_on or not restored):
+                    self._watchdog.take_over()
+                elif self._watchdog:
+                    self._watchdog.close()
 
     def _torque_off(self) -> None:
         """Switch the torque off, in several tries."""

@@ -16,7 +16,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -106,8 +106,12 @@ class Watchdog:
         """From now on only switch the torque off: the way back is not to be taken."""
         self._send({"limp": True})
 
+    def restore(self, registers: Mapping[str, Mapping[str, int]]) -> None:
+        """Set these registers back, by joint, if the driver ends without having done so."""
+        self._send({"registers": registers})
+
     def take_over(self) -> None:
-        """Torque-off was not confirmed and the bus is released; the watchdog keeps trying."""
+        """Torque-off or a register was not confirmed and the bus is released: keep trying."""
         self.only_limp()
         self._close_pipe()
 

@@ -2,7 +2,7 @@
 
 When the pipe closes without a message, or no beat comes for a second, it kills what is left of the
 driver, opens the bus itself, stops the joints, takes them back to the pose in which the robot was
-found, and switches the torque off.
+found, switches the torque off, and sets registers back that the driver had changed.
 
     python -P -m pupper_sysid.hardware.safety.watchdog_process    (started by `watchdog.Watchdog`)
 """
@@ -27,6 +27,7 @@ from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
+from pupper_sysid.hardware.safety.registers import ChangedRegisters
 
 HANG_S = 1.0
 """Without a beat for so long, the driver counts as hung."""
@@ -47,6 +48,7 @@ def main() -> None:
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     pipe, received, pose, only_limp = sys.stdin.fileno(), b"", None, False
+    registers: dict[str, dict[str, int]] = {}
     last, patience_s = time.monotonic(), HANG_S
     while True:
         ready, _, _ = select.select([pipe], [], [], 0.1)
@@ -64,6 +66,7 @@ def main() -> None:
                 if "disarm" in message:
                     pose = None
                 only_limp |= "limp" in message
+                registers = message.get("registers", registers)
             if not data:
                 break
         elif pose is not None and time.monotonic() - last > patience_s:
@@ -72,6 +75,8 @@ def main() -> None:
             break
     if pose is not None:
         park(orders, pose, only_limp)
+    if registers:
+        restore(orders, registers)
 
 
 def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = False) -> None:
@@ -115,6 +120,33 @@ def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = F
                 left = [name for name in left if name not in guard.joint_names]
         finally:
             guard.close()
+
+
+def restore(orders: dict[str, Any], registers: dict[str, dict[str, int]]) -> None:
+    """Set registers back; tries for some seconds. The torque is off.
+
+    Parameters
+    ----------
+    orders : dict
+        First message of `Watchdog`.
+    registers : dict
+        Values by joint and name.
+    """
+    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
+    servo_map = (
+        joint_map_from(orders["map"], "the joint map").per_servo() if orders["map"] else None
+    )
+    start = time.monotonic()
+    while registers and time.monotonic() - start < _GIVE_UP_S:
+        try:
+            bus = open_bus(address, servo_map, list(registers))
+        except PupperError:
+            time.sleep(0.02)
+            continue
+        changed = ChangedRegisters(bus, found=registers)
+        changed.restore()
+        registers = changed.found
+        bus.close()
 
 
 def _go_home(guard: GuardedBus, pose_rad: dict[str, float]) -> None:

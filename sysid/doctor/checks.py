@@ -15,6 +15,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.doctor.causality import causality_findings, crossed
 from pupper_sysid.sysid.doctor.clock import clock_findings, tone_findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
+from pupper_sysid.sysid.doctor.servo_setup import register_findings
 from pupper_sysid.sysid.doctor.signals import (
     frozen_findings,
     interpolation_findings,
@@ -36,7 +37,7 @@ _FEW_MISSING, _MANY_MISSING = 0.02, 0.5
 _LEAST_FRESH = 16
 _CHECKS = (
     motion_findings, tone_findings, wrap_findings, unit_findings, frozen_findings, offset_findings,
-    causality_findings, start_findings, stop_findings, interpolation_findings,
+    causality_findings, start_findings, stop_findings, interpolation_findings, register_findings,
 )  # fmt: skip
 
 

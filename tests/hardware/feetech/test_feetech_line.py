@@ -12,10 +12,11 @@ from scservo_sdk import scservo_def
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech import scan
-from pupper_sysid.hardware.feetech.bus import FeetechBus, memory_of, open_line
+from pupper_sysid.hardware.feetech.bus import FeetechBus, open_line
 from pupper_sysid.hardware.feetech.frames import Frame
 from pupper_sysid.hardware.feetech.line import FeetechLine
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.feetech.settings import memory_of
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from support.servo_servers import (
@@ -398,7 +399,7 @@ def test_a_500000_baud_scs_line_is_found_without_naming_the_rate(monkeypatch):
     with on_a_port(still_servos(SCS0009, baud=500_000)) as server:
         bus = FeetechBus(server.device)
         assert bus.metadata["baud"] == 500_000
-        assert bus.metadata["servos"]["LF_hip"]["model"] == "SCS0009"
+        assert bus.servo_setups()["LF_hip"]["model"] == "SCS0009"
         assert bus.metadata["joint_map"] == "mini_pupper_2_direct"
         assert len(bus.joint_names) == 12
         bus.close()
