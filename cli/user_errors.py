@@ -8,12 +8,13 @@ program has are here: `--debug`, `--version` and `--install-completion`.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,6 +31,12 @@ _COMPLETIONS = {
     "zsh": ".zfunc/_{}",
 }
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+
+_OF_THE_SYSTEM = (
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG,
+    errno.EISDIR, errno.ENOTDIR,
+)  # fmt: skip
+"""Errors of files that are the user's to mend, not defects."""
 
 Options = TypeVar("Options")
 
@@ -111,6 +118,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         if "--install-completion" in arguments:
             arguments = _completion(program)
         yield [a for a in arguments if a != "--debug"]
+        sys.stdout.flush()
         if code := _signalled():  # it ended as after Ctrl-C, with everything done
             sys.exit(code)
     except PupperError as error:
@@ -127,6 +135,9 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     except Exception as error:
         if debug:
             raise
+        if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
+            _print_error(_of_the_system(error))
+            sys.exit(InputError.exit_code)
         _print_error(
             f"{type(error).__name__}: {error}. This is a defect of {program}; run again with "
             "--debug and report what it prints."
@@ -135,6 +146,16 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     finally:
         _stop_no_more()
         forget()
+
+
+def _of_the_system(error: OSError) -> str:
+    """Sentence for a file or stream that the system refuses."""
+    where = error.filename
+    if where is None:
+        where = "standard output"
+        with suppress(OSError):  # what its buffer holds would fail once more at the exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return f"{where}: {error.strerror}. Make room, or choose another file or folder."
 
 
 def _print_error(error: str) -> None:
@@ -158,7 +179,10 @@ def _completion(program: str) -> list[str]:
             "another one."
         )
     path = Path.home() / _COMPLETIONS[shell].format(program)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path.parent} cannot be made: {error.strerror}. Check $HOME.") from error
     hint = "Open a new terminal to use it."
     if shell == "zsh":
         hint = f"With `fpath+=({path.parent})` before compinit in ~/.zshrc, open a new terminal."

@@ -15,6 +15,7 @@ from pupper_sysid.common.errors import FileExistsRefusal, InputError
 
 PACKAGE = "pupper-sysid"
 
+_LONGEST_NAME = 100  # bytes; file systems take 255, and endings are added
 _SYNC_S = 1.0  # at most this much is lost with the power
 
 
@@ -23,6 +24,30 @@ def refuse_overwrite(path: Path, force: bool = False) -> None:
     if path.exists() and not force:
         raise FileExistsRefusal(
             f"{path} exists already. Choose another name, or set `force=True` to replace it."
+        )
+
+
+def refuse_path(name: str, option: str) -> None:
+    """Refuse a name of a run or walk that would not be one folder: a path, or an odd name.
+
+    Parameters
+    ----------
+    name : str
+    option : str
+        The option that gave it, for the message.
+
+    Raises
+    ------
+    InputError
+        If it is empty, too long, starts with a point, or has a separator or control character.
+    """
+    if not name.strip() or name[0] == "." or set(name) & set("/\\") or not name.isprintable():
+        raise InputError(
+            f"{option} {name!r} is not the name of one folder. Use letters, digits, '-' and '_'."
+        )
+    if len(name.encode()) > _LONGEST_NAME:
+        raise InputError(
+            f"{option} has {len(name)} characters; use at most {_LONGEST_NAME}, in ASCII."
         )
 
 

@@ -22,6 +22,7 @@ from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, trained_a
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_path
 from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
 from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.connect import open_guarded
@@ -114,6 +115,8 @@ def _run(options: Deploy) -> None:
             rate=options.rate or PLAYBACK_HZ, json=options.json, force=options.force,
         ).run()  # fmt: skip
         return
+    if options.name is not None:
+        refuse_path(options.name, "--name")
     if options.policy is None:
         raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
     import torch

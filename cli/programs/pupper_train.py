@@ -24,6 +24,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pupper_sysid.cli.terminal import err, out, print_json, warn
 from pupper_sysid.cli.user_errors import parse, user_errors
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import refuse_path
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.train.run_file import Run, preset
@@ -87,6 +88,8 @@ def _run(options: Options, given: list[str]) -> None:
     if options.print_config:
         print(yaml.safe_dump(plain(run), sort_keys=False), end="")
         return
+    if options.name is not None:
+        refuse_path(options.name, "--name")
     if options.resume is None and not options.benchmark:
         check_actuator(run.actuator)
     # torch and rsl_rl take seconds to import: only after the settings were checked

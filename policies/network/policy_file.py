@@ -44,8 +44,11 @@ _AGAIN = "Copy the whole folder again."
 
 class _Part(BaseModel):
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True, allow_inf_nan=False
     )
+
+
+_Angle = Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)]
 
 
 class ObservationPart(_Part):
@@ -68,21 +71,22 @@ class Contract(_Part):
     observation: Annotated[list[ObservationPart], Field(min_length=1, max_length=32)]
     base_velocity: Literal["zero", "true"]
     """Whether the trunk's speed is zeros or the true one."""
-    velocity_steps: int
+    velocity_steps: Annotated[int, Field(gt=0, le=1000)]
     """Control steps between the two readings of a joint velocity."""
     action_history: Annotated[int, Field(ge=0, le=1000)]
     """Number of past actions in the observation, newest first."""
     action_scale_rad: Annotated[float, Field(gt=0, le=10)]
-    default_pose_rad: dict[str, float]
+    default_pose_rad: dict[str, _Angle]
     """Target = default pose + scale · action, in this order of joints."""
-    control_step_s: Annotated[float, Field(gt=0, le=1)]
-    physics_step_s: Annotated[float, Field(gt=0, le=1)]
+    control_step_s: Annotated[float, Field(ge=1e-3, le=1)]
+    physics_step_s: Annotated[float, Field(ge=1e-5, le=1)]
     knee: Literal["linkage", "serial"]
     actuator: str
     actuator_sha256: str | None
     feedback: str
     dead_time_s: Annotated[
-        list[float], Field(validation_alias=AliasChoices("dead_time_s", "delay_s"))
+        list[Annotated[float, Field(ge=0, le=10)]],
+        Field(min_length=2, max_length=2, validation_alias=AliasChoices("dead_time_s", "delay_s")),
     ]
     """Shortest and longest dead time it was trained with; `delay_s` in version 1."""
     training: dict[str, Any]

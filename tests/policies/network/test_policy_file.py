@@ -138,6 +138,11 @@ def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(tmp_path):
         ({"base_velocity": "guessed"}, "base_velocity"),
         ({"extra": 1}, "extra"),
         ({"default_pose_rad": {"LF_hip": 0.0}}, "default_pose_rad"),
+        ({"default_pose_rad": {"LF_hip": 50.0}}, "default_pose_rad"),
+        ({"velocity_steps": 10**9}, "velocity_steps"),
+        ({"control_step_s": 1e-9}, "control_step_s"),
+        ({"dead_time_s": [0.01, float("nan")]}, "dead_time_s"),
+        ({"dead_time_s": []}, "dead_time_s"),
         ({"weights_sha256": "0" * 63}, "weights_sha256"),
     ],
 )
