@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -169,3 +170,34 @@ def test_what_is_no_robot_is_refused_in_a_sentence(capsys):
     assert "no joint" in refused(
         capsys, program, "sweep", "--joint-map", "arm.joints.yaml", "--joints", "LF_hip"
     )
+
+
+BODY = (
+    "<mujoco>{}<worldbody><body>"
+    '<joint name="k" axis="0 0 1" range="{}"/>{}</body>{}</worldbody></mujoco>'
+)
+GEOM = '<geom size=".02"/>'
+
+
+@pytest.mark.parametrize("ends", ["nan nan", "60 -60", "10 10", "1e300 2e300", "inf 3"])
+def test_a_range_that_mujoco_ignores_is_refused(capsys, ends):
+    Path("range.xml").write_text(BODY.format("", ends, GEOM, ""))
+    said = refused(capsys, pupper_sysid, "init-robot", "range.xml")
+    assert "the range of joint k is not two rising numbers" in said
+
+
+@pytest.mark.parametrize(
+    "bomb",
+    [
+        '<asset><texture name="t" type="2d" builtin="flat" width="60000" height="60000"/></asset>',
+        '<asset><hfield name="h" nrow="60000" ncol="60000" size="1 1 1 1"/></asset>',
+        '<include file="pipe"/>',
+    ],
+)
+def test_a_model_that_takes_too_much_to_read_is_refused(capsys, monkeypatch, bomb):
+    monkeypatch.setattr("pupper_sysid.sim.robot.hinges._TIME_S", 1)
+    if "pipe" in bomb:
+        os.mkfifo("pipe")
+    Path("bomb.xml").write_text(BODY.format(bomb, "-1 1", GEOM, ""))
+    said = refused(capsys, pupper_sysid, "init-robot", "bomb.xml")
+    assert "take height fields, textures" in said or "cannot be read as a robot" in said

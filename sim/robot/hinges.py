@@ -1,0 +1,136 @@
+"""Hinges of a robot's MJCF or URDF, read in a child process with limits on memory and time.
+
+A model file can ask for any amount of memory (height fields, textures, `replicate`) or block (an
+include of a pipe). MuJoCo therefore reads it in a process of its own, which prints the hinges as
+JSON: `python -m pupper_sysid.sim.robot.hinges FILE`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pupper_sysid.common.errors import InputError
+
+_LARGEST_BYTES = 50_000_000
+_MEMORY_BYTES = 2 << 30
+_TIME_S = 20
+_ADVICE = "Give an MJCF or URDF that MuJoCo's viewer opens, with its meshes beside it."
+
+
+@dataclass(frozen=True)
+class Hinge:
+    """A hinge joint of a model.
+
+    Attributes
+    ----------
+    name : str
+        Empty if it has none.
+    limited : bool
+    low, high : float or None
+        Its range [rad]; where it is not limited as the file has them, None for other than finite
+        numbers.
+    driven : bool
+        Whether an actuator drives it, by itself or through a tendon; in a model without actuators
+        every hinge is.
+    """
+
+    name: str
+    limited: bool
+    low: float | None
+    high: float | None
+    driven: bool
+
+
+def hinges_of(path: Path) -> list[Hinge]:
+    """All hinges of the model in `path`, in its order.
+
+    Raises
+    ------
+    InputError
+        If MuJoCo cannot read the file, or needs too much memory or time for it.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} is no file. Give your robot's MJCF or URDF.")
+    if path.stat().st_size > _LARGEST_BYTES:
+        raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB: no robot's MJCF.")
+    command = [sys.executable, "-m", __name__, str(path.resolve())]
+    try:
+        ended = subprocess.run(command, capture_output=True, timeout=2 * _TIME_S, check=False)
+        lines = ended.stdout.decode(errors="replace").splitlines()
+        found = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
+    except (subprocess.TimeoutExpired, ValueError):
+        found = {"out_of": "time"}
+    if "out_of" in found:
+        raise InputError(
+            f"{path} takes MuJoCo more than {_MEMORY_BYTES >> 30} GB or {_TIME_S} s to read. A "
+            "joint map needs joints and actuators only: take height fields, textures, replicated "
+            "bodies and includes out."
+        )
+    if "reason" in found:
+        reason = "".join(c if c.isprintable() else " " for c in found["reason"])
+        reason = " ".join(reason.split()).rstrip(".")
+        raise InputError(f"{path} cannot be read as a robot: {reason}. {_ADVICE}")
+    return [Hinge(**hinge) for hinge in found["hinges"]]
+
+
+def _limit_this_process() -> None:
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits; the time is limited from outside
+        return
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (_TIME_S, _TIME_S))
+
+
+def _read(path: str) -> list[Hinge]:
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    _limit_this_process()
+    model = mujoco.MjModel.from_xml_path(path)
+    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    driven = _driven(model, mujoco) if model.nu else set(hinges)
+    found = []
+    for j in hinges:
+        ends = [float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j]]
+        limited = bool(model.jnt_limited[j])
+        found.append(Hinge(model.joint(j).name, limited, *ends, driven=j in driven))
+    return found
+
+
+def _driven(model, mujoco) -> set[int]:
+    """Joints that an actuator drives."""
+    found: set[int] = set()
+    trn = mujoco.mjtTrn
+    for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
+        if kind == trn.mjTRN_JOINT or kind == trn.mjTRN_JOINTINPARENT:
+            found.add(int(target))
+        elif kind == trn.mjTRN_TENDON:
+            first = model.tendon_adr[target]
+            for wrap in range(first, first + model.tendon_num[target]):
+                if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:
+                    found.add(int(model.wrap_objid[wrap]))
+    return found
+
+
+def _main() -> None:
+    try:
+        found = {"hinges": [asdict(hinge) for hinge in _read(sys.argv[1])]}
+    except MemoryError:
+        found = {"out_of": "memory"}
+    except Exception as error:  # whatever MuJoCo raises is about the file
+        found = {"reason": str(error)}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    import os
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log where it runs
+        os.chdir(folder)
+        _main()
+        os.chdir("/")
