@@ -1,0 +1,289 @@
+"""Servo card: a calibration without a robot, in one YAML file.
+
+A card holds the numbers of one servo type at one supply voltage and one set of gains, their origin
+(repository, file, commit, licence; for our own fits hashes of the data and scores), and whether
+they are published by others or measured here. A card of several specimens, such as the joints of an
+arm, has their numbers by name; a joint of that name takes its own, any other the default's.
+`cards.files` reads one.
+
+`ServoCard.calibration` is the same as a calibration, which every joint name fits, so that a card is
+accepted wherever a calibration is. Its feedback is ideal: a card has no bus.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import write_text
+from pupper_sysid.common.strict_yaml import dump
+from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
+from pupper_sysid.servo_models.calibration.parts import (
+    NO_SPEED_LIMIT_RAD_S,
+    Actuator,
+    Feedback,
+    JointCalibration,
+    NotNegative,
+    Number,
+    Part,
+    Quantity,
+    RatiosToArmature,
+    Scale,
+    Selection,
+)
+from pupper_sysid.servo_models.cards.data_sheet import counts_of
+from pupper_sysid.servo_models.cards.numbers import (
+    PositionLoop,
+    ServoNumbers,
+    TorquePD,
+    stated,
+)
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
+
+SCHEMA = "pupper-servo-card"
+SCHEMA_VERSION = 1
+
+_Text = Annotated[str, Field(min_length=1)]
+
+_HEADER = """\
+# Servo card of pupper-sysid: numbers of one servo type, and where they come from.
+#
+# A bare number is stated without an interval. One that was measured here reads
+# {value, low, high, identified, why}; low and high are the ends of its 90 % interval.
+# SI units, at the end of each name; torques hold at `supply_v`. Unknown keys are refused.
+"""
+
+
+class Gains(Part):
+    """Gains of the firmware's position loop, as registers hold them."""
+
+    p: NotNegative | None = None
+    """P gain, or null where the source does not state it."""
+    i: NotNegative | None = None
+    """I gain, or null."""
+    d: NotNegative | None = None
+    """D gain, or null."""
+
+
+class Source(Part):
+    """Origin of the numbers."""
+
+    title: _Text
+    """Name of the work or data set."""
+    url: Annotated[str, Field(pattern=r"^https://\S+$")]
+    """Its address."""
+    file: str | None = None
+    """File inside the repository that states the numbers."""
+    commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None = None
+    """Commit at which that file was read."""
+    licence: _Text
+    """Licence of that file, in words."""
+
+
+class Score(Part):
+    """One error of the numbers on recordings."""
+
+    what: _Text
+    """Which error, and on which recordings."""
+    value: NotNegative
+    """Its value, in `unit`."""
+    unit: _Text
+    """Its unit, such as rad."""
+
+
+class ServoCard(Part):
+    """Numbers of one servo type. Frozen; see the module's text.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        If its parts do not fit each other; `load_card` raises `InputError`.
+    """
+
+    schema_name: Annotated[Literal["pupper-servo-card"], Field(alias="schema")] = SCHEMA
+    """Kind of the file."""
+    schema_version: Literal[1] = SCHEMA_VERSION
+    """Version of the file's format."""
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
+    """Name of the card: lower-case letters, digits and hyphens."""
+    servo: _Text
+    """Manufacturer and model of the servo."""
+    sku: str | None = None
+    """Manufacturer's order number of the variant, or null."""
+    supply_v: Annotated[Number, Field(gt=0, le=100)] | None = None
+    """Supply voltage of the numbers [V], or null where the source does not state it."""
+    gains: Gains = Gains()
+    """Gains at which the numbers hold."""
+    load: _Text
+    """What the servo moved when it was measured."""
+    published: bool
+    """Whether the numbers are cited from others; false for a fit of this project."""
+    source: Source
+    """Origin of the numbers; of our own fits, of their recordings."""
+    data: Annotated[tuple[InputFile, ...], Field(strict=False)] = ()
+    """Recordings of our own fit, by name and hash."""
+    scores: Annotated[tuple[Score, ...], Field(strict=False)] = ()
+    """Errors of the numbers on recordings."""
+    date: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")]
+    """Day on which the numbers were read from the source, or fitted: year-month-day."""
+    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Notes for the reader, in sentences."""
+    as_published: dict[str, Number | str] = Field(default_factory=dict)
+    """Parameters word for word as the source has them, where ours are derived from them."""
+    default: _Text = "servo"
+    """Specimen that stands for the servo type."""
+    specimens: Annotated[dict[str, ServoNumbers], Field(min_length=1)]
+    """Numbers by specimen; a single one is called servo."""
+
+    @model_validator(mode="after")
+    def _check(self) -> ServoCard:
+        if self.default not in self.specimens:
+            raise ValueError(
+                f"default is {self.default}, which is no specimen of it "
+                f"({', '.join(self.specimens)})"
+            )
+        loops = any(isinstance(n, PositionLoop) for n in self.specimens.values())
+        if loops and (self.gains.p is None or self.supply_v is None):
+            raise ValueError("numbers of a position_loop need gains.p and supply_v")
+        return self
+
+    @property
+    def numbers(self) -> PositionLoop | TorquePD:
+        """Numbers of the default specimen."""
+        return self.specimens[self.default]
+
+    def pd(self, joint: str | None = None, p_gain: float | None = None) -> TorquePD:
+        """The servo as a PD in torque.
+
+        Parameters
+        ----------
+        joint : str, optional
+            A specimen's name; that of any other joint means the default's.
+        p_gain : float, optional
+            Another P gain than the card's.
+
+        Raises
+        ------
+        InputError
+            If another gain is wanted of numbers that are torques already.
+        """
+        numbers = self.specimens.get(joint or self.default, self.numbers)
+        if isinstance(numbers, PositionLoop):
+            own = self.gains.p if p_gain is None else p_gain
+            assert own is not None
+            return numbers.as_pd(own)
+        if p_gain is not None and p_gain != self.gains.p:
+            raise InputError(
+                f"{self.name} states torques, not how they follow from the P gain, so they hold "
+                f"only as they are. Leave `p_gain` out, or take a card of a position loop."
+            )
+        return numbers
+
+    def calibration(self) -> Calibration:
+        """The card as a calibration that fits every joint name."""
+        return CardCalibration(
+            robot=f"any robot with {self.servo} (card {self.name})",
+            created=f"{self.date}T00:00:00+00:00",
+            inputs=self.data,
+            notes=tuple(self._notes()),
+            joints={name: self._joint(name) for name in self._in_default_order()},
+        )
+
+    def to_yaml(self) -> str:
+        """Text of the file: a header that explains it, then the data."""
+        data = self.model_dump(mode="json", by_alias=True, exclude_none=True)
+        return f"{_HEADER}\n{dump(data)}"
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write this card to `path` as YAML, in one atomic step.
+
+        Raises
+        ------
+        InputError
+            If `path` exists and `force` is not set, or if it cannot be written.
+        """
+        write_text(Path(path), self.to_yaml(), force)
+
+    def _in_default_order(self) -> list[str]:
+        """Specimens, the default first: it is what other joints fall back on."""
+        return sorted(self.specimens, key=lambda name: name != self.default)
+
+    def _notes(self) -> list[str]:
+        kind = "cited from" if self.published else "fitted here to recordings of"
+        told = [
+            f"Servo card {self.name}: {kind} {self.source.title}, {self.source.url}.",
+            "A card has no bus: its feedback is ideal, every reading fresh and on time.",
+        ]
+        pd = self.pd()
+        if isinstance(self.numbers, PositionLoop) and self.numbers.left_out_of_pd:
+            told.append(self.numbers.left_out_of_pd)
+        if pd.dead_time_s is None:
+            told.append("The source has no dead time; 0 stands for it.")
+        return [*told, *self.notes]
+
+    def _joint(self, name: str) -> JointCalibration:
+        pd = self.pd(name)
+        armature = pd.armature_kg_m2.value
+        dead = pd.dead_time_s or Quantity(value=0.0, identified="no", why="the source has none")
+        ends = (
+            dead.value if dead.low is None else dead.low,
+            dead.value if dead.high is None else dead.high,
+        )
+        low, high = whole_steps(*ends, TIME_STEP_S)
+        torques = {
+            "stiffness": pd.stiffness_nm_per_rad,
+            "damping": pd.damping_nm_s_per_rad or _absent(),
+            "friction_loss": pd.friction_loss_nm,
+            "effort_limit": pd.effort_limit_nm,
+            "back_emf": pd.back_emf_nm_s_per_rad or _absent(),
+        }
+        counts = counts_of(self.servo)
+        return JointCalibration(
+            actuator=Actuator(
+                model="delayed_pd",
+                stiffness_nm_per_rad=torques["stiffness"],
+                damping_nm_s_per_rad=torques["damping"],
+                friction_loss_nm=torques["friction_loss"],
+                armature_kg_m2=pd.armature_kg_m2,
+                effort_limit_nm=torques["effort_limit"],
+                velocity_limit_rad_s=pd.velocity_limit_rad_s or _absent(NO_SPEED_LIMIT_RAD_S),
+                back_emf_nm_s_per_rad=torques["back_emf"],
+                dead_time_s=dead,
+                delay_steps_min=low,
+                delay_steps_max=high,
+                physics_step_s=TIME_STEP_S,
+                ratios_to_armature=RatiosToArmature(
+                    **{n: stated(q.value / armature) for n, q in torques.items()}
+                ),
+                scale=Scale(
+                    anchor="preset" if self.published else "loaded recording",
+                    value_nm=pd.effort_limit_nm.value,
+                    source=f"servo card {self.name} ({self.source.title})",
+                ),
+            ),
+            feedback=Feedback(
+                poll_period_s=_ideal(), loss=_ideal(), offset_rad=_ideal(), mean_age_s=_ideal(),
+                quantum_rad=_ideal(2 * float(np.pi) / counts if counts else 0.0),
+            ),
+            selection=Selection(model=f"card {self.name}"),
+        )  # fmt: skip
+
+
+class CardCalibration(Calibration):
+    """A card as a calibration: joints without a specimen of their own take the default's."""
+
+    def joint(self, name: str) -> JointCalibration:
+        """Calibration of the joint `name`, whatever its name."""
+        return self.joints.get(name) or next(iter(self.joints.values()))
+
+
+def _absent(value: float = 0.0) -> Quantity:
+    return Quantity(value=value, identified="no", why="the model has none")
+
+
+def _ideal(value: float = 0.0) -> Quantity:
+    return Quantity(value=value, identified="no", why="a card has no bus")

@@ -1,0 +1,180 @@
+"""Data sheet values of servos by model number: stall torque, no-load speed, counts.
+
+A free-air recording leaves the scale of the torques open; the stall torque of the servo's data
+sheet sets it. `stall_torque` gives that of the recorded servo at its supply voltage;
+`STALL_TORQUE_NM` of `common.joints` is the Mini Pupper's.
+
+Data sheets state a few voltages. Between them torque and speed are taken as proportional to the
+voltage of the nearest one, as those of a DC motor are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pupper_sysid.common.errors import InputError
+
+_RPM = 2 * 3.141592653589793 / 60
+_KG_CM = 0.0980665
+
+
+@dataclass(frozen=True)
+class Rating:
+    """What a data sheet states at one supply voltage.
+
+    Attributes
+    ----------
+    supply_v : float
+        Supply voltage [V].
+    stall_torque_nm : float
+        Torque at standstill [N·m].
+    no_load_speed_rad_s : float or None
+        Speed without load [rad/s]; None where it is not stated.
+    source : str
+        Where it is stated.
+    """
+
+    supply_v: float
+    stall_torque_nm: float
+    no_load_speed_rad_s: float | None
+    source: str
+
+
+@dataclass(frozen=True)
+class DataSheet:
+    """One servo model; several ratings may be of several variants.
+
+    Attributes
+    ----------
+    name : str
+        Manufacturer's model name.
+    model_number : int
+        What its model register holds.
+    counts_per_turn : float
+        Readings per turn of the output.
+    ratings : tuple of Rating
+        By rising voltage.
+    """
+
+    name: str
+    model_number: int
+    counts_per_turn: float
+    ratings: tuple[Rating, ...]
+
+    def at(self, supply_v: float | None = None) -> Rating:
+        """Rating at a supply voltage, in proportion to the nearest that is stated.
+
+        Parameters
+        ----------
+        supply_v : float, optional
+            [V]; without one the lowest stated rating, whose source then says so.
+        """
+        if supply_v is None:
+            lowest = self.ratings[0]
+            if len(self.ratings) == 1:
+                return lowest
+            others = ", ".join(
+                f"{r.stall_torque_nm:.2f} N·m at {r.supply_v:g} V" for r in self.ratings[1:]
+            )
+            doubt = f"{lowest.source}; the supply voltage is not recorded, and there is {others}"
+            return Rating(
+                lowest.supply_v, lowest.stall_torque_nm, lowest.no_load_speed_rad_s, doubt
+            )
+        nearest = min(self.ratings, key=lambda r: abs(r.supply_v - supply_v))
+        share = supply_v / nearest.supply_v
+        if share == 1:
+            return nearest
+        speed = nearest.no_load_speed_rad_s
+        return Rating(
+            supply_v, nearest.stall_torque_nm * share, None if speed is None else speed * share,
+            f"{nearest.source}; in proportion from {nearest.supply_v:g} V to {supply_v:g} V",
+        )  # fmt: skip
+
+
+_STS_12 = (
+    "Feetech data sheet of the 12 V variant (C018), 30 kg·cm and 45 rpm, as quoted in "
+    "TheRobotStudio/SO-ARM100 issue 134"
+)
+_STS_7 = "data sheet of the 7.4 V variant, 19.5 kg·cm and 52 rpm, as quoted by DFRobot for SER0069"
+_XL330 = "Robotis e-Manual of the XL330-M288-T"
+_SHEETS = (
+    DataSheet(
+        "STS3215", 777, 4096,
+        (
+            Rating(7.4, 19.5 * _KG_CM, 52 * _RPM, _STS_7),
+            Rating(12.0, 30 * _KG_CM, 45 * _RPM, _STS_12),
+        ),
+    ),
+    DataSheet(
+        "STS3250", 2825, 4096,
+        (
+            Rating(
+                12.0, 50 * _KG_CM, 3.141592653589793 / 3 / 0.133,
+                "Feetech specification of 2024-01-16, 50 kg·cm and 0.133 s/60°, as quoted by "
+                "robonine.com",
+            ),
+        ),
+    ),
+    DataSheet(
+        "SCS0009", 1284, 1024 * 1.2,
+        (
+            Rating(
+                6.0, 2.3 * _KG_CM, None,
+                "vendor's page, 2.3 kg·cm at 6 V; the shop of the Mini Pupper states 3.5 kg·cm "
+                "for its servo of this class",
+            ),
+        ),
+    ),
+    DataSheet(
+        "XL330-M288", 1200, 4096,
+        (
+            Rating(3.7, 0.42, 76 * _RPM, _XL330),
+            Rating(5.0, 0.52, 103 * _RPM, _XL330),
+            Rating(6.0, 0.60, 123 * _RPM, _XL330),
+        ),
+    ),
+)  # fmt: skip
+
+
+def data_sheet(model: str | int) -> DataSheet | None:
+    """Data sheet of a servo by its model number, or by a name that contains the model's.
+
+    Examples
+    --------
+    >>> data_sheet(777).name, data_sheet("Feetech STS3215").name, data_sheet("MG90S")
+    ('STS3215', 'STS3215', None)
+    """
+    if isinstance(model, int):
+        return next((s for s in _SHEETS if s.model_number == model), None)
+    plain = model.upper().replace(" ", "").replace("_", "-")
+    return next((s for s in _SHEETS if s.name in plain), None)
+
+
+def counts_of(model: str | int) -> float | None:
+    """Readings per turn of a servo model; None if it is not known."""
+    sheet = data_sheet(model)
+    return sheet.counts_per_turn if sheet else None
+
+
+def stall_torque(model: str | int, supply_v: float | None = None) -> tuple[float, str]:
+    """Stall torque [N·m] of a servo model at a supply voltage, and its source in words.
+
+    Raises
+    ------
+    InputError
+        If no data sheet of that model is known.
+
+    Examples
+    --------
+    >>> torque, source = stall_torque("STS3215", 12.0)
+    >>> round(torque, 2)
+    2.94
+    """
+    sheet = data_sheet(model)
+    if sheet is None:
+        raise InputError(
+            f"No data sheet of the servo {model} is known here. Give its stall torque with "
+            f"`stall_torque_nm`; known are {', '.join(s.name for s in _SHEETS)}."
+        )
+    rating = sheet.at(supply_v)
+    return rating.stall_torque_nm, f"{sheet.name} at {rating.supply_v:g} V: {rating.source}"

@@ -1,0 +1,198 @@
+"""Servo cards: cited numbers follow from their sources, and files that are wrong are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam
+from pupper_sysid.servo_models.cards.card import ServoCard
+from pupper_sysid.servo_models.cards.data_sheet import data_sheet, stall_torque
+from pupper_sysid.servo_models.cards.files import card_names, load_card
+from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, stated
+
+SHIPPED = card_names()
+
+
+def loop(**changed: float) -> PositionLoop:
+    """A position loop with round numbers."""
+    numbers = {
+        "error_gain": 0.1, "duty_limit": 0.9, "stall_torque_nm": 2.0, "back_emf_nm_s_per_rad": 0.4,
+        "armature_kg_m2": 0.02, "friction_loss_nm": 0.05, "viscous_friction_nm_s_per_rad": 0.1,
+    } | changed  # fmt: skip
+    return PositionLoop.model_validate({"model": "position_loop"} | numbers)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_card_is_valid_says_its_source_and_survives_a_round_trip(name, tmp_path):
+    card = load_card(name)
+    assert card.name == name
+    assert card.source.url.startswith("https://") and card.source.licence
+    if card.published:
+        assert card.source.file and len(card.source.commit or "") == 40
+        assert not card.data, "hashes are of our own data"
+    card.save(tmp_path / "card.yaml")
+    assert load_card(tmp_path / "card.yaml") == card
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_numbers_that_are_derived_follow_from_what_the_source_states(name):
+    card = load_card(name)
+    if "kt" not in card.as_published:
+        return
+    stated_there = BamParameters.model_validate(card.as_published)
+    assert from_bam(stated_there, ACTUATORS[stated_there.actuator]) == card.numbers
+
+
+def test_a_position_loop_becomes_a_pd_by_the_formulas_of_its_module():
+    # P 20, 0.1 duty per rad and P, 2 N·m at full duty: 0.1 * 20 * 2 = 4 N·m/rad, limit 0.9 * 2
+    pd = loop().as_pd(p_gain=20)
+    assert pd.stiffness_nm_per_rad.value == pytest.approx(4.0)
+    assert pd.effort_limit_nm.value == pytest.approx(1.8)
+    assert pd.parameters.back_emf == pytest.approx(0.5)  # 0.4 of the motor, 0.1 of the gears
+    assert pd.parameters.damping == 0.0
+    # (1.8 - 0.05) N·m are left for 0.5 N·m·s/rad
+    assert pd.top_speed_rad_s == pytest.approx(3.5)
+    assert loop().as_pd(p_gain=20, voltage_share=0.5).stiffness_nm_per_rad.value == pytest.approx(2)
+
+
+def test_the_first_bam_file_of_the_sts3215_gives_the_numbers_that_everybody_copied():
+    # kt 1.2116, R 2.6762 at 7.4 V and P 32: 7.4 * kt / R = 3.35 N·m; 0.166 * 32 * 3.35 = 17.8;
+    # kt² / R + 0.0591 = 0.6077, which SO-ARM100 and Open Duck round to 0.60
+    card = load_card("sts3215-bam-m1-early")
+    assert isinstance(card.numbers, PositionLoop)
+    assert card.numbers.stall_torque_nm.value == pytest.approx(3.35, abs=0.005)
+    assert card.pd().stiffness_nm_per_rad.value == pytest.approx(17.8, abs=0.05)
+    assert card.pd().parameters.back_emf == pytest.approx(0.6077, abs=1e-4)
+    copied = load_card("sts3215-soarm100-early").pd()
+    assert copied.stiffness_nm_per_rad.value == pytest.approx(17.8)
+
+
+def test_the_kscale_card_gives_what_its_authors_exported():
+    # its README.md, M1: kp 23.458, force range 4.4457, damping 1.3843
+    pd = load_card("sts3215-kscale-m1").pd()
+    assert pd.stiffness_nm_per_rad.value == pytest.approx(23.458, rel=1e-4)
+    assert pd.effort_limit_nm.value == pytest.approx(4.4457, rel=1e-4)
+    assert pd.parameters.back_emf == pytest.approx(1.3843, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [n for n in SHIPPED if "-bam-" in n or "-kscale-" in n])
+def test_a_card_of_bam_goes_back_to_the_parameter_file_it_came_from(name):
+    card = load_card(name)
+    made, source = to_bam(card), card.as_published
+    assert made["model"] == source["model"] and made["actuator"] == source["actuator"]
+    for key, value in source.items():
+        if isinstance(value, float) and key not in ("q_offset", "score", "trial_number"):
+            assert made[key] == pytest.approx(value, rel=1e-12), key
+    assert from_bam(BamParameters.model_validate(made), ACTUATORS[made["actuator"]]).as_pd(
+        32
+    ).parameters.stiffness == pytest.approx(card.pd(p_gain=32).parameters.stiffness)
+
+
+def test_a_bam_parameter_file_is_read_as_a_card(tmp_path):
+    path = tmp_path / "m4.json"
+    path.write_text(json.dumps(load_card("sts3215-bam-m4").as_published))
+    card = load_card(path)
+    assert card.numbers == load_card("sts3215-bam-m4").numbers
+    path.write_text(json.dumps({"model": "m1", "kt": 1.0, "R": 2.0, "actuator": "mx64"}))
+    with pytest.raises(InputError, match="armature is missing"):
+        load_card(path)
+    path.write_text(json.dumps(load_card("sts3215-bam-m4").as_published | {"actuator": "mx64"}))
+    with pytest.raises(InputError, match="actuator mx64 is not known here"):
+        load_card(path)
+
+
+def test_torques_of_a_simulator_cannot_become_bam_parameters():
+    with pytest.raises(InputError, match="states torques of a simulator"):
+        to_bam(load_card("sts3215-open-duck"))
+
+
+def edited(tmp_path: Path, old: str, new: str) -> str:
+    """The sentence with which a shipped card is refused once `old` reads `new`."""
+    text = load_card("sts3215-open-duck").to_yaml()
+    assert old in text
+    path = tmp_path / "card.yaml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError) as caught:
+        load_card(path)
+    message = str(caught.value)
+    assert str(path) in message and message.endswith((".", ".)"))
+    return message
+
+
+def test_cards_that_cannot_be_trusted_are_refused_in_a_sentence(tmp_path):
+    assert "is not a key of this file. Did you mean licence?" in edited(
+        tmp_path, "licence:", "license:"
+    )
+    assert "needs" not in edited(tmp_path, "stiffness_nm_per_rad: 13.37", "stiffness: 13.37")
+    assert "looks like g·cm²" in edited(tmp_path, "armature_kg_m2: 0.027", "armature_kg_m2: 27.0")
+    assert "newer version" in edited(tmp_path, "schema_version: 1", "schema_version: 2")
+    assert "no specimen" in edited(tmp_path, "default: servo", "default: knee")
+    assert "is not a servo card" in edited(tmp_path, "pupper-servo-card", "pupper-calibration")
+    assert "commit" in edited(tmp_path, "commit: 20ce9d0f", "commit: 20ce9d")
+
+
+def test_a_missing_card_names_the_nearest(tmp_path):
+    with pytest.raises(InputError, match="Did you mean sts3215-bam-m1"):
+        load_card("sts3215-bam-m11")
+
+
+def test_a_position_loop_without_p_gain_is_refused(tmp_path):
+    text = load_card("sts3215-bam-m1").to_yaml().replace("p: 32.0, ", "", 1)
+    (tmp_path / "card.yaml").write_text(text)
+    with pytest.raises(InputError, match="need gains.p and supply_v"):
+        load_card(tmp_path / "card.yaml")
+
+
+def test_another_p_gain_scales_the_stiffness_and_torques_of_a_simulator_refuse_it():
+    card = load_card("sts3215-kscale-m1")
+    ratio = card.pd().stiffness_nm_per_rad.value / card.pd(p_gain=16).stiffness_nm_per_rad.value
+    assert ratio == pytest.approx(2.0)
+    with pytest.raises(InputError, match="only as they are"):
+        load_card("sts3215-soarm100").pd(p_gain=32)
+
+
+def test_a_card_is_a_calibration_for_any_joint_and_own_specimens_for_joints_of_that_name():
+    card = load_card("sts3215-anchorbench")
+    made = card.calibration()
+    own = made.delayed_pd(["elbow_flex", "LF_hip"]).parameters
+    np.testing.assert_allclose(own.stiffness, [14.715496, 47.782635])
+    assert made.held_feedback("LF_hip").quantum_rad == pytest.approx(2 * math.pi / 4096)
+    assert any("no dead time" in note for note in made.notes)
+
+
+def test_a_number_with_an_interval_keeps_it(tmp_path):
+    card = load_card("sts3215-open-duck")
+    dead = {"value": 0.02, "low": 0.018, "high": 0.023, "identified": "yes"}
+    data = card.model_dump(mode="json", by_alias=True, exclude_none=True)
+    data["specimens"]["servo"]["dead_time_s"] = dead
+    made = ServoCard.model_validate(data)
+    made.save(tmp_path / "card.yaml")
+    actuator = load_card(tmp_path / "card.yaml").calibration().joint("any").actuator
+    assert (actuator.dead_time_s.low, actuator.dead_time_s.high) == (0.018, 0.023)
+    assert (actuator.delay_steps_min, actuator.delay_steps_max) == (9, 12)
+
+
+def test_a_data_sheet_is_found_by_model_number_and_scaled_with_the_voltage():
+    # 30 kg·cm at 12 V
+    assert stall_torque(777, 12.0)[0] == pytest.approx(30 * 0.0980665)
+    assert stall_torque("Feetech STS3215", 11.0)[0] == pytest.approx(30 * 0.0980665 * 11 / 12)
+    torque, source = stall_torque(777)
+    assert torque == pytest.approx(19.5 * 0.0980665)
+    assert "supply voltage is not recorded" in source
+    assert data_sheet("dynamixel xl330_m288") is data_sheet(1200)
+    with pytest.raises(InputError, match="No data sheet of the servo MG90S"):
+        stall_torque("MG90S")
+
+
+def test_a_pd_without_velocity_terms_has_no_known_top_speed():
+    pd = TorquePD(
+        model="delayed_pd", stiffness_nm_per_rad=stated(10.0), friction_loss_nm=stated(0.0),
+        armature_kg_m2=stated(0.01), effort_limit_nm=stated(1.0),
+    )  # fmt: skip
+    assert pd.top_speed_rad_s is None
