@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -27,9 +29,26 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
+_CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+
+
+class _PlainConsole(Console):
+    """Console on which text from files cannot move the cursor, set colours or reverse lines."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control is None and _CONTROL.search(segment.text):
+                segment = Segment(
+                    _CONTROL.sub("\N{REPLACEMENT CHARACTER}", segment.text), segment.style
+                )
+            yield segment
+
+
 # no markup: names of files and joints may have brackets; `Text` where something is to stand out
-out = Console(highlight=False, markup=False)
-err = Console(stderr=True, highlight=False, markup=False)
+out = _PlainConsole(highlight=False, markup=False)
+err = _PlainConsole(stderr=True, highlight=False, markup=False)
 
 
 def load_all(paths: Sequence[Path]) -> list[Recording]:
@@ -55,7 +74,9 @@ def print_json(value: Any) -> None:
     """Print one JSON object on stdout; non-finite numbers become null."""
     from pupper_sysid.common.results import plain
 
-    print(json.dumps(plain(value), indent=2, ensure_ascii=False))
+    text = json.dumps(plain(value), indent=2, ensure_ascii=False)
+    # control characters that JSON leaves as they are; its line ends are not within strings
+    print(_CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
 
 
 def warn(sentences: Iterable[str]) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from pupper_sysid.common.errors import InputError
 
@@ -61,7 +62,7 @@ def hinges_of(path: Path) -> list[Hinge]:
     try:
         ended = subprocess.run(command, capture_output=True, timeout=2 * _TIME_S, check=False)
         lines = ended.stdout.decode(errors="replace").splitlines()
-        found = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
+        found: dict[str, Any] = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
     except (subprocess.TimeoutExpired, ValueError):
         found = {"out_of": "time"}
     if "out_of" in found:
