@@ -41,7 +41,9 @@ SCHEMA = "pupper-sysid joint map"
 SCHEMA_VERSION = 1
 REST_MARGIN_RAD = 0.4
 """Margin of the rest pose to both limits, where they allow it."""
-PRESETS = ("mini_pupper_2", "mini_pupper_2_300deg", "mini_pupper_2_direct", "sts3215")
+PRESETS = (
+    "mini_pupper_2", "mini_pupper_2_300deg", "mini_pupper_2_direct", "sts3215", "bench_sts3215",
+)  # fmt: skip
 
 Frame = Literal["proxy", "raw"]
 Linkage = Literal["parallel knee", "none"]

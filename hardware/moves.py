@@ -22,6 +22,18 @@ def raised_cosine(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
     return 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
 
 
+def minimum_jerk(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Quintic ramp from 0 to 1 over `share` 0 to 1: at rest, unaccelerated, at both ends.
+
+    Examples
+    --------
+    >>> minimum_jerk(np.array([0.0, 0.5, 2.0])).tolist()
+    [0.0, 0.5, 1.0]
+    """
+    s = np.clip(share, 0.0, 1.0)
+    return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
+
+
 def first_pose(bus: ServoBus, period_s: float) -> NDArray[np.float64]:
     """Pose of the robot, shape (joints,) [rad]; waits up to 2 s for the first readings.
 

@@ -174,6 +174,20 @@ class EmulatedBus:
         self._goal = np.full(len(self.joint_names), np.nan)
         return True
 
+    def servo_setups(self) -> dict[str, dict[str, Any]]:
+        """By joint, what a recording's header says of its servo; empty where nothing is known."""
+        plant: Any = self._plant
+        return getattr(plant, "servo_setups", lambda joints: {})(self.joint_names)
+
+    def register(self, joint: str, name: str) -> int:
+        """Present value of a register; see `hardware.bus.RegisterBus`."""
+        return self._registers().register(self.joint_names.index(joint), name)
+
+    def set_register(self, joint: str, name: str, value: int) -> None:
+        """Set a register; see `hardware.bus.RegisterBus`."""
+        at = max(self._clock.now(), self._arrival_s)
+        self._registers().set_register(self.joint_names.index(joint), at, name, value)
+
     def close(self) -> None:
         """Release the bus; the truth can still be read."""
         self._closed = True
@@ -234,6 +248,16 @@ class EmulatedBus:
         count = whole(self._centre + sign * (position - zero) / self._quantum)
         count = np.clip(count, 0, 2 * self._centre - 1)
         return zero + sign * (count - self._centre) * self._quantum, count.astype(int)
+
+    def _registers(self) -> Any:
+        """The plant, if its servos have registers."""
+        self._refuse_closed()
+        if not hasattr(self._plant, "set_register"):
+            raise BusError(
+                "emulated bus: the servos of this robot have no registers. Give a load, such as "
+                "pendulum:0.1kg@0.10m, for a bench whose servo has them."
+            )
+        return self._plant
 
     def _refuse_closed(self) -> None:
         if self._closed:

@@ -98,6 +98,7 @@ class FeetechEmulator:
         self.readings: list[tuple[float, int, int]] = []
         """Every position measured for an answer: time, id, count."""
         self.servos: dict[int, _Servo] = {}
+        self._acting = [n for n in bench.acting_registers if n in series.registers]
         for servo_id in ids if ids is not None else bench.map.ids:
             memory = bytearray(MEMORY_BYTES)
             self.servos[servo_id] = _Servo(memory)
@@ -109,6 +110,8 @@ class FeetechEmulator:
                 self._set(servo_id, name, value)
             memory[series.lock_address] = 1
             k = bench.index_of_id[servo_id]
+            for name in self._acting:
+                self._set(servo_id, name, bench.register(k, name))
             self._set(servo_id, "goal_position", bench.count(k, 0.0))
 
     def receive(
@@ -171,6 +174,9 @@ class FeetechEmulator:
         servo.memory[address : address + len(data)] = data
         touched = range(address, address + len(data))
         k = self.bench.index_of_id[servo_id]
+        for name in self._acting:
+            if self.series.registers[name].address in touched:
+                self.bench.set_register(k, at, name, self._get(servo_id, name))
         if self.series.registers["goal_position"].address in touched:
             # the goal clips at the servo's own angle limits, and switches the torque on
             low, high = self._get(servo_id, "min_angle"), self._get(servo_id, "max_angle")

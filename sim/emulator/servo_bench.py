@@ -8,6 +8,7 @@ can be tried without a robot.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -102,6 +103,21 @@ class ServoBench:
         """Signed duty in thousandths, in the direction of the counts."""
         direction = 1 if self._scale[index] > 0 else -1
         return round(1000 * direction * self.plant.load(index))
+
+    @property
+    def acting_registers(self) -> Sequence[str]:
+        """Registers of the servos that act on their motion; none in free air."""
+        return getattr(self.plant, "acting_registers", ())
+
+    def register(self, index: int, name: str) -> int:
+        """Value of one of `acting_registers`."""
+        plant: Any = self.plant
+        return plant.register(index, name)
+
+    def set_register(self, index: int, time_s: float, name: str, value: int) -> None:
+        """Set one of `acting_registers` from `time_s` on."""
+        plant: Any = self.plant
+        plant.set_register(index, time_s, name, value)
 
     def imu(self, time_s: float) -> ImuSample | None:
         """Latest sample of the robot's IMU."""

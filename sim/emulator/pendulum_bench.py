@@ -1,0 +1,200 @@
+"""A bench: servos that swing a pendulum each, with settable registers, behind any emulated bus.
+
+    robot = draw_bench(rng, Pendulum(0.1, 0.1))
+    bus = EmulatedBus(robot, rng, plant=PendulumBench(robot))
+
+The defaults are an STS3215 at 7.4 V, to the accuracy to which published models agree. The truth
+beside a recording has `loaded_servo`, the numbers of `PendulumServoParameters`, and `actuator`, the
+DelayedPD servo that is equivalent at the factory's gains where nothing saturates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.emulator.pendulum_servo import (
+    PHYSICS_STEP_S,
+    REGISTERS,
+    PendulumServo,
+    PendulumServoParameters,
+)
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
+from pupper_sysid.sim.emulator.servo_bench import AMBIENT_C, SUPPLY_V
+
+BENCH_MAP = "bench_sts3215"
+"""Joint map of one STS3215 on a bench: joint `bench`, id 1, 0 rad at its centre count."""
+
+
+@dataclass(frozen=True)
+class Pendulum:
+    """A load, as `sysid.recordings.servo_setup.PendulumLoad` describes it in a recording."""
+
+    mass_kg: float = 0.0
+    length_m: float = 0.0
+    arm_mass_kg: float = 0.0
+    hanging_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class BenchSpec:
+    """A kind of servos on a bench: means, and spreads of their logarithms from servo to servo."""
+
+    torque_nm: float = 1.8
+    duty_per_rad: float = 0.19
+    back_emf_nm_s_rad: float = 0.34
+    friction_nm: float = 0.05
+    armature_kg_m2: float = 0.015
+    dead_time_s: float = 0.012
+    dead_time_sd_s: float = 0.0015
+    spread: float = 0.12
+    backlash_rad: float = 0.0
+    output_friction_nm: float = 0.002
+    """Acts only with backlash."""
+    offset_sd_rad: float = 0.002
+    reading_noise_rad: float = 0.0004
+    """A quarter of a count."""
+    registers: tuple[tuple[str, int], ...] = ()
+    """Registers that differ from the factory's."""
+
+
+@dataclass(frozen=True)
+class BenchRobot(EmulatedRobot):
+    """Servos on a bench; the `actuator` of each is equivalent at its present gains."""
+
+    loaded: tuple[PendulumServoParameters, ...] = ()
+    registers: tuple[tuple[str, int], ...] = ()
+
+    def truth(self) -> dict[str, Any]:
+        """All true parameters as plain numbers and strings, ready for YAML."""
+        found = super().truth()
+        for servo, loaded in zip(self.servos, self.loaded, strict=True):
+            found["joints"][servo.joint]["loaded_servo"] = loaded.truth()
+            found["joints"][servo.joint]["registers"] = REGISTERS | dict(self.registers)
+        return found
+
+
+class PendulumBench:
+    """A `ServoPlant` of loaded servos, whose registers act."""
+
+    acting_registers = tuple(REGISTERS)
+
+    def __init__(self, robot: BenchRobot):
+        pose = robot.joint_map.rest_pose().tolist()
+        self._servos = [
+            PendulumServo(p, x, dict(robot.registers))
+            for p, x in zip(robot.loaded, pose, strict=True)
+        ]
+
+    def command(self, index: int, time_s: float, angle_rad: float) -> None:
+        """Command one servo from `time_s` on; a limp one ignores it."""
+        self._servos[index].command(time_s, angle_rad)
+
+    def torque(self, index: int, time_s: float, on: bool) -> None:
+        """Hold the present position, or go limp, from `time_s` on."""
+        self._servos[index].torque(time_s, on)
+
+    def angle(self, index: int, time_s: float) -> float:
+        """True angle of a servo [rad]."""
+        return self._servos[index].position_at(time_s)
+
+    def load(self, index: int) -> float:
+        """Signed duty of a servo at the time of the last `angle` call."""
+        return self._servos[index].load
+
+    def imu(self, time_s: float) -> ImuSample:
+        """Gravity alone."""
+        return ImuSample(time_s, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2]), False)
+
+    def servo_setups(self, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """By joint, what a recording's header says of its servo."""
+        found = {}
+        for joint, servo in zip(joints, self._servos, strict=True):
+            own = {name: servo.register(name) for name in REGISTERS}
+            gains = {f"{name}_gain": own.pop(name) for name in ("p", "i", "d")}
+            found[joint] = {"model": "STS3215", **gains, "supply_voltage_v": SUPPLY_V}
+            found[joint] |= {"temperature_c": AMBIENT_C, "registers": own}
+        return found
+
+    def register(self, index: int, name: str) -> int:
+        """Value of a register that acts on the motion."""
+        return self._servos[index].register(name)
+
+    def set_register(self, index: int, time_s: float, name: str, value: int) -> None:
+        """Set a register of a servo from `time_s` on."""
+        self._servos[index].set_register(time_s, name, value)
+
+
+def draw_bench(
+    rng: np.random.Generator,
+    load: Pendulum | None = None,
+    spec: BenchSpec | None = None,
+    joint_map: JointMap | None = None,
+) -> BenchRobot:
+    """Draw servos on a bench, one per joint of the map, each with the same load.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    load : Pendulum, optional
+        Default: none, in free air.
+    spec : BenchSpec, optional
+    joint_map : JointMap, optional
+        Default: one servo, `BENCH_MAP`.
+    """
+    spec, load = spec or BenchSpec(), load or Pendulum()
+    layout = (joint_map or load_joint_map(BENCH_MAP)).per_servo()
+    reading = replace(
+        directly_read(layout),
+        offset_sd_rad=spec.offset_sd_rad,
+        reading_noise_rad=spec.reading_noise_rad,
+    )
+    drawn = draw_robot(rng, reading, layout)
+    registers = REGISTERS | dict(spec.registers)
+    servos, loaded = [], []
+    for servo in drawn.servos:
+        torque, duty, emf, friction, armature = np.exp(spec.spread * rng.standard_normal(5))
+        late = spec.dead_time_s + spec.dead_time_sd_s * rng.standard_normal()
+        own = PendulumServoParameters(
+            torque_nm=float(spec.torque_nm * torque),
+            duty_per_rad=float(spec.duty_per_rad * duty),
+            back_emf_nm_s_rad=float(spec.back_emf_nm_s_rad * emf),
+            friction_nm=float(spec.friction_nm * friction),
+            armature_kg_m2=float(spec.armature_kg_m2 * armature),
+            dead_time_s=float(max(late, 2 * PHYSICS_STEP_S)),
+            mass_kg=load.mass_kg,
+            length_m=load.length_m,
+            arm_mass_kg=load.arm_mass_kg,
+            hanging_rad=load.hanging_rad,
+            count_rad=reading.quantum_rad,
+            backlash_rad=spec.backlash_rad,
+            output_friction_nm=spec.output_friction_nm,
+        )
+        loaded.append(own)
+        servos.append(_equivalent(servo, own, registers))
+    return BenchRobot(reading, tuple(servos), layout, tuple(loaded), spec.registers)
+
+
+def _equivalent(
+    servo: EmulatedServo, own: PendulumServoParameters, registers: dict[str, int]
+) -> EmulatedServo:
+    """`servo` with the DelayedPD servo that moves alike for small errors."""
+    per_rad = own.torque_nm * own.duty_per_rad
+    actuator = DelayedPDParameters(
+        stiffness=per_rad * registers["p"],
+        damping=per_rad * registers["d"] * own.d_time_s,
+        friction_loss=own.friction_nm,
+        armature=own.armature_kg_m2 + own.load_inertia_kg_m2,
+        effort_limit=own.torque_nm * min(registers["torque_limit"], 1000) / 1000,
+        velocity_limit=math.inf,
+        dead_time_s=own.dead_time_s,
+        back_emf=own.back_emf_nm_s_rad,
+    )
+    return replace(servo, actuator=actuator)

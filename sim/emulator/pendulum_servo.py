@@ -1,0 +1,300 @@
+"""One servo with a position loop in duty that swings a pendulum, stepped by MuJoCo.
+
+    duty   = clip(duty_per_rad * (P * error - D * d_time_s * speed), ±torque limit)
+    torque = torque_nm * duty - back_emf * speed          (limp: 0)
+
+against Coulomb friction, armature, and the gravity and inertia of a point mass on an arm. The error
+is set-point minus encoder in whole counts; inside the dead zone the duty is 0, outside at least the
+minimum start force. Set-points come `dead_time_s` after their commands, and follow a ramp if the
+registers acceleration or goal speed ask for one. With `backlash_rad` the motor turns the encoder's
+shaft through gears with that much play: the encoder sits on the output, as in these servos.
+
+The registers are those of `hardware.feetech.registers`, by name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.servo_mjcf import (
+    FRICTION_SOLIMP,
+    INTEGRATOR,
+    attributes,
+    friction_solref,
+)
+
+PHYSICS_STEP_S = 0.001
+GRAVITY_M_S2 = 9.81
+ACCELERATION_UNIT = 100
+"""Counts/s² per unit of the register acceleration."""
+
+REGISTERS = {
+    "p": 32, "d": 32, "i": 0, "min_start_force": 16, "dead_zone_cw": 1, "dead_zone_ccw": 1,
+    "acceleration": 0, "goal_speed": 0, "torque_limit": 1000, "max_torque": 1000,
+}  # fmt: skip
+"""Registers that act on the motion, as an STS3215 leaves the factory (`i` does not act here)."""
+
+_STILL_RAD_S, _STILL_RAD_S2, _STILL_STEPS = 1e-4, 1e-2, 50
+_HORN_KG_M2 = 1e-5  # output side without a load
+
+
+@dataclass(frozen=True)
+class PendulumServoParameters:
+    """True numbers of a servo and its load."""
+
+    torque_nm: float
+    """Torque at full duty and standstill [N·m]."""
+    duty_per_rad: float
+    """Duty per radian of error and unit of the P gain."""
+    back_emf_nm_s_rad: float
+    """Torque lost per speed [N·m·s/rad]."""
+    friction_nm: float
+    """Coulomb friction of motor and gears [N·m]."""
+    armature_kg_m2: float
+    """Reflected inertia of motor and gears."""
+    dead_time_s: float
+    """From a command's arrival to its first torque."""
+    mass_kg: float = 0.0
+    """Point mass at the end of the arm; 0 for free air."""
+    length_m: float = 0.0
+    arm_mass_kg: float = 0.0
+    """Mass of the arm, a uniform rod."""
+    hanging_rad: float = 0.0
+    """Position at which the mass hangs straight down."""
+    count_rad: float = 0.0
+    """Resolution of the position loop; 0 for a continuous one."""
+    d_time_s: float = 0.001
+    """Derivative time per unit ratio of D to P: one turn of the loop."""
+    backlash_rad: float = 0.0
+    """Play between motor and output."""
+    output_friction_nm: float = 0.0
+    """Coulomb friction of the output shaft, beyond the play."""
+
+    @property
+    def load_inertia_kg_m2(self) -> float:
+        """Inertia of the load about the axis [kg·m²]."""
+        return (self.mass_kg + self.arm_mass_kg / 3) * self.length_m**2
+
+    @property
+    def gravity_nm(self) -> float:
+        """Largest torque of gravity [N·m]."""
+        return (self.mass_kg + self.arm_mass_kg / 2) * GRAVITY_M_S2 * self.length_m
+
+    def truth(self) -> dict[str, float]:
+        """All numbers, ready for YAML."""
+        return {name: float(value) for name, value in asdict(self).items()} | {
+            "load_inertia_kg_m2": self.load_inertia_kg_m2,
+            "gravity_nm": self.gravity_nm,
+        }
+
+
+class PendulumServo:
+    """A servo with its load; time starts at 0 and must not go backwards.
+
+    Parameters
+    ----------
+    parameters : PendulumServoParameters
+    position_rad : float
+        Where it rests at the start, commanded there for long.
+    registers : dict of str to int, optional
+        Other than `REGISTERS`.
+    """
+
+    def __init__(
+        self,
+        parameters: PendulumServoParameters,
+        position_rad: float,
+        registers: dict[str, int] | None = None,
+    ):
+        self.parameters = parameters
+        self._registers = REGISTERS | (registers or {})
+        self._model = mujoco.MjModel.from_xml_string(_xml(parameters, PHYSICS_STEP_S))
+        self._data = mujoco.MjData(self._model)
+        self._data.qpos[0] = position_rad
+        if parameters.backlash_rad:  # the load lies on one side of the play
+            side = math.copysign(parameters.backlash_rad / 2, position_rad - parameters.hanging_rad)
+            self._data.qpos[:] = position_rad + side, -side
+        mujoco.mj_forward(self._model, self._data)
+        self._dt = PHYSICS_STEP_S
+        self._step = self._still = 0
+        self._goal = self._setpoint = float(position_rad)
+        self._rate = self._duty = 0.0
+        self._queue: deque[tuple[float, float]] = deque()
+        self._limp = False
+        self._tune()
+
+    def command(self, time_s: float, position_rad: float) -> None:
+        """Set the command from `time_s` on; times must not go backwards."""
+        if not self._limp:
+            self._queue.append((time_s + self.parameters.dead_time_s, float(position_rad)))
+            self._still = 0
+
+    def torque(self, time_s: float, on: bool) -> None:
+        """Hold the present position, or go limp, from `time_s` on."""
+        self._goal = self._setpoint = self.position_at(time_s)
+        self._limp, self._rate, self._duty, self._still = not on, 0.0, 0.0, 0
+        self._queue.clear()
+        self._model.dof_damping[0] = self.parameters.back_emf_nm_s_rad if on else 0.0
+
+    def register(self, name: str) -> int:
+        """Value of a register."""
+        return self._registers[name]
+
+    def set_register(self, time_s: float, name: str, value: int) -> None:
+        """Set a register from `time_s` on; one that does not act is kept."""
+        self.position_at(time_s)
+        self._registers[name] = int(value)
+        self._still = 0
+        self._tune()
+
+    def position_at(self, time_s: float) -> float:
+        """True position of the output [rad], at most one step before the latest asked."""
+        if time_s > 0:
+            last = math.ceil(time_s / self._dt - 1e-9)
+            while self._step < last:
+                if self._still > _STILL_STEPS:
+                    self._step = last
+                else:
+                    self._advance()
+        ahead = max(self._step * self._dt - max(time_s, 0.0), 0.0)
+        position, speed = self._output()
+        return position - speed * min(ahead, self._dt)
+
+    @property
+    def load(self) -> float:
+        """Signed duty at the time last asked for."""
+        return self._duty
+
+    def _output(self) -> tuple[float, float]:
+        qpos, qvel = self._data.qpos, self._data.qvel
+        if self.parameters.backlash_rad:
+            return float(qpos[0] + qpos[1]), float(qvel[0] + qvel[1])
+        return float(qpos[0]), float(qvel[0])
+
+    def _advance(self) -> None:
+        """One physics step, with one turn of the position loop."""
+        data = self._data
+        position, speed = self._output()
+        if not self._limp:
+            self._follow(self._mean_goal())
+            self._duty = self._drive(position, speed)
+        data.ctrl[0] = self._duty
+        mujoco.mj_step(self._model, data)
+        self._step += 1
+        moving = (
+            self._queue
+            or abs(speed) > _STILL_RAD_S
+            or abs(data.qacc[0]) > _STILL_RAD_S2
+            or self._setpoint != self._goal
+        )
+        self._still = 0 if moving else self._still + 1
+
+    def _mean_goal(self) -> float:
+        """Mean of the delayed command over the present step; ended ones leave the queue."""
+        queue, since = self._queue, self._step * self._dt
+        stop = since + self._dt
+        if not queue or queue[0][0] >= stop:
+            return self._goal
+        mean = 0.0
+        while queue and queue[0][0] < stop:
+            at, goal = queue.popleft()
+            at = max(at, since)
+            mean += self._goal * (at - since)
+            since, self._goal = at, goal
+        return (mean + self._goal * (stop - since)) / self._dt
+
+    def _follow(self, goal: float) -> None:
+        """Move the set-point to `goal`, on a ramp if the registers ask for one."""
+        if math.isinf(self._top_speed) and math.isinf(self._top_acceleration):
+            self._setpoint = goal
+            return
+        way = goal - self._setpoint
+        wanted = min(self._top_speed, abs(way) / self._dt)
+        if not math.isinf(self._top_acceleration):
+            gain = self._top_acceleration * self._dt
+            # the speed from which the rest of the way is enough to stop
+            wanted = min(wanted, math.sqrt(2 * self._top_acceleration * abs(way)))
+            wanted = math.copysign(wanted, way)
+            self._rate = min(max(wanted, self._rate - gain), self._rate + gain)
+        else:
+            self._rate = math.copysign(wanted, way)
+        step = self._rate * self._dt
+        if abs(way - step) < 1e-9 or (abs(way) < 1e-4 and abs(self._rate) < 2e-1):
+            self._setpoint, self._rate = goal, 0.0
+        else:
+            self._setpoint += step
+
+    def _drive(self, position: float, speed: float) -> float:
+        """Duty of the position loop."""
+        count = self.parameters.count_rad
+        error = self._setpoint - position
+        if count:
+            counts = round(self._setpoint / count) - round(position / count)
+            zone = self._registers["dead_zone_ccw" if counts > 0 else "dead_zone_cw"]
+            if abs(counts) <= zone:
+                return 0.0
+            error = counts * count
+        duty = self._p * error - self._d * speed
+        if abs(duty) < self._least:
+            duty = math.copysign(self._least, error)
+        return min(max(duty, -self._most), self._most)
+
+    def _tune(self) -> None:
+        """Take the registers over into the loop."""
+        own, p = self._registers, self.parameters
+        count = p.count_rad or math.tau / 4096
+        self._p = p.duty_per_rad * own["p"]
+        self._d = p.duty_per_rad * own["d"] * p.d_time_s
+        self._least = own["min_start_force"] / 1000 if p.count_rad else 0.0
+        self._most = min(own["torque_limit"], own["max_torque"], 1000) / 1000
+        self._top_speed = own["goal_speed"] * count or math.inf
+        self._top_acceleration = own["acceleration"] * ACCELERATION_UNIT * count or math.inf
+
+
+def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
+    """MJCF: a motor on a hinge about y, and its load, directly or through gears with play."""
+    solver = {
+        "solreffriction": " ".join(map(_number, friction_solref(time_step_s))),
+        "solimpfriction": " ".join(map(_number, FRICTION_SOLIMP)),
+    }
+    motor: dict[str, Any] = solver | {
+        "name": "motor", "type": "hinge", "axis": "0 1 0", "ref": _number(p.hanging_rad),
+        "armature": _number(p.armature_kg_m2), "damping": _number(p.back_emf_nm_s_rad),
+        "frictionloss": _number(p.friction_nm),
+    }  # fmt: skip
+    total = p.mass_kg + p.arm_mass_kg
+    load = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
+    if total > 0 and p.length_m > 0:
+        below = (p.mass_kg + p.arm_mass_kg / 2) * p.length_m / total
+        inertia = _number(max(p.load_inertia_kg_m2 - total * below**2, 1e-12))
+        load = (
+            f'<inertial pos="0 0 {_number(-below)}" mass="{_number(total)}" '
+            f'diaginertia="{inertia} {inertia} {inertia}"/>'
+        )
+    if p.backlash_rad:
+        half = p.backlash_rad / 2
+        play = attributes(
+            solver
+            | {
+                "name": "play", "type": "hinge", "axis": "0 1 0", "armature": repr(_HORN_KG_M2),
+                "limited": "true", "range": f"{_number(-half)} {_number(half)}",
+                "solreflimit": "0.002 1", "solimplimit": "0.99 0.9999 0.0001",
+                "frictionloss": _number(p.output_friction_nm),
+            }
+        )  # fmt: skip
+        gears = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
+        load = f"{gears}<body><joint {play}/>{load}</body>"
+    return (
+        f'<mujoco><compiler angle="radian"/><option timestep="{time_step_s}" '
+        f'integrator="{INTEGRATOR}" gravity="0 0 {-GRAVITY_M_S2}"/>'
+        f"<worldbody><body><joint {attributes(motor)}/>{load}</body></worldbody>"
+        f'<actuator><motor joint="motor" gear="{_number(p.torque_nm)}"/></actuator></mujoco>'
+    )
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
