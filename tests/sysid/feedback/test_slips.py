@@ -105,15 +105,34 @@ def test_live_and_unresolved_feedback_is_left_as_it_is():
     assert redate(trials, live, motions) is live
 
 
-def stretch(jump=0.0):
-    """Changed rows of a poll each 60 ms read each 20 ms, without loss, for 3 s; a jump at 1.5 s."""
+def jumped_polls(jump):
+    """A poll each 60 ms for 3 s, with a jump at 1.5 s."""
     polls = 0.0613 * np.arange(49) + 0.004
-    polls = np.where(polls > 1.5, polls + jump, polls)
-    end = 0.02 * np.ceil(polls / 0.02)
+    return np.where(polls > 1.5, polls + jump, polls)
+
+
+def stretch(jump=0.0):
+    """Changed rows of these polls read each 20 ms, without loss."""
+    end = 0.02 * np.ceil(jumped_polls(jump) / 0.02)
     keep = np.concatenate([[True], np.diff(end) > 0])
     end = end[keep]
     none = np.zeros(0)
     return Stretch(0, 0.0, 3.0, end - 0.02, end, none, none)
+
+
+@pytest.mark.parametrize("scale", [0.016, 0.02, 0.025])
+def test_residuals_that_a_slip_has_widened_do_not_hide_it(scale):
+    # 5 mrad of noise; readings dated by one lattice leave three to five times that
+    polls = jumped_polls(0.011)
+
+    def track(time):
+        return 0.3 * np.sin(4 * np.pi * time)
+
+    value = track(polls) + 0.005 * np.random.default_rng(0).standard_normal(len(polls))
+    found = find_segments(stretch(0.011), value, 0.0613, 0.0025, np.nan, track, scale)
+    assert [s.start_s for s in found[1:]] == pytest.approx([1.5], abs=0.1)
+    steady = track(jumped_polls(0.0)) + value - track(polls)
+    assert len(find_segments(stretch(), steady, 0.0613, 0.0025, np.nan, track, scale)) == 1
 
 
 def test_segments_meet_at_the_jump_and_one_lattice_suffices_without():
