@@ -20,11 +20,8 @@ from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.sysid.recordings.importers.log import Log
-from pupper_sysid.sysid.recordings.importers.recognise import (
-    is_log_folder,
-    read_content,
-    read_folder,
-)
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.recognise import read_content, read_folder
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.table import (
@@ -44,13 +41,16 @@ _ADVICE = "; what is there can be continued with `resume`"
 _LARGEST_BYTES = 500e6
 
 
-def load(path: Path | str) -> Recording:
+def load(path: Path | str, options: LogOptions | None = None) -> Recording:
     """Read and validate a recording in any known layout.
 
     Parameters
     ----------
     path : Path or str
-        CSV file: this project's form, or a layout of `sysid.recordings.layouts`.
+        CSV file of this project, or a file or folder of another one's log
+        (`sysid.recordings.importers`): the layout is found by content.
+    options : LogOptions, optional
+        Columns, units and joint names of a log that does not say them.
 
     Returns
     -------
@@ -62,20 +62,21 @@ def load(path: Path | str) -> Recording:
     InputError
         If it is not a recording or cannot be used; the message names the line and column.
     """
-    path = Path(path)
-    if is_log_folder(path):
-        return _imported(path, read_folder(path))
+    path, options = Path(path), options or LogOptions()
+    if path.is_dir():
+        return _imported(path, read_folder(path, options))
     if path.name.endswith(".truth.csv"):
         raise InputError(
             f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
             "not a recording; load that file instead."
         )
     data = read_bytes(path)
-    log = read_content(path, data)
+    log = read_content(path, data, options)
     if log is not None:
         return _imported(path, log)
     parsed = parse(path, as_text(path, data))
-    table, metadata, warnings = convert(path, parsed)
+    table, metadata, warnings = convert(path, parsed, options)
+    check_metadata(path, metadata)
     table, more = check(path, table)
     digest = hashlib.sha256(data).hexdigest()
     found = [*parsed.warnings, *warnings, *more]

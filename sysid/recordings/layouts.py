@@ -1,11 +1,15 @@
-"""Layouts of other people's logs, recognised by their columns and turned into tidy rows.
+"""Tables of known columns, turned into tidy rows: this project's, two of the Mini Pupper, others'.
 
-* one joint, tones one after another, times restarting with each: `time_s, freq_hz, motor_idx,
-  command_rad, actual_rad`, angles relative to the standing pose (the SpotDMouse sweep script);
-* twelve joints played back: `time_s, loop`, then `<joint>_command_rad, <joint>_position_rad`.
+* one Mini Pupper joint, tones one after another, times restarting with each: `time_s, phase,
+  freq_hz, motor_idx, signal, command_rad, actual_rad`, angles relative to the standing pose (the
+  SpotDMouse sweep script);
+* Mini Pupper joints played back: `time_s, loop`, then `<joint>_command_rad, <joint>_position_rad`
+  with the names of its joints;
+* any other table with a time, commands and positions (`importers.wide`).
 
-Both log the time of the loop, not of the read; a read is assumed `READ_AFTER_SEND_S` after the
-command was sent, and the metadata say so.
+Pose, counts and bus of the Mini Pupper are taken for the first two only. They log the time of the
+loop, not of the read; a read is assumed `READ_AFTER_SEND_S` after the command was sent, and the
+metadata say so.
 """
 
 from __future__ import annotations
@@ -19,17 +23,19 @@ import pandas as pd
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.times import PAUSE_S, READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.importers.unknown import unknown_columns
+from pupper_sysid.sysid.recordings.importers.wide import Table, read_table
 from pupper_sysid.sysid.recordings.table import REQUIRED_COLUMNS, Parsed, require
 
-READ_AFTER_SEND_S = 0.0005
-PAUSE_S = 0.5
-"""Return to the start pose between tones of the sweep script, not in its file."""
-
-_SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
-_PLAYBACK = ("time_s", "loop")
+SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
+PLAYBACK = ("time_s", "loop")
 
 
-def convert(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
+def convert(
+    path: Path | str, parsed: Parsed, options: LogOptions | None = None
+) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
     """Tidy table, metadata and warnings of a parsed file of any known layout.
 
     Raises
@@ -37,18 +43,51 @@ def convert(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, A
     InputError
         If the columns belong to no known layout.
     """
+    options = options or LogOptions()
     columns = set(parsed.table.columns)
-    if "send_time_s" in columns or "read_time_s" in columns:
+    if {"send_time_s", "read_time_s"} & columns and not options.command:
         require(path, parsed.table, REQUIRED_COLUMNS)
+        options.refuse("recording of this project", ())
         return parsed.table, parsed.metadata, []
-    if {"actual_rad", "freq_hz"} & columns and "motor_idx" in columns:
-        require(path, parsed.table, _SWEEP)
+    named = options.command or options.time or options.unit
+    if is_sweep(columns) and not named:
+        require(path, parsed.table, SWEEP)
+        options.refuse("Mini Pupper sweep", ())
         return _sweep(path, parsed)
-    if any(f"{j}_command_rad" in columns or f"{j}_position_rad" in columns for j in JOINT_NAMES):
-        require(path, parsed.table, _PLAYBACK)
+    own = [j for j in JOINT_NAMES if {f"{j}_command_rad", f"{j}_position_rad"} & columns]
+    if own and not named:
+        require(path, parsed.table, PLAYBACK)
+        options.refuse("Mini Pupper playback", ())
         return _playback(path, parsed)
-    require(path, parsed.table, REQUIRED_COLUMNS)
-    raise AssertionError("a table with all tidy columns was taken above")
+    table = _table(parsed)
+    if not options.command and (text := unknown_columns(table.names)):
+        raise InputError(f"{path}: {text}")
+    log = read_table(path, table, options)
+    # what the log's own header says of its robot counts
+    metadata = log.metadata | parsed.metadata
+    metadata["bus"] = log.metadata["bus"] | (parsed.metadata.get("bus") or {})
+    return log.table, metadata, log.warnings
+
+
+def is_sweep(columns: set[str]) -> bool:
+    """Whether these are columns of the Mini Pupper's sweep script."""
+    return (
+        "motor_idx" in columns
+        and bool({"actual_rad", "freq_hz"} & columns)
+        and (bool({"signal", "phase"} & columns))
+    )
+
+
+def _table(parsed: Parsed) -> Table:
+    """Columns of a parsed file, those of text apart."""
+    numbers, texts = {}, {}
+    for name in parsed.table.columns:
+        values = parsed.table[name]
+        if name in parsed.faults or not pd.api.types.is_numeric_dtype(values):
+            texts[str(name)] = [str(v) for v in values]
+        else:
+            numbers[str(name)] = values.to_numpy(float)
+    return Table(numbers, texts, parsed.faults)
 
 
 def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:

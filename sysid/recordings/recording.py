@@ -21,7 +21,9 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
-from pupper_sysid.sysid.recordings.layouts import READ_AFTER_SEND_S, convert
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.recordings.table import (
     OPTIONAL_COLUMNS,
@@ -214,7 +216,12 @@ class Recording:
 
     @classmethod
     def from_frame(
-        cls, table: pd.DataFrame, *, metadata: Mapping[str, Any] | None = None, name: str = "frame"
+        cls,
+        table: pd.DataFrame,
+        *,
+        metadata: Mapping[str, Any] | None = None,
+        name: str = "frame",
+        options: LogOptions | None = None,
     ) -> Recording:
         """A recording from a table, validated like a file.
 
@@ -228,6 +235,8 @@ class Recording:
             Header entries, such as `bus` and `start_pose_rad`.
         name : str
             For messages, tables and figures.
+        options : LogOptions, optional
+            Columns, units and joint names of a table of other columns.
 
         Raises
         ------
@@ -244,14 +253,20 @@ class Recording:
                 given.setdefault("read_after_send_s", READ_AFTER_SEND_S)
             for column, value in (("trial", 0), ("frequency_hz", np.nan)):
                 table[column] = table.get(column, value)
+        faults: dict[str, str] = {}
+        strict = "send_time_s" in table or "motor_idx" in table
         for column in table.columns.difference(TEXT_COLUMNS):
             try:
                 table[column] = table[column].astype(float)
             except (TypeError, ValueError):
-                raise InputError(f"{name}, column {column}: its values are not numbers.") from None
+                fault = f"{name}, column {column}: its values are not numbers."
+                if strict:
+                    raise InputError(fault) from None
+                faults[str(column)] = fault
+                continue
             if np.isinf(table[column]).any():
                 raise InputError(f"{name}, column {column}: a value is infinite.")
-        tidy, known, warnings = convert(name, Parsed(given, table))
+        tidy, known, warnings = convert(name, Parsed(given, table, faults=faults), options)
         others = tidy.columns.difference(REQUIRED_COLUMNS, sort=False)
         tidy = tidy.reindex(columns=[*REQUIRED_COLUMNS, *others])
         tidy, more = check(name, tidy)

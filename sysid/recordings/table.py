@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.sysid.recordings.importers.log import MOST_CELLS
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -87,11 +88,14 @@ class Parsed:
     table : pandas.DataFrame
         Numbers, but for the columns of text; empty cells are NaN.
     warnings : list of str
+    faults : dict of str to str
+        Columns of other projects' logs that hold text, and the sentence on the first such cell.
     """
 
     metadata: dict[str, Any]
     table: pd.DataFrame
     warnings: list[str] = field(default_factory=list)
+    faults: dict[str, str] = field(default_factory=dict)
 
 
 def parse(path: Path, text: str) -> Parsed:
@@ -117,6 +121,9 @@ def parse(path: Path, text: str) -> Parsed:
     if len(set(columns)) != len(columns):
         raise InputError(f"{path}, line {rows[0][0]}: a column name stands twice. Rename one.")
     ours = "send_time_s" in columns
+    strict = ours or "motor_idx" in columns
+    if not ours and len(columns) * len(rows) > MOST_CELLS:
+        raise InputError(f"{path} has more than {MOST_CELLS:,} cells. Split it by joint.")
     body = rows[1:]
     cancelled = _cancelled(lines, columns, body) if ours else []
     for trial, first, last in cancelled:
@@ -143,11 +150,17 @@ def parse(path: Path, text: str) -> Parsed:
         warnings.append("it was not recorded to its end; what is there is used.")
     if not cells:
         raise InputError(f"{path} has column names but no rows. Record it again.")
-    data = {
-        name: _column(path, name, [row[k] for row in cells], numbers)
-        for k, name in enumerate(columns)
-    }
-    return Parsed(metadata, pd.DataFrame(data), warnings)
+    data: dict[str, Any] = {}
+    faults: dict[str, str] = {}
+    for k, name in enumerate(columns):
+        own = [row[k] for row in cells]
+        try:
+            data[name] = _column(path, name, own, numbers)
+        except InputError as error:
+            if strict:
+                raise
+            data[name], faults[name] = own, str(error)
+    return Parsed(metadata, pd.DataFrame(data), warnings, faults)
 
 
 def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
@@ -351,5 +364,6 @@ def _refuse_degrees(path: Path | str, column: str, values: np.ndarray) -> None:
     if largest > _LARGEST_RAD:
         raise InputError(
             f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
-            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533."
+            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533, or "
+            "convert the log with `pupper-sysid import --unit deg` (counts:4096, …)."
         )

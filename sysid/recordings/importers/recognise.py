@@ -1,51 +1,139 @@
-"""Find a log's layout by its content, and read it: `read_log`."""
+"""Find a log's layout by its content, and read it: `read_folder`, `read_content`."""
 
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.bam import is_bam, read_bam
-from pupper_sysid.sysid.recordings.importers.log import Log, text_of
-from pupper_sysid.sysid.recordings.importers.sage import is_sage, read_sage
+from pupper_sysid.sysid.recordings.importers import (
+    bam,
+    ktune,
+    lerobot,
+    numpy_file,
+    parquet,
+    ros,
+    sage,
+)
+from pupper_sysid.sysid.recordings.importers.log import Log, joint_names, text_of
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
-_JSON = (b"{", b"[")
+_ENDINGS = (".csv", ".json", ".mcap", ".db3", ".npz", ".parquet")
 
 
 def is_log_folder(folder: Path) -> bool:
     """Whether a folder is one log, such as a dataset, rather than a folder of recordings."""
-    return folder.is_dir() and is_sage(folder)
+    return folder.is_dir() and (
+        sage.is_sage(folder) or lerobot.is_lerobot(folder) or ros.is_bag(folder)
+    )
 
 
-def read_folder(folder: Path) -> Log:
+def logs_in(path: Path) -> list[Path]:
+    """The logs that a path stands for: itself, or those in a folder that is none.
+
+    Raises
+    ------
+    InputError
+        If a folder holds none.
+    """
+    if not path.is_dir() or is_log_folder(path):
+        return [path]
+    found = [p for p in sorted(path.iterdir()) if is_log_folder(p) or _may_be_log(p)]
+    if not found:
+        raise InputError(f"{path}: {unknown_folder(p.name for p in path.iterdir())}")
+    return found
+
+
+def holds_other_logs(folder: Path) -> bool:
+    """Whether a folder is another project's log or holds some, rather than recordings as CSV."""
+    if is_log_folder(folder):
+        return True
+    return any(is_log_folder(p) or (_may_be_log(p) and p.suffix != ".csv")
+               for p in folder.iterdir())  # fmt: skip
+
+
+def _may_be_log(path: Path) -> bool:
+    return path.is_file() and path.suffix in _ENDINGS and not path.name.endswith(".truth.csv")
+
+
+def read_folder(folder: Path, options: LogOptions) -> Log:
     """The log in a folder.
 
     Raises
     ------
     InputError
-        If it holds none.
+        If it holds none, or its rows cannot be used.
     """
-    if is_sage(folder):
-        return read_sage(folder)
-    raise InputError(f"{folder} is a folder without a log of a known layout.")
+    if sage.is_sage(folder):
+        options.refuse(sage.LAYOUT)
+        return chosen(folder, sage.read_sage(folder), options)
+    if lerobot.is_lerobot(folder):
+        options.refuse(lerobot.LAYOUT, ("joints", "unit", "units"))
+        return chosen(folder, lerobot.read_lerobot(folder, options), options)
+    if ros.is_bag(folder):
+        return ros.read_bag(folder, options)
+    inside = [p.name for p in logs_in(folder)]
+    raise InputError(
+        f"{folder} holds {len(inside)} logs ({', '.join(inside[:3])}, …). Commands take the "
+        "folder; in Python load them one by one and give the list."
+    )
 
 
-def read_content(path: Path, data: bytes) -> Log | None:
+def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     """The log in a file's content; None if it is CSV text.
 
     Raises
     ------
     InputError
-        If the layout is unknown or its rows cannot be used.
+        If the layout is unknown, or its rows cannot be used.
     """
+    digest = hashlib.sha256(data).hexdigest()
+    if data.startswith(ros.MAGIC):
+        return replace(ros.read_mcap(path, data, options), sha256=digest)
+    if data.startswith(ros.SQLITE):
+        return replace(ros.read_sqlite(path, options), sha256=digest)
+    if data.startswith(numpy_file.MAGIC):
+        return replace(numpy_file.read_npz(path, data, options), sha256=digest)
+    if data.startswith(parquet.MAGIC):
+        return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start.startswith(_JSON):
+    if start[:1] in (b"{", b"["):
         found = border.parse_json(text_of(path, data), str(path), "Give the log as it was written.")
-        if is_bam(found):
-            log = read_bam(path, found)
-        else:
-            raise InputError(f"{path} is JSON of no known layout.")
-        return Log(log.table, log.metadata, log.warnings, hashlib.sha256(data).hexdigest())
+        for layout, known, read in (
+            (bam.LAYOUT, bam.is_bam, bam.read_bam),
+            (ktune.LAYOUT, ktune.is_ktune, ktune.read_ktune),
+        ):
+            if known(found):
+                options.refuse(layout)
+                return chosen(path, replace(read(path, found), sha256=digest), options)
+        raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
     return None
+
+
+def chosen(path: Path, log: Log, options: LogOptions) -> Log:
+    """Only the joints that the options name, called as they say.
+
+    Raises
+    ------
+    InputError
+        If one is not in the log.
+    """
+    if not options.joints:
+        return log
+    recorded = log.metadata["joints"]
+    wanted = joint_names(path, list(options.joints))
+    lacking = [j for j in wanted if j not in recorded]
+    if lacking:
+        raise InputError(f"{path}: `joints` names {lacking[0]}; it has {', '.join(recorded)}.")
+    names = dict(zip(wanted, joint_names(path, list(options.joints.values())), strict=True))
+    table = log.table.loc[log.table["joint"].isin(wanted)].copy()
+    table["joint"] = [names[joint] for joint in table["joint"]]
+    metadata: dict[str, Any] = log.metadata | {"joints": list(names.values())}
+    for key in ("servos", "loads", "assumed_units"):
+        if key in metadata:
+            metadata[key] = {names[j]: v for j, v in metadata[key].items() if j in names}
+    return replace(log, table=table, metadata=metadata)

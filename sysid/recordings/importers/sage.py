@@ -33,6 +33,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     rows,
     text_of,
 )
+from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
 from pupper_sysid.sysid.recordings.importers.units import scale_by_step
 
 LAYOUT = "SAGE folder"
@@ -75,13 +76,9 @@ def read_sage(folder: Path) -> Log:
         metadata["servos"] = {name: dict(_SETUP) for name in names}
     elif same:
         turns = [(sent, sent)] * len(names)
-        doubt = float(np.median(np.diff(sent))) / 2 if len(sent) > 1 else 0.0
-        metadata["bus"] = {"read_time_doubt_s": min(max(doubt, 0.0), 1.0)}
-        warnings.append(
-            "commands and readings have the same time stamps, so it is not known when in a turn "
-            "each was sent or read: lag and dead time are in doubt by half a turn "
-            f"({1e3 * doubt:.0f} ms)."
-        )
+        doubt, text = doubt_of_a_turn(sent)
+        metadata["bus"] = {"read_time_doubt_s": doubt}
+        warnings.append(text)
     else:
         sent, commands, kept = held_commands(sent, commands, stamped)
         stamped, positions = stamped[kept], positions[kept]

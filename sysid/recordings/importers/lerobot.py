@@ -1,0 +1,205 @@
+"""LeRobot datasets, v2.1 and v3: folders with `meta/info.json` and `data/**/*.parquet`.
+
+`action` and `observation.state` are lists with a number per joint, named in `meta/info.json`; an
+episode is a trial. A turn of LeRobot's loop reads the state, then takes the action and sends it.
+`timestamp` is the frame's number over the rate, so the true times are lost: a command is taken to
+be sent a quarter of a frame after the state was read, and all lags are in doubt by half a frame.
+
+Angles are shares of each joint's calibrated range (−100 … 100, a gripper's 0 … 100) or degrees, and
+the calibration is not in the dataset. Feetech and Dynamixel servos have 4,096 counts a turn, so the
+step of the readings gives the scale. Lag and dead time do not depend on it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.border import parse_json
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.importers.log import (
+    MOST_CELLS,
+    Log,
+    joint_names,
+    number,
+    read_files,
+    rows,
+    text_of,
+)
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.parquet import read_columns
+from pupper_sysid.sysid.recordings.importers.times import one_after_another
+from pupper_sysid.sysid.recordings.importers.units import COUNT_RAD, smallest_step
+
+LAYOUT = "LeRobot dataset"
+
+_ACTION, _STATE = "action", "observation.state"
+_SENT_AFTER = 0.25  # of a frame: reading the state and the cameras come before
+_NOMINAL_RAD = np.pi  # range of a joint whose readings show no step
+_MOST_FILES = 10_000
+_FEETECH = ("so100", "so101", "lekiwi", "xlerobot")
+
+
+def is_lerobot(folder: Path) -> bool:
+    """Whether `folder` holds such a dataset."""
+    return (folder / "meta" / "info.json").is_file()
+
+
+def read_lerobot(folder: Path, options: LogOptions) -> Log:
+    """The dataset's episodes as rows, a trial each.
+
+    Raises
+    ------
+    InputError
+        If `meta/info.json` or the data are not as described.
+    """
+    info_path = folder / "meta" / "info.json"
+    data_paths = sorted((folder / "data").rglob("*.parquet"))[: _MOST_FILES + 1]
+    if not data_paths:
+        raise InputError(
+            f"{folder} is a LeRobot dataset without data/**/*.parquet. Fetch its data folder, too."
+        )
+    if len(data_paths) > _MOST_FILES:
+        raise InputError(f"{folder} has more than {_MOST_FILES} data files. Give a part of it.")
+    contents, digest = read_files(folder, [info_path, *data_paths])
+    info = parse_json(text_of(info_path, contents[info_path]), str(info_path))
+    names = _names(info_path, info)
+    fps = number(info_path, info.get("fps"), "fps")
+    if not 1 <= fps <= 10_000:
+        raise InputError(f"{info_path}, fps is {fps:g}. Write the dataset's frames per second.")
+    parts = [
+        read_columns(p, contents[p], [_ACTION, _STATE, "episode_index", "frame_index"])
+        for p in data_paths
+    ]
+    if sum(part[_STATE].size for part in parts) > MOST_CELLS:
+        raise InputError(f"{folder} has more than {MOST_CELLS:,} values. Give a part of it.")
+    columns = {key: _joined(folder, key, [part[key] for part in parts]) for key in parts[0]}
+    commands, positions = (
+        _chosen(folder, columns[key], names[key], names["joints"]) for key in (_ACTION, _STATE)
+    )
+    joints = joint_names(info_path, names["joints"])
+    for key in ("episode_index", "frame_index"):
+        if not np.isfinite(columns[key]).all():
+            raise InputError(f"{folder}, column {key}: a value is missing. Mend the dataset.")
+    episode, time_s = one_after_another(columns["frame_index"] / fps, columns["episode_index"])
+    scales, texts = _scales(positions, joints)
+    for k, joint in enumerate(joints):
+        if given := options.unit_of(names["joints"][k], joint):
+            scales[k], texts[joint] = given.scale, f"{given.scale:.5f} (given)"
+    metadata: dict[str, Any] = {
+        "imported_from": LAYOUT,
+        "codebase_version": str(info.get("codebase_version"))[:20],
+        "robot_type": str(info.get("robot_type"))[:80],
+        "joints": joints,
+        "readings": "live",
+        "times": f"nominal: frame / {fps:g} Hz",
+        "assumed_units": texts,
+        "bus": {"read_time_doubt_s": min(0.5 / fps, 1.0)},
+    }
+    if metadata["robot_type"].startswith(_FEETECH):
+        metadata["servos"] = {joint: {"model": "STS3215"} for joint in joints}
+    table = pd.concat(
+        [
+            rows(
+                joint, time_s + _SENT_AFTER / fps, time_s, scales[k] * commands[:, k],
+                scales[k] * positions[:, k], episode,
+            )
+            for k, joint in enumerate(joints)
+        ],
+        ignore_index=True,
+    )  # fmt: skip
+    return Log(table, metadata, _warnings(fps, texts), digest)
+
+
+def _warnings(fps: float, texts: dict[str, str]) -> list[str]:
+    by_text: dict[str, list[str]] = {}
+    for joint, text in texts.items():
+        by_text.setdefault(text, []).append(joint)
+    units = "; ".join(f"{', '.join(joints)}: {text}" for text, joints in by_text.items())
+    return [
+        f"its times are frame numbers over {fps:g} Hz, not clock readings: when a state was read "
+        "and an action sent is not known within a frame, so lag and dead time are in doubt by half "
+        f"a frame ({500 / fps:.0f} ms). Record with time stamps to know them better.",
+        f"its angles are not in rad. Scales in rad per unit: {units}. Torques, speeds and errors "
+        "scale with it; lag and dead time do not.",
+    ]
+
+
+def _names(path: Path, info: Any) -> dict[str, list[str]]:
+    """Names of the columns of action and state, and those in both that are positions."""
+    features = info.get("features") if isinstance(info, dict) else None
+    if not isinstance(features, dict):
+        raise InputError(f"{path}: features is missing, so this is no LeRobot dataset.")
+    found: dict[str, list[str]] = {}
+    for key in (_ACTION, _STATE):
+        feature = features.get(key)
+        if not isinstance(feature, dict):
+            raise InputError(
+                f"{path}, features: {key} is missing. A servo's dataset needs {_ACTION} and "
+                f"{_STATE}."
+            )
+        names = feature.get("names")
+        if isinstance(names, dict):  # v2: {"motors": [...]}
+            names = [n for group in names.values() if isinstance(group, list) for n in group]
+        if not isinstance(names, list) or not names:
+            shape = feature.get("shape")
+            count = shape[0] if isinstance(shape, list) and shape else 0
+            names = [f"joint_{k}" for k in range(count if isinstance(count, int) else 0)][:1000]
+        found[key] = [str(name) for name in names]
+    both = [name for name in found[_STATE] if name in found[_ACTION]]
+    positions = [name for name in both if name.endswith(".pos")]
+    if not both:
+        raise InputError(
+            f"{path}: no joint has both {_ACTION} and {_STATE}; action has "
+            f"{', '.join(found[_ACTION])[:200]}."
+        )
+    return found | {"joints": positions or both}
+
+
+def _joined(folder: Path, key: str, parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    if len({part.shape[1:] for part in parts}) > 1:
+        raise InputError(f"{folder}: {key} has another length in one of the data files.")
+    return np.concatenate(parts)
+
+
+def _chosen(
+    folder: Path, values: NDArray[np.float64], names: list[str], wanted: list[str]
+) -> NDArray[np.float64]:
+    """The wanted joints' columns."""
+    values = values.reshape(len(values), -1)
+    if values.shape[1] != len(names):
+        raise InputError(
+            f"{folder}: meta/info.json names {len(names)} joints, the data have {values.shape[1]}."
+        )
+    return values[:, [names.index(name) for name in wanted]]
+
+
+def _scales(
+    positions: NDArray[np.float64], joints: list[str]
+) -> tuple[list[float], dict[str, str]]:
+    """Radians per unit of each joint, and in words where the scale is from."""
+    steps = [smallest_step(positions[:, k]) for k in range(len(joints))]
+    found = [COUNT_RAD / step if step > 0 else 0.0 for step in steps]
+    farthest = float(np.nanmax(np.abs(positions))) if positions.size else 0.0
+    scales, texts = [], {}
+    for k, joint in enumerate(joints):
+        span = 100.0 if positions[:, k].min() >= 0 and "gripper" in joint else 200.0
+        if abs(found[k] - 1) < 0.02:
+            scale, text = 1.0, "1 (rad: readings are whole counts of 4096 a turn apart)"
+        elif 0.2 <= span * found[k] <= 2 * np.pi:
+            scale = found[k]
+            text = f"{scale:.5f} (readings are {steps[k]:.4g} units apart, taken for 1/4096 turn)"
+        elif farthest <= np.pi:
+            scale, text = 1.0, "1 (assumed: no value is beyond ±π)"
+        elif farthest > 101:
+            scale, text = np.pi / 180, f"{np.pi / 180:.5f} (assumed: degrees)"
+        else:
+            scale = _NOMINAL_RAD / span
+            text = f"{scale:.5f} (assumed: {span:g} units are a range of π)"
+        scales.append(scale)
+        texts[joint] = text
+    return scales, texts

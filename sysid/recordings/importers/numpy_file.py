@@ -1,0 +1,64 @@
+"""NumPy archives (`.npz`): arrays by name, of shape (rows,) or (rows, joints).
+
+    np.savez("log.npz", time=t, command=commands, position=positions, joint_names=["knee", "ankle"])
+
+Objects (pickles) are never loaded.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, MOST_COLUMNS, Log
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
+
+LAYOUT = "NumPy archive"
+MAGIC = b"PK\x03\x04"
+
+_NAMES = ("joint_names", "joints", "names", "motor_names")
+
+
+def read_npz(path: Path, data: bytes, options: LogOptions) -> Log:
+    """The archive's arrays as rows.
+
+    Raises
+    ------
+    InputError
+        If it is no archive, unpacks to too much, holds objects, or lacks columns.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            inside = archive.infolist()
+        size = sum(member.file_size for member in inside)
+        if len(inside) > MOST_COLUMNS or size > LARGEST_BYTES:
+            raise InputError(
+                f"{path} unpacks to {len(inside)} arrays and {size / 1e6:.0f} MB; at most "
+                f"{MOST_COLUMNS} and {LARGEST_BYTES / 1e6:.0f} MB are read. Split it."
+            )
+        with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
+            arrays = {name: loaded[name] for name in loaded.files}
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive raises whatever zlib, zipfile and NumPy do
+        pickled = "pickle" in str(error)
+        raise InputError(
+            f"{path} holds Python objects, which are never loaded. Save arrays of numbers."
+            if pickled
+            else f"{path} is no NumPy archive, or is damaged. Save it again with numpy.savez."
+        ) from error
+    names = next(
+        ([str(n) for n in arrays[key].ravel()[:1000]] for key in _NAMES
+         if key in arrays and arrays[key].dtype.kind in "US"),
+        list(options.joints),
+    )  # fmt: skip
+    numeric = {k: v for k, v in arrays.items() if v.dtype.kind in "biuf" and v.ndim in (1, 2)}
+    lengths = [len(v) for v in numeric.values()]
+    rows = max(set(lengths), key=lengths.count) if lengths else 0
+    columns = {k: v.astype(float) for k, v in numeric.items() if len(v) == rows}
+    return read_table(path, Table(expanded(columns, names)), options, LAYOUT)

@@ -1,0 +1,136 @@
+"""What a user can say of a log whose columns do not say it: `LogOptions`, or a mapping file.
+
+# so101.yaml, given as `--mapping so101.yaml`
+time: t_ms
+command: goal.{joint}
+position: present.{joint}
+joints: {shoulder pan: shoulder_pan, "6": gripper}     # the log's name: yours
+unit: deg
+units: {gripper: "percent:1.9"}
+read_before_send: true
+stamp: start
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from pupper_sysid.common.border import read_yaml, validated
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.importers.units import Unit, unit
+
+Stamp = Literal["start", "middle", "end"]
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """Columns, units, names and order of a log. What is left out is found from the log.
+
+    Attributes
+    ----------
+    time : str, optional
+        Column of the time.
+    command, position : str, optional
+        Columns, with `{joint}` where the joint's name stands: `action.{joint}`. Of a ROS log the
+        topics.
+    trial : str, optional
+        Column that numbers trials, episodes or loops.
+    joints : mapping of str to str
+        Joints to read, by the log's name, and what to call them; empty for all.
+    unit : str, optional
+        See `units.unit`.
+    units : mapping of str to str
+        The same for single joints, by the log's name or the new one.
+    read_before_send : bool, optional
+        Whether a turn reads the position before it sends the command.
+    stamp : {"start", "middle", "end"}, optional
+        Where in a turn its time stamp was taken.
+    """
+
+    time: str | None = None
+    command: str | None = None
+    position: str | None = None
+    trial: str | None = None
+    joints: Mapping[str, str] = field(default_factory=dict)
+    unit: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    read_before_send: bool | None = None
+    stamp: Stamp | None = None
+
+    def __post_init__(self) -> None:
+        for text in [self.unit, *self.units.values()]:
+            if text is not None:
+                unit(text)
+        if self.stamp not in (None, "start", "middle", "end"):
+            raise InputError(f"`stamp` is {self.stamp}; it must be start, middle or end.")
+        if bool(self.command) != bool(self.position):
+            raise InputError("`command` and `position` belong together: give both or none.")
+        for name in ("command", "position"):
+            if (text := getattr(self, name)) and text.count("{joint}") > 1:
+                raise InputError(f"`{name}` has {{joint}} twice; write it once.")
+
+    def unit_of(self, *names: str) -> Unit | None:
+        """Unit of a joint under any of its names, if one was given."""
+        text = next((self.units[n] for n in names if n in self.units), self.unit)
+        return None if text is None else unit(text)
+
+    def refuse(self, layout: str, allowed: tuple[str, ...] = ("joints",)) -> None:
+        """Refuse options that a layout has no use for.
+
+        Raises
+        ------
+        InputError
+            If one other than `allowed` was given.
+        """
+        given = [f.name for f in fields(self) if getattr(self, f.name) not in (None, {})]
+        useless = [name for name in given if name not in allowed]
+        if useless:
+            raise InputError(
+                f"This is a {layout}, which says itself what `{useless[0]}` would say. Leave it "
+                "out."
+            )
+
+
+class _MappingFile(BaseModel):
+    """A mapping file; see the module."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    time: str | None = None
+    command: str | None = None
+    position: str | None = None
+    trial: str | None = None
+    joints: list[str] | dict[str, str] = []
+    unit: str | None = None
+    units: dict[str, str] = {}
+    read_before_send: bool | None = None
+    stamp: Stamp | None = None
+
+
+def read_mapping(path: Path) -> LogOptions:
+    """Options from a mapping file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or has unknown keys.
+    """
+    data, lines = read_yaml(path)
+    found = validated(_MappingFile, data, path, lines).model_dump()
+    if isinstance(found["joints"], list):
+        found["joints"] = {name: name for name in found["joints"]}
+    return LogOptions(**found)
+
+
+def merged(first: LogOptions, second: LogOptions) -> LogOptions:
+    """Options of `first`, and of `second` where `first` has none."""
+    values: dict[str, Any] = {}
+    for f in fields(LogOptions):
+        own = getattr(first, f.name)
+        values[f.name] = getattr(second, f.name) if own in (None, {}) else own
+    return LogOptions(**values)

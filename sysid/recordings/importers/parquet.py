@@ -1,0 +1,142 @@
+"""Parquet files within budgets: columns of numbers, or of lists with one number per joint.
+
+A file alone (pandas, polars, one file of a LeRobot dataset) is read as a table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.importers.log import MOST_CELLS, MOST_COLUMNS, Log
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
+
+LAYOUT = "parquet table"
+MAGIC = b"PAR1"
+
+
+def read_parquet(path: Path, data: bytes, options: LogOptions) -> Log:
+    """A file's columns of numbers as rows.
+
+    Raises
+    ------
+    InputError
+        If it is no parquet file, is too large, or lacks columns.
+    """
+    columns = columns_of(path, data)
+    arrays = read_columns(path, data, [name for name, numeric in columns.items() if numeric])
+    texts = _texts(path, data, [name for name in columns if name in ("joint", "motor")])
+    return read_table(path, Table(expanded(arrays, list(options.joints)), texts), options, LAYOUT)
+
+
+def _library(path: Path) -> Any:
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError(
+            f"{path} is a parquet file; reading it needs pyarrow. Install pupper-sysid[logs]."
+        ) from None
+    return pyarrow
+
+
+def columns_of(path: Path, data: bytes) -> dict[str, bool]:
+    """Names of a file's columns, and whether each is of numbers (or lists of numbers).
+
+    Raises
+    ------
+    InputError
+        If it is no parquet file, or the library is not installed.
+    """
+    pa = _library(path)
+    schema = _open(path, data).schema_arrow
+    if len(schema) > MOST_COLUMNS:
+        raise InputError(f"{path} has {len(schema)} columns; at most {MOST_COLUMNS} are read.")
+
+    def numeric(kind: Any) -> bool:
+        if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+            kind = kind.value_type
+        return bool(
+            pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+        )
+
+    return {field.name: numeric(field.type) for field in schema}
+
+
+def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Columns of numbers, shape (rows,), or of equally long lists, shape (rows, length).
+
+    Raises
+    ------
+    InputError
+        If a column is missing, has no numbers, is ragged, or the table is too large.
+    """
+    pa = _library(path)
+    file = _open(path, data)
+    known = columns_of(path, data)
+    lacking = [name for name in names if name not in known]
+    if lacking:
+        raise InputError(
+            f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(known)[:300]}."
+        )
+    meta = file.metadata
+    chunks = (
+        meta.row_group(g).column(c) for g in range(meta.num_row_groups)
+        for c in range(meta.num_columns)
+    )  # fmt: skip
+    if sum(c.num_values for c in chunks if c.path_in_schema.split(".list.")[0] in names) > (
+        MOST_CELLS
+    ):
+        raise InputError(f"{path} has more than {MOST_CELLS:,} values. Split the log.")
+    try:
+        table = file.read(columns=list(names), use_threads=False)
+        return {name: _array(path, name, table.column(name)) for name in names}
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
+
+
+def _texts(path: Path, data: bytes, names: Sequence[str]) -> dict[str, list[str]]:
+    """Columns of text."""
+    table = _open(path, data).read(columns=list(names), use_threads=False) if names else None
+    return {name: [str(v) for v in table.column(name).to_pylist()] for name in names if table}
+
+
+def _open(path: Path, data: bytes) -> Any:
+    pa = _library(path)
+    try:
+        return pa.parquet.ParquetFile(pa.BufferReader(data))
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a parquet file, or is cut off: {_first(error)}. Fetch it again."
+        ) from error
+
+
+def _array(path: Path, name: str, column: Any) -> NDArray[np.float64]:
+    """Numbers of a column; an empty cell is NaN."""
+    pa = _library(path)
+    kind = column.type
+    if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)):
+        return np.asarray(column.to_pandas().to_numpy(), float)
+    flat = np.asarray(column.combine_chunks().flatten().to_pandas().to_numpy(), float)
+    rows = len(column)
+    width = len(flat) // rows if rows else 0
+    lengths = {width} if not rows else set(_lengths(column))
+    if lengths != {width}:
+        raise InputError(f"{path}, column {name}: its lists are not equally long. Mend the log.")
+    return flat.reshape(rows, width)
+
+
+def _lengths(column: Any) -> list[Any]:
+    from pyarrow import compute as loaded
+
+    compute: Any = loaded  # its functions are made when it is imported
+    return compute.unique(compute.list_value_length(column)).to_pylist()
+
+
+def _first(error: Exception) -> str:
+    return str(error).splitlines()[0][:200].rstrip(".") if str(error) else type(error).__name__

@@ -1,0 +1,101 @@
+"""The sentences on a log of no known layout: every layout, and what is missing for it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers import wide
+
+OURS = (
+    "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
+)  # fmt: skip
+SWEEP = ("time_s", "freq_hz", "motor_idx", "signal", "command_rad", "actual_rad")
+PLAYBACK = ("time_s", "loop", "LF_hip_command_rad", "LF_hip_position_rad")
+_IMU = {"gx", "gy", "gz", "ax", "ay", "az"}
+
+FILES = (
+    "SAGE folder (control.csv, state_motor.csv, joint_list.txt)",
+    "LeRobot dataset (folder with meta/info.json and data/**/*.parquet)",
+    "rosbag2 folder or MCAP file (JointState, and commands as JointTrajectory, Float64MultiArray "
+    "or JointState)",
+    "BAM or K-Scale JSON (entries[].timestamp, position, goal_position)",
+    "ktune JSON (data[].time_since_start, position, commanded_position)",
+    "NumPy .npz or parquet with the columns of a table",
+)
+"""Layouts other than tables of text."""
+
+
+def unknown_columns(names: Sequence[str]) -> str:
+    """Why a table has no known layout; empty where it may have one.
+
+    Every tabular layout is listed with the columns that it lacks here.
+    """
+    own = set(names)
+    lacks_pair = wide.missing(names)
+    has_time = wide.has_time(names)
+    if lacks_pair == "" and has_time:
+        return ""
+    if {n.lower() for n in own} >= _IMU and lacks_pair.startswith("no column"):
+        return (
+            "it holds an IMU's readings (gx … az), and no commands and positions of joints, so "
+            "nothing of a servo can be measured with it. Give a log of commands and positions."
+        )
+    lacks = [lacks_pair] if lacks_pair else []
+    lacks += [] if has_time else [f"no column is a time ({', '.join(wide.TIMES[:4])} …)"]
+    parts = [
+        f"any table: {' and '.join(lacks)}",
+        *(
+            f"{layout}: {', '.join(c for c in columns if c not in own)} missing"
+            for layout, columns in (
+                ("recording of this project", OURS),
+                ("Mini Pupper sweep", SWEEP),
+                ("Mini Pupper playback", PLAYBACK),
+            )
+        ),
+    ]
+    return (
+        f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
+        f"{_hint(names)}Name the columns with `pupper-sysid import` --time, --command and "
+        f"--position. Other layouts: {'; '.join(FILES)}."
+    )
+
+
+def unknown_json(keys: Iterable[str]) -> str:
+    """Why JSON has no known layout."""
+    own = set(map(str, keys))
+    return (
+        f"it is JSON of no known layout; it has {_listed(sorted(own)) or 'no keys'}. BAM or "
+        f"K-Scale: {_lack(own, ('entries',))}; ktune: {_lack(own, ('config', 'data'))}. Other "
+        f"layouts: {'; '.join(FILES)}; a table as CSV."
+    )
+
+
+def unknown_folder(names: Iterable[str]) -> str:
+    """Why a folder has no known layout."""
+    own = set(names)
+    sage = ("control.csv", "state_motor.csv", "joint_list.txt")
+    return (
+        f"it is a folder without a log: it has {_listed(sorted(own)[:20]) or 'nothing'}. SAGE: "
+        f"{_lack(own, sage)}; LeRobot: {_lack(own, ('meta', 'data'))}; rosbag2: "
+        f"{_lack(own, ('metadata.yaml',))}. Give a log's file or folder."
+    )
+
+
+def _lack(own: set[str], wanted: Sequence[str]) -> str:
+    lacking = [name for name in wanted if name not in own]
+    return f"{', '.join(lacking)} missing" if lacking else "not as expected inside"
+
+
+def _hint(names: Sequence[str]) -> str:
+    """A column that may be a misspelt one of this project."""
+    for name in names:
+        near = difflib.get_close_matches(name, [n for n in OURS if n not in names], 1, 0.8)
+        if near:
+            return f"Was '{printable(name)[:40]}' meant as {near[0]}? Rename it. "
+    return ""
+
+
+def _listed(names: Sequence[str]) -> str:
+    return printable(", ".join(map(str, names)))[:300]
