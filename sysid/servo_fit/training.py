@@ -17,10 +17,14 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.memory import keep_freed_memory
 from pupper_sysid.sysid.servo_fit.linear import LinearFits, fading, learns_from
+from pupper_sysid.sysid.servo_fit.lstm_kernel import Lstm
+from pupper_sysid.sysid.servo_fit.mlp_kernel import Mlp
 from pupper_sysid.sysid.servo_fit.windows import WINDOW, Samples
 
 _BEND = 3.0  # robust standard deviations beyond which a reading pulls with constant force
 _ROWS_PER_STEP = 4096
+_MEANS = (0.9, 0.999)  # of Adam: of gradients and of their squares
+_LARGEST_GRADIENT = 10.0
 
 
 @dataclass(frozen=True)
@@ -121,8 +125,7 @@ def train(
     weights = {
         k: w.expand(*shape, *w.shape[4:]).clone().requires_grad_(True) for k, w in start.items()
     }
-    optimiser = torch.optim.Adam(weights.values(), recipe.learning_rate)
-    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, recipe.steps)
+    adam = _Adam(list(weights.values()))
     every = _tensors(data, linear, sets)
     readings = every["learns"].sum((-1, -2)).clamp(min=1)[:, :, None, None]  # per joint and set
     decay = torch.tensor(recipe.decays)[:, None] / (recipe.units * readings)
@@ -137,44 +140,40 @@ def train(
         out = bound * torch.tanh(out / bound)
         out = out.mean(3, keepdim=True) if averaged else out
         joints, *_, windows, outputs = out.shape
-        flat = out.reshape(joints, -1, windows, outputs)
-        index = part["index"][:, None].expand(-1, flat.shape[1], -1, -1)
-        four = torch.stack([torch.gather(flat, 3, index + k) for k in range(4)], dim=-1)
-        seen = (four * part["weight"][:, None]).sum(-1).reshape(*out.shape[:4], windows, -1)
+        flat = out.reshape(joints, -1, windows, outputs).transpose(1, 2)
+        seen = torch.matmul(flat, part["look"]).transpose(1, 2)
+        seen = seen.reshape(*out.shape[:4], windows, -1)
         return seen - part["residual"][:, :, None, None]
 
     def checkpoint(step: int) -> Checkpoint:
         parts = []
         with torch.no_grad():
             for low in range(0, data.windows, 4 * per_step):
-                found = error_of(_some(every, slice(low, low + 4 * per_step)), averaged=True)[
-                    :, :, :, 0
-                ]
+                part = _some(every, slice(low, low + 4 * per_step))
+                found = error_of(part, averaged=True)[:, :, :, 0]
                 parts.append(found.permute(0, 3, 4, 1, 2).numpy())
             now = {k: w.detach().numpy().copy() for k, w in weights.items()}
         return Checkpoint(step, np.concatenate(parts, axis=1), now)
 
+    part = _some(every, slice(0, per_step))
     try:
         for step in range(recipe.steps + 1):
             if step and (step % recipe.check_every == 0) and watch(checkpoint(step)):
                 break
             if step == recipe.steps:
                 break
-            part = every
             if data.windows > per_step:
                 chosen = batches.choice(data.windows, per_step, replace=False)
                 part = _some(every, torch.from_numpy(chosen))
-            optimiser.zero_grad()
             bend = _BEND * part["spread"][:, :, None, None, None, None]
             loss = bend**2 * (torch.sqrt(1 + (error_of(part) / bend) ** 2) - 1) * 2
             counted = part["learns"][:, :, None, None]
             # mean over the readings of a set, then sum over independent networks
             total = (loss * counted).sum((-1, -2)) / counted.sum((-1, -2)).clamp(min=1)
             size = sum((w**2).flatten(4).sum(-1) for k, w in weights.items() if "weight" in k)
-            (total + decay * size).sum().backward()
-            torch.nn.utils.clip_grad_norm_(weights.values(), 10.0 * total.numel() ** 0.5)
-            optimiser.step()
-            falling.step()
+            largest = _LARGEST_GRADIENT * total.numel() ** 0.5
+            rate = 0.5 * recipe.learning_rate * (1 + np.cos(np.pi * step / recipe.steps))
+            adam.descend((total + decay * size).sum(), rate, largest)
             if progress:
                 progress(step + 1)
     except KeyboardInterrupt:
@@ -198,13 +197,45 @@ def _tensors(
 
 
 def _some(every: dict[str, torch.Tensor], chosen) -> dict[str, torch.Tensor]:
-    """Some windows of every array that has them."""
+    """Some windows of every array that has them, and `look`, which looks readings up.
+
+    `look` (joints, windows, outputs, readings) has the four weights of each reading.
+    """
     found = dict(every)
     for name in ("command", "index", "weight"):
         found[name] = every[name][:, chosen]
     for name in ("residual", "learns"):
         found[name] = every[name][:, :, chosen]
-    return found
+    index, weight = found["index"], found["weight"]
+    look = torch.zeros(*index.shape[:2], WINDOW + 3, index.shape[2])
+    for n in range(4):
+        look.scatter_add_(2, index[:, :, None] + n, weight[:, :, None, :, n])
+    return found | {"look": look}
+
+
+class _Adam:
+    """Adam (Kingma and Ba, 2015); `torch.optim` takes longer to import than to train a joint."""
+
+    def __init__(self, weights: list[torch.Tensor]) -> None:
+        self._weights = weights
+        self._means = [(torch.zeros_like(w), torch.zeros_like(w)) for w in weights]
+        self._steps = 0
+
+    def descend(self, loss: torch.Tensor, rate: float, largest: float) -> None:
+        """One step, with a gradient whose norm is at most `largest`."""
+        gradients = torch.autograd.grad(loss, self._weights)
+        norm = float(torch.sqrt(sum(((g**2).sum() for g in gradients), torch.zeros(()))))
+        keep = min(1.0, largest / (norm + 1e-6))
+        self._steps += 1
+        a, b = _MEANS
+        whole, whole_square = 1 - a**self._steps, 1 - b**self._steps
+        with torch.no_grad():
+            for w, g, (mean, square) in zip(self._weights, gradients, self._means, strict=True):
+                g = g * keep
+                mean.lerp_(g, 1 - a)
+                square.mul_(b).addcmul_(g, g, value=1 - b)
+                w.addcdiv_(mean, square.sqrt().div_(whole_square**0.5).add_(1e-8),
+                           value=-rate / whole)  # fmt: skip
 
 
 # ------------------------------------------------------------------------------- networks
@@ -228,16 +259,12 @@ def _mlp_forward(
     w: dict[str, torch.Tensor], command: torch.Tensor, fade: torch.Tensor, past: int
 ) -> torch.Tensor:
     """Outputs (*shape, windows, WINDOW + 3) of commands (joints, windows, past + WINDOW + 2)."""
-    joints, sets, decays, members, taps, units = w["weight_0"].shape
+    joints, sets, decays, members, taps, _ = w["weight_0"].shape
     history = command[..., past - taps :].unfold(-1, taps, 1).flip(-1)  # newest first
     windows, outputs = history.shape[1:3]
-    x = (history * fade).reshape(joints, windows * outputs, taps)
-    # all networks of a joint have the same inputs: one wide product serves them all
-    wide = w["weight_0"].permute(0, 4, 1, 2, 3, 5).reshape(joints, taps, -1)
-    h = torch.relu(torch.baddbmm(w["bias_0"].reshape(joints, 1, -1), x, wide))
-    h = h.reshape(joints, windows * outputs, -1, units)
-    out = torch.einsum("jnqu,jqu->jqn", h, w["weight_1"].reshape(joints, -1, units))
-    out = out + w["bias_1"].reshape(joints, -1, 1)
+    x = (history * fade).reshape(joints, windows * outputs, taps).mT.contiguous()
+    own = [w[k].flatten(1, 3) for k in ("weight_0", "bias_0", "weight_1")]
+    out = Mlp.apply(*own, x) + w["bias_1"].reshape(joints, -1, 1)
     return out.reshape(joints, sets, decays, members, windows, outputs)
 
 
@@ -260,21 +287,11 @@ def _lstm_forward(
     w: dict[str, torch.Tensor], command: torch.Tensor, fade: torch.Tensor, past: int
 ) -> torch.Tensor:
     """Outputs (*shape, windows, WINDOW + 3) of commands (joints, windows, past + WINDOW + 2)."""
-    joints, sets, decays, members, units, gates = w["weight_hidden"].shape
-    nets = joints * sets * decays * members
-    windows, steps = command.shape[1:]
-    recurrent = w["weight_hidden"].reshape(nets, units, gates)
-    x = command[:, None].expand(-1, nets // joints, -1, -1).reshape(nets, windows, steps)
-    drive = x.permute(2, 0, 1)[..., None] * w["weight_input"].reshape(nets, 1, gates)
-    drive = drive + w["bias"].reshape(nets, 1, gates)
-    hidden = cell = torch.zeros(nets, windows, units)
-    seen = []
-    for t in range(steps):
-        i, f, g, o = torch.baddbmm(drive[t], hidden, recurrent).chunk(4, -1)
-        cell = torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
-        hidden = torch.sigmoid(o) * torch.tanh(cell)
-        if t >= past - 1:
-            seen.append(hidden)
-    out = torch.einsum("tnwu,nu->nwt", torch.stack(seen), w["weight_out"].reshape(nets, units))
-    out = out + w["bias_out"].reshape(nets, 1, 1)
-    return out.reshape(joints, sets, decays, members, windows, -1)
+    shape = w["bias_out"].shape
+    own = {k: v.flatten(1, 3) for k, v in w.items()}
+    out = Lstm.apply(
+        own["weight_input"][:, :, 0], own["weight_hidden"], own["bias"], own["weight_out"],
+        command.contiguous(), past - 1,
+    )  # fmt: skip
+    out = out + own["bias_out"][:, :, None, None]
+    return out.reshape(*shape, *out.shape[2:])
