@@ -227,19 +227,28 @@ def _correlations(trial: Trial, live: bool, grid: float, count: int) -> NDArray[
     # lag m (from -ahead to before) looks at command row i - m, stored at i - m + before
     there = np.ones(before + len(command))
 
-    def correlate(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-        product = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size)
-        shift = before - np.arange(-ahead, before + 1)  # i - m + before - i
-        return product[shift]
+    shift = before - np.arange(-ahead, before + 1)  # i - m + before - i
 
-    n = correlate(mask, there)
-    sy, syy = correlate(y, there), correlate(square, there)
+    def transform(a: NDArray) -> NDArray[np.complex128]:
+        return np.fft.rfft(a, size)
+
+    def correlate(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+        """Of transforms; the first is conjugate."""
+        return np.fft.irfft(a * b, size)[shift]
+
+    of_mask, of_y, of_square = (np.conj(transform(a)) for a in (mask, y, square))
+    of_there = transform(there)
+    n, sy, syy = (correlate(a, of_there) for a in (of_mask, of_y, of_square))
     rho = np.zeros((len(_POLES_S), count))
-    rest = _rest(trial)
+    own = np.concatenate([np.full(before, _rest(trial)), command])
     for k, pole in enumerate(_POLES_S):
-        own = np.concatenate([np.full(before, rest), command])
         u = _low_pass(own, pole, grid) - command.mean()
-        su, suu, suy = correlate(mask, u), correlate(mask, u * u), correlate(y, u)
+        of_u = transform(u)
+        su, suu, suy = (
+            correlate(of_mask, of_u),
+            correlate(of_mask, transform(u * u)),
+            correlate(of_y, of_u),
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             covariance = suy - sy * su / n
             scale = np.sqrt(np.maximum((syy - sy**2 / n) * (suu - su**2 / n), 0.0))
