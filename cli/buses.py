@@ -10,6 +10,7 @@ from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.monitor import GuardLimits
 
 JOINTS_FILE = Path("joints.yaml")
 
@@ -22,8 +23,13 @@ def chosen_map(text: str | None) -> JointMap | None:
     return None if text is None else load_joint_map(text)
 
 
-def connect(bus: str, joint_map: str | None, joints: Sequence[str] | None = None) -> GuardedBus:
+def connect(
+    bus: str,
+    joint_map: str | None,
+    joints: Sequence[str] | None = None,
+    limits: GuardLimits | None = None,
+) -> GuardedBus:
     """The bus at an address, guarded and in servo coordinates."""
     address = parse_address(bus)
     chosen = chosen_map(joint_map)
-    return open_guarded(address, chosen.per_servo() if chosen else None, joints)
+    return open_guarded(address, chosen.per_servo() if chosen else None, joints, limits)

@@ -11,6 +11,7 @@ from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 
@@ -24,7 +25,10 @@ def open_bus(
 
 
 def open_guarded(
-    address: BusAddress, joint_map: JointMap | None = None, joints: Sequence[str] | None = None
+    address: BusAddress,
+    joint_map: JointMap | None = None,
+    joints: Sequence[str] | None = None,
+    limits: GuardLimits | None = None,
 ) -> GuardedBus:
     """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
     bus = open_bus(address, joint_map, joints)
@@ -33,4 +37,4 @@ def open_guarded(
     except BaseException:
         bus.close()
         raise
-    return GuardedBus(bus, watchdog=watchdog)
+    return GuardedBus(bus, limits, watchdog)

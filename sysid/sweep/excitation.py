@@ -11,7 +11,7 @@ change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import gcd
 from typing import Any
@@ -21,9 +21,20 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
-from pupper_sysid.hardware.moves import raised_cosine
+from pupper_sysid.sysid.sweep.waveforms import (
+    Offset,
+    after,
+    chirp,
+    multisine,
+    peaks,
+    prbs,
+    scaled,
+    sine,
+    square,
+    steps,
+)
 
-KINDS = ("sine", "chirp", "multisine", "steps", "square")
+KINDS = ("sine", "chirp", "multisine", "steps", "square", "prbs")
 
 HIGHEST_HZ = 25.0
 """Half of the usual 52 Hz command rate: a faster tone cannot be commanded."""
@@ -62,12 +73,18 @@ class TrialPlan:
     offset : callable
         Command minus start pose [rad] at times since the trial's start [s]: shape (n,) to shape
         (n,), or (n, joints) where joints move differently.
+    p_gain : float
+        P gain of the moving servos, the register's value; NaN leaves it as it is.
+    release_s : float
+        Time since the trial's start from which the torque is off.
     """
 
     joints: tuple[str, ...]
     frequency_hz: float
     duration_s: float
-    offset: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    offset: Offset
+    p_gain: float = float("nan")
+    release_s: float = float("inf")
 
     def command(self, time_s: float, start_rad: NDArray[np.float64]) -> NDArray[np.float64]:
         """Commands [rad], shape (joints,), for joints that start at `start_rad`."""
@@ -87,12 +104,15 @@ class Plan:
         Written into the recording's header.
     warnings : tuple of str
         Changes of the requested amplitudes and frequencies.
+    nearest_start_rad : float
+        Largest distance of a moving joint from its start pose at which the plan may begin.
     """
 
     trials: tuple[TrialPlan, ...]
     start_pose_rad: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_POSE))
     description: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    nearest_start_rad: float = float("inf")
 
     @property
     def duration_s(self) -> float:
@@ -119,16 +139,17 @@ def plan(
     kind : str
         "sine": one trial per frequency; "chirp": one from the lowest to the highest frequency,
         logarithmic; "multisine": one with all frequencies at once, Schroeder phases; "steps": one
-        with steps of a third, two thirds and all of the amplitude; "square": one per frequency.
+        with steps of a third, two thirds and all of the amplitude; "square": one per frequency;
+        "prbs": a pseudo-random binary sequence.
     joints : sequence of str
     frequencies_hz : sequence of float
-        Ignored by "steps".
+        Ignored by "steps" and "prbs".
     amplitude_rad : float
-        Largest excursion from the start pose. It is not reduced for steps and square waves, which
-        are meant to reach the speed limit.
+        Largest excursion from the start pose. It is not reduced for steps, square waves and PRBS,
+        which are meant to reach the speed limit.
     duration_s : float, optional
         Of each trial without its lead-in. Default: for tones 5 s or 5 periods, whichever is
-        longer; 20 s for a chirp or multisine; one pass for steps.
+        longer; 20 s for a chirp, a multisine or a PRBS; one pass for steps.
     loop_period_s : float
         Time between commands.
     speed_limit_rad_s : float
@@ -159,7 +180,7 @@ def plan(
             raise InputError(f"excitation: {name} is {value}; it must be a positive number.")
     highest = min(HIGHEST_HZ, 0.5 / loop_period_s)
     frequencies = [_checked_frequency(f, highest) for f in frequencies_hz]
-    if not frequencies and kind != "steps":
+    if not frequencies and kind not in ("steps", "prbs"):
         raise InputError("excitation: no frequency was chosen; give at least one, such as 1-10.")
     warnings: list[str] = []
     amplitude_rad = _within(amplitude_rad, joints, margin_rad or {}, warnings)
@@ -176,30 +197,32 @@ def plan(
                 )
             if kind == "sine":
                 amplitude = _bounded(amplitude_rad, 2 * np.pi * f, top_speed, f"{f:g} Hz", warnings)
-                shapes.append((f, time, _sine(f, amplitude)))
+                shapes.append((f, time, sine(f, amplitude)))
             else:
-                shapes.append((np.nan, time, _square(f, amplitude_rad)))
+                shapes.append((np.nan, time, square(f, amplitude_rad)))
     elif kind == "chirp":
         low, high, time = min(frequencies), max(frequencies), duration_s or 20.0
         _bounded(amplitude_rad, 2 * np.pi * high, top_speed, f"chirp at {high:g} Hz", warnings)
-        shapes = [(np.nan, time, _chirp(low, high, time, amplitude_rad, top_speed))]
+        shapes = [(np.nan, time, chirp(low, high, time, amplitude_rad, top_speed))]
     elif kind == "multisine":
-        shape = _multisine(frequencies)
-        peak, speed = _peaks(shape, min(frequencies))
+        shape = multisine(frequencies)
+        peak, speed = peaks(shape, min(frequencies))
         amplitude = _bounded(amplitude_rad, speed / peak, top_speed, "multisine", warnings)
-        shapes = [(np.nan, duration_s or 20.0, _scaled(shape, amplitude / peak))]
+        shapes = [(np.nan, duration_s or 20.0, scaled(shape, amplitude / peak))]
+    elif kind == "prbs":
+        shapes = [(np.nan, duration_s or 20.0, prbs(amplitude_rad))]
     else:
-        offset, one_pass = _steps(amplitude_rad)
+        offset, one_pass = steps(amplitude_rad)
         shapes = [(np.nan, duration_s or one_pass, offset)]
     trials = tuple(
-        TrialPlan((joint,), float(f), LEAD_IN_S + time, _after(LEAD_IN_S, offset))
+        TrialPlan((joint,), float(f), LEAD_IN_S + time, after(LEAD_IN_S, offset))
         for joint in joints
         for f, time, offset in shapes
     )
     description = {
         "kind": kind,
         "amplitude_rad": amplitude_rad,
-        "frequencies_hz": [] if kind == "steps" else frequencies,
+        "frequencies_hz": [] if kind in ("steps", "prbs") else frequencies,
         "lead_in_s": LEAD_IN_S,
         "speed_limit_rad_s": speed_limit_rad_s,
         "warnings": list(dict.fromkeys(warnings)),
@@ -276,9 +299,6 @@ def off_harmonics(frequency_hz: float, rates_hz: Sequence[float], duration_s: fl
     return frequency_hz
 
 
-Offset = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-
-
 def _checked_frequency(value: float, highest_hz: float) -> float:
     if not (np.isfinite(value) and 0 < value <= highest_hz):
         raise InputError(
@@ -319,73 +339,3 @@ def _bounded(
         f"so that the speed stays at {top_speed:.2f} rad/s."
     )
     return reduced
-
-
-def _after(lead_in_s: float, offset: Offset) -> Offset:
-    """`offset` after a rest."""
-
-    def shifted(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        time_s = np.asarray(time_s, float) - lead_in_s
-        return np.where(time_s > 0, offset(np.maximum(time_s, 0.0)), 0.0)
-
-    return shifted
-
-
-def _scaled(offset: Offset, factor: float) -> Offset:
-    return lambda t: factor * offset(t)
-
-
-def _sine(frequency_hz: float, amplitude: float) -> Offset:
-    # full amplitude after half a period: smooth, and still an onset that excites the dynamics
-    return lambda t: (
-        amplitude * raised_cosine(2 * frequency_hz * t) * np.sin(2 * np.pi * frequency_hz * t)
-    )
-
-
-def _square(frequency_hz: float, amplitude: float) -> Offset:
-    return lambda t: amplitude * np.where((t * frequency_hz) % 1.0 < 0.5, 1.0, -1.0)
-
-
-def _chirp(low: float, high: float, duration_s: float, amplitude: float, top_speed: float):
-    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
-        rate = np.log(high / low) / duration_s
-        grown = np.exp(rate * t)
-        cycles = low * t if rate == 0 else low * (grown - 1) / rate
-        bounded = np.minimum(amplitude, top_speed / (2 * np.pi * low * grown))
-        return bounded * raised_cosine(2 * low * t) * np.sin(2 * np.pi * cycles)
-
-    return offset
-
-
-def _multisine(frequencies: Sequence[float]) -> Offset:
-    """Equal amplitudes, Schroeder phases (IEEE Trans. Inf. Theory 16, 1970): a low crest factor."""
-    f = np.array(frequencies)
-    k = np.arange(1, len(f) + 1)
-    phase = -np.pi * k * (k - 1) / len(f)
-
-    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
-        tones = np.sin(2 * np.pi * f * np.asarray(t)[:, None] + phase)
-        return raised_cosine(2 * f.min() * np.asarray(t)) * tones.sum(axis=-1)
-
-    return offset
-
-
-def _peaks(offset: Offset, lowest_hz: float) -> tuple[float, float]:
-    """Largest excursion and speed of `offset` over 20 of its longest periods."""
-    t = np.arange(0.0, 20.0 / lowest_hz, 0.001)
-    value = offset(t)
-    return float(np.abs(value).max()), float(np.abs(np.diff(value)).max() / 0.001)
-
-
-def _steps(amplitude: float) -> tuple[Offset, float]:
-    """Steps up and down in three sizes, and the duration of one pass [s]."""
-    levels = amplitude * np.array([1, 0, -1, 0, 2, 0, -2, 0, 3, 0, -3, 3, -3, 0]) / 3
-    # golden-ratio holds of 0.45 to 0.75 s: edges meet loop and poll at ever different phases
-    holds = 0.45 + 0.3 * ((np.arange(len(levels)) * (np.sqrt(5) - 1) / 2) % 1.0)
-    edges = np.concatenate([[0.0], np.cumsum(holds)])
-
-    def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
-        index = np.searchsorted(edges, np.asarray(t) % edges[-1], side="right") - 1
-        return levels[index]
-
-    return offset, float(edges[-1])

@@ -3,8 +3,11 @@
 `record` moves the robot to the start pose, runs the trials at a fixed rate, and returns to the
 start pose after each. Every command passes the safety guard, and the recording holds the command
 that the guard sent. Rows are written at every tick, so that an interrupted recording can be read up
-to there and continued (`sysid.sweep.resume`). The robot is always parked and the bus closed at the
-end.
+to there and continued (`sysid.sweep.resume`). At the end the robot is always parked, changed gains
+are set back, and the bus is closed.
+
+Trials of a bench (`sysid.sweep.bench`) may set the P gain and switch the torque off on the way;
+afterwards it is on again only once the joints have come to rest.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.common.errors import BusError, InputError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, ServoBus, header_entries
 from pupper_sysid.hardware.loop import FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
@@ -28,8 +31,16 @@ from pupper_sysid.sysid.sweep.resume import Resume
 REST_S = 0.5
 """Rest at the start pose before every trial [s], not recorded: servo and bus settle."""
 
+REST_SPREAD_RAD, REST_FOR_S, REST_WITHIN_S = 0.02, 0.6, 20.0
+"""After a drop: joints whose readings vary by less than this, for so long, are at rest; the longest
+wait for that [s]."""
+
 RETURN_S = 0.4
 """Shortest duration of the return to the start pose after a trial [s]."""
+
+P_REGISTER = "p"
+
+_CHECK_LINE = "Check the cable; cut the servos' power if they still hold."
 
 Progress = Callable[[float, float, str], None]
 """Called with seconds done, seconds in all, and the name of the present work."""
@@ -117,6 +128,10 @@ class _Session:
         self._sent = self._start.copy()
         self._total_s = plan.duration_s
         self._shift_s = 0.0
+        self._gains: dict[str, float] = {}
+        self._on_a_bench = any(
+            np.isfinite(t.p_gain) or np.isfinite(t.release_s) for t in plan.trials
+        )
 
     def run(self, path: Path, metadata: dict[str, Any], force: bool) -> Path:
         """Record all trials, from opening the file to parking the robot."""
@@ -124,6 +139,7 @@ class _Session:
         present = first_pose(bus, self._loop.period_s)
         self._start = np.where(np.isfinite(self._start), self._start, present)
         self._sent = present
+        self._refuse_far(present)
         first, rows = 0, 0
         if resume is None:
             writer = RecordingWriter(path, self._header(metadata), force)
@@ -138,9 +154,12 @@ class _Session:
                 self._move_to_start()
                 done = sum(trial.duration_s for trial in self._plan.trials[:first])
                 for number, trial in enumerate(self._plan.trials[first:], first):
+                    self._set_gain(trial)
                     self._hold(REST_S)
                     rows += self._trial(number, trial, writer, done)
                     done += trial.duration_s
+                    if np.isfinite(trial.release_s):
+                        self._catch(done)
                     self._move_to_start()
             except SafetyStop:
                 bus.limp()  # for the loop's own stop, too, which the guard does not see
@@ -174,20 +193,68 @@ class _Session:
         what = f"{', '.join(trial.joints[:3])}{' …' if len(trial.joints) > 3 else ''}"
         if np.isfinite(trial.frequency_hz):
             what += f" at {trial.frequency_hz:g} Hz"
-        rows = 0
+        rows, on = 0, True
         for elapsed in self._loop.ticks(trial.duration_s):
             goal = self._start.copy()
             # at the present time, not the planned one: a late tick keeps the phase of the tone
             goal[index] = trial.command(elapsed, self._start[index])
-            sent = bus.write(goal)
-            self._sent = sent.position_rad
+            held = elapsed < trial.release_s
+            if held:
+                sent = bus.write(goal)
+                self._sent, sent_s = sent.position_rad, sent.time_s
+            else:  # a command would switch the torque on again
+                sent_s = bus.now()
+                if on and not bus.torque(False):
+                    raise BusError(f"{what}: the torque could not be switched off. {_CHECK_LINE}")
+            on = held
             sample = bus.read()
-            writer.append(
-                _rows(number, trial, index, sent.time_s, self._sent, sample, self._shift_s)
-            )
+            made = _rows(number, trial, index, sent_s, self._sent, sample, self._shift_s)
+            if self._on_a_bench:
+                made = [r | {"p_gain": trial.p_gain, "torque_enabled": float(on)} for r in made]
+            writer.append(made)
             rows += len(index)
             self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
         return rows
+
+    def _refuse_far(self, present: NDArray[np.float64]) -> None:
+        """Refuse to begin where a load cannot be hanging."""
+        moving = {joint for trial in self._plan.trials for joint in trial.joints}
+        for k, joint in enumerate(self._bus.joint_names):
+            away = abs(present[k] - self._start[k])
+            if joint in moving and away > self._plan.nearest_start_rad:
+                raise InputError(
+                    f"{joint} was found {away:.2f} rad from where its load hangs "
+                    f"({self._start[k]:.2f} rad). Let it hang freely; if it does, give the reading "
+                    "there as hanging=…rad of the load, or measure the joint map's zero."
+                )
+
+    def _set_gain(self, trial: TrialPlan) -> None:
+        """Set the trial's P gain at its joints, read back, if it is not set yet."""
+        if not np.isfinite(trial.p_gain):
+            return
+        for joint in trial.joints:
+            if self._gains.get(joint) != trial.p_gain:
+                self._bus.set_register(joint, P_REGISTER, int(trial.p_gain))
+                self._gains[joint] = trial.p_gain
+
+    def _catch(self, done: float) -> None:
+        """Wait until the limp joints are at rest; then hold them where they are."""
+        bus, recent = self._bus, []
+        self._progress(done, self._total_s, "waiting for rest")
+        for _ in self._between.ticks(REST_WITHIN_S):
+            sample = bus.read()
+            if np.isfinite(sample.position_rad).all():
+                recent.append((bus.now(), sample.position_rad))
+            recent = [(t, q) for t, q in recent if t >= bus.now() - REST_FOR_S]
+            whole = recent and bus.now() - recent[0][0] > 0.8 * REST_FOR_S and len(recent) > 5
+            if whole and np.ptp([q for _, q in recent], axis=0).max() < REST_SPREAD_RAD:
+                bus.torque(True)
+                self._sent = bus.sent
+                return
+        raise SafetyStop(
+            f"a load still swings {REST_WITHIN_S:.0f} s after it was dropped, so the torque stays "
+            "off. Check that the arm is fixed to the servo's horn."
+        )
 
     def _move_to_start(self) -> None:
         """Move from the last command to the start pose on a raised cosine."""

@@ -51,13 +51,17 @@ class Request(BaseModel):
     kind: str
     joints: list[str]
     frequencies_hz: list[float]
-    amplitude_rad: float
+    amplitude_rad: float | None
     duration_s: float | None
     playback: str | None
     loops: int = Field(1, ge=1, le=1000)
     """Of a playback; absent in recordings of older versions."""
     plan: str | None = None
     """Plan file that is executed."""
+    load: str | None = None
+    """Of a bench: a pendulum, or `none`; absent in sweeps of robots."""
+    gains: list[int] = []
+    """P gains of a bench."""
     until: Series | None = None
     """Absent unless the sweep goes on until an interval is narrow."""
 

@@ -13,6 +13,13 @@ import numpy as np
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect
+from pupper_sysid.cli.commands.recording.bench import (
+    BENCH_MAP,
+    BENCH_RATE_HZ,
+    loads_of,
+    open_bench,
+    plan_of_bench,
+)
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
@@ -20,6 +27,14 @@ from pupper_sysid.hardware.address import EMULATED, bus_name
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.sysid.sweep.bench import (
+    BENCH,
+    BENCH_KINDS,
+    FREQUENCIES_HZ,
+    parse_gains,
+    parse_load,
+)
 from pupper_sysid.sysid.sweep.excitation import (
     LOOP_PERIOD_S,
     POLL_RATE_HZ,
@@ -36,8 +51,8 @@ class Sweep:
     Example: pupper-sysid sweep --freqs 1-10 --joints LF
     """
 
-    freqs: str = "1-10"
-    """Frequencies [Hz]: 1-10, 1-10:0.5 or 1,2,4,6.5."""
+    freqs: str | None = None
+    """Frequencies [Hz]: 1-10, 1-10:0.5 or 1,2,4,6.5; by default 1-10, on a bench 0.5,1,2,4."""
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; one after the other."""
     bus: str = EMULATED
@@ -46,8 +61,21 @@ class Sweep:
     joint_map: str | None = None
     """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
     fits the bus. With the emulated bus, the robot that is emulated."""
-    kind: Literal["sine", "chirp", "multisine", "steps", "square"] = "sine"
-    """Shape of the motion."""
+    kind: (
+        Literal[
+            "sine", "chirp", "multisine", "steps", "square", "prbs", "bench", "drop", "reversal"
+        ]
+        | None
+    ) = None
+    """Shape of the motion; by default sine, or bench with --load: tones, chirp, prbs, steps and
+    drops. drop and reversal (slow strokes, for backlash) are of a bench, too."""
+    load: str | None = None
+    """One servo on a bench, and what it swings: pendulum:0.1kg@0.10m (mass, distance from the axis;
+    ,arm=0.02kg and ,hanging=0.1rad where they are not 0), or none. Without a joint map: an STS3215
+    of id 1."""
+    gains: str | None = None
+    """With --load: P gains at which everything is recorded, such as 8,16,32. The servo's own is
+    set back at the end."""
     playback: Path | None = None
     """Play the commands of this recording or command file instead."""
     loops: int = 1
@@ -60,12 +88,13 @@ class Sweep:
     own beside the first, named _2, _3, …"""
     most_seconds: float = 180.0
     """With --until: longest recorded time of a joint [s], all rounds together."""
-    amplitude: float = 0.3
-    """Largest excursion from the start pose [rad]; less where the speed limit asks for it."""
+    amplitude: float | None = None
+    """Largest excursion from the start pose [rad], by default 0.3; less where the speed limit asks
+    for it. On a bench by default 0.5, strokes 0.3, lifts 1.4."""
     duration: float | None = None
     """Length of each trial [s]; by default 5 s or five periods, whichever is longer."""
-    rate: float = round(1 / LOOP_PERIOD_S, 2)
-    """Control loop [Hz]."""
+    rate: float | None = None
+    """Control loop [Hz]; by default 52.63, on a bench 100."""
     out: Path | None = None
     """File to write; by default recordings/<kind>_<date>_<time>.csv."""
     resume: Path | None = None
@@ -93,7 +122,7 @@ class Sweep:
             request, whole = dict(metadata["sweep"]), "completed" in metadata
         else:
             request, whole = self._request(), False
-            name = "playback" if self.playback else "plan" if self.plan else self.kind
+            name = "playback" if self.playback else "plan" if self.plan else request["kind"]
             path = self.out or FOLDER / f"{name}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
             if path.suffix != ".csv":
                 raise InputError(f"--out {path}: a recording is a .csv file.")
@@ -142,29 +171,37 @@ class Sweep:
             ):
                 record(
                     bus, chosen, path, loop_period_s=request["loop_period_s"],
-                    metadata={"seed": request["seed"], "sweep": request, "priority": priority},
+                    metadata={"seed": request["seed"], "sweep": request, "priority": priority}
+                    | loads_of(request),
                     force=self.force, resume=point, progress=advance,
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
+            _say_what_stays(bus)
             if path.exists() and (point or not existed or self.force):
                 say_how_to_resume(path)
             raise
+        _say_what_stays(bus)
         terminal.warn(_guard_warnings(path))
         written = [path]
+        bus = bus.bus if isinstance(bus, GuardedBus) else bus
         if self.truth and isinstance(bus, EmulatedBus):
             written += bus.write_truth(path.with_suffix(""), self.force)
         return chosen, written
 
     def _request(self) -> dict[str, Any]:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
-        terminal.need_positive("--rate", self.rate)
+        rate = self.rate
+        if rate is None:
+            rate = BENCH_RATE_HZ if self.load else round(1 / LOOP_PERIOD_S, 2)
+        terminal.need_positive("--rate", rate)
         terminal.need_positive("--most-seconds", self.most_seconds)
         bus = bus_name(self.bus)
         if self.loops < 1:
             raise InputError(f"--loops is {self.loops}; it must be at least 1.")
         if self.real_time and bus != EMULATED:
             raise InputError("--real-time: a real bus always runs in real time; leave it out.")
-        loop_period_s = 1.0 / self.rate
+        loop_period_s = 1.0 / rate
+        self._refuse_bench_options()
         if self.plan is None:
             joints = select_joints(self.joints, self._joints_there())
         else:
@@ -175,22 +212,56 @@ class Sweep:
             proposal = load_plan(self.plan)
             joints = select_joints(self.joints, proposal.joints)
             loop_period_s = proposal.loop_period_s
+        if self.load is not None and len(joints) > 1:
+            raise InputError(
+                f"--load: a bench is one servo, and {len(joints)} were chosen; name it with "
+                "--joints."
+            )
         return {
             "bus": bus,
-            "joint_map": self.joint_map,
+            "joint_map": self._map(),
             "real_time": self.real_time,
             "seed": self.seed,
             "loop_period_s": loop_period_s,
-            "kind": self.kind,
+            "kind": self.kind or ("sine" if self.load is None else BENCH),
             "joints": joints,
-            "frequencies_hz": parse_frequencies(self.freqs),
-            "amplitude_rad": self.amplitude,
+            "frequencies_hz": self._frequencies(),
+            "amplitude_rad": self.amplitude or (None if self.load else 0.3),
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
             "loops": self.loops,
             "plan": str(self.plan) if self.plan else None,
+            "load": self.load,
+            "gains": parse_gains(self.gains) if self.gains else [],
             "until": self._series(joints) if self.until else None,
         }
+
+    def _frequencies(self) -> list[float]:
+        if self.freqs is None and self.load is not None:
+            return list(FREQUENCIES_HZ)
+        return parse_frequencies("1-10" if self.freqs is None else self.freqs)
+
+    def _refuse_bench_options(self) -> None:
+        """Gains, drops and strokes are for a bench, and a bench has no plan or playback."""
+        if self.load is None:
+            alone = "--gains" if self.gains else f"--kind {self.kind}"
+            if self.gains or self.kind in BENCH_KINDS:
+                raise InputError(
+                    f"{alone} is for one servo on a bench, not for a robot's legs: add --load "
+                    "pendulum:0.1kg@0.10m, or --load none for a servo in free air."
+                )
+            return
+        parse_load(self.load)
+        other = next((n for n in ("plan", "playback", "until") if getattr(self, n)), None)
+        if other:
+            raise InputError(f"--load and --{other}: give one of the two.")
+
+    def _map(self) -> str | None:
+        """The joint map that is named; of a bench, the preset unless there is one in the folder."""
+        if self.load is None or self.joint_map is not None:
+            return self.joint_map
+        there = JOINTS_FILE.exists() and bus_name(self.bus) != EMULATED
+        return None if there else BENCH_MAP
 
     def _series(self, joints: list[str]) -> dict[str, Any]:
         """What the recordings of a sweep with `until` have in common, and the number of this."""
@@ -208,7 +279,7 @@ class Sweep:
     def _joints_there(self) -> tuple[str, ...]:
         """Joints to choose from: those of the joint map that is named or is in this folder."""
         here = JOINTS_FILE if bus_name(self.bus) != EMULATED and JOINTS_FILE.exists() else None
-        chosen = self.joint_map or here
+        chosen = self._map() or here
         return load_joint_map(chosen).joint_names if chosen else JOINT_NAMES
 
     def _print(self, joints: list[str], chosen: Plan, written: list[Path], elapsed: float) -> None:
@@ -245,8 +316,21 @@ def say_how_to_resume(path: Path) -> None:
     )
 
 
+def _say_what_stays(bus: ServoBus) -> None:
+    """Warn of registers that could not be set back."""
+    if isinstance(bus, GuardedBus):
+        terminal.warn(
+            f"{joint}: its register {name} could not be set back to {value}. Switch the servo's "
+            f"power off and on; if `scan` still shows another value, write {value} yourself."
+            for joint, own in bus.registers.found.items()
+            for name, value in own.items()
+        )
+
+
 def _open(request: dict[str, Any]) -> ServoBus:
     """The bus that a request names."""
+    if request.get("load"):
+        return open_bench(request)
     if request["bus"] == EMULATED:
         from pupper_sysid.sim.emulator.bus import EmulatedBus
         from pupper_sysid.sim.emulator.robot import directly_read, draw_robot
@@ -277,6 +361,8 @@ def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
     free = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
     margin = dict(zip(bus.joint_names, map(float, free), strict=True))
     speed_limit = bus.metadata["speed_limit_rad_s"]
+    if request.get("load"):
+        return plan_of_bench(request, bus)
     if request.get("plan"):
         from pupper_sysid.sysid.plan.plan_file import executable, load_plan
 

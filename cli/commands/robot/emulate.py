@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -26,8 +27,16 @@ from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
+from pupper_sysid.sim.emulator.pendulum_bench import (
+    BENCH_MAP,
+    BenchSpec,
+    Pendulum,
+    PendulumBench,
+    draw_bench,
+)
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sysid.sweep.bench import parse_load
 
 
 @dataclass(frozen=True)
@@ -82,6 +91,11 @@ class Feetech(Common):
 
     model: Literal["sts3215", "scs0009"] = "sts3215"
     """Which servos."""
+    load: str | None = None
+    """A bench instead of a robot: one STS3215 that swings a pendulum, such as
+    pendulum:0.1kg@0.10m, or bare (none). Its registers act on the motion."""
+    backlash: float = 0.0
+    """With --load: play of its gears [degrees]."""
     joint_map: str | None = None
     """Joint map of another robot, such as `init-robot` writes."""
     ids: str = "all"
@@ -100,16 +114,35 @@ class Feetech(Common):
         rng = np.random.default_rng(self.seed)
         series = STS3215 if self.model == "sts3215" else SCS0009
         preset = "sts3215" if series is STS3215 else "mini_pupper_2_direct"
+        if self.load:
+            preset = BENCH_MAP
+            if series is not STS3215 or self.walking:
+                raise InputError(
+                    "--load is a bench with one STS3215: leave out --model, --walking."
+                )
+        elif self.backlash:
+            raise InputError("--backlash is of a bench: give --load, too, or --load none.")
         layout = load_joint_map(self.joint_map or preset)
         if self.joint_map and self.walking:
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
         baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
         if baud not in BAUD_RATES:
             raise InputError(f"--baud {baud}: choose {', '.join(map(str, BAUD_RATES))}.")
-        # read directly, a servo answers with its present position: no polls, none lost
-        spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
-        robot = draw_robot(rng, spec, layout if self.joint_map else None)
-        bench = _bench(self, robot, layout, rng)
+        load = None
+        if self.load:
+            load = parse_load(self.load)
+            loaded = draw_bench(
+                rng, Pendulum(**(load.model_dump() if load else {})),
+                BenchSpec(backlash_rad=math.radians(self.backlash)), layout,
+            )  # fmt: skip
+            plant = PendulumBench(loaded)
+            own = rng.spawn(1)[0]
+            bench = ServoBench(loaded, layout, own, self.by_hand, keep_log=False, plant=plant)
+        else:
+            # read directly, a servo answers with its present position: no polls, none lost
+            spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
+            robot = draw_robot(rng, spec, layout if self.joint_map else None)
+            bench = _bench(self, robot, layout, rng)
         emulator = FeetechEmulator(
             bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
             BusFaults.parse(self.faults, rng), self.echo,
@@ -122,7 +155,16 @@ class Feetech(Common):
             _write_truth(self, bench)
             what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
             what += f"; IMU at {self.imu_socket}." if self.imu_socket else "."
-            _serve(server, what, f"feetech:{server.device}", self.walking, self.joint_map)
+            bus = f"feetech:{server.device}"
+            if self.load:
+                shown = " --joint-map " + self.joint_map if self.joint_map else ""
+                kind = " --gains 8,16,32" if load else " --kind reversal"
+                _serve_with(
+                    server, f"{what} Load: {self.load}.",
+                    f"  pupper-sysid sweep --load {self.load}{kind}{shown} --bus {bus}\n",
+                )  # fmt: skip
+            else:
+                _serve(server, what, bus, self.walking, self.joint_map)
 
 
 Emulate = (
@@ -180,14 +222,16 @@ def _serve(
     walking: bool,
     own_map: str | None = None,
 ) -> None:
-    terminal.out.print(what, soft_wrap=True)
     which, bus = ("", f"{name} --joint-map {own_map}") if own_map else (" --joints LF", name)
     # a sweep is for legs in free air
     sweep = "" if walking else f"  pupper-sysid sweep --freqs 1-10{which} --bus {bus}\n"
-    terminal.out.print(
-        f"In another terminal:\n{sweep}  pupper-sysid monitor --bus {bus}\nCtrl-C ends it.",
-        soft_wrap=True,
-    )
+    _serve_with(server, what, f"{sweep}  pupper-sysid monitor --bus {bus}\n")
+
+
+def _serve_with(server: ProxySocket | FeetechPty, what: str, commands: str) -> None:
+    """Serve until Ctrl-C; `commands` are what to type elsewhere."""
+    terminal.out.print(what, soft_wrap=True)
+    terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.", soft_wrap=True)
     with real_time_priority():  # bytes that come late would look like a slow servo
         server.serve()
 
