@@ -87,11 +87,7 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
         lines.append(f"{shown:{group_width}}{word:{width}}{summary}")
         last = group
     return "\n".join(
-        [
-            *lines,
-            "",
-            "COMMAND --help lists options; --install-completion sets up the shell.",
-        ]
+        [*lines, "COMMAND --help lists options; --install-completion sets up the shell."]
     )
 
 

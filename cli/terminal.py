@@ -23,7 +23,7 @@ from rich.text import Text
 
 from pupper_sysid.cli.flags import spell
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import select_joints
+from pupper_sysid.common.joints import select_joints, share_sentences
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet
@@ -52,16 +52,23 @@ err = _PlainConsole(stderr=True, highlight=False, markup=False)
 
 
 def load_all(paths: Sequence[Path]) -> list[Recording]:
-    """Read `paths`, or the newest recording in `recordings/`, and show the warnings."""
+    """Read `paths`, or the newest recording in `recordings/`, and show the warnings.
+
+    A folder that is no log itself stands for all logs in it.
+    """
     from pupper_sysid.sysid.recordings.files import load, newest_recording
+    from pupper_sysid.sysid.recordings.importers.recognise import logs_in
 
     chosen = list(paths)
     if not chosen:
         chosen = [newest_recording()]
         err.print(f"Taking the newest recording, {chosen[0]}.", soft_wrap=True)
-    recordings = [load(path) for path in chosen]
+    recordings = [load(log) for path in chosen for log in logs_in(path)]
+    by_name: dict[str, tuple[str, ...]] = {}
     for recording in recordings:
-        warn(f"{recording.name}: {text}" for text in recording.warnings)
+        by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)
+    for names, text in share_sentences(by_name):
+        warn([f"{'all logs' if names == 'All joints' else names}: {text}"])
     return recordings
 
 

@@ -11,9 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from pupper_sysid.cli.dispatch import Command, run_command
 
-DESCRIPTION = """Measure a cheap servo and get a simulator that moves like it. Try it without a
-robot: `pupper-sysid sweep --freqs 1-10`, then `delay`, `calibrate`, `report`.
-"""
+DESCRIPTION = "Measure a cheap servo. Without a robot: `sweep`, `calibrate`, `report`."
 _SUMMARIES = {
     "robot": {
         "init-robot": "Begin a joint map for another robot.",
@@ -24,6 +22,7 @@ _SUMMARIES = {
     },
     "recording": {
         "sweep": "Move joints in tones or steps and record them.",
+        "import": "Turn another project's log into a recording.",
         "doctor": "Check whether a recording is usable.",
         "delay": "Split the lag into bus, sensor and servo.",
         "bode": "Measure the frequency response.",
@@ -42,12 +41,13 @@ _SUMMARIES = {
     },
 }
 _HOLD_BUS = {"scan", "monitor", "calibrate-joints", "emulate", "sweep"}
+_MODULES = {"import": "import_log"}  # a module cannot be called `import`
 # `fit-servo` of the group `model` is the class FitServo in commands/model/fit_servo.py
 COMMANDS = {
     word: Command(
         group,
         summary,
-        f"{group}.{word.replace('-', '_')}:{word.title().replace('-', '')}",
+        f"{group}.{_MODULES.get(word, word.replace('-', '_'))}:{word.title().replace('-', '')}",
         word in _HOLD_BUS,
     )
     for group, summaries in _SUMMARIES.items()

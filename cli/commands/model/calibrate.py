@@ -60,10 +60,11 @@ class Calibrate:
     def run(self) -> None:
         """Calibrate, print, write."""
         from pupper_sysid.sysid.identify.calibrate import calibrate
+        from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
 
         started = time.perf_counter()
         terminal.need_positive("--stall-torque", self.stall_torque)
-        if len(self.recordings) == 1 and self.recordings[0].is_dir():
+        if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
             self._fleet(self.recordings[0], started)
             return
         if self.cluster:

@@ -84,10 +84,11 @@ class FitServo:
     def run(self) -> None:
         """Fit, score, save, print."""
         from pupper_sysid.servo_models.servo_file import CONTRACT
+        from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
         from pupper_sysid.sysid.servo_fit.fit import fit_servo
 
         split = self._split()
-        if len(self.recordings) == 1 and self.recordings[0].is_dir():
+        if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
             self._fleet(self.recordings[0], split)
             return
         if self.cluster:

@@ -19,8 +19,8 @@ class Doctor:
     Example: pupper-sysid doctor recordings/sweep.csv
     """
 
-    recording: tyro.conf.Positional[Path | None] = None
-    """Recording to examine; by default the newest in recordings/."""
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings to examine, pooled per joint; by default the newest in recordings/."""
     json: bool = False
     """Print one JSON object and nothing else."""
     seed: int = 0
@@ -30,13 +30,14 @@ class Doctor:
         """Examine and print."""
         from pupper_sysid.sysid.doctor.examination import examine
 
-        (recording,) = terminal.load_all([self.recording] if self.recording else [])
-        found = examine(recording, seed=self.seed)
+        recordings = terminal.load_all(self.recordings)
+        found = examine(recordings, seed=self.seed)
         if self.json:
             terminal.print_json(found)
             return
+        title = found.recording if len(recordings) < 4 else f"{len(recordings)} recordings"
         shown = terminal.table(
-            recording.name, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
+            title, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
             "loss", "step mrad", "reading − command mrad",
         )  # fmt: skip
         for name, j in found.items():

@@ -48,12 +48,16 @@ def logs_in(path: Path) -> list[Path]:
     return found
 
 
-def holds_other_logs(folder: Path) -> bool:
-    """Whether a folder is another project's log or holds some, rather than recordings as CSV."""
-    if is_log_folder(folder):
-        return True
-    return any(is_log_folder(p) or (_may_be_log(p) and p.suffix != ".csv")
-               for p in folder.iterdir())  # fmt: skip
+def is_fleet(path: Path) -> bool:
+    """Whether a path is a folder of this project's recordings, each of a robot of its own.
+
+    A folder that is another project's log, or holds some, is one robot.
+    """
+    if not path.is_dir() or is_log_folder(path):
+        return False
+    return not any(
+        is_log_folder(p) or (_may_be_log(p) and p.suffix != ".csv") for p in path.iterdir()
+    )
 
 
 def _may_be_log(path: Path) -> bool:

@@ -1,0 +1,101 @@
+"""`import`: another project's log as a recording of this one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.files import refuse_overwrite
+
+
+@dataclass(frozen=True)
+class Import:
+    """Turn another project's log into a recording file, and say what was assumed.
+
+    The layout is found by content: LeRobot dataset, SAGE folder, BAM or ktune JSON, MCAP, rosbag2,
+    NumPy archive, parquet, or a table (CSV) with any joint names. Other commands read such logs
+    directly; import them to name columns, units or joints, or to look at the rows.
+
+    Example: pupper-sysid import arm.csv --time t_ms --command 'goal.{joint}' --position
+    'present.{joint}' --unit deg --read-before-send
+    """
+
+    log: tyro.conf.Positional[Path]
+    """File or folder."""
+    out: Path | None = None
+    """Recording to write; by default the log's name and .csv, in this folder."""
+    time: str | None = None
+    """Column of the time."""
+    command: str | None = None
+    """Columns of commands, {joint} for the joint's name: action.{joint}. ROS: the topic."""
+    position: str | None = None
+    """Columns of positions: observation.state.{joint}. ROS: the topic."""
+    trial: str | None = None
+    """Column that numbers trials or episodes."""
+    joints: str | None = None
+    """Joints to read, with commas, by the log's names: a,b; by default all."""
+    unit: str | None = None
+    """Of angles: rad, deg, counts:4096 (of a turn), percent:3.5 (rad that −100 … 100 span) or
+    scale:0.01 (rad per unit)."""
+    read_before_send: bool = False
+    """A turn reads the position before it sends the command."""
+    stamp: Literal["start", "middle", "end"] | None = None
+    """Where in a turn (a command sent, a position read) its time stamp was taken."""
+    mapping: Path | None = None
+    """YAML file with these options as keys, new names and units of joints; see docs/formats.md."""
+    force: bool = False
+    """Replace the recording if it exists."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Read, check, write."""
+        from pupper_sysid.sysid.recordings.files import load
+        from pupper_sysid.sysid.recordings.importers.options import (
+            LogOptions,
+            merged,
+            read_mapping,
+        )
+
+        out = self.out or Path(f"{self.log.resolve().stem}.csv")
+        refuse_overwrite(out, self.force)
+        options = LogOptions(
+            self.time, self.command, self.position, self.trial,
+            {name.strip(): name.strip() for name in (self.joints or "").split(",") if name.strip()},
+            self.unit, {}, self.read_before_send or None, self.stamp,
+        )  # fmt: skip
+        if self.mapping:
+            options = merged(options, read_mapping(self.mapping))
+        recording = load(self.log, options)
+        recording.save(out, self.force)
+        terminal.warn(recording.warnings)
+        layout = recording.metadata.get("imported_from", "recording of this project")
+        if self.json:
+            terminal.print_json(
+                {
+                    "written": str(out),
+                    "imported_from": layout,
+                    "joints": recording.joints,
+                    "rows": len(recording.table),
+                    "loop_period_s": recording.loop_period_s,
+                    "warnings": list(recording.warnings),
+                }
+            )
+            return
+        shown = terminal.table(f"{self.log}: {layout}", "joint", "trials", "rows", "s",
+                               "command rad", "position rad")  # fmt: skip
+        for joint in recording.joints:
+            trials = recording.trials(joint)
+            rows = recording.table[recording.table["joint"] == joint]
+            shown.add_row(
+                joint, str(len(trials)), str(len(rows)),
+                terminal.number(sum(float(t.send_time_s[-1] - t.send_time_s[0]) for t in trials)),
+                *(f"{rows[c].min():.2f} … {rows[c].max():.2f}"
+                  for c in ("command_rad", "position_rad")),
+            )  # fmt: skip
+        terminal.out.print(shown)
+        terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}", soft_wrap=True)
