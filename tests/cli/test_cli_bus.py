@@ -55,7 +55,8 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     bus = recording.metadata["bus"]
     assert recording.joints == ["LF_thigh"] and bus["baud"] == 1_000_000
     assert recording.trials("LF_thigh")[0].readings == "live"
-    assert bus["servos"]["LF_thigh"]["p"] == 32 and bus["servos"]["LF_thigh"]["return_delay"] == 250
+    servo = recording.trials("LF_thigh")[0].servo
+    assert servo.p_gain == 32 and servo.registers["return_delay"] == 250
     assert recording.metadata["completed"]["guard"]["clipped"] == 0
     doubt = recording.trials("LF_thigh")[0].read_time_doubt_s
     # half of a turn with a return delay of 500 µs, and what this host adds
