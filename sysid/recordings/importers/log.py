@@ -88,12 +88,17 @@ def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
         raise InputError(f"{path} has {len(given)} joints; at most {MOST_JOINTS} are read.")
     found = []
     for name in given:
-        text = re.sub(r"[^A-Za-z0-9]+", "_", _ENDINGS.sub("", str(name).strip())).strip("_")
+        text = re.sub(r"[^A-Za-z0-9]+", "_", bare_name(str(name))).strip("_")
         found.append((text if text[:1].isalpha() else f"joint_{text}".rstrip("_"))[:64])
     twice = [n for n in found if found.count(n) > 1]
     if twice:
         raise InputError(f"{path}: two joints would be called {twice[0]}. Rename one of them.")
     return found
+
+
+def bare_name(name: str) -> str:
+    """A joint's name without the word position behind it: `gripper.pos` is `gripper`."""
+    return _ENDINGS.sub("", name.strip()) or name
 
 
 def numbers(

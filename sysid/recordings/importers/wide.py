@@ -28,6 +28,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     MOST_CELLS,
     MOST_COLUMNS,
     Log,
+    bare_name,
     joint_names,
     rows,
 )
@@ -42,12 +43,16 @@ COMMANDS = (
     "command", "commands", "cmd", "commanded", "commanded_position", "position_command",
     "action", "actions", "goal", "goals", "goal_position", "goal_positions", "target", "targets",
     "target_position", "desired", "desired_position", "setpoint", "set_point", "reference", "ref",
-    "q_des", "q_cmd", "q_target", "ctrl",
+    "q_des", "q_cmd", "q_target", "ctrl", "goal_pos", "target_pos", "command_pos", "cmd_pos",
+    "desired_pos", "des_pos", "pos_goal", "pos_target", "pos_command", "pos_cmd", "pos_desired",
+    "pos_des", "position_target", "position_goal", "position_desired", "q_ref", "q_d",
 )  # fmt: skip
 POSITIONS = (
     "position", "positions", "observation.state", "observation", "obs", "state", "actual",
     "actual_position", "measured", "measured_position", "present_position", "present", "reading",
     "feedback", "pos", "qpos", "q", "joint_pos", "joint_position", "joint_positions", "angle",
+    "actual_pos", "measured_pos", "present_pos", "current_pos", "current_position", "meas_pos",
+    "pos_actual", "pos_measured", "pos_present", "position_actual", "position_measured", "q_meas",
 )  # fmt: skip
 _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz")
@@ -182,9 +187,10 @@ def _patterns(words: Sequence[str]) -> list[re.Pattern[str]]:
     for word in sorted(words, key=len, reverse=True):
         text = re.escape(word)
         found += [
+            rf"{text}{_ENDING}",
+            rf"{text}(?P<joint>\d+){_ENDING}",
             rf"(?P<joint>.*\S)[_./:\s-]{text}{_ENDING}",
             rf"{text}[_./:\s\[-]\s*(?P<joint>[^\]]*?[^\]\s_])\]?{_ENDING}",
-            rf"{text}{_ENDING}",
         ]
     return [re.compile(pattern, re.IGNORECASE) for pattern in found]
 
@@ -204,7 +210,7 @@ def _matches(pattern: re.Pattern[str], names: Sequence[str]) -> dict[str, tuple[
         if match:
             groups = match.groupdict()
             others = [g for g in match.groups() if g and g != groups.get("joint")]
-            joint = groups.get("joint") or _SOLE
+            joint = bare_name(groups.get("joint") or _SOLE)
             found.setdefault(joint, (name, others[-1].lower() if others else ""))
     return found
 
