@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import re
 import sqlite3
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -164,8 +165,8 @@ def _mcap(path: Path, data: bytes, warnings: list[str]) -> Iterator[_Raw]:
                 elif isinstance(one, Record) and one.channel_id in channels:
                     topic, kind = channels[one.channel_id]
                     yield topic, kind, one.log_time, one.data
-    except EndOfFile:
-        warnings.append("it was cut short and is used up to there.")
+    except (EndOfFile, struct.error):  # the library unpacks what is left of a record
+        warnings.append("it was cut short, or is damaged, and is used up to there.")
     except (McapError, ValueError, RuntimeError, EOFError) as error:
         said = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise InputError(
