@@ -13,7 +13,7 @@ from pupper_sysid.common.border import read_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
-from pupper_sysid.servo_models.calibration.calibration import PRESETS
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
@@ -79,7 +79,7 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
     None if there is none.
     """
     name = run.actuator if run else policy.contract.actuator
-    if name in (*PRESETS, IDEAL):
+    if name == IDEAL or is_shipped(name):
         return name, True
     wanted, found = policy.contract.actuator_sha256, _near(name, path)
     same = [f for f in found if wanted is None or (f.is_file() and sha256(f) == wanted)]

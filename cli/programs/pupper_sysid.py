@@ -38,6 +38,7 @@ _SUMMARIES = {
     "use": {
         "report": "Write figures and tables as one HTML page.",
         "export": "Convert for MuJoCo, Isaac Lab, Newton, CSV …",
+        "servo": "List, show and compare servo cards.",
     },
 }
 _HOLD_BUS = {"scan", "monitor", "calibrate-joints", "emulate", "sweep"}

@@ -16,7 +16,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
-from importlib import resources
+from importlib import import_module, resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -233,18 +233,29 @@ class Calibration(Part):
         write_text(Path(path), self.to_yaml(), force)
 
 
+def is_shipped(name: Path | str) -> bool:
+    """Whether `name` is a preset's or a shipped servo card's, rather than a file's."""
+    return str(name) in PRESETS or str(name) in _cards().card_names()
+
+
+def _cards() -> Any:
+    """Servo cards, which are made of calibrations and so cannot be imported before them."""
+    return import_module("pupper_sysid.servo_models.cards.files")
+
+
 def utc_now() -> str:
     """The present time in the form of `Calibration.created`."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def load_calibration(path_or_preset: Path | str) -> Calibration:
-    """Read a calibration file, or a preset by its name.
+    """Read a calibration file or servo card, or a preset or shipped card by its name.
 
     Parameters
     ----------
     path_or_preset : Path or str
-        A YAML file, or one of `PRESETS`. A file that is named like a preset is `./paper`.
+        A YAML file, one of `PRESETS`, or a shipped servo card (`cards.files.card_names`). A file
+        that is named like a preset is `./paper`.
 
     Returns
     -------
@@ -269,10 +280,13 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
         folder = resources.files("pupper_sysid.servo_models") / "presets"
         with resources.as_file(folder / f"{path_or_preset}.yaml") as file:
             return _load(file)
+    if _cards().is_card(path_or_preset):
+        return _cards().card_calibration(path_or_preset)
     path = Path(path_or_preset)
     if not path.exists():
         near = difflib.get_close_matches(path.name, PRESETS, n=1)
         hint = f"Did you mean the preset {near[0]}?" if near else f"Presets: {', '.join(PRESETS)}."
+        hint += "" if near else " `pupper-sysid servo list` shows servo cards."
         raise InputError(f"{path} does not exist. Check the name. {hint}")
     return _load(path)
 

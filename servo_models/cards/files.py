@@ -12,7 +12,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
+from pupper_sysid.common.border import read_json, read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.cards.bam import load_bam
@@ -30,11 +30,16 @@ def card_names() -> tuple[str, ...]:
 
 
 def is_card(path: Path | str) -> bool:
-    """Whether this is the name of a shipped card, or a file that states the schema of one."""
+    """Whether this is the name of a shipped card, the file of one, or a parameter file of BAM."""
     if str(path) in card_names():
         return True
     file = Path(path)
-    if file.suffix.lower() not in (".yaml", ".yml") or not file.is_file():
+    if not file.is_file():
+        return False
+    if file.suffix.lower() == ".json":
+        data = read_json(file)
+        return isinstance(data, dict) and {"kt", "R"} <= data.keys()
+    if file.suffix.lower() not in (".yaml", ".yml"):
         return False
     data, _ = read_yaml(file)
     return isinstance(data, dict) and data.get("schema") == SCHEMA

@@ -16,7 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
+from pupper_sysid.servo_models.calibration.calibration import (
+    PRESETS,
+    Calibration,
+    is_shipped,
+    load_calibration,
+)
 from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
     PARAMETER_KEYS,
@@ -219,16 +224,16 @@ def servo_model_of(actuator: str | Path, control_step_s: float) -> JointArrays |
 
 
 def check_actuator(actuator: str) -> None:
-    """Refuse what is neither a preset, nor `ideal`, nor something that exists.
+    """Refuse what is neither a preset, nor a shipped card, nor `ideal`, nor something that exists.
 
     Raises
     ------
     InputError
         If it is none of them.
     """
-    if actuator not in (*PRESETS, IDEAL) and not Path(actuator).exists():
+    if actuator != IDEAL and not is_shipped(actuator) and not Path(actuator).exists():
         raise InputError(
             f"`actuator` {actuator}: there is no such file. Give a calibration "
-            f"(`pupper-sysid calibrate` writes one), a servo model's folder, or one of "
-            f"{', '.join((*PRESETS, IDEAL))}."
+            f"(`pupper-sysid calibrate` writes one), a servo model's folder, a servo "
+            f"card (`pupper-sysid servo list`), or one of {', '.join((*PRESETS, IDEAL))}."
         )

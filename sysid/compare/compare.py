@@ -20,7 +20,12 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, internal
-from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration, load_calibration
+from pupper_sysid.servo_models.calibration.calibration import (
+    PRESETS,
+    Calibration,
+    is_shipped,
+    load_calibration,
+)
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
 from pupper_sysid.sysid.compare.readings import (
@@ -278,7 +283,7 @@ def _open(given: str | Path | Calibration | ServoFit, data: ServoData) -> _Opene
             band={j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()},
             of_rows=tuple(j for j, mode in contract.readings_counted.items() if mode == "all"),
         )  # fmt: skip
-    if str(given) in PRESETS or path.suffix.lower() in (".yaml", ".yml"):
+    if is_shipped(given) or path.suffix.lower() in (".yaml", ".yml", ".json"):
         return _calibrated(load_calibration(given), f"DelayedPD ({path.name})", data)
     raise InputError(
         f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor one of the "

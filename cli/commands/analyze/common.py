@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -55,7 +56,7 @@ class Analysis(ABC):
 
         from pupper_sysid.common.figure_style import save
 
-        name = type(self).__name__.lower()
+        name = re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()  # the command's word
         if not self.policies:
             raise InputError(f"No policy was named: pupper-analyze {name} runs/<name>.")
         torch.set_num_threads(1)

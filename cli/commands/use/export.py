@@ -20,11 +20,13 @@ _MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
 
 @dataclass(frozen=True)
 class Export:
-    """Write a calibration, a preset, a recording, a servo model or a policy for other programs.
+    """Write a calibration, a servo card, a recording, a servo model or a policy for other programs.
 
     Example: pupper-sysid export calibrated.yaml --to isaaclab --physics-step 0.005
 
     Example: pupper-sysid export calibrated.yaml --to csv --out calibrated.csv
+
+    Example: pupper-sysid export sts3215-bam-m6 --to bam
 
     Example: pupper-sysid export servo/ --to onnx --out servo.onnx
 
@@ -32,11 +34,14 @@ class Export:
     """
 
     source: tyro.conf.Positional[str]
-    """calibrated.yaml, the name of a preset (paper, release), a recording, or the folder of a servo
-    model, a policy or a training run."""
-    to: Literal["csv", "mjcf", "isaaclab", "mjlab", "newton", "json", "onnx", "torchscript"] = "csv"
-    """Format: csv, a tidy table; mjcf, isaaclab, mjlab, newton and json of calibrations, for other
-    simulators; onnx and torchscript of learned servo models and policies."""
+    """calibrated.yaml, the name of a preset (paper, release), a servo card, a recording, or the
+    folder of a servo model, a policy or a training run."""
+    to: Literal[
+        "csv", "mjcf", "isaaclab", "mjlab", "newton", "json", "bam", "onnx", "torchscript"
+    ] = "csv"
+    """Format: csv, a tidy table; mjcf, isaaclab, mjlab, newton and json of calibrations and cards,
+    for other simulators; bam of cards, parameters for BAM; onnx and torchscript of learned servo
+    models and policies."""
     physics_step: float | None = None
     """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf and
     0.005 for the others."""
@@ -51,10 +56,10 @@ class Export:
     def run(self) -> None:
         """Convert and write."""
         from pupper_sysid.cli.policy_choice import is_policy
-        from pupper_sysid.servo_models.calibration.calibration import PRESETS
+        from pupper_sysid.servo_models.calibration.calibration import is_shipped
 
         path = Path(self.source)
-        if self.source not in PRESETS and path.is_dir():
+        if not is_shipped(self.source) and path.is_dir():
             target = self._policy(path) if is_policy(path) else self._servo_model(path)
         else:
             target = self._table(path)
@@ -94,24 +99,33 @@ class Export:
         return target
 
     def _table(self, path: Path) -> Path:
-        from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
+        from pupper_sysid.servo_models.calibration.calibration import (
+            PRESETS,
+            is_shipped,
+            load_calibration,
+        )
+        from pupper_sysid.servo_models.cards.files import is_card
         from pupper_sysid.sysid.export.tidy_csv import to_csv
         from pupper_sysid.sysid.recordings.files import load
 
         if path.name in ("contract.json", "weights.safetensors"):
             raise InputError(f"{self.source} is part of a servo model; give its folder.")
-        kind = path.suffix.lower()
-        if self.source not in PRESETS and kind not in (".yaml", ".yml", ".csv"):
+        kind, card = path.suffix.lower(), is_card(self.source)
+        named = is_shipped(self.source) or card
+        if not named and kind not in (".yaml", ".yml", ".csv"):
             raise InputError(
                 f"{self.source}: neither a calibration (.yaml), nor a recording (.csv), nor the "
-                f"folder of a servo model, nor one of the presets {', '.join(PRESETS)}."
+                "folder of a servo model, nor a servo card (`pupper-sysid servo list`), nor one of "
+                f"the presets {', '.join(PRESETS)}."
             )
+        if self.to == "bam":
+            return self._bam(path, card)
         if self.to in ("onnx", "torchscript"):
             raise InputError(
                 f"{self.source} cannot become {self.to}: only a learned servo model can, a folder "
                 "that `pupper-sysid fit-servo` wrote. Export it with `--to csv`."
             )
-        if self.source in PRESETS or kind != ".csv":
+        if named or kind != ".csv":
             found = load_calibration(self.source)
             if self.to != "csv":
                 return self._simulator(path, found)
@@ -125,6 +139,22 @@ class Export:
             terminal.warn(found.warnings)
         target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
         to_csv(found, target, self.force)
+        return target
+
+    def _bam(self, path: Path, card: bool) -> Path:
+        """A servo card as a parameter file of BAM."""
+        from pupper_sysid.servo_models.cards.files import load_card
+        from pupper_sysid.sim.export.bam import not_in_bam, to_bam_json
+
+        if not card:
+            raise InputError(
+                f"{self.source} is no servo card, and BAM needs motor and position loop: give a "
+                "card (`pupper-sysid servo list`)."
+            )
+        found = load_card(self.source)
+        target = self.out or Path(f"{path.name.removesuffix(path.suffix)}_bam.json")
+        write_text(target, to_bam_json(found), self.force)
+        terminal.warn(not_in_bam(found))
         return target
 
     def _simulator(self, path: Path, calibration: Calibration) -> Path:

@@ -1,0 +1,240 @@
+"""`servo`: list, show and compare servo cards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from textwrap import wrap
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
+
+if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.parts import Quantity
+    from pupper_sysid.servo_models.cards.card import ServoCard
+    from pupper_sysid.servo_models.cards.compare import Servo as Compared
+
+_WIDTH = 78
+
+
+@dataclass(frozen=True)
+class List:
+    """List the servo cards of this tool, and what each says.
+
+    Example: pupper-sysid servo list
+    """
+
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Read every card and print a table."""
+        from pupper_sysid.servo_models.cards.files import card_names, load_card
+
+        cards = {name: load_card(name) for name in card_names()}
+        if self.json:
+            terminal.print_json({"cards": {n: _summary(c) for n, c in cards.items()}})
+            return
+        table = terminal.table(
+            "Servo cards, as PD in torque", "name", "V", "P", "N·m/rad", "N·m", "kg·m²", "friction",
+            "dead ms",
+        )  # fmt: skip
+        for name, card in cards.items():
+            pd, n = card.pd(), terminal.number
+            table.add_row(
+                name + ("" if card.published else " *"), _plain(card.supply_v),
+                _plain(card.gains.p),
+                n(pd.stiffness_nm_per_rad.value, 1), n(pd.effort_limit_nm.value, 2),
+                n(pd.armature_kg_m2.value, 4), n(pd.friction_loss_nm.value, 3),
+                terminal.ms(pd.dead_time_s.value if pd.dead_time_s else None),
+            )  # fmt: skip
+        terminal.out.print(table)
+        ours = any(not card.published for card in cards.values())
+        terminal.err.print(
+            ("* fitted here, all others cited. " if ours else "All are cited from others. ")
+            + "`pupper-sysid servo show NAME` says where from.",
+            soft_wrap=True,
+        )
+
+
+@dataclass(frozen=True)
+class Show:
+    """Show one servo card: numbers, source, licence, notes.
+
+    Example: pupper-sysid servo show sts3215-bam-m6
+    """
+
+    card: tyro.conf.Positional[str]
+    """Name of a card, a card file, or a parameter file of BAM (.json)."""
+    gain: float | None = None
+    """P gain other than the card's, for the PD in torque."""
+    yaml: bool = False
+    """Print the card's file, and nothing else: a beginning for one of your own."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Read the card and print it."""
+        from pupper_sysid.servo_models.cards.files import load_card
+
+        card = load_card(self.card)
+        if self.gain is not None:
+            terminal.need_positive("--gain", self.gain)
+        if self.yaml:
+            print(card.to_yaml(), end="")
+            return
+        if self.json:
+            terminal.print_json(_summary(card, self.gain) | {"card": card})
+            return
+        for line in _head(card):
+            terminal.out.print(line)
+        for name in card.specimens:
+            terminal.out.print(_numbers(card, name, self.gain))
+        for note in card.notes:
+            for n, line in enumerate(wrap(note, _WIDTH - 2)):
+                terminal.out.print(("- " if n == 0 else "  ") + line)
+
+
+@dataclass(frozen=True)
+class Diff:
+    """Compare two servos number by number: cards, calibrations or presets.
+
+    Example: pupper-sysid servo diff sts3215-bam-m1 calibrated.yaml --joint shoulder_pan
+    """
+
+    first: tyro.conf.Positional[str]
+    """A card's name or file, a parameter file of BAM, a calibration or a preset."""
+    second: tyro.conf.Positional[str]
+    """Another one."""
+    joint: str | None = None
+    """Joint of a calibration, or specimen of a card; by default the first."""
+    gain: float | None = None
+    """P gain at which cards of a position loop are taken, instead of their own."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Read both and print a table."""
+        from pupper_sysid.servo_models.cards.compare import differences, servo_of
+
+        if self.gain is not None:
+            terminal.need_positive("--gain", self.gain)
+        one, other = (servo_of(n, self.joint, self.gain) for n in (self.first, self.second))
+        found = differences(one, other)
+        if self.json:
+            terminal.print_json({"first": one, "second": other, "differences": found})
+            return
+        table = terminal.table("", "", _column(one), _column(other), "ratio")
+        for row in found:
+            table.add_row(
+                f"{row.quantity} [{row.unit}]", _with_interval(row.first),
+                _with_interval(row.second), terminal.number(row.ratio, 2),
+            )  # fmt: skip
+        terminal.out.print(table)
+        for line in wrap(_verdict(found), _WIDTH):
+            terminal.out.print(line)
+
+
+Servo = (
+    Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[Diff, tyro.conf.subcommand("diff")]
+)
+
+
+def _summary(card: ServoCard, gain: float | None = None) -> dict[str, Any]:
+    """What `list --json` says of a card."""
+    return {
+        "servo": card.servo, "supply_v": card.supply_v, "p_gain": card.gains.p,
+        "published": card.published, "source": card.source, "load": card.load,
+        "default": card.default, "pd": {name: card.pd(name, gain) for name in card.specimens},
+    }  # fmt: skip
+
+
+def _head(card: ServoCard) -> list[str]:
+    gains = {g.upper(): v for g, v in card.gains if v is not None}
+    rows: dict[str, str] = {
+        "servo": card.servo + (f" ({card.sku})" if card.sku else ""),
+        "set-up": ", ".join(
+            [f"{_plain(card.supply_v)} V"] * (card.supply_v is not None)
+            + [f"{name} {_plain(value)}" for name, value in gains.items()]
+        )
+        or "not stated",
+        "load": card.load,
+        "numbers": f"cited, read on {card.date}" if card.published else f"fitted on {card.date}",
+        "source": card.source.title,
+        "": card.source.url,
+        " ": card.source.file or "",
+        "  ": f"commit {card.source.commit}" if card.source.commit else "",
+        "licence": card.source.licence,
+        "data": "; ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in card.data),
+        "scores": "; ".join(f"{s.value:.4g} {s.unit}, {s.what}" for s in card.scores),
+    }
+    lines = [card.name]
+    for name, text in rows.items():
+        for n, line in enumerate(wrap(text, _WIDTH - 9, break_on_hyphens=False)):
+            lines.append(f"{name.strip() if n == 0 else '':9}{line}")
+    return lines
+
+
+def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
+    """Table of one specimen: as it is stated, and as a PD in torque."""
+    from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, unit
+
+    numbers, pd = card.specimens[name], card.pd(name, gain)
+    table = terminal.table(f"\n{name}" if len(card.specimens) > 1 else "", "", "value", "unit")
+    shown: Mapping[str, PositionLoop | TorquePD] = {"": pd}
+    if isinstance(numbers, PositionLoop):
+        p = card.gains.p if gain is None else gain
+        shown = {"position loop": numbers, f"as PD in torque, P {_plain(p)}": pd}
+    for title, part in shown.items():
+        if title:
+            table.add_row(title, "", "")
+        for key in type(part).model_fields:
+            value: Any = getattr(part, key)
+            if key != "model" and value is not None:
+                unit_text = unit(key)
+                table.add_row(f"  {_words(key)}", _with_interval(value), unit_text)
+    return table
+
+
+def _words(key: str) -> str:
+    """A field's name without its unit."""
+    from pupper_sysid.common.border import UNIT_OF_SUFFIX
+
+    end = next((e for e in UNIT_OF_SUFFIX if key.endswith(f"_{e}")), "")
+    return key.removesuffix(f"_{end}").replace("_", " ")
+
+
+def _with_interval(quantity: Quantity | None) -> str:
+    if quantity is None:
+        return "–"
+    text = f"{quantity.value:.4g}"
+    if quantity.low is not None and quantity.high is not None:
+        text += f" [{quantity.low:.3g}, {quantity.high:.3g}]"
+    return text
+
+
+def _column(servo: Compared) -> str:
+    return servo.name if servo.part is None else f"{servo.name} {servo.part}"
+
+
+def _plain(value: float | None) -> str:
+    return "–" if value is None else f"{value:g}"
+
+
+def _verdict(found: list[Any]) -> str:
+    """The largest difference in words."""
+    known = [row for row in found if row.ratio is not None]
+    if not known:
+        raise InputError("The two have no number in common.")
+    most = max(known, key=lambda row: row.distance)
+    if most.distance < 0.02:
+        return "They agree within 2 % in every number that both state."
+    return (
+        f"They differ most in {most.quantity}: {most.ratio:.3g} times. Numbers that only one "
+        "states show a dash."
+    )

@@ -1,0 +1,92 @@
+"""`servo list | show | diff`, and cards in the place of calibrations."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from pupper_sysid.cli.programs.pupper_sysid import main
+from pupper_sysid.common.strict_yaml import load
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.cards.files import card_names, load_card
+from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
+
+pytestmark = pytest.mark.usefixtures("narrow")
+
+
+@pytest.fixture
+def narrow(monkeypatch) -> None:
+    """A terminal of 80 columns."""
+    from pupper_sysid.cli import terminal
+
+    monkeypatch.setattr(terminal.out, "width", 80)
+
+
+def lines_of(capsys, *arguments: str) -> list[str]:
+    """What a command prints on stdout."""
+    main(list(arguments))
+    return capsys.readouterr().out.splitlines()
+
+
+def test_the_list_names_every_card_and_fits_the_terminal(capsys):
+    lines = lines_of(capsys, "servo", "list")
+    assert max(map(len, lines)) <= 80
+    assert [line.split()[0] for line in lines[2:]] == list(card_names())
+    main(["servo", "list", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert list(found["cards"]) == list(card_names())
+
+
+@pytest.mark.parametrize("name", card_names())
+def test_every_card_is_shown_with_its_source_within_the_terminal(name, capsys):
+    lines = lines_of(capsys, "servo", "show", name)
+    assert max(map(len, lines)) <= 80
+    text = "".join(line.strip() for line in lines)
+    card = load_card(name)
+    assert (card.source.commit or "") in text and card.source.url in text
+
+
+def test_another_gain_and_the_file_itself(capsys, tmp_path):
+    main(["servo", "show", "sts3215-kscale-m1", "--gain", "16", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["pd"]["servo"]["stiffness_nm_per_rad"] == pytest.approx(23.458 / 2, rel=1e-3)
+    lines = lines_of(capsys, "servo", "show", "sts3215-open-duck", "--yaml")
+    assert load("\n".join(lines))[0]["name"] == "sts3215-open-duck"
+
+
+def test_a_difference_of_two_cards_and_of_a_card_and_a_calibration(capsys):
+    lines = lines_of(capsys, "servo", "diff", "sts3215-kscale-m1", "sts3215-soarm100")
+    assert max(map(len, lines)) <= 80
+    assert any("stiffness" in line and "42.5" in line for line in lines)
+    main(["servo", "diff", "sts3215-bam-m1", "paper", "--joint", "LF_thigh", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["second"]["part"] == "LF_thigh"
+    stiffness = found["differences"][0]
+    assert (stiffness["quantity"] == "stiffness" and stiffness["second"] == 70.0) or (
+        stiffness["second"]["value"] == 70.0
+    )
+
+
+def test_a_card_is_taken_where_a_calibration_is(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    load_card("sts3215-bam-m1").save("mine.yaml")
+    for given in ("sts3215-bam-m1", "mine.yaml"):
+        assert load_calibration(given).joint("elbow").actuator.effort_limit_nm.value > 3
+        check_actuator(given)
+    ranges = servo_ranges("sts3215-bam-m1")
+    assert set(ranges.value["stiffness"]) == {ranges.value["stiffness"][0]}
+    for target in ("mjcf", "isaaclab", "mjlab", "json", "csv"):
+        main(["export", "sts3215-bam-m1", "--to", target, "--out", f"servo.{target}"])
+    assert 'class="servo_servo"' in (tmp_path / "servo.mjcf").read_text()
+
+
+def test_a_card_goes_to_bam_and_comes_back(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(["export", "sts3215-bam-m6", "--to", "bam"])
+    back, there = load_card("sts3215-bam-m6_bam.json").pd(), load_card("sts3215-bam-m6").pd()
+    assert back.stiffness_nm_per_rad.value == pytest.approx(there.stiffness_nm_per_rad.value)
+    main(["export", "sts3215-bam-m6_bam.json", "--to", "mjcf"])
+    with pytest.raises(SystemExit):
+        main(["export", "paper", "--to", "bam"])
+    assert "is no servo card" in capsys.readouterr().err
