@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_CELLS
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
@@ -342,7 +343,7 @@ def _cancelled(
 def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
     if name in TEXT_COLUMNS:
         return [c.strip() for c in cells]
-    values = np.full(len(cells), np.nan)
+    values, shown = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):
         text = cell.strip()
         if text == "":
@@ -351,11 +352,11 @@ def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
             values[k] = float(text)
         except ValueError:
             raise InputError(
-                f"{path}, line {numbers[k]}, column {name}: '{text[:40]}' is not a number. "
-                "Mend the cell, or leave it empty if there was no reading."
+                f"{path}, line {numbers[k]}, column {shown}: '{printable(text[:40])}' is not a "
+                "number. Mend the cell, or leave it empty if there was no reading."
             ) from None
         if np.isinf(values[k]):
-            raise InputError(f"{path}, line {numbers[k]}, column {name}: the value is infinite.")
+            raise InputError(f"{path}, line {numbers[k]}, column {shown}: the value is infinite.")
     return values
 
 

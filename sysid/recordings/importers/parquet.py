@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_CELLS, MOST_COLUMNS, Log
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
@@ -84,20 +85,28 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         raise InputError(
             f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(known)[:300]}."
         )
-    meta = file.metadata
-    chunks = (
-        meta.row_group(g).column(c) for g in range(meta.num_row_groups)
-        for c in range(meta.num_columns)
-    )  # fmt: skip
-    if sum(c.num_values for c in chunks if c.path_in_schema.split(".list.")[0] in names) > (
-        MOST_CELLS
-    ):
+    if _values(path, file, names) > MOST_CELLS:
         raise InputError(f"{path} has more than {MOST_CELLS:,} values. Split the log.")
     try:
         table = file.read(columns=list(names), use_threads=False)
         return {name: _array(path, name, table.column(name)) for name in names}
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
+
+
+def _values(path: Path, file: Any, names: Sequence[str]) -> int:
+    """How many numbers the columns of these names say they have."""
+    meta = file.metadata
+    try:
+        chunks = [
+            meta.row_group(g).column(c)
+            for g in range(meta.num_row_groups)
+            for c in range(meta.num_columns)
+        ]
+        own = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
+        return sum(c.num_values for c in own)
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(f"{path} is a damaged parquet file: {_first(error)}.") from error
 
 
 def _texts(path: Path, data: bytes, names: Sequence[str]) -> dict[str, list[str]]:
@@ -139,4 +148,5 @@ def _lengths(column: Any) -> list[Any]:
 
 
 def _first(error: Exception) -> str:
-    return str(error).splitlines()[0][:200].rstrip(".") if str(error) else type(error).__name__
+    text = printable(str(error).splitlines()[0][:200]) if str(error) else type(error).__name__
+    return text.strip().rstrip(".")

@@ -167,7 +167,7 @@ def _mcap(path: Path, data: bytes, warnings: list[str]) -> Iterator[_Raw]:
                     yield topic, kind, one.log_time, one.data
     except (EndOfFile, struct.error):  # the library unpacks what is left of a record
         warnings.append("it was cut short, or is damaged, and is used up to there.")
-    except (McapError, ValueError, RuntimeError, EOFError) as error:
+    except (McapError, ValueError, RuntimeError, EOFError, OverflowError) as error:
         said = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise InputError(
             f"{path} is a damaged MCAP file: {printable(said)}. Try `mcap recover`."
@@ -302,6 +302,8 @@ def _topics(path: Path, raw: Sequence[_Raw]) -> dict[str, _Topic]:
         if kind not in _KINDS:
             continue
         try:
+            if not 0 <= log_ns < 2**63:
+                raise ValueError("its time in the log is no time")
             message = decode(kind, data)
         except ValueError as error:
             raise InputError(

@@ -24,6 +24,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.held import held_commands
 from pupper_sysid.sysid.recordings.importers.log import (
     MOST_CELLS,
@@ -160,7 +161,7 @@ def _value(
         if not np.all(np.isfinite(found)):
             raise ValueError
     except (ValueError, TypeError, IndexError, RecursionError, OverflowError):
-        cell = cells[at][:40] if at < len(cells) else "nothing"
+        cell = printable(cells[at][:40]) if at < len(cells) else "nothing"
         raise InputError(
             f"{path}, line {line}: '{cell}' where {wanted} belongs. Mend or remove the line."
         ) from None

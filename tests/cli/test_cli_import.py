@@ -1,0 +1,103 @@
+"""`import` and the commands that take logs of other projects directly."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
+from support.command_line import refused, run
+from support.real_recordings import real_folder
+
+TIME = 0.02 * np.arange(200)
+
+
+@pytest.fixture
+def arm(tmp_path, monkeypatch):
+    """A log in degrees, with columns of its own."""
+    monkeypatch.chdir(tmp_path)
+    wave = np.rad2deg(0.4 * np.sin(2 * np.pi * TIME))
+    late = np.rad2deg(0.4 * np.sin(2 * np.pi * (TIME - 0.06)))
+    columns = {"t_ms": 1e3 * TIME}
+    for joint in ("pan", "tilt"):
+        columns |= {f"u {joint}": wave, f"y {joint}": late}
+    pd.DataFrame(columns).to_csv(tmp_path / "arm.log", index=False)
+    return tmp_path / "arm.log"
+
+
+COLUMNS = ("--time", "t_ms", "--command", "u {joint}", "--position", "y {joint}", "--unit", "deg")
+
+
+def test_a_log_is_imported_by_its_columns_and_says_what_was_assumed(capsys, arm):
+    code, out, err = run(capsys, "import", arm, *COLUMNS, "--out", "rec.csv")
+    assert code == 0 and "pan" in out and "Wrote rec.csv" in err and "half a turn" in err
+    (trial,) = load("rec.csv").trials("tilt")
+    np.testing.assert_allclose(trial.command_rad, 0.4 * np.sin(2 * np.pi * TIME), atol=1e-9)
+    assert "exists already" in refused(
+        capsys, pupper_sysid, "import", arm, *COLUMNS, "--out", "rec.csv"
+    )
+
+
+def test_joints_order_and_json(capsys, arm):
+    code, out, _ = run(
+        capsys, "import", arm, *COLUMNS, "--joints", "pan", "--read-before-send", "--json"
+    )
+    found = json.loads(out)
+    assert code == 0 and found["joints"] == ["pan"] and found["written"] == "arm.csv"
+    assert found["rows"] == 200 and found["imported_from"] == "table" and not found["warnings"]
+    (trial,) = load("arm.csv").trials("pan")
+    assert (trial.read_time_s < trial.send_time_s).all()
+
+
+def test_a_mapping_file_stands_for_the_options(capsys, arm):
+    (arm.parent / "map.yaml").write_text(
+        "time: t_ms\ncommand: 'u {joint}'\nposition: 'y {joint}'\nunit: deg\n"
+        "joints: {pan: shoulder}\n"
+    )
+    assert run(capsys, "import", arm, "--mapping", "map.yaml")[0] == 0
+    assert load("arm.csv").joints == ["shoulder"]
+
+
+def test_half_a_choice_of_columns_and_useless_options_are_refused(capsys, arm, tmp_path):
+    assert "belong together" in refused(
+        capsys, pupper_sysid, "import", arm, "--command", "u {joint}"
+    )
+    assert "Write rad, deg" in refused(capsys, pupper_sysid, "import", arm, "--unit", "furlong")
+    entries = [{"timestamp": 0.1, "position": 0, "goal_position": 0}]
+    (tmp_path / "bam.json").write_text(json.dumps({"entries": entries}))
+    said = refused(capsys, pupper_sysid, "import", tmp_path / "bam.json", "--unit", "deg")
+    assert "BAM JSON" in said and "--unit" in said
+
+
+def test_doctor_takes_several_logs_and_folders_of_logs(capsys, arm):
+    for name in ("a.csv", "b.csv"):
+        assert run(capsys, "import", arm, *COLUMNS, "--out", f"logs/{name}")[0] == 0
+    for given in (("logs/a.csv", "logs/b.csv"), ("logs",)):
+        code, out, err = run(capsys, "doctor", *given, "--json")
+        assert code == 0, err
+        assert json.loads(out)["recording"] == "a, b"
+
+
+def test_a_folder_of_another_projects_logs_is_one_robot(tmp_path):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "sweep.csv").write_text("")
+    assert is_fleet(tmp_path / "own") and not is_fleet(tmp_path / "own" / "sweep.csv")
+    (tmp_path / "bam").mkdir()
+    (tmp_path / "bam" / "a.json").write_text("{}")
+    assert not is_fleet(tmp_path / "bam")
+
+
+@pytest.mark.parametrize("folder", ["ktune_robstride", "mini_pupper_full_band", "lerobot_so101"])
+def test_folders_of_real_logs_are_examined_without_renaming_anything(capsys, folder):
+    code, out, err = run(capsys, "doctor", real_folder(folder), "--json")
+    assert code == 0, err
+    assert all(j["verdict"] != "do not use" for j in json.loads(out)["joints"].values())
+
+
+def test_a_folder_of_imu_logs_is_answered_in_a_sentence(capsys):
+    assert "IMU" in refused(capsys, pupper_sysid, "doctor", real_folder("mini_pupper_imu"))
