@@ -44,8 +44,8 @@ from pupper_sysid.sysid.compare.readings import (
     with_ages,
 )
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.identify.joint_fit import CandidateFit
 from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.results import CandidateFit
 from pupper_sysid.sysid.identify.simulation import free_run
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording

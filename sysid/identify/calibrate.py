@@ -11,16 +11,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from pupper_sysid.common.children import end_with_parent
 from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult, fit_joint
-from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, each_joint
+from pupper_sysid.sysid.identify.joint_fit import (
+    Presets,
+    StructureFit,
+    conclude,
+    fit_joint,
+    fit_structure,
+)
+from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.identify.search import SIMULATED
+from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, usable_trials
+from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,7 +97,7 @@ def calibrate(
     source : str
         Where the anchor comes from.
     workers : int
-        Processes; joints are independent.
+        Processes. Joints are independent, and so are the two structures of a joint.
     progress : callable, optional
         Called with a joint's name when it is done.
 
@@ -101,7 +111,78 @@ def calibrate(
     InputError
         If a joint has too little motion.
     """
-    work = partial(fit_joint, seed=seed, presets=preset_parameters())
-    fits = each_joint(work, recordings, joints, workers, progress)
+    trials, presets = usable_trials(recordings, joints), preset_parameters()
+    if workers > 1:
+        fits = side_by_side(trials, seed, presets, workers, progress)
+    else:
+        fits = {}
+        for joint, own in trials.items():
+            fits[joint] = fit_joint(joint, own, seed, presets)
+            if progress:
+                progress(joint)
     made = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm, source)
     return CalibrationResult(joints=fits, calibration=made)
+
+
+def side_by_side(
+    trials: dict[str, tuple[Trial, ...]],
+    seed: int,
+    presets: Presets,
+    workers: int,
+    progress: Callable[[str], None] | None,
+) -> dict[str, JointCalibrationResult]:
+    """`fit_joint` of every joint, its stages on several processes, so that none waits long.
+
+    Parameters
+    ----------
+    trials : dict of str to tuple of Trial
+        By joint.
+    seed : int
+    presets : dict
+        As for `fit_joint`.
+    workers : int
+        Processes.
+    progress : callable or None
+        Called with a joint's name when it is done.
+
+    Raises
+    ------
+    InputError
+        If a joint has too little motion; the others are not waited for.
+    """
+    from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+
+    ready: dict[str, PreparedJoint] = {}
+    structures: dict[str, dict[str, StructureFit]] = {joint: {} for joint in trials}
+    found: dict[str, JointCalibrationResult] = {}
+    tasks: dict[Future[Any], tuple[str, str]] = {}
+    with ProcessPoolExecutor(workers, initializer=end_with_parent) as pool:
+
+        def start(joint: str, stage: str, *work: Any) -> None:
+            tasks[pool.submit(*work)] = (joint, stage)
+
+        try:
+            for joint, own in trials.items():
+                start(joint, "preparation", prepare_joint, joint, own, seed)
+            while tasks:
+                for future in wait(tasks, return_when=FIRST_COMPLETED).done:
+                    joint, stage = tasks.pop(future)
+                    made = future.result()
+                    if stage == "preparation":
+                        ready[joint] = made
+                        for name in SIMULATED:
+                            start(joint, name, fit_structure, made, name)
+                    elif stage in SIMULATED:
+                        own = structures[joint]
+                        own[stage] = made
+                        if len(own) == len(SIMULATED):
+                            start(joint, "", conclude, joint, ready[joint], own, presets)
+                    else:
+                        found[joint] = made
+                        if progress:
+                            progress(joint)
+        except BaseException:  # an error, Ctrl-C: leaving the block would wait for the rest
+            for worker in (pool._processes or {}).values():
+                worker.kill()
+            raise
+    return {joint: found[joint] for joint in trials}

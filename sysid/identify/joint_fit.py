@@ -10,16 +10,14 @@ posterior (`sysid.identify.posterior`), over both where the data do not tell the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.common.results import Result, derived, flat, internal
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.models import (
     CANDIDATE_MODELS,
@@ -31,6 +29,12 @@ from pupper_sysid.sysid.identify.noise import command_jitter
 from pupper_sysid.sysid.identify.output_error import Fit
 from pupper_sysid.sysid.identify.posterior import Posterior, posterior
 from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint, refit
+from pupper_sysid.sysid.identify.results import (
+    UNTOLD,
+    CandidateFit,
+    JointCalibrationResult,
+    plausible,
+)
 from pupper_sysid.sysid.identify.scores import Scores, rms, score
 from pupper_sysid.sysid.identify.search import (
     PREFERRED,
@@ -49,9 +53,6 @@ Presets = Mapping[str, Mapping[str, DelayedPDParameters]]
 """Published settings by name, then by joint."""
 
 _PREFERENCE = 1.05
-_TELLING_NATS = 5.0
-"""Difference of the log-likelihoods of two structures that tells them apart."""
-UNTOLD = "the data do not tell a set-point of limited rate from back-EMF"
 _WIDE = 4.0
 _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
@@ -59,115 +60,19 @@ _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CandidateFit(Result):
-    """One candidate model, fitted to one joint.
-
-    Attributes
-    ----------
-    model : str
-        Its name in `sysid.identify.models`.
-    parameters : dict of str to Interval
-        By name, which ends in the unit.
-    undecided : dict of str to str
-        Parameters that the data do not identify, each with the reason.
-    scores : Scores
-    """
-
-    model: str
-    parameters: dict[str, Interval]
-    undecided: dict[str, str]
-    scores: Scores
-
-    @property
-    def values(self) -> dict[str, float]:
-        """The parameters without their intervals."""
-        return {name: p.value for name, p in self.parameters.items()}
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointCalibrationResult(Result):
-    """Calibration of one joint.
-
-    Attributes
-    ----------
-    model : str
-        The candidate with the smallest error on unseen frequencies.
-    simulated_model : str
-        Of `SIMULATED`, the one that calibrations carry.
-    structure_nats : dict of str to float
-        Of those: by how much the log-likelihood of each is below that of the best.
-    command_jitter_s : Interval
-        Standard deviation of the latency of commands that the noise of fast tones amounts to.
-    candidate_models : dict of str to CandidateFit
-        Simplest first.
-    lag : LagBudget
-        With the dead time of DelayedPD.
-    presets : dict of str to Scores
-        Published settings, scored in the same way.
-    warnings : tuple of str
-    trials : tuple of TrialData
-        The readings of the fit.
-    """
-
-    joint: str
-    model: str
-    simulated_model: str
-    structure_nats: dict[str, float]
-    command_jitter_s: Interval
-    candidate_models: dict[str, CandidateFit]
-    lag: LagBudget
-    presets: dict[str, Scores]
-    warnings: tuple[str, ...]
-    trials: tuple[TrialData, ...] = internal()
-
-    @property
-    def delayed_pd(self) -> CandidateFit:
-        """The fit that simulators run: DelayedPD with the speed limit of `simulated_model`."""
-        return self.candidate_models[self.simulated_model]
-
-    @property
-    def rival(self) -> CandidateFit | None:
-        """The other fit that simulators could run, if the data do not tell the two apart."""
-        others = [n for n in plausible(self.structure_nats) if n != self.simulated_model]
-        return self.candidate_models[others[0]] if others else None
-
-    @property
-    def dead_time_s(self) -> Interval:
-        """Dead time [s]; the interval covers every structure that the data allow."""
-        assert self.lag.dead_time_s is not None
-        return self.lag.dead_time_s
-
-    @derived
-    def delay_steps(self) -> tuple[int, int]:
-        """Dead-time interval in whole physics steps, rounded outward."""
-        return whole_steps(self.dead_time_s.low, self.dead_time_s.high, TIME_STEP_S)
-
-    def __str__(self) -> str:
-        scores = self.delayed_pd.scores
-        return (
-            f"DelayedPD with {1e3 * self.dead_time_s.value:.1f} ms dead time, free-run error "
-            f"{1e3 * scores.rmse_fresh_rad:.1f} mrad on fresh readings, "
-            f"{1e3 * scores.rmse_leave_one_frequency_out_rad:.1f} mrad on unseen frequencies"
-        )
-
-    def rows(self) -> list[dict[str, Any]]:
-        """One row per candidate model."""
-        return [
-            {"chosen": name == self.model} | flat(fit.to_dict())
-            for name, fit in self.candidate_models.items()
-        ]
-
-
 def joint_lag(joint: str, trials: tuple[Trial, ...], seed: int = 0) -> LagBudget:
     """Lag budget of one joint, its dead time that of `fit_joint`."""
-    return _fit_simulated(prepare_joint(joint, trials, seed)).lag
+    ready = prepare_joint(joint, trials, seed)
+    return _compared({name: fit_structure(ready, name) for name in SIMULATED}, ready).lag
 
 
 def fit_joint(
     joint: str, trials: tuple[Trial, ...], seed: int = 0, presets: Presets | None = None
 ) -> JointCalibrationResult:
     """Fit every candidate model to one joint and choose.
+
+    `prepare_joint`, `fit_structure` of each of `SIMULATED`, and `conclude` are its stages: the
+    structures can be fitted side by side.
 
     Parameters
     ----------
@@ -185,11 +90,62 @@ def fit_joint(
         If there is too little motion.
     """
     ready = prepare_joint(joint, trials, seed)
-    data, noise = ready.data, ready.noise_rad
-    pd = _fit_simulated(ready)
-    best = dict(pd.fits)
-    fitted = dict(pd.fitted)
-    unseen = [f.scores.rmse_leave_one_frequency_out_rad for f in pd.fitted.values()]
+    structures = {name: fit_structure(ready, name) for name in SIMULATED}
+    return conclude(joint, ready, structures, presets)
+
+
+@dataclass(frozen=True)
+class StructureFit:
+    """One model that simulators run, fitted to one joint.
+
+    Attributes
+    ----------
+    fits : list of Fit
+        To all trials, then without each fold's.
+    drawn : Posterior
+    fitted : CandidateFit
+    """
+
+    fits: list[Fit]
+    drawn: Posterior
+    fitted: CandidateFit
+
+
+def fit_structure(ready: PreparedJoint, name: str) -> StructureFit:
+    """Fit the model `name`, one of `SIMULATED`, and draw its posterior."""
+    data, noise, folds = ready.data, ready.noise_rad, leave_one_out_folds(ready.data)
+    model = candidate_model(name)
+    fits = fit_with_folds(model, data, folds, noise, ready.fit_rng(), {})
+    fits[0] = min(fits[0], ready.first[name], key=lambda f: f.cost)
+    drawn = posterior(model, data, noise, fits[0], ready.fit_rng())
+    again = refit(name, data, noise, replace(fits[0], values=drawn.best))
+    fits[0] = min(fits[0], again, key=lambda f: f.cost)
+    return StructureFit(fits, drawn, _candidate_fit(model, fits, ready, folds, drawn))
+
+
+def conclude(
+    joint: str,
+    ready: PreparedJoint,
+    structures: Mapping[str, StructureFit],
+    presets: Presets | None = None,
+) -> JointCalibrationResult:
+    """Fit the other candidate models, compare all and choose.
+
+    Parameters
+    ----------
+    joint : str
+    ready : PreparedJoint
+    structures : dict of str to StructureFit
+        Of all of `SIMULATED`.
+    presets : dict, optional
+        As for `fit_joint`.
+    """
+    structures = {name: structures[name] for name in SIMULATED}
+    data, noise, folds = ready.data, ready.noise_rad, leave_one_out_folds(ready.data)
+    pd = _compared(structures, ready)
+    best = {name: s.fits for name, s in structures.items()}
+    fitted = {name: s.fitted for name, s in structures.items()}
+    unseen = [f.scores.rmse_leave_one_frequency_out_rad for f in fitted.values()]
     for model in CANDIDATE_MODELS:
         if model.name in best:
             continue
@@ -197,27 +153,21 @@ def fit_joint(
         made = _candidate_fit(model, fits, ready, {})
         # a model that errs more on what it was fitted to cannot be better on unseen tones
         if made.scores.rmse_fresh_rad <= min(unseen):
-            fits = fit_with_folds(model, data, pd.folds, noise, ready.fit_rng(), best)
-            made = _candidate_fit(model, fits, ready, pd.folds)
+            fits = fit_with_folds(model, data, folds, noise, ready.fit_rng(), best)
+            made = _candidate_fit(model, fits, ready, folds)
         best[model.name], fitted[model.name] = fits, made
     fitted = {model.name: fitted[model.name] for model in CANDIDATE_MODELS}
     chosen = _choose(fitted, pd.carried)
-    carried = candidate_model(pd.carried)
-    values = pd.fits[pd.carried][0].values
+    jitter = command_jitter(
+        candidate_model(pd.carried), best[pd.carried][0].values, ready.recorded, data, noise,
+        _date_sd_s(ready.lag.feedback), ready.fit_rng(),
+    )  # fmt: skip
     return JointCalibrationResult(
         joint=joint,
         model=chosen,
         simulated_model=pd.carried,
         structure_nats=pd.nats,
-        command_jitter_s=command_jitter(
-            carried,
-            values,
-            ready.recorded,
-            data,
-            noise,
-            _date_sd_s(ready.lag.feedback),
-            ready.fit_rng(),
-        ),
+        command_jitter_s=jitter,
         candidate_models=fitted,
         lag=pd.lag,
         presets={
@@ -241,49 +191,27 @@ def _date_sd_s(lattice: PollLattice) -> float:
     return max(float(lattice.blur_s / np.sqrt(12)), _POLL_SD_S)
 
 
-def plausible(structure_nats: Mapping[str, float]) -> list[str]:
-    """Structures that the data do not tell from the best."""
-    return [name for name, nats in structure_nats.items() if nats <= _TELLING_NATS]
-
-
 @dataclass(frozen=True)
-class _Simulated:
-    """Fits of the models that simulators run.
+class _Compared:
+    """Comparison of the models that simulators run.
 
     Attributes
     ----------
-    fits : dict of str to list of Fit
-        To all trials, then without each fold's.
-    fitted : dict of str to CandidateFit
     nats : dict of str to float
         By how much the log-likelihood of each is below that of the best.
     carried : str
     lag : LagBudget
         With dead time and offset.
-    folds : dict of float to tuple of bool
     """
 
-    fits: dict[str, list[Fit]]
-    fitted: dict[str, CandidateFit]
     nats: dict[str, float]
     carried: str
     lag: LagBudget
-    folds: dict[float, tuple[bool, ...]] = field(repr=False)
 
 
-def _fit_simulated(ready: PreparedJoint) -> _Simulated:
-    data, noise, folds = ready.data, ready.noise_rad, leave_one_out_folds(ready.data)
-    fits: dict[str, list[Fit]] = {}
-    drawn: dict[str, Posterior] = {}
-    fitted: dict[str, CandidateFit] = {}
-    for name in SIMULATED:
-        model = candidate_model(name)
-        fits[name] = fit_with_folds(model, data, folds, noise, ready.fit_rng(), fits)
-        fits[name][0] = min(fits[name][0], ready.first[name], key=lambda f: f.cost)
-        drawn[name] = posterior(model, data, noise, fits[name][0], ready.fit_rng())
-        again = refit(name, data, noise, replace(fits[name][0], values=drawn[name].best))
-        fits[name][0] = min(fits[name][0], again, key=lambda f: f.cost)
-        fitted[name] = _candidate_fit(model, fits[name], ready, folds, drawn[name])
+def _compared(structures: Mapping[str, StructureFit], ready: PreparedJoint) -> _Compared:
+    drawn = {name: s.drawn for name, s in structures.items()}
+    fitted = {name: s.fitted for name, s in structures.items()}
     # both are counted at the temperature of the better one, or the worse fit would excuse itself
     best = min(drawn, key=lambda name: drawn[name].lowest_cost)
     nats = {
@@ -304,7 +232,7 @@ def _fit_simulated(ready: PreparedJoint) -> _Simulated:
     dead_time = replace(dead_time, low=max(dead_time.low, 0.0))
     offset = fitted[carried].parameters["offset_rad"].value
     lag = ready.lag.with_dead_time(dead_time, offset)
-    return _Simulated(fits, fitted, nats, carried, lag, folds)
+    return _Compared(nats, carried, lag)
 
 
 def _score_preset(parameters: DelayedPDParameters, data: tuple[TrialData, ...]) -> Scores:
@@ -412,7 +340,7 @@ def _choose(fitted: dict[str, CandidateFit], carried: str) -> str:
 
 
 def _warnings(
-    joint: str, fitted: dict[str, CandidateFit], chosen: str, simulated: _Simulated
+    joint: str, fitted: dict[str, CandidateFit], chosen: str, simulated: _Compared
 ) -> list[str]:
     pd = fitted[simulated.carried]
     found = []

@@ -15,7 +15,8 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult, fit_joint
+from pupper_sysid.sysid.identify.joint_fit import fit_joint
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import LARGEST_RAD, Setup
 from pupper_sysid.sysid.plan.planner import JointPlan, PlannedTrial, Prediction, propose
 from pupper_sysid.sysid.plan.servos import (

@@ -11,8 +11,8 @@ from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration, Quantity
-from pupper_sysid.sysid.identify.joint_fit import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
+from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.search import SIMULATED
 from pupper_sysid.sysid.identify.simulation import TrialData
 from pupper_sysid.sysid.lag.lag_budget import LagBudget

@@ -17,7 +17,7 @@ from pathlib import Path
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds
 from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S
 from pupper_sysid.sysid.plan.proposal import Margins, SweepPlan, plan_from_fits, recorded_s

@@ -15,7 +15,7 @@ import numpy as np
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 
 _FEW_FREQUENCIES = 4
 _FAST_HZ = 5.0  # below it a servo of 20 ms dynamics looks like 20 ms more of dead time

@@ -29,7 +29,7 @@ from pupper_sysid.common.figure_style import (
     axes_column,
     styled,
 )
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial

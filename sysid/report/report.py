@@ -17,7 +17,7 @@ from pupper_sysid.common.files import refuse_overwrite, versions
 from pupper_sysid.common.page import Picture, Section, Table, WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import PREFERRED
 from pupper_sysid.sysid.recordings.joints import (
     Joints,

@@ -14,7 +14,7 @@ from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.common.results import flat, plain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
-from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
 MODEL_NAMES = {

@@ -14,7 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.identify.joint_fit import JointCalibrationResult
+    from pupper_sysid.sysid.identify.results import JointCalibrationResult
     from pupper_sysid.sysid.plan.proposal import SweepPlan
     from pupper_sysid.sysid.plan.until import JointOutcome, Outcome
     from pupper_sysid.sysid.recordings.recording import Recording
