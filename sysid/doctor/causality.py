@@ -20,7 +20,10 @@ from pupper_sysid.sysid.feedback.quantisation import quantum
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _LOOSE = 0.25, 0.6  # share of the position's variance that the command explains
-_ECHO_ROWS, _ECHO_STEPS, _ECHO_SHARE = 30, 5.0, 0.99
+_ECHO_ROWS, _ECHO_SHARE = 30, 0.99
+_ECHO_STEPS, _ECHO_PAST_ROWS = 2.0, 5  # half steps that the command moves within so many rows
+_ECHO_OF_ROW = 0.01  # of the command's motion in a row: no servo is as precise in time
+_ECHO_TRAVEL = 8.0  # steps: within fewer any lag looks like an echo
 _DELAYED_STEPS = 10.0  # per row: then a lag that changes by a tenth of a row shows
 _LONGEST_ECHO_S, _MOST_SHIFTS = 0.6, 60
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.5, 0.1
@@ -94,19 +97,28 @@ def _simultaneous(one: Sequence[Trial], other: Sequence[Trial]) -> bool:
 
 
 def _echo(trials: Sequence[Trial], step: float) -> Finding | None:
-    """The position is the command itself, some rows late, to within a quantisation step."""
+    """The position is the command itself, some rows late, to within a quantisation step.
+
+    Nearly all rows must agree to within half a step while the command moves: however coarse the
+    steps, a servo's inertia and friction carry its readings over some of them earlier or later.
+    """
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
-    near = 0.55 * step + 1e-5
-    fast = [_rows_after_motion(t, _ECHO_STEPS * near) for t in trials]
+    moves = np.concatenate([np.abs(np.diff(t.command_rad)) for t in trials])
+    usual = float(np.median(moves[moves > 0])) if (moves > 0).any() else 0.0
+    near = max(0.55 * step + 1e-5, _ECHO_OF_ROW * usual)  # the step may not have been found
+    least = _ECHO_STEPS * near
+    moving = [np.flatnonzero(_recent_travel(t.command_rad) > least) for t in trials]
+    if max(float(np.ptp(t.command_rad)) for t in trials) < _ECHO_TRAVEL * step:
+        return None
     for shift in range(min(round(_LONGEST_ECHO_S / max(loop, 1e-4)), _MOST_SHIFTS) + 1):
-        parts = [
-            t.position_rad[late] - t.command_rad[late - shift]
-            for t, rows in zip(trials, fast, strict=True)
-            if len(late := rows[rows >= shift])
-        ]
+        parts = []
+        for t, rows in zip(trials, moving, strict=True):
+            sent = rows[rows + shift < len(t.position_rad)]
+            parts.append(t.position_rad[sent + shift] - t.command_rad[sent])
         left = np.concatenate([np.zeros(0), *parts])
+        left = left[np.isfinite(left)]
         if len(left) < _ECHO_ROWS:
-            return None
+            break
         middle = 0.5 * float(np.sum(np.quantile(left, (0.01, 0.99))))
         if np.mean(np.abs(left - middle) <= near) >= _ECHO_SHARE:
             late = f"{shift} row{'s' if shift != 1 else ''} late" if shift else "in the same row"
@@ -116,6 +128,12 @@ def _echo(trials: Sequence[Trial], step: float) -> Finding | None:
             )
             return Finding(REFUSE, text)
     return _delayed(trials, near, loop)
+
+
+def _recent_travel(command: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Range of the command over each row and those just before it [rad]."""
+    padded = np.concatenate([np.full(_ECHO_PAST_ROWS, command[0]), command])
+    return np.ptp(np.lib.stride_tricks.sliding_window_view(padded, _ECHO_PAST_ROWS + 1), axis=1)
 
 
 def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | None:

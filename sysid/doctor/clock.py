@@ -24,6 +24,7 @@ _LONG_GAP = 3.0  # loop periods
 _LOST_TIME = 0.25  # share of the recorded time that may lie in gaps
 _DISORDER = 0.1  # share of rows
 _READ_APART_S, _READ_APART_LOOPS = 0.2, 5.0
+_READ_EARLY_LOOPS, _READ_EARLY_S = 1.5, 0.005  # a turn that reads first is one loop early
 _ROWS_PER_PERIOD = 2.2  # with two a tone and its mirror image look alike
 _IS_TONE = 0.5  # of the command's variance; a square wave has 0.81
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
@@ -89,6 +90,12 @@ def _two_clocks(trials: Sequence[Trial], loop: float) -> list[Finding]:
         return [Finding(REFUSE, f"readings are stamped {middle:.3g} s after the commands of their "
                                 "rows: `read_time_s` and `send_time_s` are of two clocks. Stamp "
                                 "both with one monotonic clock.")]  # fmt: skip
+    early = -middle
+    if early > max(_READ_EARLY_S, _READ_EARLY_LOOPS * loop):
+        return [Finding(CARE, f"readings are stamped {1e3 * early:.0f} ms before the commands of "
+                              f"their rows, which is {early / loop:.1f} turns of the loop: lag and "
+                              "dead time come out too short by as much, unless they were read "
+                              "then. Stamp each reading when it arrives.")]  # fmt: skip
     drift = float(np.ptp(np.quantile(apart, (0.02, 0.98))))
     if drift > max(_READ_APART_S, _READ_APART_LOOPS * loop):
         return [Finding(CARE, f"the time from a command to its reading varies by {drift:.3g} s: "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from pupper_sysid.sysid.doctor.checks import cautions, findings, refuse_unusable
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.preparation import prepare_joint
 from support.garbage import GARBAGE, good, spoilt
-from support.made_recordings import JOINT, good_recording, made
+from support.made_recordings import JOINT, USUAL_SERVO, Setup, good_recording, made, record
 
 
 def verdict(recording) -> str:
@@ -48,6 +49,30 @@ def test_good_recordings_of_random_servos_are_for_use():
         recording = good_recording(np.random.default_rng([11, seed]))
         found += [f.verdict for f in findings(recording.trials(JOINT)) if f.verdict != "use"]
     assert found == []  # one in a hundred asks for care: benchmarks/garbage.py
+
+
+@pytest.mark.parametrize(("rate", "step"), [(150.0, 0.0057), (150.0, 0.012), (32.0, 0.0015)])
+def test_an_echo_is_seen_whether_its_steps_are_coarse_or_not_even_found(rate, step):
+    # 0.09 rad at 4 Hz: 15 mrad a row at 150 Hz, so that each row moves by three steps at most
+    setup = Setup(USUAL_SERVO, rate, amplitude_rad=0.09 if rate > 100 else 0.5)
+    rows = record(setup, np.random.default_rng(1)).table.drop(columns="joint")
+    late = rows.groupby("trial")["command_rad"].shift(2).fillna(0.0)
+    assert verdict(made(rows.assign(position_rad=step * np.round(late / step)))) == "do not use"
+    servo = made(rows.assign(position_rad=step * np.round(rows.position_rad / step)))
+    assert verdict(servo) == "use"
+
+
+def test_readings_stamped_rows_before_their_commands_ask_for_care():
+    slow = replace(USUAL_SERVO, dead_time_s=0.237, stiffness=600.0)
+    rows = record(Setup(slow, 50.0), np.random.default_rng(2)).table.drop(columns="joint")
+    assert verdict(made(rows)) == "use"
+    # less than the servo's own lag, so that cause and effect keep their order
+    early = made(rows.assign(read_time_s=rows.read_time_s - 0.15))
+    assert verdict(early) == "use with care"
+    (text,) = cautions(JOINT, early.trials(JOINT))
+    assert "stamped 148 ms before" in text  # each row is read 2 ms after it is sent
+    # a loop that reads first and then sends is one turn early
+    assert verdict(made(rows.assign(read_time_s=rows.read_time_s - 0.02))) == "use"
 
 
 @pytest.mark.parametrize("kind", ["tones", "chirp", "prbs", "teleoperation", "steps"])
