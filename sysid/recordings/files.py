@@ -19,9 +19,9 @@ import numpy as np
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
-from pupper_sysid.sysid.recordings.importers.log import Log
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.recognise import read_content, read_folder
+from pupper_sysid.sysid.recordings.importers.shared.log import Log
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.table import (

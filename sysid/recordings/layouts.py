@@ -23,8 +23,8 @@ import pandas as pd
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.times import PAUSE_S, READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.times import PAUSE_S, READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_columns
 from pupper_sysid.sysid.recordings.importers.wide import Table, read_table
 from pupper_sysid.sysid.recordings.table import REQUIRED_COLUMNS, Parsed, require

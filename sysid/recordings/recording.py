@@ -21,8 +21,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.times import READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.recordings.table import (

@@ -18,7 +18,7 @@ from pupper_sysid.common.border import parse_json, refuse_other_version, validat
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.log import MOST_CELLS
+from pupper_sysid.sysid.recordings.importers.shared.log import MOST_CELLS
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1

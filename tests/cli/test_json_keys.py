@@ -17,6 +17,7 @@ SAMPLE = ROOT / "data/samples/sweep.csv"
 COMMANDS = {
     "sweep": ("--freqs", "4", "--joints", "LF_hip"),
     "plan": (SAMPLE.with_name("calibrated.yaml"), "--joints", "LF_hip"),
+    "import": (SAMPLE,),
     "doctor": (SAMPLE,),
     "delay": (SAMPLE, "--joints", "LF_hip"),
     "bode": (SAMPLE, "--joints", "LF_hip"),

@@ -55,7 +55,7 @@ class Import:
     def run(self) -> None:
         """Read, check, write."""
         from pupper_sysid.sysid.recordings.files import load
-        from pupper_sysid.sysid.recordings.importers.options import (
+        from pupper_sysid.sysid.recordings.importers.shared.options import (
             LogOptions,
             merged,
             read_mapping,

@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.log import Log, joint_names, number, numbers, rows
+from pupper_sysid.sysid.recordings.importers.shared.log import (
+    Log,
+    joint_names,
+    number,
+    numbers,
+    rows,
+)
 
 LAYOUT = "BAM JSON"
 

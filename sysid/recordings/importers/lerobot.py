@@ -1,4 +1,4 @@
-"""LeRobot datasets, v2.1 and v3: folders with `meta/info.json` and `data/**/*.parquet`.
+"""LeRobot datasets, v2.1 and v3: folders with `meta/info.json` and parquet files.
 
 `action` and `observation.state` are lists with a number per joint, named in `meta/info.json`; an
 episode is a trial. A turn of LeRobot's loop reads the state, then takes the action and sends it.
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.border import parse_json
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.log import (
+from pupper_sysid.sysid.recordings.importers.parquet import read_columns
+from pupper_sysid.sysid.recordings.importers.shared.log import (
     MOST_CELLS,
     Log,
     joint_names,
@@ -30,10 +31,9 @@ from pupper_sysid.sysid.recordings.importers.log import (
     rows,
     text_of,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.parquet import read_columns
-from pupper_sysid.sysid.recordings.importers.times import one_after_another
-from pupper_sysid.sysid.recordings.importers.units import COUNT_RAD, smallest_step
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.times import one_after_another
+from pupper_sysid.sysid.recordings.importers.shared.units import COUNT_RAD, smallest_step
 
 LAYOUT = "LeRobot dataset"
 

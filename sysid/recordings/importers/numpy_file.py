@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, MOST_COLUMNS, Log
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, MOST_COLUMNS, Log
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
 
 LAYOUT = "NumPy archive"

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.log import MOST_CELLS, MOST_COLUMNS, Log
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.log import MOST_CELLS, MOST_COLUMNS, Log
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
 
 LAYOUT = "parquet table"

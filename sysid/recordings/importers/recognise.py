@@ -18,8 +18,8 @@ from pupper_sysid.sysid.recordings.importers import (
     ros,
     sage,
 )
-from pupper_sysid.sysid.recordings.importers.log import Log, joint_names, text_of
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.log import Log, joint_names, text_of
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
 _ENDINGS = (".csv", ".json", ".mcap", ".db3", ".npz", ".parquet")

@@ -25,16 +25,6 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.held import held_commands
-from pupper_sysid.sysid.recordings.importers.log import (
-    LARGEST_BYTES,
-    MOST_CELLS,
-    Log,
-    joint_names,
-    read_files,
-    rows,
-)
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.ros_messages import (
     JOINT_STATE,
     MULTI_ARRAY,
@@ -43,6 +33,16 @@ from pupper_sysid.sysid.recordings.importers.ros_messages import (
     decode,
     plain_type,
 )
+from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
+from pupper_sysid.sysid.recordings.importers.shared.log import (
+    LARGEST_BYTES,
+    MOST_CELLS,
+    Log,
+    joint_names,
+    read_files,
+    rows,
+)
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 
 LAYOUT = "ROS 2 log"
 MAGIC = b"\x89MCAP"

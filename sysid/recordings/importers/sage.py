@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.held import held_commands
-from pupper_sysid.sysid.recordings.importers.log import (
+from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
+from pupper_sysid.sysid.recordings.importers.shared.log import (
     MOST_CELLS,
     Log,
     joint_names,
@@ -34,8 +34,8 @@ from pupper_sysid.sysid.recordings.importers.log import (
     rows,
     text_of,
 )
-from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
-from pupper_sysid.sysid.recordings.importers.units import scale_by_step
+from pupper_sysid.sysid.recordings.importers.shared.times import doubt_of_a_turn
+from pupper_sysid.sysid.recordings.importers.shared.units import scale_by_step
 
 LAYOUT = "SAGE folder"
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.log import (
+from pupper_sysid.sysid.recordings.importers.shared.log import (
     MOST_CELLS,
     MOST_COLUMNS,
     Log,
@@ -32,9 +32,9 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.times import one_after_another, seconds, turns
-from pupper_sysid.sysid.recordings.importers.units import Unit, unit
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.times import one_after_another, seconds, turns
+from pupper_sysid.sysid.recordings.importers.shared.units import Unit, unit
 
 LAYOUT = "table"
 

@@ -7,7 +7,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from support.real_recordings import real_folder
 
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -7,8 +7,9 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.importers.options import LogOptions, merged, read_mapping
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.recording import Recording
+from support.package import ROOT
 
 TIME = 0.02 * np.arange(60)
 COMMAND = {"knee": 0.3 * np.sin(TIME), "ankle": 0.2 * np.cos(TIME)}
@@ -242,3 +243,12 @@ def test_two_joints_that_would_be_called_alike_are_refused(tmp_path):
     made.to_csv(tmp_path / "log.csv", index=False)
     with pytest.raises(InputError, match="two joints would be called a_b"):
         load(tmp_path / "log.csv")
+
+
+def test_the_mapping_file_of_the_documentation_is_one(tmp_path):
+    page = (ROOT / "docs/formats.md").read_text()
+    (tmp_path / "arm.yaml").write_text(page.split("```yaml\n# arm.yaml\n")[1].split("```")[0])
+    options = read_mapping(tmp_path / "arm.yaml")
+    assert options.joints == {"shoulder pan": "pan", "6": "gripper"}
+    assert options.unit_of("pan").scale == pytest.approx(np.pi / 180)
+    assert options.unit_of("gripper").scale == pytest.approx(1.9 / 200)

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pupper_sysid.common.border import read_yaml, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.units import Unit, unit
+from pupper_sysid.sysid.recordings.importers.shared.units import Unit, unit
 
 Stamp = Literal["start", "middle", "end"]
 

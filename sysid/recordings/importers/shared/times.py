@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 
 READ_AFTER_SEND_S = 0.0005
 """Time between sending a command and reading the position where a log does not say."""

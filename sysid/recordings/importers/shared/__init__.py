@@ -1,0 +1,1 @@
+"""What importers share: rows and budgets, options, times, units, and held commands."""
