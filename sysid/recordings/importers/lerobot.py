@@ -3,7 +3,7 @@
 `action` and `observation.state` are lists with a number per joint, named in `meta/info.json`; an
 episode is a trial. A turn of LeRobot's loop reads the state, then takes the action and sends it.
 `timestamp` is the frame's number over the rate, so the true times are lost: a command is taken to
-be sent a quarter of a frame after the state was read, and all lags are in doubt by half a frame.
+be sent half a frame after the state was read, and all lags are in doubt by half a frame.
 
 Angles are shares of each joint's calibrated range (−100 … 100, a gripper's 0 … 100) or degrees, and
 the calibration is not in the dataset. Feetech and Dynamixel servos have 4,096 counts a turn, so the
@@ -38,7 +38,7 @@ from pupper_sysid.sysid.recordings.importers.shared.units import COUNT_RAD, smal
 LAYOUT = "LeRobot dataset"
 
 _ACTION, _STATE = "action", "observation.state"
-_SENT_AFTER = 0.25  # of a frame: reading the state and the cameras come before
+_SENT_AFTER = 0.5  # of a frame: it waits for the cameras' next pictures in between
 _NOMINAL_RAD = np.pi  # range of a joint whose readings show no step
 _MOST_FILES = 10_000
 _FEETECH = ("so100", "so101", "lekiwi", "xlerobot")

@@ -82,7 +82,7 @@ def test_times_are_nominal_and_the_lag_is_in_doubt_by_half_a_frame(tmp_path):
     recording = load(dataset(tmp_path))
     first, second = recording.trials("shoulder_pan")
     np.testing.assert_allclose(first.read_time_s, np.arange(60) / 30)
-    np.testing.assert_allclose(first.send_time_s - first.read_time_s, 1 / 120)
+    np.testing.assert_allclose(first.send_time_s - first.read_time_s, 1 / 60)
     assert first.read_time_doubt_s == pytest.approx(1 / 60)
     assert second.read_time_s[0] > first.read_time_s[-1]
     assert any("frame numbers over 30 Hz" in text for text in recording.warnings)
