@@ -14,7 +14,7 @@ _SHOWN = 4000
 
 @styled
 def demand_figure(demand: ServoDemand) -> Figure:
-    """Needed torque over speed, by kind of joint; the line is what the servo has left."""
+    """Needed torque over speed, by kind of joint; the line is what the servo has."""
     figure, axes = axes_column(len(KINDS), 2.3 * len(KINDS))
     for kind, one in zip(KINDS, axes, strict=True):
         names = [name for name in demand.joints if name.endswith(f"_{kind}")]
@@ -25,13 +25,13 @@ def demand_figure(demand: ServoDemand) -> Figure:
         own = demand.joints[names[0]]
         stall, top = own.stall_torque_nm, own.top_speed_rad_s
         end = float(speed.max())
-        if top is None:
-            one.plot([0, end], [stall, stall], color=RED)
-        else:
-            one.plot([0, top, top], [stall, own.torque_at_top_nm, 0.0], color=RED)
+        last = end if top is None else top
+        at_last = stall if top is None else own.torque_at_top_nm
+        # driving the torque left falls with speed, braking it rises by as much
+        one.plot([0, last, last, 0], [stall, at_last, at_last - 2 * stall, -stall], color=RED)
         one.set_title(kind)
         one.set_ylabel("N·m")
     axes[0].plot([], [], color=RED, label=demand.servo)
-    axes[0].legend(loc="upper right")
-    axes[-1].set_xlabel("speed [rad/s]; torque is positive in the direction of motion")
+    axes[0].legend(loc="center right")
+    axes[-1].set_xlabel("speed [rad/s]; torque is positive where it drives")
     return figure

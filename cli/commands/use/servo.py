@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +13,7 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 
 if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.calibration import InputFile
     from pupper_sysid.servo_models.calibration.parts import Quantity
     from pupper_sysid.servo_models.cards.card import ServoCard
     from pupper_sysid.servo_models.cards.compare import Servo as Compared
@@ -170,7 +171,7 @@ def _head(card: ServoCard) -> list[str]:
         " ": card.source.file or "",
         "  ": f"commit {card.source.commit}" if card.source.commit else "",
         "licence": card.source.licence,
-        "data": "; ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in card.data),
+        "data": _files(card.data),
         "scores": "; ".join(f"{s.value:.4g} {s.unit}, {s.what}" for s in card.scores),
     }
     lines = [card.name]
@@ -180,14 +181,20 @@ def _head(card: ServoCard) -> list[str]:
     return lines
 
 
+def _files(data: Sequence[InputFile]) -> str:
+    if len(data) > 4:
+        return f"{len(data)} files, {data[0].name} to {data[-1].name}; hashes with --yaml"
+    return "; ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in data)
+
+
 def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
     """Table of one specimen: as it is stated, and as a PD in torque."""
-    from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, unit
+    from pupper_sysid.servo_models.cards.numbers import TorquePD, unit
 
     numbers, pd = card.specimens[name], card.pd(name, gain)
     table = terminal.table(f"\n{name}" if len(card.specimens) > 1 else "", "", "value", "unit")
-    shown: Mapping[str, PositionLoop | TorquePD] = {"": pd}
-    if isinstance(numbers, PositionLoop):
+    shown: Mapping[str, Any] = {"": pd}
+    if not isinstance(numbers, TorquePD):
         p = card.gains.p if gain is None else gain
         shown = {"position loop": numbers, f"as PD in torque, P {_plain(p)}": pd}
     for title, part in shown.items():
@@ -204,8 +211,12 @@ def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
 def _words(key: str) -> str:
     """A field's name without its unit."""
     from pupper_sysid.common.border import UNIT_OF_SUFFIX
+    from pupper_sysid.servo_models.cards.numbers import unit
 
-    end = next((e for e in UNIT_OF_SUFFIX if key.endswith(f"_{e}")), "")
+    # a name may only look as if it ended in a unit: duty_per_rad is in 1/rad
+    end = next(
+        (e for e, u in UNIT_OF_SUFFIX.items() if key.endswith(f"_{e}") and u == unit(key)), ""
+    )
     return key.removesuffix(f"_{end}").replace("_", " ")
 
 
