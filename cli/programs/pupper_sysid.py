@@ -26,6 +26,7 @@ _SUMMARIES = {
         "doctor": "Check whether a recording is usable.",
         "delay": "Split the lag into bus, sensor and servo.",
         "bode": "Measure the frequency response.",
+        "backlash": "Measure hysteresis, dead zone and play.",
         "plan": "Plan the sweep that narrows the intervals most.",
     },
     "model": {

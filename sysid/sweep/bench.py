@@ -38,9 +38,9 @@ REACH_RAD = 1.6
 LIFT_RAD = 1.4
 LIFT_RAD_S = 0.8
 """Highest speed of a lift."""
-STROKE_RAD = 0.3
-STROKE_SPEEDS_RAD_S = (0.05, 0.1, 0.2)
-STROKES = 4
+STROKE_RAD = 0.25
+STROKE_SPEEDS_RAD_S = (0.04, 0.08, 0.12)
+STROKES = 3
 """Strokes up and down at each speed."""
 NEAREST_START_RAD = 1.0
 """A pendulum that is found farther from its hanging position is not hanging."""

@@ -90,7 +90,7 @@ class Sweep:
     """With --until: longest recorded time of a joint [s], all rounds together."""
     amplitude: float | None = None
     """Largest excursion from the start pose [rad], by default 0.3; less where the speed limit asks
-    for it. On a bench by default 0.5, strokes 0.3, lifts 1.4."""
+    for it. On a bench by default 0.5, strokes 0.25, lifts 1.4."""
     duration: float | None = None
     """Length of each trial [s]; by default 5 s or five periods, whichever is longer."""
     rate: float | None = None
