@@ -16,6 +16,7 @@ from pupper_sysid.sysid.recordings.importers import (
     numpy_file,
     parquet,
     ros,
+    ros_files,
     sage,
 )
 from pupper_sysid.sysid.recordings.importers.shared.log import Log, joint_names, text_of
@@ -96,9 +97,9 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         If the layout is unknown, or its rows cannot be used.
     """
     digest = hashlib.sha256(data).hexdigest()
-    if data.startswith(ros.MAGIC):
+    if data.startswith(ros_files.MAGIC):
         return replace(ros.read_mcap(path, data, options), sha256=digest)
-    if data.startswith(ros.SQLITE):
+    if data.startswith(ros_files.SQLITE):
         return replace(ros.read_sqlite(path, options), sha256=digest)
     if data.startswith(numpy_file.MAGIC):
         return replace(numpy_file.read_npz(path, data, options), sha256=digest)

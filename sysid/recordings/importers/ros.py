@@ -10,14 +10,10 @@ recorder received it. The header's is used where there is one, for it is nearer 
 
 from __future__ import annotations
 
-import io
 import re
-import sqlite3
-import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,17 +21,22 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.ros_files import (
+    Raw,
+    bounded,
+    mcap_messages,
+    sqlite_messages,
+)
 from pupper_sysid.sysid.recordings.importers.ros_messages import (
     JOINT_STATE,
+    KINDS,
     MULTI_ARRAY,
     TRAJECTORY,
     Message,
     decode,
-    plain_type,
 )
 from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
 from pupper_sysid.sysid.recordings.importers.shared.log import (
-    LARGEST_BYTES,
     MOST_CELLS,
     Log,
     joint_names,
@@ -45,16 +46,11 @@ from pupper_sysid.sysid.recordings.importers.shared.log import (
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 
 LAYOUT = "ROS 2 log"
-MAGIC = b"\x89MCAP"
-SQLITE = b"SQLite format 3\0"
 
-_KINDS = (JOINT_STATE, TRAJECTORY, MULTI_ARRAY)
 _COMMANDS = re.compile(r"command|cmd|goal|target|desired|setpoint|reference", re.IGNORECASE)
-_MOST_MESSAGES = 3_000_000
 _SAME_CLOCK_S = 10.0  # header and log differ by more: a header of another clock
+_MANY_LOST = 0.1  # of the commands
 _LOG_TIME_DOUBT_S, _HEADER_DOUBT_S = 0.003, 0.001
-
-_Raw = tuple[str, str, int, bytes]  # topic, type, log time [ns], content
 
 
 @dataclass
@@ -81,13 +77,13 @@ def read_bag(folder: Path, options: LogOptions) -> Log:
     """
     files = _files(folder)
     contents, digest = read_files(folder, files)
-    raw: list[_Raw] = []
+    raw: list[Raw] = []
     warnings: list[str] = []
     for path in files:
         if path.suffix == ".db3":
-            raw += _bounded(path, _sqlite(path))
+            raw += bounded(path, sqlite_messages(path))
         else:
-            raw += _bounded(path, _mcap(path, contents[path], warnings))
+            raw += bounded(path, mcap_messages(path, contents[path], warnings))
     log = _log(folder, raw, options)
     return replace(log, sha256=digest, warnings=[*warnings, *log.warnings])
 
@@ -101,7 +97,7 @@ def read_mcap(path: Path, data: bytes, options: LogOptions) -> Log:
         If it cannot be read, or positions or commands are missing.
     """
     warnings: list[str] = []
-    log = _log(path, _bounded(path, _mcap(path, data, warnings)), options)
+    log = _log(path, bounded(path, mcap_messages(path, data, warnings)), options)
     return replace(log, warnings=[*warnings, *log.warnings])
 
 
@@ -113,139 +109,43 @@ def read_sqlite(path: Path, options: LogOptions) -> Log:
     InputError
         If it cannot be read, or positions or commands are missing.
     """
-    return _log(path, _bounded(path, _sqlite(path)), options)
-
-
-# --------------------------------------------------------------------------------- containers
+    return _log(path, bounded(path, sqlite_messages(path)), options)
 
 
 def _files(folder: Path) -> list[Path]:
+    """A bag's files, in the order of their numbers."""
     return sorted(p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file())
-
-
-def _bounded(path: Path, messages: Iterator[_Raw]) -> list[_Raw]:
-    found: list[_Raw] = []
-    for message in messages:
-        found.append(message)
-        if len(found) > _MOST_MESSAGES:
-            raise InputError(f"{path} has more than {_MOST_MESSAGES:,} messages. Split it.")
-    return found
-
-
-def _mcap(path: Path, data: bytes, warnings: list[str]) -> Iterator[_Raw]:
-    """Messages of the known types in an MCAP file; one that is cut off gives what there is."""
-    try:
-        from mcap.exceptions import EndOfFile, McapError
-        from mcap.records import Channel, Chunk, Schema
-        from mcap.records import Message as Record
-        from mcap.stream_reader import StreamReader, breakup_chunk
-    except ImportError:
-        raise InputError(
-            f"{path} is an MCAP file; reading it needs mcap. Install pupper-sysid[logs]."
-        ) from None
-    schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
-    left = LARGEST_BYTES
-    try:
-        stream = StreamReader(
-            io.BytesIO(data), emit_chunks=True, record_size_limit=int(LARGEST_BYTES)
-        )
-        for record in stream.records:
-            inside: Sequence[Any] = [record]
-            if isinstance(record, Chunk):
-                record.data = _unpacked(path, record.compression, record.data, int(left))
-                record.compression = ""
-                left -= len(record.data)
-                inside = breakup_chunk(record)
-            for one in inside:
-                if isinstance(one, Schema):
-                    schemas[one.id] = plain_type(one.name)
-                elif isinstance(one, Channel):
-                    channels[one.id] = one.topic, schemas.get(one.schema_id, "")
-                elif isinstance(one, Record) and one.channel_id in channels:
-                    topic, kind = channels[one.channel_id]
-                    yield topic, kind, one.log_time, one.data
-    except (EndOfFile, struct.error):  # the library unpacks what is left of a record
-        warnings.append("it was cut short, or is damaged, and is used up to there.")
-    except (McapError, ValueError, RuntimeError, EOFError, OverflowError) as error:
-        said = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise InputError(
-            f"{path} is a damaged MCAP file: {printable(said)}. Try `mcap recover`."
-        ) from error
-
-
-def _unpacked(path: Path, compression: str, data: bytes, most: int) -> bytes:
-    """A chunk's content, at most `most` bytes of it."""
-    if compression == "zstd":
-        import zstandard
-
-        try:
-            found = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)).read(most + 1)
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from error
-    elif compression == "lz4":
-        import lz4.frame
-
-        found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1)
-    else:
-        found = data
-    if len(found) > most:
-        raise InputError(f"{path} unpacks to more than {LARGEST_BYTES / 1e6:.0f} MB. Split it.")
-    return found
-
-
-def _sqlite(path: Path) -> Iterator[_Raw]:
-    """Messages of the known types in a bag's database, opened for reading only."""
-    address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
-    try:
-        with sqlite3.connect(address, uri=True) as database:
-            topics = {
-                int(n): (str(name), plain_type(str(kind)))
-                for n, name, kind in database.execute("SELECT id, name, type FROM topics")
-            }
-            wanted = [n for n, (_, kind) in topics.items() if kind in _KINDS]
-            marks = ",".join("?" * len(wanted[:500]))
-            for n, time_ns, data in database.execute(
-                f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})",
-                wanted[:500],
-            ):
-                topic, kind = topics[n]
-                yield topic, kind, int(time_ns), bytes(data)
-    except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{path} is no readable rosbag2 database: {printable(str(error))[:120]}. Convert it "
-            "with `ros2 bag convert` to MCAP."
-        ) from error
 
 
 # ------------------------------------------------------------------------------------- topics
 
 
-def _log(path: Path, raw: Sequence[_Raw], options: LogOptions) -> Log:
+def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
     """Rows of all joints that have both a position and a command."""
     options.refuse(LAYOUT, ("command", "position", "joints", "unit", "units"))
     topics = _topics(path, raw)
     state_name = options.position or _state(path, topics)
     state = _named(path, topics, state_name, "position")
+    names = [options.command] if options.command else _commands(topics, state_name)
     warnings: list[str] = []
-    state_s, state_by = _times(state)
+    commanded = {name: _named(path, topics, name, "command") for name in names}
+    one_clock = all(_headers(topic) is not None for topic in (state, *commanded.values()))
+    state_s, state_by = _times(state, one_clock)
     start = state_s[0]
     state_s = (state_s - start) * 1e-9
     positions = _by_joint(state, ())
     order = state.messages[0].names
-    names = [options.command] if options.command else _commands(topics, state_name)
     found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], str]] = {}
     clocks = {f"{state_name}: {state_by}"}
     several = 0
-    for name in names:
-        topic = _named(path, topics, name, "command")
+    for name, topic in commanded.items():
         own = tuple(options.joints) or order
         if topic.kind == MULTI_ARRAY and len(own) == len(topic.messages[0].positions):
             warnings.append(
                 f"{name} does not name its joints; they were taken in the order "
                 f"{', '.join(map(printable, own))[:200]}. Give `joints` if it is another."
             )
-        times, by = _times(topic)
+        times, by = _times(topic, one_clock)
         clocks.add(f"{name}: {by}")
         several = max(several, max(m.points for m in topic.messages))
         for joint, values in _by_joint(topic, own).items():
@@ -266,17 +166,24 @@ def _log(path: Path, raw: Sequence[_Raw], options: LogOptions) -> Log:
             f"{path}: `joints` names none of {', '.join(map(printable, found))[:200]}."
         )
     ours = joint_names(path, [options.joints.get(j) or j for j in chosen])
-    parts = []
+    parts, lost = [], 0.0
     for theirs, name in zip(chosen, ours, strict=True):
         times, values, _ = found[theirs]
         held = np.isfinite(values)
         send, command, kept = held_commands(times[held], values[held], state_s)
+        inside = (times[held] >= state_s[0]) & (times[held] <= state_s[-1])
+        lost = max(lost, 1 - np.sum(send != state_s[kept]) / max(int(inside.sum()), 1))
         given = options.unit_of(theirs, name)
         scale, zero = (given.scale, given.zero) if given else (1.0, 0.0)
         parts.append(
             rows(name, send, state_s[kept], (command - zero) * scale,
                  (positions[theirs][kept] - zero) * scale)
         )  # fmt: skip
+    if lost > _MANY_LOST:
+        warnings.append(
+            f"{100 * lost:.0f} % of the commands were replaced before the next reading and have no "
+            "row. Record the positions at least as often as the commands."
+        )
     by_log = any(by == "log" for _, _, by in found.values()) or state_by == "log"
     doubt = _LOG_TIME_DOUBT_S if by_log else _HEADER_DOUBT_S
     if by_log:
@@ -294,12 +201,12 @@ def _log(path: Path, raw: Sequence[_Raw], options: LogOptions) -> Log:
     return Log(pd.concat(parts, ignore_index=True), metadata, warnings)
 
 
-def _topics(path: Path, raw: Sequence[_Raw]) -> dict[str, _Topic]:
+def _topics(path: Path, raw: Sequence[Raw]) -> dict[str, _Topic]:
     """Decoded messages by topic."""
     found: dict[str, _Topic] = {}
     values = 0
     for topic, kind, log_ns, data in raw:
-        if kind not in _KINDS:
+        if kind not in KINDS:
             continue
         try:
             if not 0 <= log_ns < 2**63:
@@ -364,14 +271,23 @@ def _needs(topics: Mapping[str, _Topic]) -> str:
     )
 
 
-def _times(topic: _Topic) -> tuple[NDArray[np.int64], str]:
-    """Times [ns] and whose they are, the header's or the log's."""
-    log = np.array(topic.log_ns, np.int64)
-    header = np.array([m.stamp_ns for m in topic.messages], np.int64)
-    usable = (header > 0).all() and (np.diff(header) >= 0).all()
-    if usable and abs(float(np.median(header - log))) < 1e9 * _SAME_CLOCK_S:
-        return header, "header"
-    return log, "log"
+def _headers(topic: _Topic) -> NDArray[np.int64] | None:
+    """Times of the headers [ns]; None where there are none, or they run backwards."""
+    found = np.array([m.stamp_ns for m in topic.messages], np.int64)
+    return found if found.any() and (np.diff(found) >= 0).all() else None
+
+
+def _times(topic: _Topic, one_clock: bool) -> tuple[NDArray[np.int64], str]:
+    """Times [ns] and whose they are, the header's or the log's.
+
+    Headers are believed where all topics have them (`one_clock`, which may be a simulation's), or
+    where theirs is the log's clock.
+    """
+    log, header = np.array(topic.log_ns, np.int64), _headers(topic)
+    if header is None:
+        return log, "log"
+    same = abs(float(np.median(header - log))) < 1e9 * _SAME_CLOCK_S
+    return (header, "header") if one_clock or same else (log, "log")
 
 
 def _by_joint(topic: _Topic, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:

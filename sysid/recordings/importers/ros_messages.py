@@ -1,4 +1,4 @@
-"""Four ROS 2 messages from their bytes (CDR), since a bag in SQLite holds no definitions of them.
+"""Three ROS 2 messages from their bytes (CDR), since a bag in SQLite holds no definitions of them.
 
 `decode` reads `sensor_msgs/JointState`, `trajectory_msgs/JointTrajectory` and
 `std_msgs/Float64MultiArray`. No length in the bytes is believed beyond the bytes there are.
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 JOINT_STATE = "sensor_msgs/JointState"
 TRAJECTORY = "trajectory_msgs/JointTrajectory"
 MULTI_ARRAY = "std_msgs/Float64MultiArray"
+KINDS = (JOINT_STATE, TRAJECTORY, MULTI_ARRAY)
 
 
 @dataclass(frozen=True)

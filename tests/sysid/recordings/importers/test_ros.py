@@ -167,9 +167,33 @@ def test_commands_as_joint_states_are_told_by_their_topic_and_matched_by_name(tm
         load(path, LogOptions(command="/cmd", position="/joint_states"))
 
 
-def test_a_header_of_zero_or_of_another_clock_is_not_believed(tmp_path):
+def test_a_header_of_zero_is_none(tmp_path):
     recording = load(written(tmp_path / "a.mcap", messages(stamps=False)))
-    assert "/joint_commands: log" in recording.metadata["times"]
+    assert recording.metadata["times"] == ["/joint_commands: log", "/joint_states: header"]
+
+
+def simulated(found):
+    """The same messages with headers of a clock that starts at 0."""
+    for topic, kind, log_ns, content in found:
+        if "header" in content:
+            stamp = content["header"]["stamp"]
+            time_ns = stamp["sec"] * 10**9 + stamp["nanosec"] - START_NS
+            content = content | {"header": header(max(time_ns, 0))}
+        yield topic, kind, log_ns, content
+
+
+def test_headers_of_another_clock_are_believed_if_all_topics_have_them(tmp_path):
+    (trial,) = load(written(tmp_path / "a.mcap", simulated(messages()))).trials("pan")
+    np.testing.assert_allclose(
+        trial.read_time_s - trial.send_time_s, 1e-9 * READ_LATE_NS, atol=1e-9
+    )
+    arrays = simulated(messages("std_msgs/msg/Float64MultiArray"))
+    recording = load(written(tmp_path / "b.mcap", arrays))
+    assert recording.metadata["times"] == ["/joint_commands: log", "/joint_states: log"]
+    (trial,) = recording.trials("pan")
+    np.testing.assert_allclose(
+        trial.read_time_s - trial.send_time_s, 1e-9 * READ_LATE_NS, atol=1e-9
+    )
 
 
 def test_each_reading_gets_the_command_in_force_and_none_is_interpolated(tmp_path):
@@ -185,6 +209,15 @@ def test_each_reading_gets_the_command_in_force_and_none_is_interpolated(tmp_pat
     np.testing.assert_array_equal(trial.command_rad[::2], trial.command_rad[1::2])
     np.testing.assert_allclose(trial.command_rad[::2], COMMANDS[:, 0])
     assert (np.diff(trial.send_time_s) > 0).all()
+
+
+def test_commands_that_no_reading_saw_are_said(tmp_path):
+    whole = list(messages())
+    every_second = [m for k, m in enumerate(whole) if m[0] != "/joint_states" or k % 4 == 1]
+    recording = load(written(tmp_path / "a.mcap", every_second))
+    assert any("% of the commands were replaced" in text for text in recording.warnings)
+    recording = load(written(tmp_path / "b.mcap", whole))
+    assert not any("replaced" in text for text in recording.warnings)
 
 
 def test_a_trajectory_of_several_points_is_said(tmp_path):
@@ -264,7 +297,7 @@ def test_damaged_and_other_databases_are_refused(tmp_path):
 
 
 def test_a_chunk_that_unpacks_to_more_than_the_budget_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros.LARGEST_BYTES", 2e4)
+    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros_files.LARGEST_BYTES", 2e4)
     with pytest.raises(InputError, match="unpacks to more than"):
         load(written(tmp_path / "a.mcap", messages()))
 
