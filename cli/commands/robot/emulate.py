@@ -34,6 +34,7 @@ from pupper_sysid.sim.emulator.pendulum_bench import (
     PendulumBench,
     draw_bench,
 )
+from pupper_sysid.sim.emulator.pendulum_servo import REGISTERS
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.sweep.bench import parse_load
@@ -96,6 +97,8 @@ class Feetech(Common):
     pendulum:0.1kg@0.10m, or bare (none). Its registers act on the motion."""
     backlash: float = 0.0
     """With --load: play of its gears [degrees]."""
+    registers: str = ""
+    """With --load: registers that differ from the factory's, e.g. p=16,goal_speed=400."""
     joint_map: str | None = None
     """Joint map of another robot, such as `init-robot` writes."""
     ids: str = "all"
@@ -120,8 +123,10 @@ class Feetech(Common):
                 raise InputError(
                     "--load is a bench with one STS3215: leave out --model, --walking."
                 )
-        elif self.backlash:
-            raise InputError("--backlash is of a bench: give --load, too, or --load none.")
+        elif self.backlash or self.registers:
+            raise InputError(
+                "--backlash and --registers are of a bench: add --load (or --load none)."
+            )
         layout = load_joint_map(self.joint_map or preset)
         if self.joint_map and self.walking:
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
@@ -133,7 +138,11 @@ class Feetech(Common):
             load = parse_load(self.load)
             loaded = draw_bench(
                 rng, Pendulum(**(load.model_dump() if load else {})),
-                BenchSpec(backlash_rad=math.radians(self.backlash)), layout,
+                BenchSpec(
+                    backlash_rad=math.radians(self.backlash),
+                    registers=_parse_registers(self.registers),
+                ),
+                layout,
             )  # fmt: skip
             plant = PendulumBench(loaded)
             own = rng.spawn(1)[0]
@@ -234,6 +243,20 @@ def _serve_with(server: ProxySocket | FeetechPty, what: str, commands: str) -> N
     terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.", soft_wrap=True)
     with real_time_priority():  # bytes that come late would look like a slow servo
         server.serve()
+
+
+def _parse_registers(text: str) -> tuple[tuple[str, int], ...]:
+    """Registers that `text` sets: p=16,goal_speed=400."""
+    found = []
+    for part in filter(None, text.split(",")):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        if name not in REGISTERS or not value.isdecimal() or int(value) > 65_535:
+            raise InputError(
+                f"--registers: '{part}' sets no register that acts here; write p=16, and of these: "
+                f"{', '.join(REGISTERS)}."
+            )
+        found.append((name, int(value)))
+    return tuple(found)
 
 
 def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
