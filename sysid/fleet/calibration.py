@@ -30,9 +30,6 @@ from pupper_sysid.common.files import sha256, write_text
 from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.calibration_file import (
-    to_calibration,
-)
 from pupper_sysid.sysid.recordings.files import load
 
 TABLE = "fleet.csv"
@@ -277,10 +274,8 @@ def _numbers(target: Path) -> dict[str, dict[str, float]]:
 
 def _calibrated(path: Path, target: Path, settings: Settings) -> None:
     """Calibrate one robot."""
-    recording = load(path)
-    results = calibrate([recording], None, settings.seed, workers=1)
-    made = to_calibration(
-        results, [recording], settings.seed, settings.stall_torque_nm, settings.source
+    made = calibrate(
+        load(path), None, settings.seed, settings.stall_torque_nm, settings.source, workers=1
     )
     made.save(target, force=True)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -264,8 +265,9 @@ def _finite(number: float) -> float | None:
     return number if np.isfinite(number) else None
 
 
+@cache
 def preset_parameters() -> dict[str, dict[str, DelayedPDParameters]]:
-    """The published settings per preset and joint, to be scored beside a fit."""
+    """The published settings per preset and joint, to be scored beside a fit; read once."""
     found = {}
     for preset in PRESETS:
         calibration = load_calibration(preset)

@@ -9,8 +9,9 @@ makes pure NumPy fast enough.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -53,9 +54,18 @@ class Problem:
 
     def scale(self) -> NDArray[np.float64]:
         """Noise of each reading of the used trials [rad]."""
+        return self._scale
+
+    @cached_property
+    def _scale(self) -> NDArray[np.float64]:
         noise = np.broadcast_to(self.noise_rad, len(self.trials))
         counts = [len(t.sample_step) * used for t, used in zip(self.trials, self.use, strict=True)]
         return np.repeat(noise, counts)
+
+    @property
+    def used(self) -> list[TrialData]:
+        """The trials that count."""
+        return [t for t, use in zip(self.trials, self.use, strict=True) if use]
 
 
 @dataclass(frozen=True)
@@ -85,19 +95,20 @@ class _Space:
     centre: NDArray[np.float64]
     precision: NDArray[np.float64]
 
-    @classmethod
-    def of(cls, model: CandidateModel) -> _Space:
-        par = model.parameters
-        low, high, centre = (
-            np.array([float(p.encode(getattr(p, name))) for p in par])
-            for name in ("low", "high", "nominal")
-        )
-        return cls(low, high, centre, np.array([p.prior_sd**-2.0 for p in par]))
-
     def cost(self, r: NDArray, points: NDArray) -> NDArray[np.float64]:
         """Soft-L1 of residuals in units of the noise, and prior; sums over the last axes."""
         prior = 0.5 * np.sum(self.precision * (points - self.centre) ** 2, axis=-1)
         return np.sum(np.sqrt(1 + r**2) - 1, axis=-1) + prior
+
+
+@cache
+def _space(model: CandidateModel) -> _Space:
+    par = model.parameters
+    low, high, centre = (
+        np.array([float(p.encode(getattr(p, name))) for p in par])
+        for name in ("low", "high", "nominal")
+    )
+    return _Space(low, high, centre, np.array([p.prior_sd**-2.0 for p in par]))
 
 
 def fit(
@@ -124,7 +135,7 @@ def fit(
     -------
     list of Fit, one per problem
     """
-    par, space = model.parameters, _Space.of(model)
+    par, space = model.parameters, _space(model)
     k, low, high = len(par), space.low, space.high
     scale = np.where([p.logarithmic for p in par], 1.0, 0.01)
     z = np.array([[float(p.encode(v)) for p, v in zip(par, row, strict=True)] for row in starts])
@@ -135,26 +146,28 @@ def fit(
             free[i, j], z[i, j] = False, float(par[j].encode(value))
     z = np.where(free, np.clip(z, low, high), z)
 
-    scales: dict[int, NDArray] = {id(p): p.scale() for p in problems}
-
     def evaluate(index: NDArray, points: NDArray, difference: float = difference):
         """Cost, gradient and curvature of the problems `index` at `points`."""
         step = difference * scale
         # the offset, last, moves every residual alike: no simulation needed for its column
         cloud = points[:, None, :] + np.concatenate([np.zeros((1, k)), np.diag(step)[:-1]])
-        residuals = _residuals(model, [problems[i] for i in index], cloud)
-        costs, gradients, curvatures = [], [], []
-        for n, i in enumerate(index):
-            noise = scales[id(problems[i])]
-            r = residuals[n] / noise
-            slopes = (r[1:] - r[0]).T / step[:-1]
-            jacobian = np.hstack([slopes, 1.0 / noise[:, None]]) * free[i]
-            weight = 1.0 / np.sqrt(1.0 + r[0] ** 2)
-            pull = space.precision * (points[n] - space.centre) * free[i]
-            costs.append(space.cost(r[0], points[n]))
-            gradients.append(jacobian.T @ (weight * r[0]) + pull)
-            curvatures.append((jacobian.T * weight) @ jacobian + np.diag(space.precision * free[i]))
-        return np.array(costs), np.array(gradients), np.array(curvatures)
+        cost, gradient = np.empty(len(index)), np.empty((len(index), k))
+        curvature = np.empty((len(index), k, k))
+        for at, errors in _residuals(model, [problems[i] for i in index], cloud):
+            noise = np.stack([problems[i].scale() for i in index[at]])
+            r, variable = errors / noise[:, None], free[index[at]]
+            jacobian = np.empty((len(at), k, noise.shape[1]))
+            jacobian[:, :-1] = (r[:, 1:] - r[:, :1]) / step[:-1, None]
+            jacobian[:, -1] = 1.0 / noise
+            jacobian *= variable[:, :, None]
+            weighted = jacobian / np.sqrt(1.0 + r[:, :1] ** 2)
+            pull = space.precision * (points[at] - space.centre)
+            cost[at] = space.cost(r[:, 0], points[at])
+            gradient[at] = (weighted @ r[:, 0, :, None])[..., 0] + pull * variable
+            curvature[at] = (
+                weighted @ jacobian.mT + np.eye(k) * (space.precision * variable)[:, None]
+            )
+        return cost, gradient, curvature
 
     everyone = np.arange(len(problems))
     cost, gradient, curvature = evaluate(everyone, z)
@@ -164,29 +177,28 @@ def fit(
         active = np.flatnonzero(stalled < 2)
         if not len(active):
             break
-        new = z[active].copy()
-        for n, i in enumerate(active):
-            diagonal = np.diag(curvature[i]) + 1e-9
-            # a coordinate pressed against its bound must not hold back the others
-            pressed = ((z[i] <= low) & (gradient[i] > 0)) | ((z[i] >= high) & (gradient[i] < 0))
-            go = free[i] & ~pressed
-            matrix = curvature[i] + np.diag(damp[i] * diagonal)
-            step = np.zeros(k)
-            step[go] = np.linalg.solve(matrix[np.ix_(go, go)], -gradient[i][go])
-            longest = np.max(np.abs(step) / scale)
-            new[n] = np.clip(z[i] + step * min(1.0, 1.0 / max(longest, 1e-12)), low, high)
-            new[n] = np.where(free[i], new[n], z[i])
+        here, slope, bent = z[active], gradient[active], curvature[active]
+        # a coordinate pressed against its bound must not hold back the others
+        pressed = ((here <= low) & (slope > 0)) | ((here >= high) & (slope < 0))
+        go = free[active] & ~pressed
+        diagonal = np.diagonal(bent, axis1=1, axis2=2) + 1e-9
+        matrix = bent + np.eye(k) * (damp[active, None] * diagonal)[:, None]
+        matrix = np.where(go[:, :, None] & go[:, None], matrix, np.eye(k))
+        step = np.linalg.solve(matrix, np.where(go, -slope, 0.0)[..., None])[..., 0]
+        longest = np.max(np.abs(step) / scale, axis=1, keepdims=True)
+        new = np.clip(here + step * np.minimum(1.0, 1.0 / np.maximum(longest, 1e-12)), low, high)
+        new = np.where(free[active], new, here)
         cost_new, gradient_new, curvature_new = evaluate(active, new)
-        for n, i in enumerate(active):
-            gained = cost[i] - cost_new[n]
-            if gained > 0:
-                z[i], cost[i] = new[n], cost_new[n]
-                gradient[i], curvature[i] = gradient_new[n], curvature_new[n]
-                damp[i] = max(damp[i] / 4, 1e-6)
-            else:
-                damp[i] = min(damp[i] * 6, 1e6)
-            # 0.05 of log-likelihood is far below anything an interval would notice
-            stalled[i] = stalled[i] + 1 if gained < 0.05 else 0
+        gained = cost[active] - cost_new
+        better = gained > 0
+        moved = active[better]
+        z[moved], cost[moved] = new[better], cost_new[better]
+        gradient[moved], curvature[moved] = gradient_new[better], curvature_new[better]
+        damp[active] = np.where(
+            better, np.maximum(damp[active] / 4, 1e-6), np.minimum(damp[active] * 6, 1e6)
+        )
+        # 0.05 of log-likelihood is far below anything an interval would notice
+        stalled[active] = np.where(gained < 0.05, stalled[active] + 1, 0)
     fits = []
     curvature = evaluate(everyone, z, _WIDE_DIFFERENCE)[2]
     for i in everyone:
@@ -239,8 +251,10 @@ def costs(
     model: CandidateModel, problem: Problem, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Cost of each of `points`, which are fitted coordinates (candidates, parameters)."""
-    r = _residuals(model, [problem], points[None])[0] / problem.scale()
-    return _Space.of(model).cost(r, points)
+    r = residuals(model, model.decode(points), problem.used)
+    if problem.recorded_minus_own is not None:
+        r = r + problem.recorded_minus_own
+    return _space(model).cost(r / problem.scale(), points)
 
 
 def global_starts(
@@ -285,14 +299,16 @@ def global_starts(
     ]))  # fmt: skip
     every = {id(trial): trial for problem in problems for trial in problem.trials}
     moments = {key: np.array(moments_if_later(model, values, t, later)) for key, t in every.items()}
+    seen = {key: _Shifted(model, values, TIME_STEP_S * later, t) for key, t in every.items()}
     best = []
     for problem in problems:
-        used = [t for t, use in zip(problem.trials, problem.use, strict=True) if use]
+        used = problem.used
         count = sum(len(t.sample_step) for t in used)
         mean, square = np.sum([moments[id(t)] for t in used], axis=0) / count
+        delay = np.argmin(square - mean**2, axis=0)
         shifted = values.copy()
-        shifted[:, 0] += TIME_STEP_S * later[np.argmin(square - mean**2, axis=0)]
-        r = residuals(model, shifted, used)
+        shifted[:, 0] += TIME_STEP_S * later[delay]
+        r = np.concatenate([seen[id(t)].at(delay) for t in used], axis=1)
         offset = -np.median(r, axis=1)
         robust = np.sqrt(1 + ((r + offset[:, None]) / problem.scale()) ** 2).sum(axis=1)
         order = np.argsort(robust)[:keep]
@@ -302,20 +318,50 @@ def global_starts(
     return np.array(best)
 
 
+class _Shifted:
+    """Residuals of candidates on one trial with delays added, each simulated once.
+
+    Problems share most trials and most of the delays that suit a candidate best.
+    """
+
+    def __init__(
+        self, model: CandidateModel, values: NDArray, later_s: NDArray, trial: TrialData
+    ) -> None:
+        self._model, self._values, self._later_s, self._trial = model, values, later_s, trial
+        self._delay = np.full(len(values), -1)
+        self._found = np.empty((len(values), len(trial.sample_step)))
+
+    def at(self, delay: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Residuals (candidates, samples) with delay number `delay` of each candidate.
+
+        The array is overwritten by the next call.
+        """
+        new = np.flatnonzero(delay != self._delay)
+        if len(new):
+            moved = self._values[new].copy()
+            moved[:, 0] += self._later_s[delay[new]]
+            self._found[new] = residuals(self._model, moved, [self._trial])
+            self._delay[new] = delay[new]
+        return self._found
+
+
 def _residuals(
     model: CandidateModel, problems: Sequence[Problem], points: NDArray
-) -> list[NDArray]:
-    """Model minus fresh reading of each problem's used trials, (candidates, samples) each."""
-    values = np.stack([p.decode(points[..., j]) for j, p in enumerate(model.parameters)], axis=-1)
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Model minus fresh reading: places of problems of the same trials, and residuals of each.
+
+    The residuals are (problems, candidates, samples). Fits to the same trials are one simulation.
+    """
+    values = model.decode(points)
     groups: dict[tuple[int, tuple[bool, ...]], list[int]] = {}
-    for i, problem in enumerate(problems):  # fits to the same trials are one simulation
-        groups.setdefault((id(problem.trials), problem.use), []).append(i)
-    found: dict[int, NDArray] = {}
-    for (_, use), members in groups.items():
-        used = [t for t, u in zip(problems[members[0]].trials, use, strict=True) if u]
-        each = residuals(model, values[members].reshape(-1, values.shape[-1]), used)
-        found.update(zip(members, each.reshape(len(members), points.shape[1], -1), strict=True))
     for i, problem in enumerate(problems):
-        if problem.recorded_minus_own is not None:
-            found[i] = found[i] + problem.recorded_minus_own
-    return [found[i] for i in range(len(problems))]
+        groups.setdefault((id(problem.trials), problem.use), []).append(i)
+    for members in groups.values():
+        flat = values[members].reshape(-1, values.shape[-1])
+        each = residuals(model, flat, problems[members[0]].used)
+        found = each.reshape(len(members), points.shape[1], -1)
+        for n, i in enumerate(members):
+            more = problems[i].recorded_minus_own
+            if more is not None:
+                found[n] += more
+        yield np.array(members), found

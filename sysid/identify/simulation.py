@@ -144,10 +144,11 @@ def free_run(
     list of ndarray, shape (steps + 1,) each
         Position at step edges relative to rest, the offset included [rad].
     """
+    kind, own = _candidates(model, values[None])
     tracks = []
     for trial in trials:
         out = np.empty((len(trial.command) + 1, 1))
-        kernel.positions(*_candidates(model, values[None], trial), *_stepped(trial), out)
+        kernel.positions(kind, own, values[:1] / trial.step_s, *_stepped(trial), out)
         tracks.append(out[:, 0] + values[-1])
     return tracks
 
@@ -164,12 +165,13 @@ def residuals(
     trials : sequence of TrialData
     """
     offset = np.ascontiguousarray(values[:, -1])
+    kind, own = _candidates(model, values)
     parts = [np.empty((len(values), 0))]
     for trial in trials:
         out = np.empty((len(values), len(trial.sample_step)))
         command, rest, step_s, stop = _stepped(trial)
         kernel.residuals(
-            *_candidates(model, values, trial), offset, command, trial.sample_step,
+            kind, own, values[:, 0] / trial.step_s, offset, command, trial.sample_step,
             trial.sample_rad, rest, step_s, stop, out,
         )  # fmt: skip
         parts.append(out)
@@ -203,22 +205,16 @@ def moments_if_later(
     total, square = np.zeros((2, len(later), len(values)))
     command, rest, step_s, stop = _stepped(trial)
     kernel.moments_if_later(
-        *_candidates(model, values, trial), command, trial.sample_step, trial.sample_rad, later,
-        rest, step_s, stop, total, square,
+        *_candidates(model, values), values[:, 0] / trial.step_s, command, trial.sample_step,
+        trial.sample_rad, later, rest, step_s, stop, total, square,
     )  # fmt: skip
     return total, square
 
 
-def _candidates(
-    model: CandidateModel, values: NDArray, trial: TrialData
-) -> tuple[int, NDArray, NDArray]:
-    """What the kernel takes of candidates: the model's number, parameters, dead times in steps."""
+def _candidates(model: CandidateModel, values: NDArray) -> tuple[int, NDArray]:
+    """What the kernel takes of candidates beside dead times: the model's number, parameters."""
     own = values[:, 1:-1] if model.columns is None else model.columns(values[:, 1:-1])
-    return (
-        kernel.KINDS.index(model.kernel or model.name),
-        np.ascontiguousarray(own),
-        values[:, 0] / trial.step_s,
-    )
+    return kernel.KINDS.index(model.kernel or model.name), np.ascontiguousarray(own)
 
 
 def _stepped(trial: TrialData) -> tuple[NDArray[np.float64], int, float, float]:

@@ -104,7 +104,7 @@ def test_an_interrupted_training_is_not_kept_for_a_finished_one(sweeps, tmp_path
     def stop(*arguments, **named):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torch.optim.Adam.step", stop)
+    monkeypatch.setattr("pupper_sysid.sysid.servo_fit.training._Adam.descend", stop)
     with pytest.raises(KeyboardInterrupt):
         fit_servo_fleet(sweeps, tmp_path / "out", ServoSettings())
     assert not (tmp_path / "out" / "r1").exists()
