@@ -49,13 +49,12 @@ def convert(
         require(path, parsed.table, REQUIRED_COLUMNS)
         options.refuse("recording of this project", ())
         return parsed.table, parsed.metadata, []
-    named = options.command or options.time or options.unit
-    if is_sweep(columns) and not named:
+    if is_sweep(columns) and not options.command:
         require(path, parsed.table, SWEEP)
         options.refuse("Mini Pupper sweep", ())
         return _sweep(path, parsed)
     own = [j for j in JOINT_NAMES if {f"{j}_command_rad", f"{j}_position_rad"} & columns]
-    if own and not named:
+    if own and not options.command:
         require(path, parsed.table, PLAYBACK)
         options.refuse("Mini Pupper playback", ())
         return _playback(path, parsed)

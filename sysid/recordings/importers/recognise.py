@@ -83,8 +83,8 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
         return ros.read_bag(folder, options)
     inside = [p.name for p in logs_in(folder)]
     raise InputError(
-        f"{folder} holds {len(inside)} logs ({', '.join(inside[:3])}, …). Commands take the "
-        "folder; in Python load them one by one and give the list."
+        f"{folder} holds {len(inside)} logs ({', '.join(inside[:3])} …). Give one of them; "
+        "commands such as `doctor` and `calibrate` take the folder, functions a list."
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.recognise import logs_in
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.package import ROOT
@@ -112,6 +113,19 @@ def test_nothing_of_the_mini_pupper_is_added_to_another_robots_log(tmp_path):
     made.assign(signal=0.0).to_csv(tmp_path / "mini.csv", index=False)
     (trial,) = load(tmp_path / "mini.csv").trials("LF_thigh")
     np.testing.assert_allclose(trial.command_rad, COMMAND["knee"] + DEFAULT_POSE["LF_thigh"])
+    with pytest.raises(InputError, match="Mini Pupper sweep, which says itself what `unit`"):
+        load(tmp_path / "mini.csv", LogOptions(unit="deg"))
+
+
+def test_a_folder_of_logs_is_no_recording(tmp_path):
+    for name in "ab":
+        table("{joint}_cmd", "{joint}_pos").to_csv(tmp_path / f"{name}.csv", index=False)
+    with pytest.raises(InputError, match="holds 2 logs"):
+        load(tmp_path)
+    assert [path.name for path in logs_in(tmp_path)] == ["a.csv", "b.csv"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="folder without a log"):
+        logs_in(tmp_path / "empty")
 
 
 def test_one_time_stamp_is_in_doubt_by_half_a_turn_unless_its_place_is_given(tmp_path):
