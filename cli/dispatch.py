@@ -81,7 +81,7 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
     """A program's help: its commands, by group, one line each."""
     group_width = 2 + max(len(c.group) for c in commands.values())
     width = 2 + max(map(len, commands))
-    lines, last = [f"usage: {program} COMMAND [OPTIONS]", description.strip(), ""], None
+    lines, last = [f"usage: {program} COMMAND [OPTIONS]", description.strip()], None
     for word, (group, summary, *_) in commands.items():
         shown = "" if group == last else group
         lines.append(f"{shown:{group_width}}{word:{width}}{summary}")

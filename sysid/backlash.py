@@ -51,7 +51,7 @@ _BEFORE_RAD, _AFTER_RAD = 0.03, 0.12  # of the hanging position: the play opens 
 _SETTLED_RAD = 0.04  # travel after a reversal from which a stroke is steady
 _CALM_S = 0.5  # after that: transients of a low gain are over
 _PIECE_RAD = 0.03
-_COUNT_SHARE = 0.03  # of a count: what rounding in the servo's own loop does to the hysteresis
+_COUNT_SHARE = 0.05  # of a count: what rounding in the servo's own loop does to the hysteresis
 _DAMPED_SHARE = 0.03  # of the lag per speed, that a D gain makes: it acts on the encoder alone
 _LEAST_STROKE_S, _LEAST_STROKES = 1.0, 6
 _DRAWS = 600
@@ -152,8 +152,8 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     if not groups:
         raise InputError(
             f"{joint}: the recording has no slow strokes at two speeds (at least {_LEAST_STROKES} "
-            f"below {FASTEST_RAD_S} rad/s, up and down). Record some with `sweep --load … --kind "
-            "reversal`."
+            f"below {FASTEST_RAD_S} rad/s, up and down). Record some: a sweep with a load, of the "
+            "kind reversal."
         )
     loaded = all(t.load is not None and t.load.gravity_nm > 0 for t in trials)
     fits = {g: _Fit(own, loaded, rng) for g, own in groups.items()}
@@ -169,7 +169,7 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     else:
         notes.append(
             "one P gain: friction and dead zone together make the hysteresis. Strokes at two or "
-            "more gains (--gains 4,8,16) tell them apart."
+            "more gains, such as 8 and 32, tell them apart."
         )
     play = None
     if loaded:
@@ -179,8 +179,8 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     else:
         notes.append(
             "no load: where the gears change sides is where the stroke reverses, and backlash "
-            "cannot be told from friction over stiffness. Hang a pendulum on it (--load "
-            "pendulum:0.1kg@0.10m)."
+            "cannot be told from friction over stiffness. Hang a pendulum on it, such as "
+            "pendulum:0.1kg@0.10m."
         )
     return JointBacklash(
         gains=tuple(measured),

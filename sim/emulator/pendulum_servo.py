@@ -19,7 +19,6 @@ from collections import deque
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,
     INTEGRATOR,
@@ -110,7 +109,9 @@ class PendulumServo:
         position_rad: float,
         registers: dict[str, int] | None = None,
     ):
-        self.parameters = parameters
+        from pupper_sysid.sim.robot.engine import mujoco
+
+        self.parameters, self._engine = parameters, mujoco
         self._registers = REGISTERS | (registers or {})
         self._model = mujoco.MjModel.from_xml_string(_xml(parameters, PHYSICS_STEP_S))
         self._data = mujoco.MjData(self._model)
@@ -183,7 +184,7 @@ class PendulumServo:
             self._follow(self._mean_goal())
             self._duty = self._drive(position, speed)
         data.ctrl[0] = self._duty
-        mujoco.mj_step(self._model, data)
+        self._engine.mj_step(self._model, data)
         self._step += 1
         moving = (
             self._queue

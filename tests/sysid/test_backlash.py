@@ -66,7 +66,7 @@ def test_one_gain_cannot_tell_friction_from_a_dead_zone_and_says_so():
     recording, true = stroked(5, 1.0, 2, gains=[8])
     found = backlash(recording)["bench"]
     assert found.dead_zone_rad is None and len(found.gains) == 1
-    assert "--gains" in found.notes[0] and "dead time" in found.notes[1]
+    assert "two or more gains" in found.notes[0] and "dead time" in found.notes[1]
     # the dead time is unknown: a wider interval, which still holds the truth
     assert found.backlash_rad is not None
     assert found.backlash_rad.low < true.backlash_rad < found.backlash_rad.high
