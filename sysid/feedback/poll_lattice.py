@@ -24,7 +24,7 @@ from scipy.special import betaincinv, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
-from pupper_sysid.sysid.feedback.poll_loss import count_loss
+from pupper_sysid.sysid.feedback.poll_loss import Sure, count_loss, fast, moves
 from pupper_sysid.sysid.feedback.poll_period import LONGEST_S, common_period, likeliest_periods
 from pupper_sysid.sysid.feedback.poll_search import (
     BLUR_S,
@@ -57,9 +57,6 @@ from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _Z = float(ndtri((1 + LEVEL) / 2))
-# of the loss's count: where motion starts and ends is not known to a poll; measured on random
-# servos (benchmarks/poll_intervals.py)
-_OVERDISPERSION = 1.6
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
 _NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
@@ -96,8 +93,8 @@ class PollLattice(Result):
         Share of rows with a new value, among all rows.
     slips : tuple of Slip
         Jumps of the poll's phase within a trial.
-    polls : int
-        Polls from which the loss was counted.
+    polls : float
+        Independent polls from which the loss was counted.
     rivals_s : tuple of float
         Periods that explain the readings about as well [s]: reads meet their instants in the same
         rows.
@@ -118,7 +115,7 @@ class PollLattice(Result):
     hit_rate: float = math.nan
     fresh_fraction: float
     slips: tuple[Slip, ...] = ()
-    polls: int = internal(default=0)
+    polls: float = internal(default=0.0)
     rivals_s: tuple[float, ...] = internal(default=())
     blur_s: float = internal(default=BLUR_S)
     phases: tuple[Phase, ...] = internal(default=())
@@ -139,23 +136,29 @@ class PollLattice(Result):
 
     @property
     def loss_interval(self) -> Interval:
-        """Loss with its 90 % interval."""
-        polls = self.polls / _OVERDISPERSION
-        failed = self.loss * polls
-        tail = (1 - LEVEL) / 2
-        low, high = (  # Jeffreys' interval of a share
-            betaincinv(failed + 0.5, polls - failed + 0.5, q) for q in (tail, 1 - tail)
-        )
-        return Interval(self.loss, min(float(low), self.loss), max(float(high), self.loss))
+        """Loss with its 90 % interval, over all periods that explain the readings."""
+        ends = [self._loss_at(period) for period in (self.poll_period_s, *self.rivals_s)]
+        return Interval(self.loss, min(low for low, _ in ends), max(high for _, high in ends))
 
     @property
     def mean_age_interval(self) -> Interval:
-        """Mean age with its 90 % interval [s]; the period's share of it is small."""
-        loss = self.loss_interval
+        """Mean age with its 90 % interval [s], likewise; the period's own error is small."""
+        ends = [
+            period * (0.5 + p / (1 - p))
+            for period in (self.poll_period_s, *self.rivals_s)
+            for p in (min(end, 0.999) for end in self._loss_at(period))
+        ]
+        return Interval(self.mean_age_s, min(ends), max(ends))
+
+    def _loss_at(self, period_s: float) -> tuple[float, float]:
+        """Jeffreys' interval of the loss if polls come each `period_s`: as many succeed."""
+        loss = max(1 - (1 - self.loss) * period_s / self.poll_period_s, 0.0)
+        polls = self.polls * self.poll_period_s / period_s
+        failed, tail = loss * polls, (1 - LEVEL) / 2
         low, high = (
-            self.poll_period_s * (0.5 + p / (1 - p)) for p in (loss.low, min(loss.high, 0.999))
+            float(betaincinv(failed + 0.5, polls - failed + 0.5, q)) for q in (tail, 1 - tail)
         )
-        return Interval(self.mean_age_s, low, high)
+        return min(low, loss), max(high, loss)
 
 
 @dataclass(frozen=True)
@@ -232,10 +235,11 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
             if not 0 <= z_score <= _CLEAR:
                 break
 
-    likely = likeliest_periods(trials, informative, [p for p, _ in periods], loop, step)
+    sure = fast(trials)
+    likely = likeliest_periods(trials, informative, [p for p, _ in periods], loop, sure)
     period = likely[0]
     phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
-    loss = count_loss(trials, phases)[0]
+    loss = count_loss(trials, phases, sure)[0]
     blur, possible = BLUR_S, _possible(loss)
     if possible is not None:
         # second pass: rows that did not change count, too, and the blur is what fits best
@@ -245,9 +249,9 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
         nothing, kind="lattice", readings="polled", time_doubt_s=0.0, poll_period_s=period,
         rivals_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
     )  # fmt: skip
-    found = _with_segments(trials, stretches, replace(found, z_score=z_score), None)
-    sure = told == "stale" and period > _NEAR_LOOP * loop
-    if found.hit_rate < 0.9 or z_score < (_SIGNIFICANT if sure else _SIGNIFICANT_ALONE):
+    found = _with_segments(trials, stretches, replace(found, z_score=z_score), None, sure)
+    known = told == "stale" and period > _NEAR_LOOP * loop
+    if found.hit_rate < 0.9 or z_score < (_SIGNIFICANT if known else _SIGNIFICANT_ALONE):
         return replace(nothing, z_score=z_score, hit_rate=found.hit_rate)
     return found
 
@@ -285,7 +289,7 @@ def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Moti
     own = [t for t, _ in polled]
     step = max(quantum(own), 1e-6)
     stretches = [s for t in own if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
-    return _with_segments(own, stretches, lattice, {t.number: m for t, m in polled})
+    return _with_segments(own, stretches, lattice, {t.number: m for t, m in polled}, None)
 
 
 def _with_segments(
@@ -293,15 +297,21 @@ def _with_segments(
     stretches: Sequence[Stretch],
     lattice: PollLattice,
     motions: Mapping[int, Motion] | None,
+    sure: Sequence[Sure] | None,
 ) -> PollLattice:
-    """The lattice with a phase of its own for each segment between slips, and all its numbers."""
+    """The lattice with a phase of its own for each segment between slips, and all its numbers.
+
+    Either the motions are known, or which polls count without them (`sure`).
+    """
     by_number = {t.number: t for t in trials}
     step = quantum(trials)
     loss = _possible(lattice.loss)
     parts: list[Stretch] = []
     phases: list[Phase] = []
     slips: list[Slip] = []
-    for stretch in stretches:
+    of: list[int] = []
+    noise = dict.fromkeys(by_number, 0.0)
+    for number, stretch in enumerate(stretches):
         trial = by_number[stretch.trial]
         value = trial.position_rad[np.searchsorted(trial.read_time_s, stretch.end)]
         old = [
@@ -312,6 +322,7 @@ def _with_segments(
         if motions is not None:
             motion = motions[trial.number]
             scale = robust_scale(value - motion(_instants(stretch, old)), step)
+            noise[trial.number] = max(noise[trial.number], scale)
         segments = find_segments(
             stretch, value, lattice.poll_period_s, lattice.blur_s, lattice.loss, motion, scale,
             old[0].phase_s if len(old) == 1 else None,
@@ -327,9 +338,12 @@ def _with_segments(
                     slips.append(slip)
             parts.append(part)
             phases.append(phase)
+            of.append(number)
     hits = np.concatenate([contains(s, p) for s, p in zip(parts, phases, strict=True)])
-    period, error = common_period(parts, phases)
-    loss, polls = count_loss(trials, phases)
+    period, error = common_period(parts, phases, of)
+    if sure is None and motions is not None:
+        sure = moves(trials, motions, noise)
+    loss, polls = count_loss(trials, phases, sure or (), known=motions is not None)
     return replace(
         lattice, poll_period_s=period, poll_period_sd_s=error, loss=loss,
         loss_sd=math.sqrt(max(loss * (1 - loss), 1.0 / polls) / polls) if polls else math.nan,
