@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
+_LINE_S = 10.0  # between lines of progress where there is no terminal
 _CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
@@ -200,9 +201,24 @@ def seconds_progress(label: str, total_s: float) -> Iterator[Any]:
 
 @contextmanager
 def _bar(label: str, total: float, count: str) -> Iterator[Any]:
-    """A progress bar on stderr if that is a terminal; yields its `update`."""
+    """A progress bar on stderr; where that is no terminal a line each `_LINE_S`.
+
+    Yields its `update`.
+    """
     with Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn(count), TimeElapsedColumn(),
         console=err, disable=not err.is_terminal, transient=True,
     ) as bar:  # fmt: skip
-        yield partial(bar.update, bar.add_task(label, total=total))
+        task = bar.add_task(label, total=total)
+        started = said = time.monotonic()
+
+        def update(**changes: Any) -> None:
+            nonlocal said
+            bar.update(task, **changes)
+            if not err.is_terminal and time.monotonic() - said >= _LINE_S:
+                said = time.monotonic()
+                shown = bar.tasks[0]
+                err.print(f"{shown.description}: {shown.percentage:.0f} %, "
+                          f"{said - started:.0f} s", soft_wrap=True)  # fmt: skip
+
+        yield update

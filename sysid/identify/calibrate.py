@@ -23,7 +23,6 @@ from pupper_sysid.sysid.identify.joint_fit import (
     Presets,
     StructureFit,
     conclude,
-    fit_joint,
     fit_structure,
 )
 from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
@@ -34,6 +33,9 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+STAGES = ("preparation", *SIMULATED, "choice")
+"""Work on one joint: dating its readings, a search, posterior and folds per structure, the rest."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,6 +83,7 @@ def calibrate(
     source: str = STALL_TORQUE_SOURCE,
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
+    staged: Callable[[str, str], None] | None = None,
 ) -> CalibrationResult:
     """Calibrate every joint of the recordings.
 
@@ -100,6 +103,8 @@ def calibrate(
         Processes. Joints are independent, and so are the two structures of a joint.
     progress : callable, optional
         Called with a joint's name when it is done.
+    staged : callable, optional
+        Called with a joint's name and one of `STAGES` when that is done.
 
     Returns
     -------
@@ -113,15 +118,34 @@ def calibrate(
     """
     trials, presets = usable_trials(recordings, joints), preset_parameters()
     if workers > 1 and len(trials) > 1:  # of one joint, a second process costs what it saves
-        fits = side_by_side(trials, seed, presets, workers, progress)
+        fits = side_by_side(trials, seed, presets, workers, progress, staged)
     else:
         fits = {}
         for joint, own in trials.items():
-            fits[joint] = fit_joint(joint, own, seed, presets)
+            fits[joint] = _one_by_one(joint, own, seed, presets, staged)
             if progress:
                 progress(joint)
     made = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm, source)
     return CalibrationResult(joints=fits, calibration=made)
+
+
+def _one_by_one(
+    joint: str,
+    trials: tuple[Trial, ...],
+    seed: int,
+    presets: Presets,
+    staged: Callable[[str, str], None] | None,
+) -> JointCalibrationResult:
+    """`fit_joint`, telling of its stages."""
+    done = staged or (lambda joint, stage: None)
+    ready, structures = prepare_joint(joint, trials, seed), {}
+    done(joint, STAGES[0])
+    for name in SIMULATED:
+        structures[name] = fit_structure(ready, name)
+        done(joint, name)
+    made = conclude(joint, ready, structures, presets)
+    done(joint, STAGES[-1])
+    return made
 
 
 def side_by_side(
@@ -130,6 +154,7 @@ def side_by_side(
     presets: Presets,
     workers: int,
     progress: Callable[[str], None] | None,
+    staged: Callable[[str, str], None] | None = None,
 ) -> dict[str, JointCalibrationResult]:
     """`fit_joint` of every joint, its stages on several processes, so that none waits long.
 
@@ -144,6 +169,8 @@ def side_by_side(
         Processes.
     progress : callable or None
         Called with a joint's name when it is done.
+    staged : callable or None
+        Called with a joint's name and one of `STAGES` when that is done.
 
     Raises
     ------
@@ -168,6 +195,8 @@ def side_by_side(
                 for future in wait(tasks, return_when=FIRST_COMPLETED).done:
                     joint, stage = tasks.pop(future)
                     made = future.result()
+                    if staged:
+                        staged(joint, stage or STAGES[-1])
                     if stage == "preparation":
                         ready[joint] = made
                         for name in SIMULATED:

@@ -59,7 +59,7 @@ class Calibrate:
 
     def run(self) -> None:
         """Calibrate, print, write."""
-        from pupper_sysid.sysid.identify.calibrate import calibrate
+        from pupper_sysid.sysid.identify.calibrate import STAGES, calibrate
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
 
         started = time.perf_counter()
@@ -73,10 +73,20 @@ class Calibrate:
         refuse_overwrite(out, self.force)  # before the work, not after it
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)
-        with terminal.progress("calibrating", len(joints)) as advance:
+        left = dict.fromkeys(joints, len(STAGES))
+        with terminal.progress("calibrating", sum(left.values())) as advance:
+
+            def staged(joint: str, stage: str) -> None:
+                left[joint] -= 1
+                advance(f"{joint}, {stage}")
+
+            def done(joint: str) -> None:  # joints under load have no stages
+                for _ in range(left.pop(joint)):
+                    advance(joint)
+
             made = calibrate(
                 recordings, joints, self.seed, self.stall_torque, self._source(),
-                workers=2, progress=advance,
+                workers=2, progress=done, staged=staged,
             )  # fmt: skip
         made.save(out, force=self.force)
         if self.json:
