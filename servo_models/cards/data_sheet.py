@@ -10,7 +10,9 @@ voltage of the nearest one, as those of a DC motor are.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from pupper_sysid.common.errors import InputError
 
@@ -178,3 +180,30 @@ def stall_torque(model: str | int, supply_v: float | None = None) -> tuple[float
         )
     rating = sheet.at(supply_v)
     return rating.stall_torque_nm, f"{sheet.name} at {rating.supply_v:g} V: {rating.source}"
+
+
+def recorded_stall_torque(servos: Iterable[Mapping[str, Any]]) -> tuple[float, str] | None:
+    """Stall torque [N·m] of a joint's servo by what its recordings say of it, and the source.
+
+    Parameters
+    ----------
+    servos : iterable of mapping
+        Set-up of the joint's servo in each recording's header (`servos`): `model` and
+        `supply_voltage_v`, where they are known.
+
+    Returns
+    -------
+    (float, str) or None
+        None where no recording names a model whose data sheet is known.
+
+    Examples
+    --------
+    >>> found = recorded_stall_torque([{"model": "STS3215", "supply_voltage_v": 12.0}])
+    >>> round(found[0], 2), recorded_stall_torque([{}]) is None
+    (2.94, True)
+    """
+    told = [s for s in servos if s.get("model") and data_sheet(s["model"])]
+    if not told:
+        return None
+    volts = next((s["supply_voltage_v"] for s in told if s.get("supply_voltage_v")), None)
+    return stall_torque(told[0]["model"], volts)
