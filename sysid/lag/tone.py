@@ -49,7 +49,7 @@ class ToneResponse:
         Window of the fit, and since when the command is this tone.
     ripple : complex
         Part of `fresh` that is ripple of the staircase (`sysid.lag.ripple`); 0 if it was not
-        asked for.
+        computed.
     ripple_draws : ndarray of complex, shape (draws,)
     """
 

@@ -29,7 +29,7 @@ from pupper_sysid.sysid.sweep.excitation import (
 )
 
 LARGEST_RAD = 0.3
-"""Largest excursion that is planned without being asked for [rad]."""
+"""Largest excursion of a plan by default [rad]."""
 
 _TONES_HZ = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0)
 _TONES_RAD = (0.05, 0.08, 0.12, 0.2, 0.3)
