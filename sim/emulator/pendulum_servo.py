@@ -5,9 +5,10 @@
 
 against Coulomb friction, armature, and the gravity and inertia of a point mass on an arm. The error
 is set-point minus encoder in whole counts; inside the dead zone the duty is 0, outside at least the
-minimum start force. Set-points come `dead_time_s` after their commands, and follow a ramp if the
-registers acceleration or goal speed ask for one. With `backlash_rad` the motor turns the encoder's
-shaft through gears with that much play: the encoder sits on the output, as in these servos.
+minimum start force. Commands and switches of the torque take effect after `dead_time_s`; set-points
+follow a ramp if the registers acceleration or goal speed ask for one. With `backlash_rad` the motor
+turns the encoder's shaft through gears with that much play: the encoder sits on the output, as in
+these servos.
 
 The registers are those of `hardware.feetech.registers`, by name.
 """
@@ -125,7 +126,8 @@ class PendulumServo:
         self._goal = self._setpoint = float(position_rad)
         self._rate = self._duty = 0.0
         self._queue: deque[tuple[float, float]] = deque()
-        self._limp = False
+        self._limp = self._off = False
+        self._switch: tuple[float, bool] | None = None
         self._tune()
 
     def command(self, time_s: float, position_rad: float) -> None:
@@ -135,11 +137,11 @@ class PendulumServo:
             self._still = 0
 
     def torque(self, time_s: float, on: bool) -> None:
-        """Hold the present position, or go limp, from `time_s` on."""
-        self._goal = self._setpoint = self.position_at(time_s)
-        self._limp, self._rate, self._duty, self._still = not on, 0.0, 0.0, 0
+        """Hold the present position, or go limp; takes effect after the dead time, too."""
+        self.position_at(time_s)
+        self._limp, self._still = not on, 0
         self._queue.clear()
-        self._model.dof_damping[0] = self.parameters.back_emf_nm_s_rad if on else 0.0
+        self._switch = time_s + self.parameters.dead_time_s, on
 
     def register(self, name: str) -> int:
         """Value of a register."""
@@ -180,7 +182,12 @@ class PendulumServo:
         """One physics step, with one turn of the position loop."""
         data = self._data
         position, speed = self._output()
-        if not self._limp:
+        if self._switch and self._switch[0] < (self._step + 0.5) * self._dt:
+            self._off, self._switch = not self._switch[1], None
+            self._goal = self._setpoint = position
+            self._rate = self._duty = 0.0
+            self._model.dof_damping[0] = 0.0 if self._off else self.parameters.back_emf_nm_s_rad
+        if not self._off:
             self._follow(self._mean_goal())
             self._duty = self._drive(position, speed)
         data.ctrl[0] = self._duty
@@ -188,6 +195,7 @@ class PendulumServo:
         self._step += 1
         moving = (
             self._queue
+            or self._switch
             or abs(speed) > _STILL_RAD_S
             or abs(data.qacc[0]) > _STILL_RAD_S2
             or self._setpoint != self._goal
