@@ -11,7 +11,7 @@ from pupper_sysid.sysid.identify.calibrate import calibrate, side_by_side
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
 from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
 from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
-from pupper_sysid.sysid.identify.output_error import Problem, fit
+from pupper_sysid.sysid.identify.output_error import Problem, fit, global_starts
 from pupper_sysid.sysid.identify.results import plausible
 from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.recordings.files import load
@@ -160,6 +160,18 @@ def test_commands_are_averaged_over_physics_steps_and_truncated_by_count():
     np.testing.assert_allclose(data.command[:1500], sampled, atol=largest / 200)
     plain = prepare(trial, read).command[:1500]
     assert np.mean(data.command[:1500] - plain) == pytest.approx(0.0057 / 2, rel=0.2)
+
+
+def test_the_starts_of_a_fit_do_not_depend_on_the_fits_beside_it():
+    trials = servo_trials(np.random.default_rng(4), (1.0, 2.0, 3.0))
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
+    data = tuple(prepare(t, readings(t, lattice)) for t in trials)
+    problems = [Problem(data, use, 0.005, {}) for use in ((True,) * 3, (True, False, True))]
+    model = candidate_model("delayed_pd")
+    together = global_starts(model, problems, np.random.default_rng(0), 64, 8)
+    for problem, starts in zip(problems, together, strict=True):
+        alone = global_starts(model, [problem], np.random.default_rng(0), 64, 8)[0]
+        np.testing.assert_array_equal(starts, alone)
 
 
 def test_a_frozen_parameter_stays_where_it_was_put():
