@@ -15,6 +15,7 @@ command jitter, poll and losses. A quantity counts where the calibration calls i
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import warnings
 from collections import defaultdict
@@ -156,10 +157,14 @@ def main() -> None:
     options = parser.parse_args()
     found: dict[str, list[Row]] = defaultdict(list)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        for rows in pool.map(partial(_quietly, options.world), range(options.robots)):
-            for row in rows:
-                found[row.quantity].append(row)
-    print(f"{options.robots} robots, {options.world}")
+        results = pool.map(partial(_quietly, options.world), range(options.robots))
+        done = 0
+        with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C: the table of what is done
+            for done, rows in enumerate(results, 1):  # noqa: B007
+                for row in rows:
+                    found[row.quantity].append(row)
+        pool.shutdown(wait=False, cancel_futures=True)
+    print(f"{done} robots, {options.world}")
     print("| quantity | identified | holds the truth | median width | not identified: holds |")
     print("|" + "---|" * 5)
     for quantity, rows in found.items():
