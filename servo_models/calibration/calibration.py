@@ -38,7 +38,7 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, Delayed
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 
 SCHEMA = "pupper-calibration"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 PRESETS = ("paper", "release")
 
 _RENAMED = {
@@ -108,7 +108,7 @@ class Calibration(Part):
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
     """Kind of the file."""
-    schema_version: Literal[2] = SCHEMA_VERSION
+    schema_version: Literal[3] = SCHEMA_VERSION
     """Version of the file's format."""
     robot: str
     """The robot that was measured."""
@@ -302,6 +302,8 @@ def _load(path: Path) -> Calibration:
     refuse_other_version(path, version, SCHEMA_VERSION)
     if version == SCHEMA_VERSION:
         return validated(Calibration, data, path, lines)
+    if version == 2:  # the same without `under_load`
+        return validated(Calibration, data | {"schema_version": SCHEMA_VERSION}, path, lines)
     data = _renamed(data) | {"schema_version": SCHEMA_VERSION}
     lines = {tuple(map(_new_name, place)): n for place, n in lines.items()}
     try:

@@ -28,6 +28,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
 )
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
+from pupper_sysid.sysid.compare import under_load
 from pupper_sysid.sysid.compare.readings import (
     ReadingRule,
     age_spread_rad,
@@ -39,15 +40,18 @@ from pupper_sysid.sysid.compare.readings import (
     shown,
     with_ages,
 )
+from pupper_sysid.sysid.compare.under_load import needs_runs
 from pupper_sysid.sysid.doctor.checks import cautions
-from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
     as_sequence,
     chosen_joints,
+    joint_rng,
     usable_trials,
 )
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
@@ -64,11 +68,22 @@ OFFSET_RULE = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class ComparedScores(scores.Scores):
+    """Root mean square and mean absolute errors of one model on one joint, or their means [rad]."""
+
+    mae_held_rad: float
+    mae_raw_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class ComparedModel(ModelScores):
     """Scores of one model on readings that it predicts.
 
     Attributes
     ----------
+    joints : dict of str to ComparedScores
+    mean : ComparedScores
+        Over joints.
     offset_rad : dict of str to float
         By joint, reading minus prediction of these recordings; empty for a model fitted here.
     age_spread_rad : dict of str to float
@@ -76,6 +91,9 @@ class ComparedModel(ModelScores):
         would have it. 0 where readings are dated.
     """
 
+    # as for the errors, with more numbers
+    joints: dict[str, ComparedScores]  # pyright: ignore[reportIncompatibleVariableOverride]
+    mean: ComparedScores
     offset_rad: dict[str, float] = field(default_factory=dict)
     age_spread_rad: dict[str, float] = field(default_factory=dict)
 
@@ -84,7 +102,20 @@ class ComparedModel(ModelScores):
         cls, own: ModelScores, offset_rad: dict[str, float], age_spread_rad: dict[str, float]
     ) -> ComparedModel:
         """The scores with the offset and the spread that belong to them."""
-        return cls(**vars(own), offset_rad=offset_rad, age_spread_rad=age_spread_rad)
+        joints = {
+            joint: ComparedScores(
+                **vars(found),
+                mae_held_rad=_mean_absolute(own.errors[joint].held),
+                mae_raw_rad=_mean_absolute(own.errors[joint].raw),
+            )
+            for joint, found in own.joints.items()
+        }
+        more = {"joints": joints, "mean": scores.mean(joints)}
+        return cls(
+            **vars(own) | more,  # pyright: ignore[reportArgumentType]
+            offset_rad=offset_rad,
+            age_spread_rad=age_spread_rad,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,6 +227,9 @@ def compare(
     """
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
     trials = usable_trials(recordings, names)
+    calibrations = _calibrations(models)
+    if needs_runs(recordings, names, list(calibrations.values())):
+        return _compare_runs(recordings, models, calibrations, names, seed, lattices)
     data = merged_groups(servo_data(recordings, names, readings, seed, lattices))
     opened: dict[str, _Opened] = {}
     notes = [text for joint in names for text in cautions(joint, trials[joint])]
@@ -243,6 +277,129 @@ def compare(
     )  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True)
+class RunComparison(Comparison):
+    """Servo models on runs under load, each with its own gain and load.
+
+    Attributes
+    ----------
+    runs : dict of str to list of BenchRun
+        By joint.
+    run_tracks : dict of str to (dict of str to list of ndarray)
+        By model, then joint: predicted readings at the steps of each run.
+    """
+
+    runs: dict[str, list[under_load.BenchRun]] = internal()
+    run_tracks: dict[str, dict[str, list[NDArray[np.float64]]]] = internal()
+
+    def reading_notes(self) -> list[str]:
+        """How readings were predicted, and which offsets were taken out."""
+        known = [j for j, own in self.runs.items() if all(b.offset_known for b in own)]
+        said = [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
+        return [*said, *([OFFSET_RULE] if len(known) < len(self.runs) else [])]
+
+    def plot(self, joints: Sequence[str] | None = None) -> Figure:
+        """Figure of the models in free run beside commands and readings, a panel per run."""
+        return under_load.figure(self.runs, self.run_tracks, joints)
+
+
+def _compare_runs(
+    recordings: Sequence[Recording],
+    models: Sequence[str | Path | Calibration | ServoFit],
+    calibrations: Mapping[str, Calibration],
+    joints: Sequence[str],
+    seed: int,
+    lattices: Mapping[str, PollLattice] | None,
+) -> RunComparison:
+    """`compare` where trials differ in gain, load or torque."""
+    if len(calibrations) < len(models):
+        raise InputError(
+            "These recordings tell of a load or of several P gains, which only calibrations and "
+            "servo cards know. Leave out folders of fit-servo."
+        )
+    notes = []
+    inputs = {r.sha256: r.name for r in recordings}
+    for name, calibration in calibrations.items():
+        notes += [
+            f"{name} was fitted to {inputs[f.sha256]}: its errors here are too small."
+            for f in calibration.inputs
+            if f.sha256 in inputs
+        ]
+    runs: dict[str, list[under_load.BenchRun]] = {}
+    rules: dict[str, ReadingRule] = {}
+    for joint in joints:
+        trials = [t for r in recordings for t in r.trials(joint)]
+        lattice = (lattices or {}).get(joint) or find_poll_lattice(
+            tuple(trials), joint_rng(seed, joint)
+        )
+        runs[joint] = under_load.bench_runs(recordings, joint, seed, lattice)
+        kind = {"every read": "live", "lattice": "own dates"}.get(lattice.kind, "as logged")
+        source = ", ".join(r.name for r in recordings)
+        rules[joint] = ReadingRule(rule=kind, source=source)
+    made: dict[str, ComparedModel] = {}
+    tracks: dict[str, dict[str, list[NDArray[np.float64]]]] = {}
+    for name, calibration in calibrations.items():
+        tracks[name], found, offset = {}, {}, {}
+        for joint, own in runs.items():
+            volts = under_load.reference_voltage(calibration, joint)
+            own = under_load.at_voltage(own, volts)
+            track, offset[joint] = under_load.predict(calibration, joint, own)
+            tracks[name][joint] = track
+            error = under_load.errors(own, track)
+            nothing = np.zeros(len(error["fresh"]))
+            found[joint] = scores.Errors(
+                error["fresh"], under_load.one_step(own, track), nothing, under_load.blocks(own),
+                error["held"], error["raw"],
+            )  # fmt: skip
+        spread = dict.fromkeys(joints, 0.0)
+        made[name] = ComparedModel.scored(ModelScores.of(found, seed), offset, spread)
+    notes += under_load.notes(calibrations, runs)
+    nan = float("nan")
+    period = float(np.median([r.loop_period_s for r in recordings]))
+    return RunComparison(
+        models=made,
+        readings=rules,
+        persistence_rmse_rad={j: under_load.persistence(own) for j, own in runs.items()},
+        repeatability_rad=dict.fromkeys(joints, nan),
+        time_step_s=period,
+        notes=tuple(notes),
+        data=ServoData(tuple(joints), period, {}, (), {}, {}),
+        tracks={},
+        bands={},
+        runs=runs,
+        run_tracks=tracks,
+    )
+
+
+def _calibrations(
+    models: Sequence[str | Path | Calibration | ServoFit],
+) -> dict[str, Calibration]:
+    """Calibrations and cards among the models, by label."""
+    found: dict[str, Calibration] = {}
+    for given in models:
+        if isinstance(given, Calibration):
+            calibration, called = given, ""
+        elif isinstance(given, ServoFit) or Path(given).is_dir() or not _is_calibration(given):
+            continue
+        else:
+            calibration, called = load_calibration(given), Path(given).name
+        loaded = any(j.under_load for j in calibration.joints.values())
+        kind = "servo under load" if loaded else "DelayedPD"
+        label = f"{kind} ({called})" if called else kind
+        if label in found:
+            label = f"{kind} ({given if called else len(found) + 1})"
+        found[label] = calibration
+    return found
+
+
+def _mean_absolute(errors: NDArray[np.float64]) -> float:
+    return float(np.mean(np.abs(errors))) if len(errors) else float("nan")
+
+
+def _is_calibration(given: str | Path) -> bool:
+    return is_shipped(given) or Path(given).suffix.lower() in (".yaml", ".yml", ".json")
+
+
 @dataclass(frozen=True)
 class _Opened:
     """A model to compare: a learned one, or a calibration."""
@@ -283,7 +440,7 @@ def _open(given: str | Path | Calibration | ServoFit, data: ServoData) -> _Opene
             band={j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()},
             of_rows=tuple(j for j, mode in contract.readings_counted.items() if mode == "all"),
         )  # fmt: skip
-    if is_shipped(given) or path.suffix.lower() in (".yaml", ".yml", ".json"):
+    if _is_calibration(given):
         return _calibrated(load_calibration(given), f"DelayedPD ({path.name})", data)
     raise InputError(
         f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor one of the "

@@ -28,6 +28,7 @@ from pupper_sysid.sysid.identify.joint_fit import (
 from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import SIMULATED
+from pupper_sysid.sysid.loaded.calibrate import fit_joints, loaded_joints, with_loaded
 from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -116,7 +117,9 @@ def calibrate(
     InputError
         If a joint has too little motion.
     """
-    trials, presets = usable_trials(recordings, joints), preset_parameters()
+    every, presets = usable_trials(recordings, joints), preset_parameters()
+    loaded = {joint: every[joint] for joint in loaded_joints(every)}
+    trials = {joint: own for joint, own in every.items() if joint not in loaded}
     if workers > 1 and len(trials) > 1:  # of one joint, a second process costs what it saves
         fits = side_by_side(trials, seed, presets, workers, progress, staged)
     else:
@@ -125,7 +128,10 @@ def calibrate(
             fits[joint] = _one_by_one(joint, own, seed, presets, staged)
             if progress:
                 progress(joint)
+    fits |= fit_joints(loaded, seed, workers, progress)
+    fits = {joint: fits[joint] for joint in every}
     made = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm, source)
+    made = with_loaded(made, fits, stall_torque_nm, source)
     return CalibrationResult(joints=fits, calibration=made)
 
 

@@ -1,0 +1,289 @@
+"""LoadedServo: a position loop in duty, a DC motor, gears with friction, and a load on the joint.
+
+What a hobby servo's firmware does is known in outline: the position error times a P gain is a duty
+cycle, which the motor turns into torque. One servo under several gains and loads is then one set of
+numbers:
+
+    duty   = clip(duty_per_rad · P · error - duty_s_per_rad · velocity, ±1)
+    motor  = stall_torque · duty · V / V0 - back_emf · velocity,   at most ±torque_limit
+    weight = -gravity · sin(position - hanging)
+    limit  = friction_loss + stribeck_friction · s
+             + (1 + load_friction_static · s) · (load_friction_motor · |motor|
+                + load_friction_load · |weight|) + load_friction_quadratic · motor²
+    (armature + load inertia) · acceleration = motor + weight - friction,   |friction| ≤ limit
+
+with s = 1 / (1 + (velocity / stribeck_speed)²), 1 at standstill. Friction grows with the torques
+that the gears transmit, as in the models M3 to M6 of BAM (Duclusaud et al., "Extended friction
+models for the physics simulation of servo actuators", ICRA 2025). `error` is zero within
+`dead_zone_rad` and counts from its edge on; `start_duty` is added wherever the error is not zero.
+With the torque switched off no duty is applied and `off_brake` of the back-EMF remains: 0 with open
+motor terminals and no viscous friction, 1 with shorted ones. Commands, and switching the torque,
+take effect after `dead_time_s`, as in `DelayedPD`. The set-point follows the command at once, or
+as a trajectory generator with an `acceleration_limit` moves it: at a rate from which it can stop on
+the command, sqrt(2 · limit · distance), that changes by the limit at most.
+
+Without the terms of the load-dependent and Stribeck friction this is `DelayedPD` with stiffness
+duty_per_rad · P · stall_torque, damping duty_s_per_rad · stall_torque and effort limit
+stall_torque, and MuJoCo runs it natively (`delayed_pd`); tests hold the three together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delay_line import DelayedServo, DelayLine
+from pupper_sysid.servo_models.delayed_pd import (
+    FRICTION_IMPEDANCE,
+    TIME_STEP_S,
+    DelayedPDParameters,
+)
+
+START_ERROR_RAD = 0.0015
+"""Error from which on `start_duty` acts in full [rad]: a count of 4,096 a turn."""
+
+
+@dataclass(frozen=True)
+class LoadedServoParameters:
+    """Numbers of a servo; floats or arrays that broadcast against each other.
+
+    Parameters
+    ----------
+    duty_per_rad : array_like
+        Duty per position error and unit of the P gain [1/rad].
+    duty_s_per_rad : array_like
+        Duty per velocity, inside of the limit on the duty [s/rad].
+    stall_torque : array_like
+        Torque at full duty and standstill, at the reference voltage [N·m].
+    back_emf : array_like
+        Torque lost per velocity: back-EMF of the motor, viscous friction of the gears [N·m·s/rad].
+    armature : array_like
+        Reflected inertia of motor and gears [kg·m²].
+    friction_loss : array_like
+        Dry friction at speed without load [N·m].
+    dead_time_s : array_like
+        From a command's arrival to its first effect on the torque [s].
+    stribeck_friction : array_like
+        Dry friction at standstill beyond `friction_loss` [N·m].
+    stribeck_speed : array_like
+        Speed at which half of it is left [rad/s].
+    load_friction_motor, load_friction_load : array_like
+        Dry friction per torque of the motor, and of the load's weight.
+    load_friction_quadratic : array_like
+        Dry friction per squared torque of the motor [1/(N·m)].
+    load_friction_static : array_like
+        By what share friction per torque is larger at standstill.
+    torque_limit : array_like
+        Largest torque of the motor, a limit on its current [N·m].
+    off_brake : array_like
+        Share of `back_emf` that remains with the torque off.
+    dead_zone_rad : array_like
+        Half-width of the error that the loop ignores [rad].
+    start_duty : array_like
+        Duty added to overcome friction wherever there is an error.
+    acceleration_limit : array_like
+        Largest acceleration of the set-point [rad/s²]: the firmware's trajectory generator.
+    """
+
+    duty_per_rad: ArrayLike
+    duty_s_per_rad: ArrayLike
+    stall_torque: ArrayLike
+    back_emf: ArrayLike
+    armature: ArrayLike
+    friction_loss: ArrayLike
+    dead_time_s: ArrayLike
+    stribeck_friction: ArrayLike = 0.0
+    stribeck_speed: ArrayLike = 0.1
+    load_friction_motor: ArrayLike = 0.0
+    load_friction_load: ArrayLike = 0.0
+    load_friction_quadratic: ArrayLike = 0.0
+    load_friction_static: ArrayLike = 0.0
+    torque_limit: ArrayLike = np.inf
+    off_brake: ArrayLike = 0.0
+    dead_zone_rad: ArrayLike = 0.0
+    start_duty: ArrayLike = 0.0
+    acceleration_limit: ArrayLike = np.inf
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """The numbers as arrays, by name."""
+        return {f.name: np.asarray(getattr(self, f.name), float) for f in fields(self)}
+
+    def delayed_pd(
+        self, p_gain: ArrayLike, load_inertia_kg_m2: ArrayLike = 0.0, torque_nm: ArrayLike = 0.0
+    ) -> DelayedPDParameters:
+        """DelayedPD at one P gain: the same servo without what simulators' actuators lack.
+
+        Gravity is the simulator's. The effort limit is the smaller of stall torque and torque
+        limit; the friction does not grow with the load.
+
+        Parameters
+        ----------
+        p_gain : array_like
+            P gain of the position loop, the register's value.
+        load_inertia_kg_m2 : array_like
+            Inertia to add to the armature [kg·m²], where no body of the simulator has it.
+        torque_nm : array_like
+            Torque of motor and load for which the friction holds [N·m].
+        """
+        own, torque = self.arrays(), np.asarray(torque_nm, float)
+        friction = own["friction_loss"] + own["load_friction_quadratic"] * torque**2
+        friction = friction + (own["load_friction_motor"] + own["load_friction_load"]) * torque
+        return DelayedPDParameters(
+            stiffness=own["duty_per_rad"] * np.asarray(p_gain) * own["stall_torque"],
+            damping=own["duty_s_per_rad"] * own["stall_torque"],
+            friction_loss=friction,
+            armature=own["armature"] + np.asarray(load_inertia_kg_m2),
+            effort_limit=np.minimum(own["stall_torque"], own["torque_limit"]),
+            velocity_limit=np.inf,
+            dead_time_s=own["dead_time_s"],
+            back_emf=own["back_emf"],
+        )
+
+
+COLUMNS = tuple(f.name for f in fields(LoadedServoParameters) if f.name != "dead_time_s")
+"""Order of the numbers in `sysid.loaded.kernel`, without the dead time."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """What the servo turns; floats or arrays that broadcast with the servo's.
+
+    Parameters
+    ----------
+    inertia_kg_m2 : array_like
+        About the joint [kg·m²].
+    gravity_nm : array_like
+        Largest torque of gravity [N·m].
+    hanging_rad : array_like
+        Position at which the load hangs [rad].
+    """
+
+    inertia_kg_m2: ArrayLike = 0.0
+    gravity_nm: ArrayLike = 0.0
+    hanging_rad: ArrayLike = 0.0
+
+
+class LoadedServo(DelayedServo):
+    """The servo model that is fitted to recordings under load. See the module's text.
+
+    Parameters
+    ----------
+    parameters : LoadedServoParameters
+    p_gain : array_like
+        P gain of the position loop, the register's value.
+    load : Load
+    time_step_s : float
+        Time step [s]; commands and positions are at this step.
+
+    Raises
+    ------
+    InputError
+        If a number is missing or negative, or the inertia or time step is zero.
+
+    Examples
+    --------
+    >>> servo = LoadedServoParameters(
+    ...     duty_per_rad=0.05, duty_s_per_rad=0.0, stall_torque=2.5, back_emf=0.3, armature=0.02,
+    ...     friction_loss=0.05, dead_time_s=0.01,
+    ... )
+    >>> model = LoadedServo(servo, p_gain=16.0, load=Load(0.01, 0.5, 0.0))
+    >>> model.reset(0.0)
+    >>> bool(0.7 < model.rollout(np.full(1000, 1.0))[-1] < 0.9)  # it droops under its load
+    True
+    """
+
+    def __init__(
+        self,
+        parameters: LoadedServoParameters,
+        p_gain: ArrayLike = 1.0,
+        load: Load | None = None,
+        time_step_s: float = TIME_STEP_S,
+    ):
+        load = load or Load()
+        self.parameters, self._values = parameters, parameters.arrays()
+        for name, value in self._values.items():
+            if np.isnan(value).any() or np.min(value) < 0:
+                raise InputError(
+                    f"LoadedServo: {name} is {np.min(value)}; it must be a positive number."
+                )
+        self._gain = np.asarray(p_gain, float)
+        self._load = [
+            np.asarray(x, float) for x in (load.inertia_kg_m2, load.gravity_nm, load.hanging_rad)
+        ]
+        if not np.min(self._values["armature"] + self._load[0]) > 0:
+            raise InputError("LoadedServo: armature and load have no inertia together.")
+        self._torque = DelayLine(self._values["dead_time_s"], time_step_s)
+        shapes = [*self._values.values(), self._gain, *self._load]
+        super().__init__(shapes, self._values["dead_time_s"], time_step_s)
+
+    def rollout(
+        self,
+        commands: ArrayLike,
+        torque_on: ArrayLike = 1.0,
+        voltage_ratio: ArrayLike = 1.0,
+    ) -> NDArray[np.float64]:
+        """Positions [rad] after each command, shape (steps, *batch); continues from the state.
+
+        Parameters
+        ----------
+        commands : array_like, shape (steps,) or (steps, *batch)
+        torque_on, voltage_ratio : array_like, shape () or (steps,)
+            Share of each step for which the torque is on; supply voltage over the reference.
+        """
+        commands = np.asarray(commands, float)
+        steps = len(commands)
+        on = np.broadcast_to(np.asarray(torque_on, float), (steps,))
+        on = np.broadcast_to(on.reshape(-1, *[1] * len(self.batch)), (steps, *self.batch))
+        self._on = self._torque.shift(on)
+        self._volts = np.broadcast_to(np.asarray(voltage_ratio, float), (steps,))
+        return super().rollout(commands)
+
+    def _rest(self, position: NDArray[np.float64]) -> None:
+        still = np.zeros(self.batch)
+        self._state = (position.copy(), still, position.copy(), still)
+        self._torque.reset(np.ones(self.batch))
+
+    def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
+        w, h = self._values, self.time_step_s
+        inertia, gravity, hanging = self._load
+        per = 1.0 / (w["armature"] + inertia)
+        stiffness = w["duty_per_rad"] * self._gain
+        y, v, target, rate = self._state
+        ramp = w["acceleration_limit"]
+        limited = np.isfinite(ramp)
+        out = np.empty(delayed.shape)
+        for k in range(len(delayed)):
+            way = delayed[k] - target
+            wanted_rate = np.sign(way) * np.sqrt(2.0 * np.where(limited, ramp, 1.0) * np.abs(way))
+            wanted_rate = np.clip(wanted_rate, -np.abs(way) / h, np.abs(way) / h)
+            rate = rate + np.clip(wanted_rate - rate, -ramp * h, ramp * h)
+            target = np.where(limited, target + rate * h, delayed[k])
+            error = target - y
+            error = error - np.clip(error, -w["dead_zone_rad"], w["dead_zone_rad"])
+            wanted = stiffness * error - w["duty_s_per_rad"] * v
+            wanted = wanted + w["start_duty"] * np.clip(error / START_ERROR_RAD, -1.0, 1.0)
+            duty = np.clip(wanted, -1.0, 1.0)
+            top = w["stall_torque"] * self._volts[k] * self._on[k]
+            share = w["off_brake"] + (1.0 - w["off_brake"]) * self._on[k]
+            back = w["back_emf"] * share
+            drawn = duty * top - back * v
+            motor = np.clip(drawn, -w["torque_limit"], w["torque_limit"])
+            damping = np.where(duty == wanted, w["duty_s_per_rad"] * top, 0.0) + back
+            damping = np.where(motor == drawn, damping, 0.0)
+            weight = -gravity * np.sin(y - hanging)
+            standing = 1.0 / (1.0 + (v / w["stribeck_speed"]) ** 2)
+            limit = w["friction_loss"] + w["stribeck_friction"] * standing
+            limit = limit + (1.0 + w["load_friction_static"] * standing) * (
+                w["load_friction_motor"] * np.abs(motor) + w["load_friction_load"] * np.abs(weight)
+            )
+            limit = (limit + w["load_friction_quadratic"] * motor**2) * per
+            force = (motor + weight) * per
+            force = force + np.clip(-FRICTION_IMPEDANCE * (v / h + force), -limit, limit)
+            v = v + force * h / (1.0 + h * damping * per)
+            y = y + v * h
+            out[k] = y
+        self._state = (y, v, target, rate)
+        return out

@@ -1,0 +1,1 @@
+"""Identify servos under load: position loop, motor, friction and gravity, in N·m."""

@@ -1,0 +1,113 @@
+"""The servo under load: against DelayedPD, against MuJoCo, and against its compiled form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, DelayedPD
+from pupper_sysid.servo_models.loaded_servo import (
+    COLUMNS,
+    Load,
+    LoadedServo,
+    LoadedServoParameters,
+)
+from pupper_sysid.sim.robot.servo_mjcf import pendulum_xml, rest_at
+from pupper_sysid.sysid.loaded import kernel
+
+STEP_S = 0.002
+SERVO = LoadedServoParameters(
+    duty_per_rad=0.06, duty_s_per_rad=0.03, stall_torque=2.4, back_emf=0.35, armature=0.02,
+    friction_loss=0.06, dead_time_s=0.0133,
+)  # fmt: skip
+EXTENDED = replace(
+    SERVO, stribeck_friction=0.05, stribeck_speed=0.2, load_friction_motor=0.15,
+    load_friction_load=0.1, load_friction_quadratic=0.03, load_friction_static=0.4,
+    torque_limit=1.6, off_brake=0.2, dead_zone_rad=0.002, start_duty=0.01,
+)  # fmt: skip
+LOAD = Load(0.0049, 0.48, 0.05)
+
+
+def commands(steps: int = 2000) -> np.ndarray:
+    time = STEP_S * np.arange(steps)
+    return 0.6 * np.sin(2.0 * time**2) + 0.5 * (time > 2.0)
+
+
+def test_without_load_and_its_friction_it_is_delayed_pd():
+    loaded = LoadedServo(SERVO, p_gain=16.0, time_step_s=STEP_S)
+    plain = DelayedPD(SERVO.delayed_pd(16.0), STEP_S)
+    loaded.reset(0.1)
+    plain.reset(0.1)
+    difference = loaded.rollout(commands()) - plain.rollout(commands())
+    assert np.abs(difference).max() < 1e-9
+
+
+def test_mujoco_swings_the_same_pendulum():
+    servo, gain = SERVO, 16.0
+    mass, length = 0.49, 0.1
+    load = Load(mass * length**2, mass * 9.81 * length, 0.0)
+    model = mujoco.MjModel.from_xml_string(
+        pendulum_xml(servo.delayed_pd(gain), mass, length, STEP_S)
+    )
+    data = mujoco.MjData(model)
+    rest_at(model, data, [0.0])
+    own = LoadedServo(servo, gain, load, STEP_S)
+    own.reset(0.0)
+    found = own.rollout(commands())
+    for k, command in enumerate(commands()):
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data)
+        assert abs(data.qpos[0] - found[k]) < 1e-6, k
+
+
+@pytest.mark.parametrize("ramp", [np.inf, 30.0])
+@pytest.mark.parametrize("servo", [SERVO, EXTENDED])
+def test_the_compiled_servo_is_the_one_in_numpy(servo: LoadedServoParameters, ramp: float):
+    servo = replace(servo, acceleration_limit=ramp)
+    steps, rest, start = 1500, 60, -0.2
+    on = np.ones(steps)
+    on[900:] = 0.0
+    volts = 1.0 + 0.1 * np.sin(np.arange(steps) / 50)
+    own = LoadedServo(servo, 16.0, LOAD, STEP_S)
+    own.reset(start)
+    expected = own.rollout(commands(steps), on, volts)
+    held = np.ones((3, rest + steps))
+    held[0, :rest], held[0, rest:] = start, commands(steps)
+    held[1, rest:], held[2, rest:] = on, volts
+    row = np.zeros((1, kernel.WIDTH))
+    values = servo.arrays()
+    row[0, : len(COLUMNS)] = [float(values[name]) for name in COLUMNS]
+    out = np.empty((steps + 1, 1))
+    load = np.array([LOAD.inertia_kg_m2, LOAD.gravity_nm, LOAD.hanging_rad])
+    kernel.positions(
+        row, np.array([0.0133 / STEP_S]), held, 16.0, load, start, rest, STEP_S,
+        -FRICTION_IMPEDANCE, out,
+    )  # fmt: skip
+    assert np.abs(out[1:, 0] - expected).max() < 1e-6
+
+
+def test_a_limp_servo_falls_to_where_its_load_hangs():
+    own = LoadedServo(replace(SERVO, friction_loss=0.03), 16.0, LOAD, STEP_S)
+    own.reset(1.2)
+    end = own.rollout(np.full(4000, 1.2), torque_on=0.0)[-1]
+    assert abs(end - 0.05) < np.arcsin(0.03 / 0.48)  # dry friction holds it there
+
+
+def test_a_set_point_with_limited_acceleration_arrives_when_theory_says():
+    # from rest to rest over x with acceleration a and then -a takes 2 sqrt(x / a)
+    stiff = replace(SERVO, duty_per_rad=5.0, stall_torque=50.0, back_emf=0.0, friction_loss=0.0,
+                    dead_time_s=0.0, acceleration_limit=20.0)  # fmt: skip
+    own = LoadedServo(stiff, 16.0, time_step_s=STEP_S)
+    own.reset(0.0)
+    found = own.rollout(np.full(500, 0.8))
+    arrived = STEP_S * np.argmax(found > 0.99 * 0.8)
+    assert arrived == pytest.approx(2 * np.sqrt(0.8 / 20.0), rel=0.1)
+
+
+def test_a_negative_number_is_refused():
+    with pytest.raises(InputError, match="stall_torque is -1"):
+        LoadedServo(replace(SERVO, stall_torque=-1.0))
