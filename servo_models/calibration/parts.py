@@ -261,7 +261,7 @@ class Actuator(Part):
         return self
 
 
-class TestedLoad(Part):
+class RecordedLoad(Part):
     """A load that a servo was recorded with."""
 
     inertia_kg_m2: NotNegative
@@ -287,7 +287,7 @@ class UnderLoad(Part):
     """P gain that the stiffness of `actuator` is for, the register's value."""
     p_gains_tested: Annotated[tuple[Number, ...], Field(strict=False)]
     """P gains of the recordings."""
-    loads_tested: Annotated[tuple[TestedLoad, ...], Field(strict=False)] = ()
+    loads_tested: Annotated[tuple[RecordedLoad, ...], Field(strict=False)] = ()
     """Loads of the recordings."""
     reference_voltage_v: Annotated[Number, Field(gt=0)] | None = None
     """Supply voltage that the stall torque is for; null where it is not scaled with the voltage."""
@@ -341,7 +341,7 @@ class UnderLoad(Part):
             for name, key in LOADED_KEYS.items()
             if (value := getattr(self, key)) is not None
         }
-        return LoadedServoParameters(**own, dead_time_s=dead_time_s)
+        return LoadedServoParameters(**{"duty_s_per_rad": 0.0, **own}, dead_time_s=dead_time_s)
 
     def how_far_tested(self, p_gain: float) -> str:
         """What the recordings say of a P gain, in a sentence.

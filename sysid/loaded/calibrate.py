@@ -25,10 +25,10 @@ from pupper_sysid.servo_models.calibration.parts import (
     Lag,
     Quantity,
     RatiosToArmature,
+    RecordedLoad,
     Scale,
     Scores,
     Selection,
-    TestedLoad,
     UnderLoad,
 )
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
@@ -344,7 +344,7 @@ def _block(found: LoadedFit, torque: float) -> UnderLoad:
         p_gain=found.p_gain,
         p_gains_tested=found.p_gains,
         loads_tested=tuple(
-            TestedLoad(inertia_kg_m2=inertia, gravity_nm=gravity)
+            RecordedLoad(inertia_kg_m2=inertia, gravity_nm=gravity)
             for inertia, gravity in (found.loads if known else ())
         ),
         reference_voltage_v=(

@@ -55,6 +55,7 @@ _MOST_COMPARED = 3
 _SEARCHED_S = 80.0
 """Duration of all runs together that the search uses; the final fit uses all."""
 _REMEMBERED_S = 0.5
+_SHARP_DEAD_TIME_S = 0.015
 _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
 
 
@@ -458,6 +459,8 @@ def _why_unidentified(
 ) -> str | None:
     if name in ("hanging_rad", "offset_rad"):
         return None
+    if name == "dead_time_s" and interval.high - interval.low < _SHARP_DEAD_TIME_S:
+        return None  # a short one may well be close to none
     if interval.low > 0 and interval.high > 4 * interval.low:
         return "its interval is wider than a factor of 4"
     if interval.low <= 0 and name not in ("off_brake",):

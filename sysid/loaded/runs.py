@@ -95,7 +95,7 @@ def prepare(
     sent = trial.send_time_s - start
     held = np.ones((3, rest + steps))
     command = whole_counts(trial)
-    held[0, :rest] = command[0]
+    held[0, :rest] = trial.initial_command_rad
     held[0, rest:] = averaged(sent, command, steps)
     if trial.torque_enabled is not None:
         on = trial.torque_enabled.astype(float)

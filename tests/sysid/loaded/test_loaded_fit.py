@@ -1,0 +1,141 @@
+"""A servo under load is found from runs of several gains, and predicts one it has not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
+from pupper_sysid.servo_models.calibration.parts import Quantity, RecordedLoad, UnderLoad
+from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
+from pupper_sysid.sysid.compare.compare import compare
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
+from pupper_sysid.sysid.loaded import search
+from pupper_sysid.sysid.loaded.calibrate import loaded_joints
+from pupper_sysid.sysid.loaded.runs import prepare
+from pupper_sysid.sysid.loaded.structures import Scales, Structure
+from pupper_sysid.sysid.recordings.recording import Recording
+
+MASS_KG, LENGTH_M = 0.4, 0.12
+TRUE = LoadedServoParameters(
+    duty_per_rad=0.06, duty_s_per_rad=0.0, stall_torque=2.0, back_emf=0.28, armature=0.012,
+    friction_loss=0.08, dead_time_s=0.014, off_brake=0.3,
+)  # fmt: skip
+STEP_S, LOOP_S = 0.002, 0.01
+
+
+def recording(gain: float, seed: int = 0, steps: int = 300) -> Recording:
+    """Random steps, then a drop, of the true servo; rows every 10 ms, readings in counts."""
+    rng = np.random.default_rng(seed)
+    command = np.repeat(rng.uniform(-0.9, 0.9, steps // 30), 30)
+    on = np.ones(steps)
+    on[-60:] = 0.0
+    load = Load(MASS_KG * LENGTH_M**2, MASS_KG * 9.81 * LENGTH_M, 0.0)
+    servo = LoadedServo(TRUE, gain, load, STEP_S)
+    servo.reset(0.0)
+    per = round(LOOP_S / STEP_S)
+    moved = servo.rollout(np.repeat(command, per), np.repeat(on, per))
+    position = np.concatenate([[0.0], moved])[1::per][:steps]
+    time = LOOP_S * np.arange(steps)
+    table = pd.DataFrame(
+        {
+            "send_time_s": time, "read_time_s": time + STEP_S, "trial": 0, "joint": "knee",
+            "frequency_hz": np.nan, "command_rad": command, "torque_enabled": on,
+            "position_rad": np.round(position * 4096 / (2 * np.pi)) * 2 * np.pi / 4096,
+        }
+    )  # fmt: skip
+    header = {
+        "readings": "live", "joints": ["knee"], "start_pose_rad": {"knee": 0.0},
+        "servos": {"knee": {"p_gain": gain}},
+        "loads": {"knee": {"mass_kg": MASS_KG, "length_m": LENGTH_M}},
+    }  # fmt: skip
+    return Recording.from_frame(table, metadata=header, name=f"p{gain:g}")
+
+
+def calibration(gains: tuple[float, ...] = (8.0, 32.0)) -> Calibration:
+    """The true servo as a calibration file carries it."""
+
+    def known(value: float) -> Quantity:
+        return Quantity(value=value, low=value, high=value, identified="yes")
+
+    preset = load_calibration("release")
+    joint = next(iter(preset.joints.values()))
+    pd_ = TRUE.delayed_pd(16.0).arrays()
+    actuator = joint.actuator.model_copy(
+        update={
+            "stiffness_nm_per_rad": known(float(pd_["stiffness"])),
+            "damping_nm_s_per_rad": known(0.0),
+            "friction_loss_nm": known(0.08),
+            "armature_kg_m2": known(0.012),
+            "effort_limit_nm": known(2.0),
+            "back_emf_nm_s_per_rad": known(0.28),
+            "velocity_limit_rad_s": known(1000.0),
+            "dead_time_s": known(0.014),
+        }
+    )
+    block = UnderLoad(
+        structure="base", known_load=True, p_gain=16.0, p_gains_tested=gains,
+        loads_tested=(RecordedLoad(inertia_kg_m2=0.006, gravity_nm=0.47),),
+        duty_per_rad=known(0.06), stall_torque_nm=known(2.0), back_emf_nm_s_per_rad=known(0.28),
+        armature_kg_m2=known(0.012), friction_loss_nm=known(0.08), off_brake=known(0.3),
+    )  # fmt: skip
+    own = joint.model_copy(update={"actuator": actuator, "under_load": block})
+    return preset.model_copy(update={"joints": {"knee": own}})
+
+
+def test_numbers_in_newton_metres_follow_from_a_known_load():
+    trials = tuple(t for g in (8.0, 32.0) for t in recording(g, int(g)).trials("knee"))
+    lattice = find_poll_lattice(trials, np.random.default_rng(0))
+    runs = tuple(r for t in trials if (r := prepare(t, lattice)) is not None)
+    scales = Scales(MASS_KG * 9.81 * LENGTH_M, MASS_KG * LENGTH_M**2, 8.0, True, True)
+    structure = Structure((), scales)
+    problem = search.Problem(structure, runs, (1e-3,) * len(runs))
+    rng = np.random.default_rng(0)
+    best = search.evolve(problem, search.search(problem, rng), rng)
+    found = structure.servo(structure.decode(best.point))
+    for name, tolerance in (
+        ("stall_torque", 0.05), ("armature", 0.05), ("friction_loss", 0.05), ("back_emf", 0.05),
+    ):  # fmt: skip
+        assert getattr(found, name) == pytest.approx(getattr(TRUE, name), rel=tolerance), name
+    assert found.dead_time_s == pytest.approx(TRUE.dead_time_s, abs=1e-3)
+
+
+def test_a_known_load_several_gains_or_torque_off_make_a_loaded_joint():
+    knee = {"knee": recording(8.0).trials("knee")}
+    assert loaded_joints(knee) == ["knee"]
+
+
+def test_a_calibration_predicts_a_gain_it_has_not_seen(tmp_path: Path):
+    path = tmp_path / "knee.yaml"
+    calibration().save(path)
+    found = compare([recording(16.0, 1), recording(16.0, 2)], [path], "knee")
+    (label,) = found.models
+    assert "knee.yaml" in label
+    plain = found.to_dict()["models"][label]
+    for part in (plain["mean"], plain["joints"]["knee"]):
+        for name in ("mae_raw_rad", "mae_held_rad", "rmse_raw_rad", "rmse_held_rad"):
+            assert part[name] < 1.5e-3, name  # a count is 1.5 mrad
+    assert any("lies between recorded gains, 8 and 32" in note for note in found.notes)
+
+
+def test_a_calibration_of_one_gain_is_told_from_one_of_any(tmp_path: Path):
+    known = calibration()
+    alone = known.model_copy(
+        update={"joints": {"knee": known.joint("knee").model_copy(update={"under_load": None})}}
+    )
+    known.save(tmp_path / "any.yaml")
+    alone.save(tmp_path / "one.yaml")
+    found = compare(recording(32.0, 3), [tmp_path / "any.yaml", tmp_path / "one.yaml"], "knee")
+    errors = {name: m.mean.mae_raw_rad for name, m in found.models.items()}
+    assert errors["servo under load (any.yaml)"] < 0.1 * errors["DelayedPD (one.yaml)"]
+
+
+def test_the_file_keeps_the_servo_under_load(tmp_path: Path):
+    calibration().save(tmp_path / "knee.yaml")
+    read = load_calibration(tmp_path / "knee.yaml").joint("knee")
+    assert read.under_load is not None
+    assert read.under_load.servo(0.014) == TRUE
+    assert read.at_p_gain(32.0).stiffness == pytest.approx(0.06 * 32 * 2.0)
