@@ -56,7 +56,7 @@ def random_servo(rng: np.random.Generator) -> PendulumServoParameters:
     )
 
 
-def motion(kind: str, time_s: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def motion(kind: str, time_s: NDArray, rng: np.random.Generator) -> NDArray:
     """Commands of a run [rad]."""
     if kind == "chirp":
         return 0.9 * np.sin(1.2 * time_s**2)

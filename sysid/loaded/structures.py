@@ -101,8 +101,8 @@ class Structure:
         if s.torque_off:
             own.append(Parameter("off_brake", 0.5, 0.0, 1.0, 1.0))
         if s.gravity:
-            own.append(Parameter("gravity_sin", 0.0, -5 * torque, 5 * torque, torque))
-            own.append(Parameter("gravity_cos", 0.0, -5 * torque, 5 * torque, torque))
+            own.append(Parameter("gravity_sin", 0.0, -2 * torque, 2 * torque, 0.3 * torque))
+            own.append(Parameter("gravity_cos", 0.0, -2 * torque, 2 * torque, 0.3 * torque))
         extra = {
             "load_friction_motor": Parameter("load_friction_motor", 0.1, 1e-4, 0.95, 2.0),
             "load_friction_load": Parameter("load_friction_load", 0.05, 1e-4, 0.95, 2.0),
