@@ -52,7 +52,7 @@ _PREFERENCE = 1.02
 _TELLING_NATS = 5.0
 _RUN_FOLDS = 4
 _MOST_COMPARED = 3
-_SEARCHED_S = 80.0
+_SEARCHED_S = 250.0
 """Duration of all runs together that the search uses; the final fit uses all."""
 _REMEMBERED_S = 0.5
 _SHARP_DEAD_TIME_S = 0.015
