@@ -55,6 +55,9 @@ _MOST_COMPARED = 3
 _SEARCHED_S = 250.0
 """Duration of all runs together that the search uses; the final fit uses all."""
 _REMEMBERED_S = 0.5
+_STEPPING_SHARE = 0.006
+"""Relative error that physics steps leave, whatever the number of readings: standard deviation over
+random emulated servos that move in other steps (`benchmarks/loaded_pendulum.py`)."""
 _SHARP_DEAD_TIME_S = 0.015
 _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
 
@@ -222,7 +225,7 @@ def fit_loaded_joint(
         own_draws = spread[features][name]
         ends = [Interval.of_draws(value, d[name]) for d in spread.values() if name in d]
         low, high = (f(x) for f, x in ((min, [e.low for e in ends]), (max, [e.high for e in ends])))
-        numbers[name] = Interval(value, min(low, value), max(high, value))
+        numbers[name] = _stepped(name, Interval(value, min(low, value), max(high, value)))
         if why := _why_unidentified(name, numbers[name], own_draws, chosen):
             undecided[name] = why
     doubt = _doubt(trials) + lattice.time_doubt_s
@@ -469,6 +472,19 @@ def _why_unidentified(
         if p.name == name and p.logarithmic and np.std(np.log(draws)) > 0.7 * p.prior_sd:
             return "these recordings do not excite it; the value is the prior's"
     return None
+
+
+def _stepped(name: str, interval: Interval) -> Interval:
+    """A torque, inertia or ratio with the error of a model that moves in steps."""
+    if name in ("dead_time_s", "hanging_rad", "offset_rad") or interval.value <= 0:
+        return interval
+    grain = float(ndtri(0.5 + LEVEL / 2)) * _STEPPING_SHARE * interval.value
+    low, high = interval.value - interval.low, interval.high - interval.value
+    return Interval(
+        interval.value,
+        max(interval.value - float(np.hypot(low, grain)), 0.0),
+        interval.value + float(np.hypot(high, grain)),
+    )
 
 
 def _grained(interval: Interval, doubt_s: float) -> Interval:
