@@ -53,7 +53,7 @@ def causality_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     refused = _scale(how) or _not_a_servo(trials, how)
     if refused:
         return [refused]
-    return [*_loose(how), *_drift(trials, how), *_changed(trials, how)]
+    return [*_loose(trials, how), *_drift(trials, how), *_changed(trials, how)]
 
 
 def crossed(trials_by_joint: Mapping[str, Sequence[Trial]]) -> dict[str, Finding]:
@@ -259,7 +259,7 @@ def _turns(trials: Sequence[Trial]) -> int:
     return count
 
 
-def _loose(how: Following) -> list[Finding]:
+def _loose(trials: Sequence[Trial], how: Following) -> list[Finding]:
     found = []
     if how.explained < _LOOSE:
         text = (
@@ -275,7 +275,9 @@ def _loose(how: Following) -> list[Finding]:
             "one by one."
         )
         found.append(Finding(CARE, text))
-    gain = how.gain[np.isfinite(how.gain)]
+    # a known load is held at a part of the command, the lower the P gain the less
+    free = [t.load is None for t in trials]
+    gain = how.gain[np.isfinite(how.gain) & free]
     if len(gain) and (np.median(gain) > _TOO_LARGE or np.max(gain) < _SMALL):
         shown = float(np.median(gain) if np.median(gain) > _TOO_LARGE else np.max(gain))
         text = (
@@ -287,10 +289,10 @@ def _loose(how: Following) -> list[Finding]:
 
 
 def _drift(trials: Sequence[Trial], how: Following) -> list[Finding]:
-    """A zero that moves during a trial."""
+    """A zero that moves during a trial; under a load that is known gravity moves it."""
     for t, left in zip(trials, how.residual_rad, strict=True):
         half = len(left) // 2
-        if half < 20:
+        if half < 20 or t.load is not None:
             continue
         moved = abs(float(np.median(left[:half]) - np.median(left[half:])))
         if moved > max(_DRIFT_RAD, _DRIFT_SHARE * float(np.ptp(t.command_rad))):
@@ -305,13 +307,14 @@ def _drift(trials: Sequence[Trial], how: Following) -> list[Finding]:
 def _changed(trials: Sequence[Trial], how: Following) -> list[Finding]:
     """Trials of one tone and amplitude that differ."""
     tones = [
-        (t.frequency_hz, float(np.ptp(t.command_rad)), g)
+        (t.frequency_hz, float(np.ptp(t.command_rad)), g, t.p_gain)
         for t, g in zip(trials, how.gain, strict=True)
         if t.frequency_hz > 0 and np.isfinite(g)
     ]
-    for n, (f, a, g) in enumerate(tones):
-        for f2, a2, g2 in tones[:n]:
+    for n, (f, a, g, p) in enumerate(tones):
+        for f2, a2, g2, p2 in tones[:n]:
             alike = abs(f - f2) < _SAME_TONE_HZ and abs(a - a2) < 0.05 * a
+            alike &= p == p2 or not np.isfinite(p + p2)  # another P gain moves differently
             if alike and abs(g - g2) > _DIFFERENT * max(abs(g), abs(g2)):
                 text = (
                     f"two trials of {f:.3g} Hz differ: the joint moves {g:.2f} and {g2:.2f} times "

@@ -42,8 +42,9 @@ _CHECKS = (
 
 
 def long_enough(trials: Sequence[Trial]) -> list[Trial]:
-    """The trials that have rows enough to be looked at."""
-    return [t for t in trials if len(t.send_time_s) >= LEAST_ROWS]
+    """The trials that have rows enough to be looked at, where their torque is on."""
+    powered = [t.powered() for t in trials]
+    return [t for t in powered if len(t.send_time_s) >= LEAST_ROWS]
 
 
 def findings(recorded: Sequence[Trial]) -> list[Finding]:

@@ -159,10 +159,11 @@ def interpolation_findings(trials: Sequence[Trial], step: float) -> list[Finding
 
 def stop_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """Readings that stay at an extreme: a mechanical stop, a limit, a saturated encoder."""
-    # friction flattens the tops of a slow tone; a stop does it in every trial, or by more
-    excess = [_pinned(t, step) for t in trials]
+    # friction flattens the tops of a slow tone; a stop does it in every trial, or by more. A known
+    # load stands still where friction holds it
+    excess = [_pinned(t, step) for t in trials if t.load is None]
     pinned = [e for e in excess if e > _PINNED[0]]
-    often = 2 * len(pinned) > len(trials) >= _ENOUGH_TRIALS
+    often = 2 * len(pinned) > len(excess) >= _ENOUGH_TRIALS
     if not pinned or (max(excess) < _PINNED[1] and not often):
         return []
     return [Finding(CARE, f"readings stay at their highest or lowest value in {len(pinned)} of "
@@ -174,8 +175,8 @@ def stop_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 def offset_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """A constant between command and reading: the joint's zero, or a whole turn."""
     away = offset(trials)
-    if not abs(away) > _NOTED_RAD:
-        return []
+    if not abs(away) > _NOTED_RAD or any(t.load is not None for t in trials):
+        return []  # a known load sags; the fit under load finds the zero
     if abs(away) > _TURNED_RAD:
         return [Finding(REFUSE, f"readings are {away:.2f} rad away from the commands, half a turn "
                                 "or more: the encoder's zero or a multiple of 2π. Subtract it from "

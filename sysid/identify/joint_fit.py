@@ -224,11 +224,13 @@ def _compared(structures: Mapping[str, StructureFit], ready: PreparedJoint) -> _
     close = [n for n in errors if not known or errors[n] <= 1.01 * min(errors.values())]
     carried = min(close, key=lambda name: nats[name])
     intervals = [fitted[n].parameters["dead_time_s"] for n in {carried, *plausible(nats)}]
+    # readings that were taken later than dated lengthen the dead time, as they do the lag
+    doubt = ready.lag.feedback.time_doubt_s + max(t.read_time_doubt_s for t in ready.recorded)
     dead_time = Interval(
         fitted[carried].parameters["dead_time_s"].value,
         min(i.low for i in intervals),
         max(i.high for i in intervals),
-    ).widened(ready.lag.feedback.time_doubt_s)
+    ).widened(doubt)
     dead_time = replace(dead_time, low=max(dead_time.low, 0.0))
     offset = fitted[carried].parameters["offset_rad"].value
     lag = ready.lag.with_dead_time(dead_time, offset)

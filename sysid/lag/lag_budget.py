@@ -199,6 +199,7 @@ def lag_budget(
     InputError
         If nothing moves, or there are too few fresh readings to say anything.
     """
+    trials = [t.powered() for t in trials]
     lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     read = [readings(t, lattice) for t in trials]
     if sum(len(r.rows) for r in read) < 16:

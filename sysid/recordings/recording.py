@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -112,6 +112,24 @@ class Trial:
     voltage_v: NDArray[np.float64] | None = None
     servo: ServoSetup = field(default_factory=ServoSetup)
     load: PendulumLoad | None = None
+
+    def powered(self) -> Trial:
+        """Its longest stretch of rows with the torque on; all of it where it always was."""
+        on = self.torque_enabled
+        if on is None or on.all():
+            return self
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
+        first, stop = max(edges.reshape(-1, 2).tolist(), key=np.diff, default=(0, 0))
+        rows = {
+            name: value[first:stop]
+            for name in (
+                "send_time_s", "read_time_s", "command_rad", "position_rad", "position_count",
+                "torque_enabled", "voltage_v",
+            )
+            if (value := getattr(self, name)) is not None
+        }  # fmt: skip
+        initial = self.initial_command_rad if first == 0 else float(self.command_rad[first - 1])
+        return replace(self, **rows, initial_command_rad=initial)
 
 
 @dataclass(frozen=True)

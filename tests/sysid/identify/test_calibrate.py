@@ -199,7 +199,8 @@ def test_the_real_sweeps_reach_the_best_published_figures(real, joint, lag, held
     pd = found.candidate_models["delayed_pd"].scores
     lattice = found.lag.feedback
     assert 1e3 * lattice.poll_period_s == pytest.approx(26.85, abs=0.15)
-    assert lattice.loss == pytest.approx(0.42, abs=0.05)
+    # of polls at which the joint moves; 0.42 counts those at which friction holds it, too
+    assert lattice.loss == pytest.approx(0.37, abs=0.05)
     assert found.lag.quantum_rad == pytest.approx(5.712e-3, abs=1e-6)
     assert 1e3 * found.lag.lag_s.value == pytest.approx(lag, abs=1.5)
     assert 1e3 * (found.lag.lag_s.high - found.lag.lag_s.low) / 2 <= 1.5
