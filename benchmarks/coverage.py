@@ -33,6 +33,7 @@ import numpy as np
 import twins
 from random_robots import sweep_random_robot
 
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.compare.truth import truth_table
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
 from pupper_sysid.sysid.identify.models import candidate_model
@@ -143,9 +144,13 @@ def real(seed: int) -> list[Row]:
     return list(of_twin(own, calibrate(twins.record(own, commands, rng))))
 
 
-def _quietly(world: str, seed: int) -> list[Row]:
+def _quietly(world: str, seed: int) -> list[Row] | None:
+    """Rows of one robot; None where `calibrate` refuses it, such as one that cannot move."""
     warnings.simplefilter("ignore")
-    return {"emulated": emulated, "live": live, "real": real}[world](seed)
+    try:
+        return {"emulated": emulated, "live": live, "real": real}[world](seed)
+    except InputError:
+        return None
 
 
 def main() -> None:
@@ -158,13 +163,14 @@ def main() -> None:
     found: dict[str, list[Row]] = defaultdict(list)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         results = pool.map(partial(_quietly, options.world), range(options.robots))
-        done = 0
+        done = refused = 0
         with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C: the table of what is done
             for done, rows in enumerate(results, 1):  # noqa: B007
-                for row in rows:
+                refused += rows is None
+                for row in rows or ():
                     found[row.quantity].append(row)
         pool.shutdown(wait=False, cancel_futures=True)
-    print(f"{done} robots, {options.world}")
+    print(f"{done} robots, {options.world}, {refused} refused")
     print("| quantity | identified | holds the truth | median width | not identified: holds |")
     print("|" + "---|" * 5)
     for quantity, rows in found.items():
@@ -172,7 +178,11 @@ def main() -> None:
         others = [r for r in rows if not r.identified]
 
         def held(some: list[Row]) -> str:
-            inside = sum(r.low <= r.truth <= r.high for r in some)
+            # a quantisation step has no width, but that of its last digits
+            slack = [1e-6 * abs(r.truth) for r in some]
+            inside = sum(
+                r.low - d <= r.truth <= r.high + d for r, d in zip(some, slack, strict=True)
+            )
             return f"{inside} ({100 * inside / len(some):.0f} %)" if some else "–"
 
         width = "–"
