@@ -7,7 +7,7 @@ follow as::
 
     stall torque = kt / R * supply voltage        at full duty, standstill
     back-EMF     = kt^2 / R
-    error gain   = error_gain of the class * error_gain_ratio
+    duty_per_rad = error_gain of the class * error_gain_ratio
 
 and back as kt = back-EMF / s, R = kt / s with s = stall torque / supply voltage. `q_offset` is the
 zero of the test bench, no number of the servo. The largest duty clips the torque; BAM's own
@@ -153,7 +153,7 @@ def from_bam(parameters: BamParameters, kind: Actuator) -> PositionLoop:
         raise InputError("A BAM parameter file needs kt and R above 0. Fit it again.")
     both = p.load_friction_base, p.load_friction_stribeck
     ours = {
-        "error_gain": kind.error_gain * (p.error_gain_ratio or 1.0),
+        "duty_per_rad": kind.error_gain * (p.error_gain_ratio or 1.0),
         "duty_limit": kind.duty_limit,
         "stall_torque_nm": p.kt / p.R * kind.supply_v,
         "back_emf_nm_s_per_rad": p.kt**2 / p.R,
@@ -161,14 +161,14 @@ def from_bam(parameters: BamParameters, kind: Actuator) -> PositionLoop:
         "friction_loss_nm": p.friction_base,
         "viscous_friction_nm_s_per_rad": p.friction_viscous,
         "stribeck_friction_nm": p.friction_stribeck,
-        "stribeck_velocity_rad_s": p.dtheta_stribeck,
+        "stribeck_speed_rad_s": p.dtheta_stribeck,
         "stribeck_exponent": p.alpha,
         "load_friction_motor": _first(p.load_friction_motor, both[0]),
-        "load_friction_external": _first(p.load_friction_external, both[0]),
+        "load_friction_load": _first(p.load_friction_external, both[0]),
         "load_stribeck_motor": _first(p.load_friction_motor_stribeck, both[1]),
-        "load_stribeck_external": _first(p.load_friction_external_stribeck, both[1]),
+        "load_stribeck_load": _first(p.load_friction_external_stribeck, both[1]),
         "load_quadratic_motor": p.load_friction_motor_quad,
-        "load_quadratic_external": p.load_friction_external_quad,
+        "load_quadratic_load": p.load_friction_external_quad,
         "velocity_limit_rad_s": p.max_velocity,
         "dead_time_s": p.command_delay,
     }
@@ -205,7 +205,7 @@ def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
     kt = emf.value / per_volt
     made: dict[str, Any] = {"kt": kt}
     if kind.has_ratio:
-        made["error_gain_ratio"] = numbers.error_gain.value / kind.error_gain
+        made["error_gain_ratio"] = numbers.duty_per_rad.value / kind.error_gain
     made |= {"R": kt / per_volt, "armature": numbers.armature_kg_m2.value, "q_offset": 0.0}
     if kind.has_ratio:
         made["max_velocity"] = numbers.velocity_limit_rad_s
@@ -222,7 +222,7 @@ def not_in_bam(card: ServoCard) -> list[str]:
     name, kind = class_of(card)
     numbers, told = card.numbers, []
     if isinstance(numbers, PositionLoop):
-        gain = numbers.error_gain.value
+        gain = numbers.duty_per_rad.value
         if not kind.has_ratio and abs(gain / kind.error_gain - 1) > 1e-6:
             told.append(
                 f"BAM's class {name} has the error gain {kind.error_gain:g} built in; the card's "
@@ -269,16 +269,16 @@ def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:
     n = numbers
     stribeck = {
         "friction_stribeck": n.stribeck_friction_nm or stated(0.0),
-        "dtheta_stribeck": n.stribeck_velocity_rad_s or stated(0.2),
+        "dtheta_stribeck": n.stribeck_speed_rad_s or stated(0.2),
         "alpha": n.stribeck_exponent or stated(1.35),
     }
-    slow = n.stribeck_friction_nm is not None or n.load_stribeck_external is not None
-    if n.load_friction_external is None:
+    slow = n.stribeck_friction_nm is not None or n.load_stribeck_load is not None
+    if n.load_friction_load is None:
         return ("m2", stribeck) if slow else ("m1", {})
-    motor, external = n.load_friction_motor or stated(0.0), n.load_friction_external
-    slow_pair = n.load_stribeck_motor or stated(0.0), n.load_stribeck_external or stated(0.0)
+    motor, external = n.load_friction_motor or stated(0.0), n.load_friction_load
+    slow_pair = n.load_stribeck_motor or stated(0.0), n.load_stribeck_load or stated(0.0)
     same = motor == external and slow_pair[0] == slow_pair[1]
-    if same and n.load_quadratic_external is None:
+    if same and n.load_quadratic_load is None:
         made = {"load_friction_base": external}
         if not slow:
             return "m3", made
@@ -289,11 +289,11 @@ def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:
         "load_friction_motor_stribeck": slow_pair[0],
         "load_friction_external_stribeck": slow_pair[1],
     }
-    if n.load_quadratic_external is None:
+    if n.load_quadratic_load is None:
         return "m5", made
     return "m6", made | {
         "load_friction_motor_quad": n.load_quadratic_motor or stated(0.0),
-        "load_friction_external_quad": n.load_quadratic_external,
+        "load_friction_external_quad": n.load_quadratic_load,
     }
 
 

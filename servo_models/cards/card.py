@@ -13,7 +13,7 @@ accepted wherever a calibration is. Its feedback is ideal: a card has no bus.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -34,15 +34,19 @@ from pupper_sysid.servo_models.calibration.parts import (
     RatiosToArmature,
     Scale,
     Selection,
+    UnderLoad,
 )
 from pupper_sysid.servo_models.cards.data_sheet import counts_of
 from pupper_sysid.servo_models.cards.numbers import (
+    LOADED_KEYS,
+    LoadedLoop,
     PositionLoop,
     ServoNumbers,
     TorquePD,
     stated,
 )
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
+from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 
 SCHEMA = "pupper-servo-card"
 SCHEMA_VERSION = 1
@@ -146,13 +150,13 @@ class ServoCard(Part):
                 f"default is {self.default}, which is no specimen of it "
                 f"({', '.join(self.specimens)})"
             )
-        loops = any(isinstance(n, PositionLoop) for n in self.specimens.values())
+        loops = any(not isinstance(n, TorquePD) for n in self.specimens.values())
         if loops and (self.gains.p is None or self.supply_v is None):
-            raise ValueError("numbers of a position_loop need gains.p and supply_v")
+            raise ValueError("numbers of a position loop need gains.p and supply_v")
         return self
 
     @property
-    def numbers(self) -> PositionLoop | TorquePD:
+    def numbers(self) -> PositionLoop | LoadedLoop | TorquePD:
         """Numbers of the default specimen."""
         return self.specimens[self.default]
 
@@ -172,7 +176,7 @@ class ServoCard(Part):
             If another gain is wanted of numbers that are torques already.
         """
         numbers = self.specimens.get(joint or self.default, self.numbers)
-        if isinstance(numbers, PositionLoop):
+        if not isinstance(numbers, TorquePD):
             own = self.gains.p if p_gain is None else p_gain
             assert own is not None
             return numbers.as_pd(own)
@@ -182,6 +186,28 @@ class ServoCard(Part):
                 f"only as they are. Leave `p_gain` out, or take a card of a position loop."
             )
         return numbers
+
+    def loaded(self, joint: str | None = None) -> tuple[LoadedServoParameters, float]:
+        """The servo as a position loop with motor and friction, and its P gain.
+
+        Parameters
+        ----------
+        joint : str, optional
+            A specimen's name; that of any other joint means the default's.
+
+        Returns
+        -------
+        parameters : LoadedServoParameters
+            For `servo_models.loaded_servo.LoadedServo`, which adds a load.
+        p_gain : float
+            P gain at which they are the card's; 1 where the card states torques without one.
+        """
+        numbers = self.specimens.get(joint or self.default, self.numbers)
+        gain = self.gains.p
+        if isinstance(numbers, TorquePD):
+            return numbers.loaded(gain or 1.0), gain or 1.0
+        assert gain is not None
+        return numbers.loaded(), gain
 
     def calibration(self) -> Calibration:
         """The card as a calibration that fits every joint name."""
@@ -219,8 +245,9 @@ class ServoCard(Part):
             "A card has no bus: its feedback is ideal, every reading fresh and on time.",
         ]
         pd = self.pd()
-        if isinstance(self.numbers, PositionLoop) and self.numbers.left_out_of_pd:
-            told.append(self.numbers.left_out_of_pd)
+        numbers = self.numbers
+        if not isinstance(numbers, TorquePD) and numbers.left_out_of_pd:
+            told.append(numbers.left_out_of_pd)
         if pd.dead_time_s is None:
             told.append("The source has no dead time; 0 stands for it.")
         return [*told, *self.notes]
@@ -265,11 +292,30 @@ class ServoCard(Part):
                     source=f"servo card {self.name} ({self.source.title})",
                 ),
             ),
+            under_load=self._under_load(name),
             feedback=Feedback(
                 poll_period_s=_ideal(), loss=_ideal(), offset_rad=_ideal(), mean_age_s=_ideal(),
                 quantum_rad=_ideal(2 * float(np.pi) / counts if counts else 0.0),
             ),
             selection=Selection(model=f"card {self.name}"),
+        )  # fmt: skip
+
+    def _under_load(self, name: str) -> UnderLoad | None:
+        """The servo at any P gain and load; None where the card states torques at one gain."""
+        numbers, gain = self.specimens[name], self.gains.p
+        if isinstance(numbers, TorquePD) or gain is None:
+            return None
+        made: dict[str, Any] = {key: getattr(numbers, key, None) for key in LOADED_KEYS.values()}
+        if isinstance(numbers, PositionLoop):
+            own = numbers.loaded().arrays()
+            finite = {n: float(x) for n, x in own.items() if np.isfinite(x) and x != 0}
+            made = {key: stated(finite[n]) for n, key in LOADED_KEYS.items() if n in finite}
+            made.setdefault("friction_loss_nm", stated(0.0))
+        made["duty_s_per_rad"] = made.get("duty_s_per_rad") or stated(0.0)
+        made.pop("dead_time_s", None)
+        return UnderLoad(
+            structure=f"card {self.name}", known_load=True, p_gain=gain, p_gains_tested=(gain,),
+            reference_voltage_v=self.supply_v, **made,
         )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 A published servo model is one of two things. `PositionLoop` is what the servo is: the firmware
 turns the position error into a duty cycle, the duty drives a DC motor, and gears rub::
 
-    duty   = clip(error_gain * P * (set-point - position), ±duty_limit)
+    duty   = clip(duty_per_rad * P * (set-point - position), ±duty_limit)
     torque = stall_torque * duty - (back_emf + viscous_friction) * velocity
 
 P is the register's value; `stall_torque` holds at full duty and the card's supply voltage, and is
@@ -11,16 +11,20 @@ proportional to it. `TorquePD` is what a simulator's file states: `servo_models.
 
 The first becomes the second for one P gain and one voltage (`PositionLoop.as_pd`)::
 
-    stiffness    = error_gain * P * stall_torque
+    stiffness    = duty_per_rad * P * stall_torque
     effort limit = duty_limit * stall_torque
     back-EMF     = back_emf + viscous_friction        (acts outside of the effort limit)
 
-Stribeck and load-dependent friction have no place in the second and are left out. A number is a
-`Quantity`; one that was published without an interval may be written as the bare number.
+Stribeck and load-dependent friction have no place in the second and are left out. Both become the
+parameters of `servo_models.loaded_servo` (`loaded`), which has them, and the load; `LoadedLoop`
+holds those themselves, for our own fits. A number is a `Quantity`; one that was published without
+an interval may be written as the bare number.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
@@ -33,20 +37,27 @@ from pupper_sysid.servo_models.calibration.parts import (
     unit_of,
 )
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 
 UNSTATED = "stated without an interval"
 """Why a bare number of a card is not identified."""
 
+_ENDINGS = ("_nm", "_nm_s_per_rad", "_kg_m2", "_rad_s", "_rad_s2", "_per_nm")
 _UNITS = {
-    "error_gain": "1/rad",
+    "duty_s_per_rad": "s/rad",
+    "load_friction_quadratic_per_nm": "1/(N·m)",
+    "load_friction_static": "1",
+    "off_brake": "1",
+    "start_duty": "1",
+    "duty_per_rad": "1/rad",
     "duty_limit": "1",
     "stribeck_exponent": "1",
     "load_friction_motor": "1",
-    "load_friction_external": "1",
+    "load_friction_load": "1",
     "load_stribeck_motor": "1",
-    "load_stribeck_external": "1",
+    "load_stribeck_load": "1",
     "load_quadratic_motor": "1/(N·m)",
-    "load_quadratic_external": "1/(N·m)",
+    "load_quadratic_load": "1/(N·m)",
 }
 
 
@@ -55,7 +66,7 @@ def unit(name: str) -> str:
 
     Examples
     --------
-    >>> unit("error_gain"), unit("armature_kg_m2")
+    >>> unit("duty_per_rad"), unit("armature_kg_m2")
     ('1/rad', 'kg·m²')
     """
     return _UNITS.get(name) or unit_of(name)
@@ -132,6 +143,22 @@ class TorquePD(Part):
             back_emf=_or(self.back_emf_nm_s_per_rad),
         )
 
+    def loaded(self, p_gain: float = 1.0) -> LoadedServoParameters:
+        """The same servo as a position loop whose P gain is `p_gain`.
+
+        A limit on the set-point's speed has no place there and is left out.
+        """
+        effort = self.effort_limit_nm.value
+        return LoadedServoParameters(
+            duty_per_rad=self.stiffness_nm_per_rad.value / (p_gain * effort),
+            duty_s_per_rad=_or(self.damping_nm_s_per_rad) / effort,
+            stall_torque=effort,
+            back_emf=_or(self.back_emf_nm_s_per_rad),
+            armature=self.armature_kg_m2.value,
+            friction_loss=self.friction_loss_nm.value,
+            dead_time_s=_or(self.dead_time_s),
+        )
+
     @property
     def top_speed_rad_s(self) -> float | None:
         """Speed at which back-EMF and dry friction use up the largest torque [rad/s].
@@ -155,7 +182,7 @@ class PositionLoop(Part):
 
     model: Literal["position_loop"]
     """Kind of these numbers."""
-    error_gain: Annotated[Cited, _FACTOR]
+    duty_per_rad: Annotated[Cited, _FACTOR]
     """Duty per unit of the P register and radian of position error [1/rad]."""
     duty_limit: Annotated[Cited, _SHARE]
     """Largest duty, as a fraction of 1."""
@@ -171,21 +198,21 @@ class PositionLoop(Part):
     """Torque lost per velocity in the gears [N·m·s/rad]."""
     stribeck_friction_nm: Annotated[Cited | None, _TORQUE] = None
     """Dry friction that is added at standstill [N·m]."""
-    stribeck_velocity_rad_s: Annotated[Cited | None, _SPEED] = None
+    stribeck_speed_rad_s: Annotated[Cited | None, _SPEED] = None
     """Speed over which it fades [rad/s]."""
     stribeck_exponent: Annotated[Cited | None, _FACTOR] = None
-    """Its decay is exp(-(speed / stribeck_velocity)^exponent)."""
+    """Its decay is exp(-(speed / stribeck_speed)^exponent)."""
     load_friction_motor: Annotated[Cited | None, _FACTOR] = None
     """Friction per torque of the motor."""
-    load_friction_external: Annotated[Cited | None, _FACTOR] = None
+    load_friction_load: Annotated[Cited | None, _FACTOR] = None
     """Friction per torque of the load."""
     load_stribeck_motor: Annotated[Cited | None, _FACTOR] = None
     """Friction per torque of the motor that is added at standstill."""
-    load_stribeck_external: Annotated[Cited | None, _FACTOR] = None
+    load_stribeck_load: Annotated[Cited | None, _FACTOR] = None
     """Friction per torque of the load that is added at standstill."""
     load_quadratic_motor: Annotated[Cited | None, _FACTOR] = None
     """Friction per squared torque of the motor that is added at standstill [1/(N·m)]."""
-    load_quadratic_external: Annotated[Cited | None, _FACTOR] = None
+    load_quadratic_load: Annotated[Cited | None, _FACTOR] = None
     """Friction per squared torque of the load that is added at standstill [1/(N·m)]."""
     velocity_limit_rad_s: Annotated[Cited | None, _SPEED] = None
     """Largest rate of the set-point [rad/s]; null where it is not limited."""
@@ -211,7 +238,7 @@ class PositionLoop(Part):
         velocity = self.back_emf_nm_s_per_rad.value + _or(self.viscous_friction_nm_s_per_rad)
         return TorquePD(
             model="delayed_pd",
-            stiffness_nm_per_rad=stated(self.error_gain.value * p_gain * stall),
+            stiffness_nm_per_rad=stated(self.duty_per_rad.value * p_gain * stall),
             friction_loss_nm=self.friction_loss_nm,
             armature_kg_m2=self.armature_kg_m2,
             effort_limit_nm=stated(self.duty_limit.value * stall),
@@ -220,16 +247,141 @@ class PositionLoop(Part):
             dead_time_s=self.dead_time_s,
         )
 
+    def loaded(self) -> LoadedServoParameters:
+        """The same servo with the frictions of `servo_models.loaded_servo`.
+
+        Exact for the loop and the motor: a limit on the duty scales the torque at full duty and the
+        gain. With the torque off the gears' viscous friction remains. BAM's Stribeck friction fades
+        as exp(-(v / v0)^a), here as 1 / (1 + (v / v1)^2) with the same speed at which half is left.
+        Friction per torque is that of a motor that works against its load, and its addition at
+        standstill one share for motor and load. Squared terms (at most 0.01 per N·m) and a limit on
+        the set-point's speed are left out.
+        """
+        limit = self.duty_limit.value
+        viscous = _or(self.viscous_friction_nm_s_per_rad)
+        brake = self.back_emf_nm_s_per_rad.value + viscous
+        per_torque = _or(self.load_friction_motor), _or(self.load_friction_load)
+        at_rest = _or(self.load_stribeck_motor) + _or(self.load_stribeck_load)
+        half = math.log(2) ** (1 / max(_or(self.stribeck_exponent, 2.0), 1e-3))
+        return LoadedServoParameters(
+            duty_per_rad=self.duty_per_rad.value / limit,
+            duty_s_per_rad=0.0,
+            stall_torque=limit * self.stall_torque_nm.value,
+            back_emf=brake,
+            armature=self.armature_kg_m2.value,
+            friction_loss=self.friction_loss_nm.value,
+            dead_time_s=_or(self.dead_time_s),
+            stribeck_friction=_or(self.stribeck_friction_nm),
+            stribeck_speed=max(_or(self.stribeck_speed_rad_s, 0.1) * half, 1e-6),
+            load_friction_motor=per_torque[0],
+            load_friction_load=per_torque[1],
+            load_friction_static=at_rest / sum(per_torque) if sum(per_torque) else 0.0,
+            off_brake=viscous / brake if brake else 0.0,
+        )
+
     @property
     def left_out_of_pd(self) -> str:
         """What `as_pd` leaves out, as a sentence; empty if nothing."""
         names = {
             "Stribeck friction": self.stribeck_friction_nm,
-            "load-dependent friction": self.load_friction_external,
+            "load-dependent friction": self.load_friction_load,
         }
         left = [name for name, number in names.items() if number is not None]
         return f"Left out of the PD: {' and '.join(left)}." if left else ""
 
 
-ServoNumbers = Annotated[PositionLoop | TorquePD, Field(discriminator="model")]
+class LoadedLoop(Part):
+    """Parameters of `servo_models.loaded_servo`, with units: what this tool fits under load."""
+
+    model: Literal["loaded_servo"]
+    """Kind of these numbers."""
+    duty_per_rad: Annotated[Cited, _FACTOR]
+    """Duty per unit of the P register and radian of position error [1/rad]."""
+    stall_torque_nm: Annotated[Cited, _TORQUE]
+    """Torque at full duty and the card's supply voltage, at standstill [N·m]."""
+    back_emf_nm_s_per_rad: Annotated[Cited, _DAMPING]
+    """Torque lost per velocity: back-EMF of motor, viscous friction of gears [N·m·s/rad]."""
+    armature_kg_m2: Annotated[Cited, _ARMATURE]
+    """Reflected inertia of motor and gears at the joint [kg·m²]."""
+    friction_loss_nm: Annotated[Cited, _TORQUE]
+    """Dry friction at speed without load [N·m]."""
+    dead_time_s: Annotated[Cited | None, _TIME] = None
+    """From a command's arrival to its first effect [s]."""
+    duty_s_per_rad: Annotated[Cited | None, _FACTOR] = None
+    """Duty per velocity, inside of the limit on the duty [s/rad]."""
+    stribeck_friction_nm: Annotated[Cited | None, _TORQUE] = None
+    """Dry friction at standstill beyond `friction_loss_nm` [N·m]."""
+    stribeck_speed_rad_s: Annotated[Cited | None, _SPEED] = None
+    """Speed at which half of it is left [rad/s]."""
+    load_friction_motor: Annotated[Cited | None, _FACTOR] = None
+    """Dry friction per torque of the motor."""
+    load_friction_load: Annotated[Cited | None, _FACTOR] = None
+    """Dry friction per torque of the load's weight."""
+    load_friction_quadratic_per_nm: Annotated[Cited | None, _FACTOR] = None
+    """Dry friction per squared torque of the motor [1/(N·m)]."""
+    load_friction_static: Annotated[Cited | None, _FACTOR] = None
+    """By what share friction per torque is larger at standstill."""
+    torque_limit_nm: Annotated[Cited | None, _TORQUE] = None
+    """Largest torque of the motor, a limit on its current [N·m]."""
+    off_brake: Annotated[Cited | None, _SHARE] = None
+    """Share of the back-EMF that remains with the torque off."""
+    dead_zone_rad: Annotated[Cited | None, _FACTOR] = None
+    """Half-width of the error that the loop ignores [rad]."""
+    start_duty: Annotated[Cited | None, _SHARE] = None
+    """Duty added wherever there is an error."""
+    acceleration_limit_rad_s2: Cited | None = None
+    """Largest acceleration of the set-point [rad/s²]."""
+
+    def loaded(self) -> LoadedServoParameters:
+        """The numbers as the servo model takes them; an unknown dead time is 0."""
+        given = {
+            name: getattr(self, key).value
+            for name, key in LOADED_KEYS.items()
+            if getattr(self, key) is not None
+        }
+        return LoadedServoParameters(**{"duty_s_per_rad": 0.0, "dead_time_s": 0.0} | given)
+
+    def as_pd(self, p_gain: float, voltage_share: float = 1.0) -> TorquePD:
+        """The same servo as a PD in torque; see `LoadedServoParameters.delayed_pd`.
+
+        Parameters
+        ----------
+        p_gain : float
+            P gain, the register's value.
+        voltage_share : float
+            Supply voltage over that of the card.
+        """
+        stall = self.stall_torque_nm.value * voltage_share
+        damping = _or(self.duty_s_per_rad) * stall
+        return TorquePD(
+            model="delayed_pd",
+            stiffness_nm_per_rad=stated(self.duty_per_rad.value * p_gain * stall),
+            damping_nm_s_per_rad=stated(damping) if damping else None,
+            friction_loss_nm=self.friction_loss_nm,
+            armature_kg_m2=self.armature_kg_m2,
+            effort_limit_nm=stated(min(stall, _or(self.torque_limit_nm, math.inf))),
+            back_emf_nm_s_per_rad=self.back_emf_nm_s_per_rad,
+            dead_time_s=self.dead_time_s,
+        )
+
+    @property
+    def left_out_of_pd(self) -> str:
+        """What `as_pd` leaves out, as a sentence; empty if nothing."""
+        names = {
+            "Stribeck friction": self.stribeck_friction_nm,
+            "load-dependent friction": self.load_friction_load or self.load_friction_motor,
+            "dead zone": self.dead_zone_rad,
+            "start duty": self.start_duty,
+        }
+        left = [name for name, number in names.items() if number is not None]
+        return f"Left out of the PD: {', '.join(left)}." if left else ""
+
+
+LOADED_KEYS = {
+    name: next(k for k in LoadedLoop.model_fields if k in (name, *(name + u for u in _ENDINGS)))
+    for name in (f.name for f in fields(LoadedServoParameters))
+}
+"""Fields of `LoadedServoParameters` and their names in `LoadedLoop`."""
+
+ServoNumbers = Annotated[PositionLoop | LoadedLoop | TorquePD, Field(discriminator="model")]
 """Numbers of one specimen of a servo."""

@@ -12,9 +12,15 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam
 from pupper_sysid.servo_models.cards.card import ServoCard
-from pupper_sysid.servo_models.cards.data_sheet import data_sheet, stall_torque
+from pupper_sysid.servo_models.cards.data_sheet import (
+    data_sheet,
+    recorded_stall_torque,
+    stall_torque,
+)
 from pupper_sysid.servo_models.cards.files import card_names, load_card
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, stated
+from pupper_sysid.servo_models.delayed_pd import DelayedPD
+from pupper_sysid.servo_models.loaded_servo import LoadedServo
 
 SHIPPED = card_names()
 
@@ -22,8 +28,9 @@ SHIPPED = card_names()
 def loop(**changed: float) -> PositionLoop:
     """A position loop with round numbers."""
     numbers = {
-        "error_gain": 0.1, "duty_limit": 0.9, "stall_torque_nm": 2.0, "back_emf_nm_s_per_rad": 0.4,
-        "armature_kg_m2": 0.02, "friction_loss_nm": 0.05, "viscous_friction_nm_s_per_rad": 0.1,
+        "duty_per_rad": 0.1, "duty_limit": 0.9, "stall_torque_nm": 2.0,
+        "back_emf_nm_s_per_rad": 0.4, "armature_kg_m2": 0.02, "friction_loss_nm": 0.05,
+        "viscous_friction_nm_s_per_rad": 0.1,
     } | changed  # fmt: skip
     return PositionLoop.model_validate({"model": "position_loop"} | numbers)
 
@@ -186,6 +193,9 @@ def test_a_data_sheet_is_found_by_model_number_and_scaled_with_the_voltage():
     assert torque == pytest.approx(19.5 * 0.0980665)
     assert "supply voltage is not recorded" in source
     assert data_sheet("dynamixel xl330_m288") is data_sheet(1200)
+    header = [{}, {"model": "STS3215"}, {"model": "STS3215", "supply_voltage_v": 12.0}]
+    assert recorded_stall_torque(header) == stall_torque("STS3215", 12.0)
+    assert recorded_stall_torque([{"model": "unknown"}]) is None
     with pytest.raises(InputError, match="No data sheet of the servo MG90S"):
         stall_torque("MG90S")
 
@@ -196,3 +206,77 @@ def test_a_pd_without_velocity_terms_has_no_known_top_speed():
         armature_kg_m2=stated(0.01), effort_limit_nm=stated(1.0),
     )  # fmt: skip
     assert pd.top_speed_rad_s is None
+
+
+def test_a_card_moves_alike_as_loaded_servo_and_as_pd_where_it_has_no_more_friction():
+    # M1 with a duty limit and without a set-point limit: nothing is left out in either form
+    card = load_card("sts3215-bam-m1-early")
+    parameters, gain = card.loaded()
+    time_s = np.arange(1500) * 0.002
+    commands = 0.8 * np.sin(2 * np.pi * 2.0 * time_s) + 0.9 * (time_s > 1.5)
+    loaded, pd = LoadedServo(parameters, gain), DelayedPD(card.pd().parameters)
+    loaded.reset(0.0)
+    pd.reset(0.0)
+    np.testing.assert_allclose(loaded.rollout(commands), pd.rollout(commands), atol=2e-3)
+
+
+def test_a_pd_in_torque_is_the_same_servo_as_a_loaded_one():
+    card = load_card("sts3215-anchorbench")
+    parameters, gain = card.loaded("elbow_flex")
+    assert gain == 1.0
+    back = parameters.delayed_pd(gain).arrays()
+    for name, value in card.pd("elbow_flex").parameters.arrays().items():
+        if name != "velocity_limit":
+            assert back[name] == pytest.approx(value), name
+
+
+def test_half_of_bams_stribeck_friction_is_left_at_the_speed_of_the_loaded_servo():
+    card = load_card("sts3215-bam-m6")
+    parameters, _ = card.loaded()
+    numbers = card.as_published
+    slow, alpha = float(numbers["dtheta_stribeck"]), float(numbers["alpha"])
+    share = math.exp(-((float(parameters.stribeck_speed) / slow) ** alpha))
+    assert share == pytest.approx(0.5)
+    # with the torque off only the gears' viscous friction brakes
+    viscous = parameters.off_brake * parameters.back_emf
+    assert viscous == pytest.approx(numbers["friction_viscous"])
+
+
+def test_a_fit_under_load_is_a_card_with_the_parameters_of_the_loaded_servo(tmp_path):
+    card = load_card("sts3215-bam-m1")
+    data = card.model_dump(mode="json", by_alias=True, exclude_none=True)
+    stall = {"value": 2.0, "low": 1.9, "high": 2.1, "identified": "yes"}
+    data["specimens"]["servo"] = {
+        "model": "loaded_servo", "duty_per_rad": 0.1, "stall_torque_nm": stall,
+        "back_emf_nm_s_per_rad": 0.4, "armature_kg_m2": 0.02, "friction_loss_nm": 0.05,
+        "torque_limit_nm": 1.5, "load_friction_motor": 0.2, "dead_time_s": 0.01,
+    }  # fmt: skip
+    ServoCard.model_validate(data).save(tmp_path / "mine.yaml")
+    mine = load_card(tmp_path / "mine.yaml")
+    parameters, gain = mine.loaded()
+    assert gain == 32 and parameters.torque_limit == 1.5 and parameters.load_friction_motor == 0.2
+    # 0.1 * 32 * 2 N·m/rad, limited by the current
+    pd = mine.pd()
+    assert pd.stiffness_nm_per_rad.value == pytest.approx(6.4)
+    assert pd.effort_limit_nm.value == 1.5
+    expected = parameters.delayed_pd(32).arrays()
+    for name, value in pd.parameters.arrays().items():
+        if name != "velocity_limit":  # 1000 stands for none
+            assert value == pytest.approx(expected[name]), name
+    assert any("load-dependent friction" in note for note in mine.calibration().notes)
+
+
+@pytest.mark.parametrize("name", ["sts3215-bam-m6", "xl330-m288"])
+def test_a_card_of_a_position_loop_is_a_calibration_at_any_gain_and_load(name):
+    card = load_card(name)
+    joint = card.calibration().joint("any")
+    assert joint.under_load is not None
+    own, gain = card.loaded()
+    made = joint.under_load.servo(float(own.dead_time_s)).arrays()
+    for field, value in own.arrays().items():
+        if field != "stribeck_speed" or made["stribeck_friction"] > 0:
+            assert made[field] == pytest.approx(value), field
+    assert joint.under_load.p_gain == gain
+    twice = joint.at_p_gain(2 * gain)
+    assert twice.stiffness == pytest.approx(card.pd(p_gain=2 * gain).parameters.stiffness)
+    assert load_card("sts3215-open-duck").calibration().joint("any").under_load is None

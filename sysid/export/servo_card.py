@@ -1,0 +1,144 @@
+"""Fits of servos under load as servo cards (`servo_models.cards`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
+from pupper_sysid.servo_models.calibration.parts import Quantity
+from pupper_sysid.servo_models.cards.card import Gains, Score, ServoCard, Source
+from pupper_sysid.servo_models.cards.data_sheet import stall_torque
+from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop
+from pupper_sysid.sysid.loaded.joint_fit import LoadedFit
+from pupper_sysid.sysid.recordings.recording import Recording
+
+_TORQUES = (
+    "stall_torque", "back_emf", "armature", "friction_loss", "stribeck_friction", "torque_limit",
+)  # fmt: skip
+
+
+def to_card(
+    name: str,
+    servo: str,
+    fits: Mapping[str, LoadedFit],
+    recordings: Sequence[Recording],
+    source: Source,
+    load: str,
+    supply_v: float | None = None,
+    gains: Gains | None = None,
+    default: str | None = None,
+    notes: Sequence[str] = (),
+) -> ServoCard:
+    """A card of fits under load.
+
+    With a known load torques are as fitted. Without one they are known per inertia only, and the
+    stall torque of the servo's data sheet at `supply_v` sets their scale.
+
+    Parameters
+    ----------
+    name : str
+        Of the card.
+    servo : str
+        Manufacturer and model.
+    fits : dict of str to LoadedFit
+        By specimen, such as a joint.
+    recordings : sequence of Recording
+        The data; names and hashes go into the card.
+    source : Source
+        Of the recordings.
+    load : str
+        What the servo moved, in words.
+    supply_v : float, optional
+        Supply voltage [V]; by default the reference voltage of the first fit.
+    gains : Gains, optional
+        I and D gain of the recordings; the P gain is the fit's.
+    default : str, optional
+        Specimen that stands for the servo type; by default that of the median stiffness.
+    notes : sequence of str
+        Sentences for the reader.
+
+    Raises
+    ------
+    InputError
+        If there is no fit, no supply voltage, or no data sheet where the load is unknown.
+    """
+    if not fits:
+        raise InputError("A servo card needs a fit. Name a joint that was fitted.")
+    first = next(iter(fits.values()))
+    volts = first.reference_voltage_v if supply_v is None else supply_v
+    if not volts > 0:
+        raise InputError(f"{name}: the recordings hold no supply voltage. Give `supply_v`.")
+    told, specimens = list(notes), {}
+    for specimen, fit in fits.items():
+        scale, why = 1.0, ""
+        if not fit.known_load:
+            anchor, sheet = stall_torque(servo, volts)
+            scale = anchor / fit.numbers["stall_torque"].value
+            why = f"scale from the stall torque {anchor:.2f} N·m, {sheet}"
+        specimens[specimen] = _loop(fit, scale, why)
+        if why and (sentence := f"Torques have their {why}.") not in told:
+            told.append(sentence)
+            told.append("The armature holds the inertia of what the joint moved.")
+    middle = sorted(fits, key=lambda s: _stiffness(specimens[s], fits[s].p_gain))[len(fits) // 2]
+    return ServoCard(
+        name=name,
+        servo=servo,
+        supply_v=float(volts),
+        gains=(gains or Gains()).model_copy(update={"p": float(first.p_gain)}),
+        load=load,
+        published=False,
+        source=source,
+        data=tuple(
+            InputFile(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
+        ),
+        scores=tuple(score for s, fit in fits.items() for score in _scores(s, fit)),
+        date=utc_now()[:10],
+        notes=tuple(told),
+        default=default or middle,
+        specimens=specimens,
+    )
+
+
+def _loop(fit: LoadedFit, scale: float, why: str) -> LoadedLoop:
+    """Numbers of one fit, torques times `scale`."""
+    made: dict[str, Quantity] = {}
+    for field, key in LOADED_KEYS.items():
+        if field == "armature" and not fit.known_load:
+            made[key] = Quantity(value=scale, identified="no", why=why)
+            continue
+        interval = fit.numbers.get(field)
+        if interval is None:
+            continue
+        factor = scale if field in _TORQUES else 1.0
+        factor = 1.0 / scale if field == "load_friction_quadratic" else factor
+        doubt = fit.undecided.get(field)
+        anchored = bool(why) and factor != 1.0
+        made[key] = Quantity(
+            value=interval.value * factor,
+            low=interval.low * factor,
+            high=interval.high * factor,
+            identified="no" if doubt else "ratio only" if anchored else "yes",
+            why=doubt or (why if anchored else None),
+        )
+    return LoadedLoop(model="loaded_servo", **made)
+
+
+def _stiffness(loop: LoadedLoop, p_gain: float) -> float:
+    return loop.as_pd(p_gain).stiffness_nm_per_rad.value
+
+
+def _scores(specimen: str, fit: LoadedFit) -> list[Score]:
+    chosen = next(s for s in fit.structures if s.name == fit.structure)
+    told = [
+        Score(what=f"{specimen}: free run, mean absolute error", value=chosen.mae_rad, unit="rad")
+    ]
+    if chosen.mae_unseen_rad >= 0:
+        unseen = ", ".join(fit.folds)
+        told.append(
+            Score(
+                what=f"{specimen}: the same on runs left out of the fit ({unseen})",
+                value=chosen.mae_unseen_rad, unit="rad",
+            )
+        )  # fmt: skip
+    return told
