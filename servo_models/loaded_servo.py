@@ -2,7 +2,7 @@
 
 What a hobby servo's firmware does is known in outline: the position error times a P gain is a duty
 cycle, which the motor turns into torque. One servo under several gains and loads is then one set of
-numbers:
+numbers::
 
     duty   = clip(duty_per_rad · P · error - duty_s_per_rad · velocity, ±1)
     motor  = stall_torque · duty · V / V0 - back_emf · velocity,   at most ±torque_limit

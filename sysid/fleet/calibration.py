@@ -27,9 +27,9 @@ from joblib import Parallel, delayed, parallel_config
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import sha256, write_text
-from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.identify.calibration_file import GIVEN_TORQUE
 from pupper_sysid.sysid.recordings.files import load
 
 TABLE = "fleet.csv"
@@ -59,8 +59,7 @@ class Settings:
     """How every recording is calibrated."""
 
     seed: int = 0
-    stall_torque_nm: float = STALL_TORQUE_NM
-    source: str = STALL_TORQUE_SOURCE
+    stall_torque_nm: float | None = None
 
 
 @dataclass
@@ -258,11 +257,12 @@ def _is_of(target: Path, path: Path, settings: Settings) -> bool:
         made = load_calibration(target)
     except InputError:
         return False
-    scales = {j.actuator.scale.value_nm for j in made.joints.values()}
+    scales = [j.actuator.scale for j in made.joints.values()]
+    given = {s.value_nm if s.source == GIVEN_TORQUE else None for s in scales}
     return (
         [i.sha256 for i in made.inputs] == [sha256(path)]
         and made.seed == settings.seed
-        and scales == {settings.stall_torque_nm}
+        and given == {settings.stall_torque_nm}
     )
 
 
@@ -274,9 +274,7 @@ def _numbers(target: Path) -> dict[str, dict[str, float]]:
 
 def _calibrated(path: Path, target: Path, settings: Settings) -> None:
     """Calibrate one robot."""
-    made = calibrate(
-        load(path), None, settings.seed, settings.stall_torque_nm, settings.source, workers=1
-    )
+    made = calibrate(load(path), None, settings.seed, settings.stall_torque_nm, workers=1)
     made.save(target, force=True)
 
 

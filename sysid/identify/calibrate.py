@@ -15,10 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pupper_sysid.common.children import end_with_parent
-from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.calibration_file import preset_parameters, to_calibration
+from pupper_sysid.sysid.identify.calibration_file import (
+    preset_parameters,
+    to_calibration,
+    torque_anchors,
+)
 from pupper_sysid.sysid.identify.joint_fit import (
     Presets,
     StructureFit,
@@ -80,8 +83,7 @@ def calibrate(
     recordings: Recordings,
     joints: Joints = None,
     seed: int = 0,
-    stall_torque_nm: float = STALL_TORQUE_NM,
-    source: str = STALL_TORQUE_SOURCE,
+    stall_torque_nm: float | None = None,
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
     staged: Callable[[str, str], None] | None = None,
@@ -96,10 +98,9 @@ def calibrate(
         Which joints; by default all that were recorded.
     seed : int
         Results of a joint depend on the seed and its name alone, not on the other joints.
-    stall_torque_nm : float
-        Torque anchor [N·m]: the servo's torque at zero speed.
-    source : str
-        Where the anchor comes from.
+    stall_torque_nm : float, optional
+        Torque anchor [N·m]: the servo's torque at zero speed; by default that of the recorded
+        servo's data sheet, or of the Mini Pupper's servo.
     workers : int
         Processes. Joints are independent, and so are the two structures of a joint.
     progress : callable, optional
@@ -130,8 +131,9 @@ def calibrate(
                 progress(joint)
     fits |= fit_joints(loaded, seed, workers, progress)
     fits = {joint: fits[joint] for joint in every}
-    made = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm, source)
-    made = with_loaded(made, fits, stall_torque_nm, source)
+    given = as_sequence(recordings)
+    made = to_calibration(fits, given, seed, stall_torque_nm)
+    made = with_loaded(made, fits, torque_anchors(list(fits), given, stall_torque_nm))
     return CalibrationResult(joints=fits, calibration=made)
 
 

@@ -36,11 +36,15 @@ from pupper_sysid.servo_models.calibration.parts import (
     Scores,
     Selection,
 )
+from pupper_sysid.servo_models.cards.data_sheet import recorded_stall_torque
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.results import UNTOLD, CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
+
+GIVEN_TORQUE = "given by the user"
+"""Source of a torque anchor that no data sheet gave."""
 
 _LIMITS = {"velocity_limit_rad_s": NO_SPEED_LIMIT_RAD_S, "back_emf_per_s": 0.0}
 """The two limits on a servo's speed, with the value that stands for none."""
@@ -50,8 +54,7 @@ def to_calibration(
     results: Mapping[str, JointCalibrationResult],
     recordings: Sequence[Recording],
     seed: int,
-    stall_torque_nm: float = STALL_TORQUE_NM,
-    source: str = STALL_TORQUE_SOURCE,
+    stall_torque_nm: float | None = None,
 ) -> Calibration:
     """The calibration file of `results`.
 
@@ -61,11 +64,10 @@ def to_calibration(
     recordings : sequence of Recording
         Their sources; names and hashes go into the file.
     seed : int
-    stall_torque_nm : float
-        Torque anchor [N·m]: the servo's torque at zero speed.
-    source : str
-        Where the anchor comes from.
+    stall_torque_nm : float, optional
+        As for `torque_anchors`.
     """
+    anchors = torque_anchors(list(results), recordings, stall_torque_nm)
     buses = [r.metadata.get("bus") or {} for r in recordings]
     kinds = {str(bus.get("kind", "unknown bus")) for bus in buses}
     maps = {str(bus["joint_map"]) for bus in buses if bus.get("joint_map")}
@@ -83,8 +85,32 @@ def to_calibration(
             "Delay belongs to the actuator; poll period, loss and age belong to the observation.",
             "Only ratios to the armature come from the recording; torques scale with the anchor.",
         ),
-        joints={name: _joint(r, stall_torque_nm, source) for name, r in results.items()},
+        joints={name: _joint(r, *anchors[name]) for name, r in results.items()},
     )
+
+
+def torque_anchors(
+    joints: Sequence[str], recordings: Sequence[Recording], stall_torque_nm: float | None = None
+) -> dict[str, tuple[float, str]]:
+    """Stall torque [N·m] that sets the scale of each joint's torques, and its source.
+
+    Parameters
+    ----------
+    joints : sequence of str
+    recordings : sequence of Recording
+        Their headers may name the servo.
+    stall_torque_nm : float, optional
+        Of all joints; by default that of the data sheet of the recorded servo, or of the Mini
+        Pupper's servo where no recording names one.
+    """
+    if stall_torque_nm is not None:
+        return dict.fromkeys(joints, (stall_torque_nm, GIVEN_TORQUE))
+    headers = [r.metadata.get("servos") or {} for r in recordings]
+    return {
+        joint: recorded_stall_torque(h.get(joint, {}) for h in headers)
+        or (STALL_TORQUE_NM, STALL_TORQUE_SOURCE)
+        for joint in joints
+    }
 
 
 def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCalibration:

@@ -199,8 +199,7 @@ def fit_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> JointCalibrat
 def with_loaded(
     calibration: Calibration,
     results: Mapping[str, JointCalibrationResult],
-    stall_torque_nm: float,
-    source: str,
+    anchors: Mapping[str, tuple[float, str]],
 ) -> Calibration:
     """The calibration with the joints that were fitted under load.
 
@@ -209,17 +208,15 @@ def with_loaded(
     calibration : Calibration
         Of all joints, from `sysid.identify.calibration_file`.
     results : mapping of joint to JointCalibrationResult
-    stall_torque_nm : float
-        Torque anchor of joints whose load is unknown [N·m].
-    source : str
-        Where the anchor comes from.
+    anchors : mapping of joint to (float, str)
+        Torque anchor of joints whose load is unknown [N·m], and its source.
     """
     loaded = {j: r for j, r in results.items() if isinstance(r, LoadedJointResult)}
     if not loaded:
         return calibration
     joints = dict(calibration.joints)
     for joint, result in loaded.items():
-        joints[joint] = _joint(result, joints[joint].feedback, stall_torque_nm, source)
+        joints[joint] = _joint(result, joints[joint].feedback, *anchors[joint])
     notes = calibration.notes
     if all(r.loaded.known_load for r in loaded.values()) and len(loaded) == len(joints):
         notes = (

@@ -44,8 +44,9 @@ class Calibrate:
     given one's name and _calibrated."""
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
-    stall_torque: float = STALL_TORQUE_NM
-    """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature."""
+    stall_torque: float | None = None
+    """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature. By
+    default of the recorded servo's data sheet; a recording with a known load needs none."""
     jobs: int = 2
     """Robots of a fleet that are calibrated at the same time."""
     cluster: str | None = None
@@ -63,7 +64,8 @@ class Calibrate:
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
 
         started = time.perf_counter()
-        terminal.need_positive("--stall-torque", self.stall_torque)
+        if self.stall_torque is not None:
+            terminal.need_positive("--stall-torque", self.stall_torque)
         if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
             self._fleet(self.recordings[0], started)
             return
@@ -85,7 +87,7 @@ class Calibrate:
                     advance(joint)
 
             made = calibrate(
-                recordings, joints, self.seed, self.stall_torque, self._source(),
+                recordings, joints, self.seed, self.stall_torque,
                 workers=2, progress=done, staged=staged,
             )  # fmt: skip
         made.save(out, force=self.force)
@@ -98,11 +100,6 @@ class Calibrate:
                 soft_wrap=True,
             )
 
-    def _source(self) -> str:
-        """Where the torque anchor comes from."""
-        given = self.stall_torque != STALL_TORQUE_NM
-        return "given with --stall-torque" if given else STALL_TORQUE_SOURCE
-
     def _fleet(self, root: Path, started: float) -> None:
         """Many robots, one after the other or side by side."""
         from pupper_sysid.sysid.fleet.calibration import Settings, calibrate_fleet, robots_in
@@ -110,7 +107,7 @@ class Calibrate:
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
         out = self.out or root.resolve().with_name(f"{root.resolve().name}_calibrated")
-        settings = Settings(self.seed, self.stall_torque, self._source())
+        settings = Settings(self.seed, self.stall_torque)
         with terminal.progress("calibrating", len(robots_in(root))) as advance:
             fleet = calibrate_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance
@@ -141,21 +138,38 @@ class Calibrate:
                 terminal.ms(paper.rmse_fresh_rad if paper else None),
             )  # fmt: skip
         terminal.out.print(shown)
+        scales = {name: made.calibration.joint(name).actuator.scale for name in made}
+        assumed = {s.value_nm for s in scales.values() if s.anchor == "stall torque"}
+        torques = "Torques are in N·m by the known load. "
+        if assumed:
+            torques = (
+                f"Torques assume a stall torque of {_listed(assumed)} N·m; recordings without a "
+                "known load give only their ratios. "
+            )
         terminal.out.print(
-            f"\nTorques assume a stall torque of {self.stall_torque:g} N·m; free-air recordings "
-            "give only their ratios. ? is not identified; limit: what limits the speed, the "
-            "set-point's slew or back-EMF (EMF). Errors are free-run, on fresh readings.",
+            f"\n{torques}? is not identified; limit: what limits the speed, the set-point's slew "
+            "or back-EMF (EMF). Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
         for r in made.values():
             terminal.warn(r.warnings)
-        if self.stall_torque == STALL_TORQUE_NM and not set(made) <= set(JOINT_NAMES):
+        strangers = [
+            name
+            for name, scale in scales.items()
+            if scale.source == STALL_TORQUE_SOURCE and name not in JOINT_NAMES
+        ]
+        if strangers:
             terminal.warn(
                 [
-                    f"{self.stall_torque:g} N·m is the stall torque of the Mini Pupper's servo. "
-                    "Give --stall-torque from your servo's data sheet: all torques scale with it."
+                    f"{', '.join(strangers)}: {STALL_TORQUE_NM:g} N·m is the stall torque of the "
+                    "Mini Pupper's servo. Give --stall-torque from your servo's data sheet: all "
+                    "torques scale with it."
                 ]
             )
+
+
+def _listed(torques: set[float]) -> str:
+    return " and ".join(f"{t:.3g}" for t in sorted(torques))
 
 
 def _mark(quantity: Quantity) -> str:
