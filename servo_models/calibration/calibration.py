@@ -165,6 +165,22 @@ class Calibration(Part):
             )
         return self.joints[name]
 
+    def at_p_gain(self, p_gain: float) -> Calibration:
+        """The calibration of the same servos at another P gain of their position loops.
+
+        Parameters
+        ----------
+        p_gain : float
+            The register's value.
+
+        Raises
+        ------
+        InputError
+            If a joint was recorded at one gain without a known load: it has no `under_load`.
+        """
+        joints = {name: joint.at_p_gain(p_gain) for name, joint in self.joints.items()}
+        return self.model_copy(update={"joints": joints})
+
     def delayed_pd(
         self, joints: Sequence[str] | None = None, time_step_s: float = TIME_STEP_S
     ) -> DelayedPD:

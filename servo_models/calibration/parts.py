@@ -9,7 +9,7 @@ range.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -94,6 +94,12 @@ class Quantity(Part):
         if self.identified == "no" and not self.why:
             raise ValueError("identified is no, so `why` must give the reason")
         return self
+
+    def scaled(self, factor: float) -> Quantity:
+        """The number and its interval times a positive `factor`."""
+        ends = (self.value, self.low, self.high)
+        value, low, high = (None if end is None else factor * end for end in ends)
+        return self.model_copy(update={"value": value, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
@@ -481,19 +487,37 @@ class JointCalibration(Part):
     warnings: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Reasons for distrust, in sentences."""
 
-    def at_p_gain(self, p_gain: float) -> DelayedPDParameters:
-        """DelayedPD at another P gain, and without load.
+    def at_p_gain(self, p_gain: float) -> JointCalibration:
+        """The same servo at another P gain: its stiffness is in proportion.
+
+        Parameters
+        ----------
+        p_gain : float
+            The register's value, > 0.
 
         Raises
         ------
         InputError
-            If the calibration is of one gain: the file has no `under_load`.
+            If the calibration is of one gain (the file has no `under_load`), or the gain is not
+            positive.
         """
         if self.under_load is None:
             raise InputError(
                 "This calibration holds at the P gain that it was recorded with. Record several "
                 "gains, or a known load, to predict others."
             )
-        servo = self.under_load.servo(self.actuator.dead_time_s.value)
-        now = servo.delayed_pd(p_gain)
-        return replace(now, friction_loss=self.actuator.friction_loss_nm.value)
+        if not p_gain > 0:
+            raise InputError(f"A P gain of {p_gain:g} is none: give a positive number.")
+        share = p_gain / self.under_load.p_gain
+        own = self.actuator
+        ratio = own.ratios_to_armature.stiffness.scaled(share)
+        stiffness = {
+            "stiffness_nm_per_rad": own.stiffness_nm_per_rad.scaled(share),
+            "ratios_to_armature": own.ratios_to_armature.model_copy(update={"stiffness": ratio}),
+        }
+        return self.model_copy(
+            update={
+                "actuator": own.model_copy(update=stiffness),
+                "under_load": self.under_load.model_copy(update={"p_gain": float(p_gain)}),
+            }
+        )

@@ -45,6 +45,9 @@ class Export:
     physics_step: float | None = None
     """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf and
     0.005 for the others."""
+    gain: float | None = None
+    """P gain of the position loop to predict, the register's value; of calibrations of servos
+    recorded at several gains or under a known load, for a simulator."""
     out: Path | None = None
     """File to write (newton: folder); by default the source's name with the format's ending, in
     this folder."""
@@ -60,6 +63,8 @@ class Export:
 
         path = Path(self.source)
         if not is_shipped(self.source) and path.is_dir():
+            if self.gain is not None:
+                raise InputError(f"--gain is of calibrations; {path} is a folder.")
             target = self._policy(path) if is_policy(path) else self._servo_model(path)
         else:
             target = self._table(path)
@@ -127,6 +132,8 @@ class Export:
             )
         if named or kind != ".csv":
             found = load_calibration(self.source)
+            if self.gain is not None:
+                found = self._at_gain(found, self.gain)
             if self.to != "csv":
                 return self._simulator(path, found)
         elif self.to != "csv":
@@ -140,6 +147,19 @@ class Export:
         target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
         to_csv(found, target, self.force)
         return target
+
+    @staticmethod
+    def _at_gain(calibration: Calibration, gain: float) -> Calibration:
+        """The calibration at another P gain; says how far that was tested."""
+        said = {
+            joint.under_load.how_far_tested(gain)
+            for joint in calibration.joints.values()
+            if joint.under_load is not None
+        }
+        found = calibration.at_p_gain(gain)
+        for sentence in sorted(said):
+            terminal.err.print(sentence, soft_wrap=True)
+        return found
 
     def _bam(self, path: Path, card: bool) -> Path:
         """A servo card as a parameter file of BAM."""

@@ -278,5 +278,6 @@ def test_a_card_of_a_position_loop_is_a_calibration_at_any_gain_and_load(name):
             assert made[field] == pytest.approx(value), field
     assert joint.under_load.p_gain == gain
     twice = joint.at_p_gain(2 * gain)
-    assert twice.stiffness == pytest.approx(card.pd(p_gain=2 * gain).parameters.stiffness)
+    stiffness = twice.actuator.stiffness_nm_per_rad.value
+    assert stiffness == pytest.approx(card.pd(p_gain=2 * gain).parameters.stiffness)
     assert load_card("sts3215-open-duck").calibration().joint("any").under_load is None

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.calibration.parts import Quantity, RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
@@ -138,4 +139,10 @@ def test_the_file_keeps_the_servo_under_load(tmp_path: Path):
     read = load_calibration(tmp_path / "knee.yaml").joint("knee")
     assert read.under_load is not None
     assert read.under_load.servo(0.014) == TRUE
-    assert read.at_p_gain(32.0).stiffness == pytest.approx(0.06 * 32 * 2.0)
+    at_32 = read.at_p_gain(32.0)
+    assert at_32.actuator.stiffness_nm_per_rad.value == pytest.approx(0.06 * 32 * 2.0)
+    assert at_32.under_load is not None and at_32.under_load.p_gain == 32.0
+    low, high = read.actuator.stiffness_nm_per_rad.low, at_32.actuator.stiffness_nm_per_rad.low
+    assert high / low == pytest.approx(32.0 / read.under_load.p_gain)
+    with pytest.raises(InputError, match="positive"):
+        read.at_p_gain(0.0)
