@@ -28,12 +28,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.joints import in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
-from pupper_sysid.servo_models.calibration.parts import (
-    PARAMETER_KEYS,
-    JointCalibration,
-    Part,
-    Whole,
-)
+from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
+from pupper_sysid.servo_models.calibration.quantity import Part, Whole
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 

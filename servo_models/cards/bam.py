@@ -25,7 +25,7 @@ from pydantic import ConfigDict
 from pupper_sysid.common.border import read_json, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.servo_models.calibration.parts import NotNegative, Number, Part
+from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
 from pupper_sysid.servo_models.cards.card import Gains, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
 

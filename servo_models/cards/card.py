@@ -27,15 +27,17 @@ from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
     Feedback,
     JointCalibration,
+    RatiosToArmature,
+    Scale,
+    Selection,
+)
+from pupper_sysid.servo_models.calibration.quantity import (
     NotNegative,
     Number,
     Part,
     Quantity,
-    RatiosToArmature,
-    Scale,
-    Selection,
-    UnderLoad,
 )
+from pupper_sysid.servo_models.calibration.under_load import UnderLoad
 from pupper_sysid.servo_models.cards.data_sheet import counts_of
 from pupper_sysid.servo_models.cards.numbers import (
     LOADED_KEYS,

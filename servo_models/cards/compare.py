@@ -9,11 +9,8 @@ from pathlib import Path
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, derived
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.calibration.parts import (
-    NO_SPEED_LIMIT_RAD_S,
-    PARAMETER_KEYS,
-    Quantity,
-)
+from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, PARAMETER_KEYS
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.files import is_card, load_card
 from pupper_sysid.servo_models.cards.numbers import TorquePD, unit
 

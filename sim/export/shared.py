@@ -20,7 +20,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
+from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.servo_models.step_size import MUJOCO, Engine, delay_at_step
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")

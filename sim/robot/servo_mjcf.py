@@ -135,8 +135,7 @@ def pendulum_xml(
     """
     joint = attributes({"name": "joint0"} | joint_attributes(servo, time_step_s))
     option = (
-        f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" '
-        'gravity="0 0 -9.81"/>'
+        f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 -9.81"/>'
     )
     return (
         f'<mujoco>{option}<worldbody><body><joint type="hinge" axis="0 1 0" {joint}/>'

@@ -26,8 +26,8 @@ from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
     PARAMETER_KEYS,
     JointCalibration,
-    Quantity,
 )
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.joint_arrays import JointArrays

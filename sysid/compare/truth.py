@@ -24,7 +24,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import JointCalibration, Quantity
+from pupper_sysid.servo_models.calibration.parts import JointCalibration
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings

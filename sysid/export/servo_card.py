@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
-from pupper_sysid.servo_models.calibration.parts import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.card import Gains, Score, ServoCard, Source
 from pupper_sysid.servo_models.cards.data_sheet import stall_torque
 from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop

@@ -17,7 +17,8 @@ from pydantic import BaseModel
 
 from pupper_sysid.common.files import write_text
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import JointCalibration, Quantity, unit_of
+from pupper_sysid.servo_models.calibration.parts import JointCalibration
+from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.table import comments
 

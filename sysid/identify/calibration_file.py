@@ -30,12 +30,12 @@ from pupper_sysid.servo_models.calibration.parts import (
     Feedback,
     JointCalibration,
     Lag,
-    Quantity,
     RatiosToArmature,
     Scale,
     Scores,
     Selection,
 )
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.data_sheet import recorded_stall_torque
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sysid.identify.models import candidate_model

@@ -17,20 +17,18 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import (
-    LOADED_KEYS,
     Actuator,
     CandidateModel,
     Feedback,
     JointCalibration,
     Lag,
-    Quantity,
     RatiosToArmature,
-    RecordedLoad,
     Scale,
     Scores,
     Selection,
-    UnderLoad,
 )
+from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
 from pupper_sysid.sysid.feedback.poll_lattice import quantum, readings
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult

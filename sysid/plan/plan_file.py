@@ -22,7 +22,7 @@ from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import utc_now
-from pupper_sysid.servo_models.calibration.parts import Number, Part, Whole
+from pupper_sysid.servo_models.calibration.quantity import Number, Part, Whole
 from pupper_sysid.sysid.plan.planner import PlannedTrial, Prediction
 from pupper_sysid.sysid.plan.proposal import LONGEST_S, Source, SweepPlan
 from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, Plan, plan

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration, Quantity
+from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.search import SIMULATED

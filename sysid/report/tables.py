@@ -13,7 +13,7 @@ from typing import Any
 from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.common.results import flat, plain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import Quantity, unit_of
+from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 

@@ -18,12 +18,11 @@ from pupper_sysid.servo_models.calibration.parts import (
     CandidateModel,
     Feedback,
     Lag,
-    Quantity,
     RatiosToArmature,
     Scale,
     Scores,
-    unit_of,
 )
+from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from support.calibration_examples import calibration, joint_calibration
 
 

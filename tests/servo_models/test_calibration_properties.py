@@ -13,7 +13,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.strict_yaml import dump, load
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.servo_models.calibration.parts import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from support.calibration_examples import calibration, joint_calibration
 
 TEXT = st.text(max_size=20)

@@ -11,12 +11,12 @@ from pupper_sysid.servo_models.calibration.parts import (
     Feedback,
     JointCalibration,
     Lag,
-    Quantity,
     RatiosToArmature,
     Scale,
     Scores,
     Selection,
 )
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 
 
 def measured(value: float, half_width: float = 0.1) -> Quantity:

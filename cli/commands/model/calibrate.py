@@ -15,7 +15,7 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 
 if TYPE_CHECKING:
-    from pupper_sysid.servo_models.calibration.parts import Quantity
+    from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.sysid.identify.calibrate import CalibrationResult
 
 _SHOWN = {

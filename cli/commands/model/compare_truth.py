@@ -40,7 +40,7 @@ class CompareTruth:
     def run(self) -> None:
         """Calibrate if need be, compare, print."""
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
-        from pupper_sysid.servo_models.calibration.parts import unit_of
+        from pupper_sysid.servo_models.calibration.quantity import unit_of
         from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
         from pupper_sysid.sysid.identify.calibrate import calibrate
 

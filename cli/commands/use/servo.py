@@ -14,7 +14,7 @@ from pupper_sysid.common.errors import InputError
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import InputFile
-    from pupper_sysid.servo_models.calibration.parts import Quantity
+    from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.servo_models.cards.card import ServoCard
     from pupper_sysid.servo_models.cards.compare import Servo as Compared
 

@@ -11,7 +11,7 @@ import yaml
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.calibration.parts import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sysid.compare import truth as module

@@ -13,7 +13,8 @@ import pytest
 from pupper_sysid.common.errors import FileExistsRefusal
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.servo_models.calibration.parts import Quantity, Scores
+from pupper_sysid.servo_models.calibration.parts import Scores
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.export.tidy_csv import CALIBRATION_COLUMNS, to_csv
 from pupper_sysid.sysid.recordings.files import load
 

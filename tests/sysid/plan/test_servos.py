@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.calibration.parts import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.plan.candidates import Setup
 from pupper_sysid.sysid.plan.planner import now, propose
 from pupper_sysid.sysid.plan.proposal import Source, plan_first_sweep, plan_from_calibration

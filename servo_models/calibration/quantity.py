@@ -1,0 +1,151 @@
+"""A number of a calibration: value, 90 % interval, whether the data identified it; its checks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from pupper_sysid.common import border
+
+UNIT_OF_NAME = {
+    "loss": "1",
+    "stiffness": "1/s²",
+    "damping": "1/s",
+    "friction_loss": "rad/s²",
+    "effort_limit": "rad/s²",
+    "back_emf": "1/s",
+    "duty_per_rad": "1/rad",
+    "duty_s_per_rad": "s/rad",
+    "load_friction_quadratic_per_nm": "1/(N·m)",
+    "delay_steps_min": "physics steps",
+    "delay_steps_max": "physics steps",
+}
+"""Units of the names that do not end in one; the torques are ratios to the armature there."""
+
+
+def unit_of(name: str) -> str:
+    """Unit of the calibration quantity `name`; empty if it has none.
+
+    Examples
+    --------
+    >>> unit_of("damping_nm_s_per_rad"), unit_of("dead_time_s"), unit_of("loss")
+    ('N·m·s/rad', 's', '1')
+    """
+    return UNIT_OF_NAME.get(name) or border.unit_of(name)
+
+
+def _python_number(value: Any) -> Any:
+    """A NumPy scalar as a Python number, the only kind in strict validation and YAML."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+Number = Annotated[float, BeforeValidator(_python_number)]
+
+Whole = Annotated[int, BeforeValidator(_python_number)]
+
+NotNegative = Annotated[Number, Field(ge=0)]
+
+
+class Part(BaseModel):
+    """Strict, frozen part of a file: no unknown key, no conversion, no NaN, no infinity."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        frozen=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
+
+
+class Quantity(Part):
+    """One number with its 90 % interval, and whether the data identify it."""
+
+    EXAMPLE: ClassVar[str] = (
+        "{value: …, low: …, high: …, identified: yes | ratio only | no, why: …}"
+    )
+
+    value: Number
+    """The number, in the unit at the end of its name."""
+    low: Number | None = None
+    """Lower end of the 90 % interval; null where there is none."""
+    high: Number | None = None
+    """Upper end of the 90 % interval; null where there is none."""
+    identified: Literal["yes", "ratio only", "no"]
+    """yes; ratio only (its ratio to the armature is known, its scale is assumed); or no."""
+    why: str | None = None
+    """Why it is not (fully) identified, or null. Needed where `identified` is no."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Quantity:
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ValueError(f"low is {self.low} and high is {self.high}; low must not exceed high")
+        if self.identified == "no" and not self.why:
+            raise ValueError("identified is no, so `why` must give the reason")
+        return self
+
+    def scaled(self, factor: float) -> Quantity:
+        """The number and its interval times a positive `factor`."""
+        ends = (self.value, self.low, self.high)
+        value, low, high = (None if end is None else factor * end for end in ends)
+        return self.model_copy(update={"value": value, "low": low, "high": high})
+
+
+@dataclass(frozen=True)
+class PlausibleRange:
+    """Values that a quantity can plausibly have; beyond them the unit is wrong.
+
+    Attributes
+    ----------
+    low, high : float
+        Smallest and largest value, in the quantity's unit.
+    looks_like : str
+        Probable unit of a larger number, for example "milliseconds".
+    factor : float
+        From that unit to the quantity's; 0 if unknown.
+    """
+
+    low: float
+    high: float
+    looks_like: str = ""
+    factor: float = 0.0
+
+    def __call__(self, quantity: Quantity | None) -> Quantity | None:
+        """`quantity`, unless one of its numbers is outside the range."""
+        if quantity is not None:
+            for number in (quantity.value, quantity.low, quantity.high):
+                if number is not None and (problem := self.problem(number)):
+                    raise ValueError(problem)
+        return quantity
+
+    def problem(self, number: float) -> str:
+        """Fault of `number` in words; empty if it is in the range."""
+        if self.low <= number <= self.high:
+            return ""
+        text = f"{number:g} is outside the possible {self.low:g} to {self.high:g}"
+        if self.looks_like and abs(number) > self.high:
+            text += f"; this looks like {self.looks_like}"
+            text += f": write {number * self.factor:g}" if self.factor else ""
+        return text
+
+
+TIME = AfterValidator(PlausibleRange(0, 1, "milliseconds", 1e-3))
+
+AGE = AfterValidator(PlausibleRange(0, 10, "milliseconds", 1e-3))
+
+LAG = AfterValidator(PlausibleRange(-1, 1, "milliseconds", 1e-3))
+
+TORQUE = AfterValidator(PlausibleRange(0, 100, "N·mm", 1e-3))
+
+RATIO = AfterValidator(PlausibleRange(0, 1e9))
+
+SMALL_ANGLE = AfterValidator(PlausibleRange(0, 0.1, "degrees", float(np.pi / 180)))
+
+OFFSET = AfterValidator(
+    PlausibleRange(-2 * float(np.pi), 2 * float(np.pi), "degrees", float(np.pi / 180))
+)
+
+SHARE = AfterValidator(PlausibleRange(0, 100))
