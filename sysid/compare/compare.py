@@ -9,17 +9,15 @@ note names models that were fitted to a recording they are compared on.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.results import Result, internal
 from pupper_sysid.servo_models.calibration.calibration import (
     PRESETS,
     Calibration,
@@ -28,30 +26,30 @@ from pupper_sysid.servo_models.calibration.calibration import (
 )
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
-from pupper_sysid.sysid.compare import under_load
+from pupper_sysid.sysid.compare.comparison import (
+    ComparedModel,
+    Comparison,
+)
 from pupper_sysid.sysid.compare.readings import (
-    ReadingRule,
     age_spread_rad,
     as_rows,
     calibrated_run,
-    in_words,
     reading_rules,
     run_with_offset,
     shown,
     with_ages,
 )
+from pupper_sysid.sysid.compare.runs import compare_runs
 from pupper_sysid.sysid.compare.under_load import needs_runs
 from pupper_sysid.sysid.doctor.checks import cautions
-from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
     as_sequence,
     chosen_joints,
-    joint_rng,
     usable_trials,
 )
-from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
@@ -60,133 +58,7 @@ from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-OFFSET_RULE = (
-    "Offsets are of this recording: for every model the median of reading minus prediction."
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedScores(scores.Scores):
-    """Root mean square and mean absolute errors of one model on one joint, or their means [rad]."""
-
-    mae_held_rad: float
-    mae_raw_rad: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedModel(ModelScores):
-    """Scores of one model on readings that it predicts.
-
-    Attributes
-    ----------
-    joints : dict of str to ComparedScores
-    mean : ComparedScores
-        Over joints.
-    offset_rad : dict of str to float
-        By joint, reading minus prediction of these recordings; empty for a model fitted here.
-    age_spread_rad : dict of str to float
-        By joint, the part of the raw error that the unknown age of readings makes: a perfect model
-        would have it. 0 where readings are dated.
-    """
-
-    # as for the errors, with more numbers
-    joints: dict[str, ComparedScores]  # pyright: ignore[reportIncompatibleVariableOverride]
-    mean: ComparedScores
-    offset_rad: dict[str, float] = field(default_factory=dict)
-    age_spread_rad: dict[str, float] = field(default_factory=dict)
-
-    @classmethod
-    def scored(
-        cls, own: ModelScores, offset_rad: dict[str, float], age_spread_rad: dict[str, float]
-    ) -> ComparedModel:
-        """The scores with the offset and the spread that belong to them."""
-        joints = {
-            joint: ComparedScores(
-                **vars(found),
-                mae_held_rad=_mean_absolute(own.errors[joint].held),
-                mae_raw_rad=_mean_absolute(own.errors[joint].raw),
-            )
-            for joint, found in own.joints.items()
-        }
-        more = {"joints": joints, "mean": scores.mean(joints)}
-        return cls(
-            **vars(own) | more,  # pyright: ignore[reportArgumentType]
-            offset_rad=offset_rad,
-            age_spread_rad=age_spread_rad,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison(Result):
-    """Servo models on the same readings.
-
-    Attributes
-    ----------
-    models : dict of str to ComparedModel
-    readings : dict of str to ReadingRule
-        By joint, when its readings were measured.
-    persistence_rmse_rad, repeatability_rad : dict of str to float
-        Per joint.
-    time_step_s : float
-        Time between commands.
-    notes : tuple of str
-    data : ServoData
-    tracks : dict of str to Tracks
-        Readings of each model in free run.
-    bands : dict of str to (dict of str to Band)
-        By model, of those that have a predictive band, then joint.
-    """
-
-    models: dict[str, ComparedModel]
-    readings: dict[str, ReadingRule]
-    persistence_rmse_rad: dict[str, float]
-    repeatability_rad: dict[str, float]
-    time_step_s: float
-    notes: tuple[str, ...]
-    data: ServoData = internal()
-    tracks: dict[str, scores.Tracks] = internal()
-    bands: dict[str, dict[str, scores.Band]] = internal()
-
-    def to_frame(self) -> pd.DataFrame:
-        """Scores, one row per joint and model."""
-        nan = float("nan")
-        rows = []
-        for joint in self.data.joints:
-            for name, model in self.models.items():
-                noise, timing = self.bands.get(name, {}).get(joint, (nan, nan))
-                rows.append(
-                    {"joint": joint, "model": name}
-                    | asdict(model.joints[joint])
-                    | {
-                        "offset_rad": model.offset_rad.get(joint, nan),
-                        "age_spread_rad": model.age_spread_rad.get(joint, nan),
-                        "readings": self.readings[joint].rule,
-                        "persistence_rmse_rad": self.persistence_rmse_rad[joint],
-                        "repeatability_rad": self.repeatability_rad[joint],
-                        "band_noise_rad": noise, "band_timing_s": timing,
-                    }
-                )  # fmt: skip
-        return pd.DataFrame(rows).set_index(["joint", "model"])
-
-    def reading_notes(self) -> list[str]:
-        """How readings were predicted, one sentence per rule, and the rule of the offset."""
-        return [OFFSET_RULE, *in_words(self.readings)]
-
-    def plot(self, joints: Sequence[str] | None = None) -> Figure:
-        """Figure of the models in free run beside commands and readings, a panel per joint.
-
-        Parameters
-        ----------
-        joints : sequence of str, optional
-            By default all.
-        """
-        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
-
-        errors = {name: model.errors for name, model in self.models.items()}
-        drawn = {name: track for name, track in self.tracks.items() if name != LINEAR}
-        return free_run_figure(self.data, drawn, errors, self.bands, joints)
+    pass
 
 
 def compare(
@@ -229,7 +101,7 @@ def compare(
     trials = usable_trials(recordings, names)
     calibrations = _calibrations(models)
     if needs_runs(recordings, names, list(calibrations.values())):
-        return _compare_runs(recordings, models, calibrations, names, seed, lattices)
+        return compare_runs(recordings, models, calibrations, names, seed, lattices)
     data = merged_groups(servo_data(recordings, names, readings, seed, lattices))
     opened: dict[str, _Opened] = {}
     notes = [text for joint in names for text in cautions(joint, trials[joint])]
@@ -277,100 +149,6 @@ def compare(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunComparison(Comparison):
-    """Servo models on runs under load, each with its own gain and load.
-
-    Attributes
-    ----------
-    runs : dict of str to list of BenchRun
-        By joint.
-    run_tracks : dict of str to (dict of str to list of ndarray)
-        By model, then joint: predicted readings at the steps of each run.
-    """
-
-    runs: dict[str, list[under_load.BenchRun]] = internal()
-    run_tracks: dict[str, dict[str, list[NDArray[np.float64]]]] = internal()
-
-    def reading_notes(self) -> list[str]:
-        """How readings were predicted, and which offsets were taken out."""
-        known = [j for j, own in self.runs.items() if all(b.offset_known for b in own)]
-        said = [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
-        return [*said, *([OFFSET_RULE] if len(known) < len(self.runs) else [])]
-
-    def plot(self, joints: Sequence[str] | None = None) -> Figure:
-        """Figure of the models in free run beside commands and readings, a panel per run."""
-        return under_load.figure(self.runs, self.run_tracks, joints)
-
-
-def _compare_runs(
-    recordings: Sequence[Recording],
-    models: Sequence[str | Path | Calibration | ServoFit],
-    calibrations: Mapping[str, Calibration],
-    joints: Sequence[str],
-    seed: int,
-    lattices: Mapping[str, PollLattice] | None,
-) -> RunComparison:
-    """`compare` where trials differ in gain, load or torque."""
-    if len(calibrations) < len(models):
-        raise InputError(
-            "These recordings tell of a load or of several P gains, which only calibrations and "
-            "servo cards know. Leave out folders of fit-servo."
-        )
-    notes = []
-    inputs = {r.sha256: r.name for r in recordings}
-    for name, calibration in calibrations.items():
-        notes += [
-            f"{name} was fitted to {inputs[f.sha256]}: its errors here are too small."
-            for f in calibration.inputs
-            if f.sha256 in inputs
-        ]
-    runs: dict[str, list[under_load.BenchRun]] = {}
-    rules: dict[str, ReadingRule] = {}
-    for joint in joints:
-        trials = [t for r in recordings for t in r.trials(joint)]
-        lattice = (lattices or {}).get(joint) or find_poll_lattice(
-            tuple(trials), joint_rng(seed, joint)
-        )
-        runs[joint] = under_load.bench_runs(recordings, joint, seed, lattice)
-        kind = {"every read": "live", "lattice": "own dates"}.get(lattice.kind, "as logged")
-        source = ", ".join(r.name for r in recordings)
-        rules[joint] = ReadingRule(rule=kind, source=source)
-    made: dict[str, ComparedModel] = {}
-    tracks: dict[str, dict[str, list[NDArray[np.float64]]]] = {}
-    for name, calibration in calibrations.items():
-        tracks[name], found, offset = {}, {}, {}
-        for joint, own in runs.items():
-            volts = under_load.reference_voltage(calibration, joint)
-            own = under_load.at_voltage(own, volts)
-            track, offset[joint] = under_load.predict(calibration, joint, own)
-            tracks[name][joint] = track
-            error = under_load.errors(own, track)
-            nothing = np.zeros(len(error["fresh"]))
-            found[joint] = scores.Errors(
-                error["fresh"], under_load.one_step(own, track), nothing, under_load.blocks(own),
-                error["held"], error["raw"],
-            )  # fmt: skip
-        spread = dict.fromkeys(joints, 0.0)
-        made[name] = ComparedModel.scored(ModelScores.of(found, seed), offset, spread)
-    notes += under_load.notes(calibrations, runs)
-    nan = float("nan")
-    period = float(np.median([r.loop_period_s for r in recordings]))
-    return RunComparison(
-        models=made,
-        readings=rules,
-        persistence_rmse_rad={j: under_load.persistence(own) for j, own in runs.items()},
-        repeatability_rad=dict.fromkeys(joints, nan),
-        time_step_s=period,
-        notes=tuple(notes),
-        data=ServoData(tuple(joints), period, {}, (), {}, {}),
-        tracks={},
-        bands={},
-        runs=runs,
-        run_tracks=tracks,
-    )
-
-
 def _calibrations(
     models: Sequence[str | Path | Calibration | ServoFit],
 ) -> dict[str, Calibration]:
@@ -390,10 +168,6 @@ def _calibrations(
             label = f"{kind} ({given if called else len(found) + 1})"
         found[label] = calibration
     return found
-
-
-def _mean_absolute(errors: NDArray[np.float64]) -> float:
-    return float(np.mean(np.abs(errors))) if len(errors) else float("nan")
 
 
 def _is_calibration(given: str | Path) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.sysid.compare.compare import ComparedModel, Comparison
+from pupper_sysid.sysid.compare.comparison import ComparedModel, Comparison
 from pupper_sysid.sysid.compare.readings import (
     age_spread_rad,
     calibrated_run,

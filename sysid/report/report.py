@@ -34,7 +34,7 @@ from pupper_sysid.sysid.report.figure_data import hold_runs, tracks
 from pupper_sysid.sysid.report.tables import MODEL_NAMES
 
 if TYPE_CHECKING:  # they bring libraries that a page does not need
-    from pupper_sysid.sysid.compare.compare import Comparison
+    from pupper_sysid.sysid.compare.comparison import Comparison
     from pupper_sysid.sysid.doctor.examination import Examination
     from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
     from pupper_sysid.sysid.servo_fit.result import ServoFit

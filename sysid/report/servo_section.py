@@ -13,7 +13,7 @@ from pupper_sysid.sysid.report.tables import KEY, number, text
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 if TYPE_CHECKING:  # it brings torch
-    from pupper_sysid.sysid.compare.compare import Comparison
+    from pupper_sysid.sysid.compare.comparison import Comparison
 
 
 def servo_section(found: Comparison) -> Section:

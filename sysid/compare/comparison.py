@@ -1,0 +1,154 @@
+"""Result of a comparison of servo models: errors per model and joint, tables, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.results import Result, internal
+from pupper_sysid.sysid.compare.readings import (
+    ReadingRule,
+    in_words,
+)
+from pupper_sysid.sysid.servo_fit import scores
+from pupper_sysid.sysid.servo_fit.data import ServoData
+from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+OFFSET_RULE = (
+    "Offsets are of this recording: for every model the median of reading minus prediction."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedScores(scores.Scores):
+    """Root mean square and mean absolute errors of one model on one joint, or their means [rad]."""
+
+    mae_held_rad: float
+    mae_raw_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedModel(ModelScores):
+    """Scores of one model on readings that it predicts.
+
+    Attributes
+    ----------
+    joints : dict of str to ComparedScores
+    mean : ComparedScores
+        Over joints.
+    offset_rad : dict of str to float
+        By joint, reading minus prediction of these recordings; empty for a model fitted here.
+    age_spread_rad : dict of str to float
+        By joint, the part of the raw error that the unknown age of readings makes: a perfect model
+        would have it. 0 where readings are dated.
+    """
+
+    # as for the errors, with more numbers
+    joints: dict[str, ComparedScores]  # pyright: ignore[reportIncompatibleVariableOverride]
+    mean: ComparedScores
+    offset_rad: dict[str, float] = field(default_factory=dict)
+    age_spread_rad: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def scored(
+        cls, own: ModelScores, offset_rad: dict[str, float], age_spread_rad: dict[str, float]
+    ) -> ComparedModel:
+        """The scores with the offset and the spread that belong to them."""
+        joints = {
+            joint: ComparedScores(
+                **vars(found),
+                mae_held_rad=_mean_absolute(own.errors[joint].held),
+                mae_raw_rad=_mean_absolute(own.errors[joint].raw),
+            )
+            for joint, found in own.joints.items()
+        }
+        more = {"joints": joints, "mean": scores.mean(joints)}
+        return cls(
+            **vars(own) | more,  # pyright: ignore[reportArgumentType]
+            offset_rad=offset_rad,
+            age_spread_rad=age_spread_rad,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Result):
+    """Servo models on the same readings.
+
+    Attributes
+    ----------
+    models : dict of str to ComparedModel
+    readings : dict of str to ReadingRule
+        By joint, when its readings were measured.
+    persistence_rmse_rad, repeatability_rad : dict of str to float
+        Per joint.
+    time_step_s : float
+        Time between commands.
+    notes : tuple of str
+    data : ServoData
+    tracks : dict of str to Tracks
+        Readings of each model in free run.
+    bands : dict of str to (dict of str to Band)
+        By model, of those that have a predictive band, then joint.
+    """
+
+    models: dict[str, ComparedModel]
+    readings: dict[str, ReadingRule]
+    persistence_rmse_rad: dict[str, float]
+    repeatability_rad: dict[str, float]
+    time_step_s: float
+    notes: tuple[str, ...]
+    data: ServoData = internal()
+    tracks: dict[str, scores.Tracks] = internal()
+    bands: dict[str, dict[str, scores.Band]] = internal()
+
+    def to_frame(self) -> pd.DataFrame:
+        """Scores, one row per joint and model."""
+        nan = float("nan")
+        rows = []
+        for joint in self.data.joints:
+            for name, model in self.models.items():
+                noise, timing = self.bands.get(name, {}).get(joint, (nan, nan))
+                rows.append(
+                    {"joint": joint, "model": name}
+                    | asdict(model.joints[joint])
+                    | {
+                        "offset_rad": model.offset_rad.get(joint, nan),
+                        "age_spread_rad": model.age_spread_rad.get(joint, nan),
+                        "readings": self.readings[joint].rule,
+                        "persistence_rmse_rad": self.persistence_rmse_rad[joint],
+                        "repeatability_rad": self.repeatability_rad[joint],
+                        "band_noise_rad": noise, "band_timing_s": timing,
+                    }
+                )  # fmt: skip
+        return pd.DataFrame(rows).set_index(["joint", "model"])
+
+    def reading_notes(self) -> list[str]:
+        """How readings were predicted, one sentence per rule, and the rule of the offset."""
+        return [OFFSET_RULE, *in_words(self.readings)]
+
+    def plot(self, joints: Sequence[str] | None = None) -> Figure:
+        """Figure of the models in free run beside commands and readings, a panel per joint.
+
+        Parameters
+        ----------
+        joints : sequence of str, optional
+            By default all.
+        """
+        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+
+        errors = {name: model.errors for name, model in self.models.items()}
+        drawn = {name: track for name, track in self.tracks.items() if name != LINEAR}
+        return free_run_figure(self.data, drawn, errors, self.bands, joints)
+
+
+def _mean_absolute(errors: NDArray[np.float64]) -> float:
+    return float(np.mean(np.abs(errors))) if len(errors) else float("nan")
