@@ -22,16 +22,17 @@ KINDS = (
 
 # No reordering of sums and no fused multiplication: stick-slip would turn the last bit into
 # another trajectory, and the NumPy reference could not be compared with.
-_SAFE = {"nnan", "nsz"}
+SAFE = {"nnan", "nsz"}
 
 
-@njit(fastmath=_SAFE, error_model="numpy", inline="always")
-def _clip(x, limit):
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
+def clip(x, limit):
+    """`x` within `±limit`; ternaries, which vectorise."""
     x = limit if x > limit else x
     return -limit if x < -limit else x
 
 
-@njit(fastmath=_SAFE, error_model="numpy")
+@njit(fastmath=SAFE, error_model="numpy")
 def _constants(kind, values, who, h, p):
     """Constants `p` (9, LANES) of one step of `h` seconds for the candidates `who`."""
     for i in range(LANES):
@@ -58,7 +59,7 @@ def _constants(kind, values, who, h, p):
             p[3, i], p[4, i], p[5, i] = 0.5 * h * v[3], v[4] * (0.5 * h), v[5] * h
 
 
-@njit(fastmath=_SAFE, error_model="numpy")
+@njit(fastmath=SAFE, error_model="numpy")
 def _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track):
     """Positions of the candidates `who` after each step, into rows 1 … `steps` of `track`."""
     p = np.zeros((9, LANES))
@@ -75,12 +76,12 @@ def _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
             d[i] = (command[k + shift[i] - 1] - now) * part[i] + now
         if kind == 4 or kind == 5:
             for i in range(LANES):
-                s[i] += _clip(d[i] - s[i], p[4, i])
+                s[i] += clip(d[i] - s[i], p[4, i])
                 wanted = (s[i] - y[i]) * p[0, i] - p[1, i] * v[i]
-                force = _clip(wanted, p[3, i])
+                force = clip(wanted, p[3, i])
                 gain = p[5, i] if force == wanted else p[8, i]
                 force -= p[7, i] * v[i]
-                force += _clip((v[i] * (1.0 / h) + force) * stop, p[2, i])
+                force += clip((v[i] * (1.0 / h) + force) * stop, p[2, i])
                 v[i] += force * gain
                 y[i] += v[i] * h
                 track[k + 1, i] = y[i]
@@ -104,8 +105,8 @@ def _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
                 track[k + 1, i] = y[i] * p[0, i]
         elif kind == 3:
             for i in range(LANES):
-                free = (v[i] + h * _clip(p[0, i] * (d[i] - y[i]), p[1, i])) * p[2, i]
-                v[i] = free - _clip(free, p[3, i])
+                free = (v[i] + h * clip(p[0, i] * (d[i] - y[i]), p[1, i])) * p[2, i]
+                v[i] = free - clip(free, p[3, i])
                 y[i] += h * v[i]
                 track[k + 1, i] = y[i]
         else:
@@ -114,15 +115,15 @@ def _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
                 loss = p[3, i] + abs(v[i]) * p[4, i]
                 x = v[i] - v[i] * loss
                 x += p[0, i] * error
-                x += _clip(error, p[2, i]) * p[1, i]
-                x -= _clip(x, p[5, i])
+                x += clip(error, p[2, i]) * p[1, i]
+                x -= clip(x, p[5, i])
                 v[i] = x / (loss + 1.0)
                 y[i] += v[i] * h
                 track[k + 1, i] = y[i]
 
 
 @njit(inline="always")
-def _lanes(first, count, who):
+def fill_lanes(first, count, who):
     """Fill `who` with candidates from `first` on, the first repeated where there are too few."""
     used = min(LANES, count - first)
     for i in range(LANES):
@@ -130,7 +131,7 @@ def _lanes(first, count, who):
     return used
 
 
-@njit(cache=True, nogil=True, fastmath=_SAFE, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def positions(kind, values, dead_time, command, pad, h, stop, out):
     """Simulate each candidate on one trial.
 
@@ -155,14 +156,14 @@ def positions(kind, values, dead_time, command, pad, h, stop, out):
     steps, count = len(out) - 1, len(values)
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
-        used = _lanes(first, count, who)
+        used = fill_lanes(first, count, who)
         _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
         for k in range(steps + 1):
             for i in range(used):
                 out[k, first + i] = track[k, i]
 
 
-@njit(cache=True, nogil=True, fastmath=_SAFE, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def residuals(kind, values, dead_time, offset, command, step, reading, pad, h, stop, out):
     """Model minus reading of each candidate on one trial.
 
@@ -181,7 +182,7 @@ def residuals(kind, values, dead_time, offset, command, step, reading, pad, h, s
     steps = min(int(np.ceil(np.max(step))) + 1, len(command) - pad) if samples else 0
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
-        used = _lanes(first, count, who)
+        used = fill_lanes(first, count, who)
         _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
         for n in range(samples):
             row = min(int(step[n]), steps - 1)
@@ -192,7 +193,7 @@ def residuals(kind, values, dead_time, offset, command, step, reading, pad, h, s
                 out[first + i, n] = position + offset[first + i] - reading[n]
 
 
-@njit(cache=True, nogil=True, fastmath=_SAFE, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def moments_if_later(
     kind, values, dead_time, command, step, reading, later, pad, h, stop, total, square
 ):
@@ -210,7 +211,7 @@ def moments_if_later(
     count, steps = len(values), len(command) - pad
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
-        used = _lanes(first, count, who)
+        used = fill_lanes(first, count, who)
         _simulate(kind, values, dead_time, who, command, steps, pad, h, stop, track)
         for m in range(len(later)):
             for n in range(len(step)):

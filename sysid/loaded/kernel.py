@@ -11,9 +11,7 @@ import numpy as np
 from numba import njit
 
 from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
-
-LANES = 16
-"""Candidates abreast: two registers of AVX-512, four of AVX2."""
+from pupper_sysid.sysid.identify.kernel import LANES, SAFE, clip, fill_lanes
 
 OFFSET, WIDTH = 19, 20
 """Column of the offset, and number of columns: `loaded_servo.COLUMNS`, then the gravity [N·m] and
@@ -21,18 +19,10 @@ the hanging position [rad] that are added to the load's, and the offset of readi
 
 NO_RAMP_RAD_S2 = 1e6
 """Acceleration of the set-point from which on it follows the command at once."""
-
-_SAFE = {"nnan", "nsz"}
 _PI, _PER_PI = 3.141592653589793, 0.3183098861837907
 
 
-@njit(fastmath=_SAFE, error_model="numpy", inline="always")
-def _clip(x, limit):
-    x = limit if x > limit else x
-    return -limit if x < -limit else x
-
-
-@njit(fastmath=_SAFE, error_model="numpy", inline="always")
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
 def _sin(x):
     """Sine to 1e-9: a Taylor series after folding; unlike the library's it fits in a register."""
     n = np.rint(x * _PER_PI)
@@ -48,7 +38,7 @@ def _sin(x):
     return r * s * (1.0 - 2.0 * odd)
 
 
-@njit(fastmath=_SAFE, error_model="numpy")
+@njit(fastmath=SAFE, error_model="numpy")
 def _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, stop, track):
     """Positions of the candidates `who` after each step, into rows 1 … `steps` of `track`."""
     y, v, c, on = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
@@ -87,22 +77,22 @@ def _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, s
             for i in range(LANES):
                 way = c[i] - g[i]
                 far = np.sqrt(2.0 * p[16, i] * abs(way))
-                wanted = _clip(way * (1.0 / h), far)
-                rate[i] += _clip(wanted - rate[i], p[16, i] * h)
+                wanted = clip(way * (1.0 / h), far)
+                rate[i] += clip(wanted - rate[i], p[16, i] * h)
                 g[i] += rate[i] * h
                 c[i] = g[i] if p[16, i] < NO_RAMP_RAD_S2 else c[i]
         for i in range(LANES):
             error = c[i] - y[i]
             start_duty = 0.0
             if firmware:
-                error -= _clip(error, p[14, i])
-                start_duty = p[15, i] * _clip(error * (1.0 / START_ERROR_RAD), 1.0)
+                error -= clip(error, p[14, i])
+                start_duty = p[15, i] * clip(error * (1.0 / START_ERROR_RAD), 1.0)
             wanted = error * p[0, i] - p[1, i] * v[i] + start_duty
-            duty = _clip(wanted, 1.0)
+            duty = clip(wanted, 1.0)
             top = p[2, i] * volt * on[i]
             back = p[13, i] + (p[3, i] - p[13, i]) * on[i]
             drawn = duty * top - back * v[i]
-            motor = _clip(drawn, p[12, i])
+            motor = clip(drawn, p[12, i])
             damping = p[1, i] * top if duty == wanted else 0.0
             damping = damping + back if motor == drawn else 0.0
             weight = -p[4, i] * _sin(y[i] - p[18, i])
@@ -113,22 +103,13 @@ def _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, s
                 limit += p[6, i] * standing + (1.0 + p[11, i] * standing) * load_friction
                 limit += p[10, i] * motor * motor
             force = motor + weight
-            force += _clip((v[i] * (1.0 / h) + force) * stop, limit)
+            force += clip((v[i] * (1.0 / h) + force) * stop, limit)
             v[i] += force * h / (1.0 + h * damping)
             y[i] += v[i] * h
             track[k + 1, i] = y[i]
 
 
-@njit(inline="always")
-def _lanes(first, count, who):
-    """Fill `who` with candidates from `first` on, the first repeated where there are too few."""
-    used = min(LANES, count - first)
-    for i in range(LANES):
-        who[i] = first + (i if i < used else 0)
-    return used
-
-
-@njit(cache=True, nogil=True, fastmath=_SAFE, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def positions(values, dead_time, run, p_gain, load, start, pad, h, stop, out):
     """Simulate each candidate on one run.
 
@@ -156,14 +137,14 @@ def positions(values, dead_time, run, p_gain, load, start, pad, h, stop, out):
     steps, count = len(out) - 1, len(values)
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
-        used = _lanes(first, count, who)
+        used = fill_lanes(first, count, who)
         _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, stop, track)
         for k in range(steps + 1):
             for i in range(used):
                 out[k, first + i] = track[k, i] + values[first + i, OFFSET]
 
 
-@njit(cache=True, nogil=True, fastmath=_SAFE, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def residuals(values, dead_time, run, p_gain, load, start, step, reading, pad, h, stop, out):
     """Model minus reading of each candidate on one run.
 
@@ -180,7 +161,7 @@ def residuals(values, dead_time, run, p_gain, load, start, step, reading, pad, h
     steps = min(int(np.ceil(np.max(step))) + 1, run.shape[1] - pad) if samples else 0
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
-        used = _lanes(first, count, who)
+        used = fill_lanes(first, count, who)
         _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, stop, track)
         for n in range(samples):
             row = min(int(step[n]), steps - 1)
