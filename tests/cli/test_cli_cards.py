@@ -20,7 +20,7 @@ def narrow(monkeypatch) -> None:
     """A terminal of 80 columns."""
     from pupper_sysid.cli import terminal
 
-    monkeypatch.setattr(terminal.out, "width", 80)
+    monkeypatch.setattr(terminal.out, "_width", 80)
 
 
 def lines_of(capsys, *arguments: str) -> list[str]:

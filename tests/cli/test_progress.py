@@ -14,7 +14,7 @@ from pupper_sysid.sysid.identify import calibrate as module
 def lines(monkeypatch):
     """What goes to stderr, and a clock that a test sets."""
     text, clock = io.StringIO(), [100.0]
-    monkeypatch.setattr(terminal.err, "file", text, raising=False)
+    monkeypatch.setattr(terminal.err, "_file", text)  # its property would keep the old one
     monkeypatch.setattr(terminal.time, "monotonic", lambda: clock[0])
     return text, clock
 
