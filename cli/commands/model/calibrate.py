@@ -119,7 +119,7 @@ class Calibrate:
     def _print(self, made: CalibrationResult) -> None:
         shown = terminal.table(
             "DelayedPD per joint", "joint", "dead time ms", "90 %", "Kp", "Kd", "fric. N·m",
-            "speed rad/s", "limit", "error mrad", "unseen Hz mrad", "paper mrad",
+            "speed rad/s", "limit", "error mrad", "unseen mrad", "paper mrad",
         )  # fmt: skip
         for name, r in made.items():
             a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores

@@ -44,8 +44,7 @@ class Delay:
             return
         budget = terminal.table(
             "Lag budget, ms: raw = stale readings + command hold + servo lag", "joint", "raw",
-            "stale readings", "command hold", "servo lag", "90 % interval", "of it dead time",
-            "90 % interval",
+            "stale", "hold", "servo", "90 %", "of it dead time", "90 %",
         )  # fmt: skip
         for name, b in found.items():
             dead = b.dead_time_s
@@ -72,7 +71,7 @@ class Delay:
     def _print_frequencies(self, found: LagBudgets) -> None:
         shown = terminal.table(
             "Per frequency, fresh readings", "joint", "Hz", "gain", "phase °", "lag ms",
-            "90 % interval", "raw lag ms", "raw gain",
+            "90 %", "raw lag ms", "raw gain",
         )  # fmt: skip
         for name, b in found.items():
             for f in b.by_frequency:
@@ -87,4 +86,5 @@ class Delay:
 
 
 def _ends(interval: Interval) -> str:
-    return f"{terminal.ms(interval.low)} … {terminal.ms(interval.high)}"
+    # without spaces, at which a narrow table would break it
+    return f"{terminal.ms(interval.low)}…{terminal.ms(interval.high)}"
