@@ -85,9 +85,14 @@ class _Stop:
 
 
 def end_politely() -> None:
-    """Treat SIGTERM and a closed terminal as Ctrl-C, so that the robot is parked first."""
+    """Treat SIGTERM and a closed terminal as Ctrl-C, so that the robot is parked first.
+
+    Ctrl-C works even where a script started the program with `&`, which has it ignored.
+    """
     if threading.current_thread() is threading.main_thread():
         stop = _Stop()
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         for name in ("SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)
             if number and signal.getsignal(number) != signal.SIG_IGN:  # `nohup` ignores the latter

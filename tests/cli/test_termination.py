@@ -89,11 +89,38 @@ def test_a_termination_signal_ends_commands_and_their_workers_within_a_second(tm
             process.stderr.close()
 
 
+def not_ignored() -> None:
+    """Have Ctrl-C act, though the tests may run in the background, where a shell ignores it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def ignored() -> None:
+    """As a script starts a program with `&`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@pytest.mark.wall_clock
+def test_ctrl_c_stops_a_robot_that_a_script_started_in_the_background(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "monitor",
+         "--bus", "emulated"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=ignored,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None and process.stdout.readline()  # it reads servos
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=10)
+    finally:
+        process.kill()
+        process.wait()
+
+
 def test_an_interrupted_calculation_does_not_wait_for_its_workers(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "calibrate",
          str(SWEEP)],
         cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        preexec_fn=not_ignored,
     )  # fmt: skip
     try:
         assert wait_until(lambda: len(children(process.pid)) >= 2, 60)
