@@ -44,6 +44,7 @@ def test_scan_of_a_silent_line_names_what_to_check(capsys):
     assert code == 1 and "no servo answers at 1000000 baud" in err and "power" in err
 
 
+@pytest.mark.wall_clock
 def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     with on_a_port(moving_servos(ids=[5])) as port:
         bus = f"feetech:{port.device}"
