@@ -297,7 +297,12 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
     path = Path(path_or_preset)
     if not path.exists():
         near = difflib.get_close_matches(path.name, PRESETS, n=1)
-        hint = f"Did you mean the preset {near[0]}?" if near else f"Presets: {', '.join(PRESETS)}."
+        cards = difflib.get_close_matches(path.name, _cards().card_names(), n=1)
+        if near or cards:
+            kind, name = ("preset", near[0]) if near else ("servo card", cards[0])
+            hint = f"Did you mean the {kind} {name}?"
+        else:
+            hint = f"Presets: {', '.join(PRESETS)}."
         hint += "" if near else " `pupper-sysid servo list` shows servo cards."
         raise InputError(f"{path} does not exist. Check the name. {hint}")
     return _load(path)

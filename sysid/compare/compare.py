@@ -8,6 +8,7 @@ note names models that were fitted to a recording they are compared on.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
     is_shipped,
     load_calibration,
 )
+from pupper_sysid.servo_models.cards.files import card_names
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
 from pupper_sysid.sysid.compare.comparison import (
@@ -39,7 +41,7 @@ from pupper_sysid.sysid.compare.readings import (
     shown,
     with_ages,
 )
-from pupper_sysid.sysid.compare.runs import compare_runs
+from pupper_sysid.sysid.compare.runs import compare_runs, refuse_missing_joints
 from pupper_sysid.sysid.compare.under_load import needs_runs
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
@@ -157,8 +159,10 @@ def _calibrations(
     for given in models:
         if isinstance(given, Calibration):
             calibration, called = given, ""
-        elif isinstance(given, ServoFit) or Path(given).is_dir() or not _is_calibration(given):
+        elif isinstance(given, ServoFit) or Path(given).is_dir():
             continue
+        elif not _is_calibration(given):
+            raise InputError(_unknown(given))
         else:
             calibration, called = load_calibration(given), Path(given).name
         loaded = any(j.under_load for j in calibration.joints.values())
@@ -214,17 +218,26 @@ def _open(given: str | Path | Calibration | ServoFit, data: ServoData) -> _Opene
             band={j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()},
             of_rows=tuple(j for j, mode in contract.readings_counted.items() if mode == "all"),
         )  # fmt: skip
-    if _is_calibration(given):
-        return _calibrated(load_calibration(given), f"DelayedPD ({path.name})", data)
-    raise InputError(
-        f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor one of the "
-        f"presets {', '.join(PRESETS)}. Make one with `pupper-sysid fit-servo` or `calibrate`."
+    return _calibrated(load_calibration(given), f"DelayedPD ({path.name})", data)
+
+
+def _unknown(given: str | Path) -> str:
+    """What to say of a model that is none."""
+    shipped = (*PRESETS, *card_names())
+    near = difflib.get_close_matches(str(given), shipped, n=1)
+    advice = (
+        f"Did you mean {near[0]}?"
+        if near
+        else "Make one with `pupper-sysid fit-servo` or `calibrate`."
+    )
+    return (
+        f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor a servo card "
+        f"(`pupper-sysid servo list`), nor one of the presets {', '.join(PRESETS)}. {advice}"
     )
 
 
 def _calibrated(calibration: Calibration, name: str, data: ServoData) -> _Opened:
-    for joint in data.joints:
-        calibration.joint(joint)
+    refuse_missing_joints(calibration, name, data.joints)
     return _Opened(name, [f.sha256 for f in calibration.inputs], calibration=calibration)
 
 

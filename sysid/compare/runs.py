@@ -64,6 +64,26 @@ class RunComparison(Comparison):
         return under_load.figure(self.runs, self.run_tracks, joints)
 
 
+def refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence[str]) -> None:
+    """Refuse to compare on joints that a calibration does not have."""
+    missing = [j for j in joints if not _has(calibration, j)]
+    if missing:
+        common = [j for j in joints if j not in missing]
+        advice = f" Compare on {', '.join(common)} only (`joints`)." if common else ""
+        raise InputError(
+            f"{name} has no joint {', '.join(missing)}; it has "
+            f"{', '.join(calibration.joints)}.{advice}"
+        )
+
+
+def _has(calibration: Calibration, joint: str) -> bool:
+    try:
+        calibration.joint(joint)  # a servo card has every joint
+    except InputError:
+        return False
+    return True
+
+
 def compare_runs(
     recordings: Sequence[Recording],
     models: Sequence[str | Path | Calibration | ServoFit],
@@ -81,11 +101,11 @@ def compare_runs(
     notes = []
     inputs = {r.sha256: r.name for r in recordings}
     for name, calibration in calibrations.items():
-        notes += [
-            f"{name} was fitted to {inputs[f.sha256]}: its errors here are too small."
-            for f in calibration.inputs
-            if f.sha256 in inputs
-        ]
+        refuse_missing_joints(calibration, name, joints)
+        fitted = [inputs[f.sha256] for f in calibration.inputs if f.sha256 in inputs]
+        if fitted:
+            which = ", ".join(fitted) if len(fitted) < 4 else f"{len(fitted)} of these recordings"
+            notes.append(f"{name} was fitted to {which}: its errors here are too small.")
     runs: dict[str, list[under_load.BenchRun]] = {}
     rules: dict[str, ReadingRule] = {}
     for joint in joints:

@@ -101,3 +101,27 @@ def test_folders_of_real_logs_are_examined_without_renaming_anything(capsys, fol
 
 def test_a_folder_of_imu_logs_is_answered_in_a_sentence(capsys):
     assert "IMU" in refused(capsys, pupper_sysid, "doctor", real_folder("mini_pupper_imu"))
+
+
+def test_the_log_itself_is_never_written_over(capsys, arm):
+    log = arm.rename(arm.with_suffix(".csv"))
+    before = log.read_bytes()
+    code, _, err = run(capsys, "import", log.name, *COLUMNS)
+    assert code == 0 and "Wrote arm_recording.csv" in err
+    assert "is the log itself" in refused(
+        capsys, pupper_sysid, "import", log, *COLUMNS, "--out", "arm.csv", "--force"
+    )
+    assert log.read_bytes() == before
+
+
+def test_a_column_that_does_not_exist_is_named(capsys, arm):
+    wrong = [c.replace("y {joint}", "z {joint}") for c in COLUMNS]
+    assert "--position is z {joint}, which fits no column; it has" in refused(
+        capsys, pupper_sysid, "import", arm, *wrong
+    )
+    whole = [c.replace("u {joint}", "u joint") for c in COLUMNS]
+    assert "({joint} stands for a joint's name)" in refused(
+        capsys, pupper_sysid, "import", arm, *whole
+    )
+    other = [c.replace("y {joint}", "y pa{joint}") for c in COLUMNS]
+    assert "no joint has both" in refused(capsys, pupper_sysid, "import", arm, *other)

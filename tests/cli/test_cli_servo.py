@@ -161,6 +161,12 @@ def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(cap
     assert code == 2
     code, _, err = run(capsys, "compare", "log.csv", "--models", "log.csv")
     assert code == 2 and "neither a servo model" in err
+    code, _, err = run(capsys, "compare", "log.csv", "--models", "sts3215-bam")
+    assert code == 2 and "Did you mean sts3215-bam-m" in err
+    code, _, err = run(
+        capsys, "compare", SAMPLE / "playback.csv", "--models", SAMPLE / "calibrated.yaml"
+    )
+    assert code == 2 and "only (--joints)" in err and "has no joint" in err
     code, _, err = run(capsys, "compare", "log.csv")
     assert code == 2 and "--models" in err
 

@@ -58,6 +58,8 @@ def test_a_missing_file_is_refused_and_a_misspelt_preset_is_recognised(tmp_path)
         load_calibration(tmp_path / "nothing.yaml")
     with pytest.raises(InputError, match="Did you mean the preset release"):
         load_calibration("relaese")
+    with pytest.raises(InputError, match="Did you mean the servo card sts3215-bam-m6"):
+        load_calibration("sts3215-bam-m66")
 
 
 @pytest.mark.parametrize(

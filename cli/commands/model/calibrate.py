@@ -117,9 +117,11 @@ class Calibrate:
         )
 
     def _print(self, made: CalibrationResult) -> None:
+        published = any("paper" in r.presets for r in made.values())
         shown = terminal.table(
             "DelayedPD per joint", "joint", "dead time ms", "90 %", "Kp", "Kd", "fric. N·m",
-            "speed rad/s", "limit", "error mrad", "unseen mrad", "paper mrad",
+            "speed rad/s", "limit", "error mrad", "unseen mrad",
+            *(["paper mrad"] if published else []),
         )  # fmt: skip
         for name, r in made.items():
             a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
@@ -135,7 +137,7 @@ class Calibrate:
                 f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
                 "EMF" if brakes else "slew",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_leave_one_frequency_out_rad),
-                terminal.ms(paper.rmse_fresh_rad if paper else None),
+                *([terminal.ms(paper.rmse_fresh_rad if paper else None)] if published else []),
             )  # fmt: skip
         terminal.out.print(shown)
         scales = {name: made.calibration.joint(name).actuator.scale for name in made}

@@ -26,7 +26,8 @@ class Compare:
     recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Recordings to compare on; by default the newest in recordings/."""
     models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL [MODEL ...]")] = ()
-    """Folders of fit-servo, calibration files, or presets (paper, release)."""
+    """Folders of fit-servo, calibration files, servo cards (names or files), or presets (paper,
+    release)."""
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     readings: Literal["auto", "fresh", "all"] = "auto"

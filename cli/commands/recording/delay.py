@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.common.joints import share_sentences
 
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
@@ -65,8 +66,8 @@ class Delay:
             shown.add_row(name, terminal.ms(value))
         terminal.out.print()
         terminal.out.print(shown)
-        for b in found.values():
-            terminal.warn(b.warnings)
+        by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in found.items()}
+        terminal.warn(f"{names}: {text}" for names, text in share_sentences(by_joint))
 
     def _print_frequencies(self, found: LagBudgets) -> None:
         shown = terminal.table(

@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 
 
@@ -27,7 +28,8 @@ class Import:
     log: tyro.conf.Positional[Path]
     """File or folder."""
     out: Path | None = None
-    """Recording to write; by default the log's name and .csv, in this folder."""
+    """Recording to write; by default the log's name and .csv, in this folder; NAME_recording.csv
+    where that is the log itself."""
     time: str | None = None
     """Column of the time."""
     command: str | None = None
@@ -61,7 +63,12 @@ class Import:
             read_mapping,
         )
 
-        out = self.out or Path(f"{self.log.resolve().stem}.csv")
+        name = self.log.resolve().stem
+        out = self.out or Path(f"{name}.csv")
+        if _same(out, self.log):
+            if self.out:
+                raise InputError(f"--out {out} is the log itself. Choose another name.")
+            out = Path(f"{name}_recording.csv")
         refuse_overwrite(out, self.force)
         options = LogOptions(
             self.time, self.command, self.position, self.trial,
@@ -99,3 +106,8 @@ class Import:
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}", soft_wrap=True)
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether both are one file, also by links."""
+    return one.exists() and other.exists() and one.samefile(other)

@@ -300,9 +300,11 @@ class Sweep:
         )
         for name in written:
             terminal.out.print(f"  {name}", soft_wrap=True)
+        last = f"delay {path}\n  pupper-sysid calibrate {path} --out calibrated.yaml"
+        if self.kind == "reversal":
+            last = f"backlash {path}"
         terminal.out.print(
-            f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid delay {path}\n"
-            f"  pupper-sysid calibrate {path} --out calibrated.yaml",
+            f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid {last}",
             soft_wrap=True,
         )
 

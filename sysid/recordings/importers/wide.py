@@ -168,7 +168,7 @@ def _pairs(path: Path | str, table: Table, options: LogOptions) -> dict[str, _Pa
         if len(both) > len(best):
             best = both
     if not best:
-        raise InputError(_no_pair(path, table, options, matched))
+        raise InputError(_no_pair(path, table, options))
     if options.joints and not (len(best) == 1 and _SOLE in best):
         lacking = [j for j in options.joints if j not in best]
         if lacking:
@@ -246,18 +246,15 @@ def _time_column(names: Sequence[str]) -> str | None:
     return next((known[word] for word in TIMES for known in (plain, bare) if word in known), None)
 
 
-def _no_pair(
-    path: Path | str,
-    table: Table,
-    options: LogOptions,
-    matched: Mapping[re.Pattern[str], dict[str, tuple[str, str]]],
-) -> str:
+def _no_pair(path: Path | str, table: Table, options: LogOptions) -> str:
     """Why no joint has both a command and a position."""
     has = f"it has {_listed(table.names)}"
-    if options.command:
-        found = [len(columns) for columns in matched.values()]
-        lost = f"`{'position' if found and found[0] else 'command'}`"
-        return f"{path}: no column fits {lost}, or none has the joint of the other; {has}."
+    if options.command and options.position:
+        for name, text in (("command", options.command), ("position", options.position)):
+            if not _matches(_template(text), table.names):
+                hint = "" if "{joint}" in text else " ({joint} stands for a joint's name)"
+                return f"{path}: `{name}` is {printable(text)}, which fits no column{hint}; {has}."
+        return f"{path}: no joint has both a column of `command` and one of `position`; {has}."
     return f"{path}: {missing(table.names)}; {has}."
 
 
