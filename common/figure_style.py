@@ -6,7 +6,10 @@ which are distinct to colour-blind readers. pyplot's global state is not used.
 
 from __future__ import annotations
 
+import hashlib
+import html
 import io
+import re
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -98,6 +101,50 @@ def svg(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def inline_svg(drawing: bytes, words: str) -> str:
+    """A drawing of `svg` as an element of an HTML page.
+
+    Parameters
+    ----------
+    drawing : bytes
+        From `svg`.
+    words : str
+        What it shows, for screen readers.
+
+    Returns
+    -------
+    str
+        An `<svg>` of class `drawing`, as wide as its parent. Colours of this style are the CSS
+        variables `--ink`, `--drawing-blue` and so on, so that a page can change them. What was
+        drawn with the `gid` "part:NAME" has the class `part-NAME`. Its ids occur once on a page.
+    """
+    text = drawing.decode()
+    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
+    head, body = text.split(">", 1)
+    (box,) = re.findall(r'viewBox="[0-9. ]+"', head)
+    body = re.sub(r'<g id="part:([\w-]+)">', r'<g class="part-\1">', body)
+    body = re.sub(r'<g id="[^"]*">', "<g>", body)
+    own = hashlib.sha256(drawing).hexdigest()[:8]
+    body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{own}-", body)
+    body = re.sub(r"#[0-9a-fA-F]{6}\b", lambda m: _variable(m.group()), body)
+    label = html.escape(words, quote=True)
+    return f'<svg class="drawing" role="img" aria-label="{label}" {box}>{body}'
+
+
+_VARIABLES = {
+    "#000000": "--ink", INK: "--ink", FAINT: "--drawing-faint", "#ffffff": "--drawing-paper",
+    _STYLE["grid.color"]: "--line", BLUE: "--drawing-blue", SKY: "--drawing-sky",
+    GREEN: "--drawing-green", ORANGE: "--drawing-orange", RED: "--drawing-red",
+    PINK: "--drawing-pink",
+}  # fmt: skip
+_BY_HEX = {colour.lower(): name for colour, name in _VARIABLES.items()}
+
+
+def _variable(colour: str) -> str:
+    name = _BY_HEX.get(colour.lower())
+    return f"var({name}, {colour})" if name else colour
+
+
 def refuse_picture(path: Path, force: bool = False) -> None:
     """Refuse a path to which no picture can be written.
 
@@ -122,6 +169,21 @@ def save(figure: Figure, path: Path, force: bool = False) -> None:
     refuse_picture(path, force)
     draw = svg if path.suffix.lower() == ".svg" else png
     write_bytes(path, draw(figure), force)
+
+
+def axes_grid(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Small multiples: `count` axes in rows of `columns`, each row `height` inches high.
+
+    Axes share their scales; a figure of several columns is twice as wide as others.
+    """
+    columns = min(columns, max(count, 1))
+    rows = -(-max(count, 1) // columns)
+    width = WIDTH_IN if columns < 3 else 2 * WIDTH_IN
+    figure = Figure(figsize=(width, 1.2 + height * rows), layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.remove()
+    return figure, grid[:count]
 
 
 def axes_column(rows: int, height: float) -> tuple[Figure, list[Axes]]:

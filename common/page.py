@@ -1,18 +1,18 @@
 """Reports as one HTML page without network or scripts: figures are inside.
 
 A page is a list of `Section` objects of text, pictures and tables, set by one template for screens
-of all sizes and for print. `write_page` writes it, and beside it its figures as PNG and SVG and its
-tables as CSV.
+of all sizes and for print; details are folded. Figures are drawings within the page, which follow
+its dark mode. `write_page` writes it, and beside it its figures as PNG and SVG and its tables as
+CSV.
 """
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from pupper_sysid.common.figure_style import png, svg
+from pupper_sysid.common.figure_style import inline_svg, png, svg
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.results import plain
 
@@ -45,7 +45,7 @@ class Table:
     Attributes
     ----------
     name : str
-        Name of its CSV file, without ending.
+        Name of its CSV file, without ending; a table without a name has no file.
     title : str
     columns : tuple of Column
         On the page.
@@ -60,6 +60,14 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     marked: str = ""
+
+    def where(self, key: str, value: object, title: str = "") -> Table:
+        """The part of the rows whose `key` is `value`, without that column; it has no file."""
+        return replace(
+            self, name="", title=title or self.title,
+            rows=tuple(row for row in self.rows if row[key] == value),
+            columns=tuple(c for c in self.columns if c.kind != "key"),
+        )  # fmt: skip
 
     def to_csv(self) -> str:
         """All values of all rows; a cell is empty where a number is not finite."""
@@ -81,26 +89,34 @@ class Picture:
     caption: str
     """What it shows; also its text for screen readers."""
     figure: Figure
+    wide: bool = False
+    """Many panels beside each other: the width of the page, scrolled on a narrow screen."""
 
     @cached_property
     def png(self) -> bytes:
-        """The figure as a PNG image, for the page."""
+        """The figure as a PNG image."""
         return png(self.figure)
 
     @cached_property
     def svg(self) -> bytes:
-        """The figure as an SVG drawing, for print."""
+        """The figure as an SVG drawing."""
         return svg(self.figure)
 
     @property
-    def base64(self) -> str:
-        """The image as text, for a `data:` address."""
-        return base64.b64encode(self.png).decode("ascii")
+    def inline(self) -> Markup:
+        """The drawing as a part of the page."""
+        return Markup(inline_svg(self.svg, self.caption))
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [pixels], from the PNG's header."""
-        return int.from_bytes(self.png[16:20], "big"), int.from_bytes(self.png[20:24], "big")
+
+@dataclass(frozen=True)
+class Fold:
+    """Details under one title, shown when it is opened."""
+
+    title: str
+    figures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    notes: Sequence[str] = ()
+    opened: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,8 +130,14 @@ class Section:
         Paragraphs.
     findings : sequence of (str, str)
         Each with its name, which may be empty.
+    toggles : dict of str to str
+        Parts of the page's figures that the reader can hide, and what they are called; a part is
+        what was drawn under that `gid`.
     figures : sequence of Picture
     tables : sequence of Table
+    files : sequence of Table
+        Written as CSV, not shown.
+    folds : sequence of Fold
     notes : sequence of str
         In small print.
     """
@@ -124,9 +146,17 @@ class Section:
     title: str
     text: Sequence[str] = ()
     findings: Sequence[tuple[str, str]] = ()
+    toggles: Mapping[str, str] = field(default_factory=dict)
     figures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
-    notes: Sequence[str] = field(default=())
+    files: Sequence[Table] = ()
+    folds: Sequence[Fold] = ()
+    notes: Sequence[str] = ()
+
+    @property
+    def pictures(self) -> list[Picture]:
+        """Those of the section and of its folds."""
+        return [*self.figures, *(p for f in self.folds for p in f.figures)]
 
 
 @dataclass(frozen=True)
@@ -160,14 +190,14 @@ def write_page(
         one cannot be written.
     """
     html = render(title, subtitle, sections)
-    drawn = [(path.parent / "figures" / p.name, p) for s in sections for p in s.figures]
+    drawn = [(path.parent / "figures" / p.name, p) for s in sections for p in s.pictures]
     pngs = {file.with_name(f"{file.name}.png"): p.png for file, p in drawn}
     svgs = {file.with_name(f"{file.name}.svg"): p.svg for file, p in drawn}
     csvs = {
         path.parent / "tables" / f"{t.name}.csv": t.to_csv()
         for s in sections
-        for t in s.tables
-        if t.rows
+        for t in (*s.tables, *s.files)
+        if t.rows and t.name
     }
     for file in (path, *pngs, *svgs, *csvs):
         refuse_overwrite(file, force)

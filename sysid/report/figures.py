@@ -27,6 +27,7 @@ from pupper_sysid.common.figure_style import (
     RED,
     SKY,
     axes_column,
+    axes_grid,
     styled,
 )
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
@@ -82,6 +83,10 @@ _LAG_KINDS = (
 )
 
 
+_LIGHT, _DARK = "#fdfdfd", "#111111"
+"""Letters on bars, which stay light or dark on a dark page."""
+
+
 def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
     """Draw one joint's bar; returns where it ends [ms]."""
     raw, dead_time = 1e3 * part.raw_lag_s.value, part.dead_time_s
@@ -98,7 +103,7 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
             box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
             axes.text(
                 left + 0.5 * shown, row - 0.13 * (name == "dead time"), f"{shown:.0f}",
-                ha="center", va="center", color="white" if colour in (BLUE, GREEN) else "black",
+                ha="center", va="center", color=_LIGHT if colour in (BLUE, GREEN) else _DARK,
                 bbox=box if hatch else None,
             )  # fmt: skip
         left += shown
@@ -132,28 +137,63 @@ def overlay_figure(
     shown = some_tracks(tracks(result) if found is None else found, panels)
     figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
     for axes, track in zip(grid, shown, strict=True):
-        start, stop = window(track)
-        fine, row = _inside(track.time_s, start, stop), _inside(track.row_time_s, start, stop)
-        fresh = _inside(track.fresh_time_s, start, stop)
-        axes.plot(
-            track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
-            label="command (zero-order hold)",
-        )  # fmt: skip
-        axes.plot(
-            track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5,
-            drawstyle="steps-post", label="raw readings",
-        )  # fmt: skip
-        axes.plot(track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2, label="DelayedPD")
-        axes.plot(
-            track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5, mec="white",
-            mew=0.6, label="fresh readings, when measured",
-        )  # fmt: skip
-        axes.set_title(_trial_name(track, result.joint))
-        axes.set_xlim(start, stop)
+        _overlay(axes, track, result.joint, 1.0)
         axes.set_ylabel("from rest [rad]")
     grid[-1].set_xlabel("time in the trial [s]")
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
     return figure
+
+
+@styled
+def overlay_grid(found: Mapping[str, list[Track]]) -> Figure:
+    """The same of every joint beside the others, one frequency each.
+
+    Parameters
+    ----------
+    found : dict of joint to list of Track
+        From `sysid.report.figure_data.tracks`; none of them empty.
+    """
+    figure, grid = axes_grid(len(found), 3, 1.75)
+    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+        spread = some_tracks(own, 3)
+        _overlay(axes, spread[len(spread) // 2], joint, 0.7)
+        if n % 3 == 0:
+            axes.set_ylabel("from rest [rad]")
+        if n >= len(grid) - 3:
+            axes.set_xlabel("time in the trial [s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _overlay(axes: Axes, track: Track, joint: str, size: float) -> None:
+    """One trial; marks and lines are `size` times as large as usual."""
+    start, stop = window(track)
+    fine, row = _inside(track.time_s, start, stop), _inside(track.row_time_s, start, stop)
+    fresh = _inside(track.fresh_time_s, start, stop)
+    axes.plot(
+        track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
+        label="command (zero-order hold)", gid="part:command",
+    )  # fmt: skip
+    axes.plot(
+        track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5 * size,
+        drawstyle="steps-post", label="raw readings", gid="part:raw",
+    )  # fmt: skip
+    axes.plot(
+        track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2 * size, label="DelayedPD",
+        gid="part:model",
+    )  # fmt: skip
+    axes.plot(
+        track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5 * size,
+        mec="white", mew=0.6 * size, label="fresh readings, when measured", gid="part:fresh",
+    )  # fmt: skip
+    axes.set_title(_trial_name(track, joint))
+    axes.set_xlim(start, stop)
+
+
+OVERLAY_PARTS = {
+    "command": "command", "raw": "raw readings", "model": "model", "fresh": "fresh readings"
+}  # fmt: skip
+"""Parts of an overlay by the end of their `gid`, and what they are called."""
 
 
 @styled
@@ -165,31 +205,40 @@ def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
     found : dict of joint to HoldRuns
         From `sysid.report.figure_data.hold_runs`.
     """
-    figure, grid = axes_column(len(found), 1.2 + 1.6 * len(found))
+    columns = 1 if len(found) <= _SINGLE else 3
+    figure, grid = axes_grid(len(found), columns, 1.6)
     length = np.arange(1, LONGEST_RUN + 1)
-    for axes, (joint, runs) in zip(grid, found.items(), strict=True):
+    for n, (axes, (joint, runs)) in enumerate(zip(grid, found.items(), strict=True)):
         lattice = runs.lattice
         axes.bar(length, runs.count, color=ORANGE, label="counted")
         title = f"{joint}: {_LATTICE_WORDS.get(lattice.kind, lattice.kind)}"
         if runs.expected is not None:
             axes.plot(
-                length, runs.expected, "D", color=INK, ms=5, label="predicted by poll and loss"
-            )
-            title = (
-                f"{joint}: a poll every {1e3 * lattice.poll_period_s:.2f} ms, "
-                f"{100 * lattice.loss:.0f} % of them lost"
-            )
+                length, runs.expected, "D", color=INK, ms=5 if columns == 1 else 3,
+                label="predicted by poll and loss",
+            )  # fmt: skip
+            lost = f"{100 * lattice.loss:.0f} %"
+            period = f"{1e3 * lattice.poll_period_s:.2f} ms"
+            title = f"{joint}: a poll every {period}, {lost} of them lost"
+            if columns > 1:
+                title = f"{joint}: {period}, {lost} lost"
         axes.set_title(title)
-        axes.set_ylabel("runs")
+        if n % columns == 0:
+            axes.set_ylabel("runs")
         axes.grid(axis="x", visible=False)
         axes.set_xticks(length, [str(n) for n in length[:-1]] + [f"≥{LONGEST_RUN}"])
-    grid[-1].set_xlabel("rows with the same value")
+        if n >= len(grid) - columns:
+            axes.set_xlabel("rows with the same value")
     names = {}
     for axes in grid:
         handles, labels = axes.get_legend_handles_labels()
         names.update(zip(labels, handles, strict=True))
     figure.legend(list(names.values()), list(names), loc="outside upper left", ncols=2)
     return figure
+
+
+_SINGLE = 3
+"""Up to so many joints have a panel of full width each."""
 
 
 _LATTICE_WORDS = {
@@ -257,30 +306,19 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     """
     found = tracks(result) if found is None else found
     figure, (over_speed, over_time) = axes_column(2, 6.0)
-    mrad = 1e3
-
-    def gathered(name: str) -> NDArray:
-        return np.concatenate([getattr(t, name) for t in found])
-
     lattice = result.lag.feedback
     age = 1e3 * (lattice.mean_age_s if np.isfinite(lattice.mean_age_s) else result.lag.stale_lag_s)
-    over_speed.plot(
-        gathered("row_speed_rad_s"), mrad * gathered("row_error_rad"), ".", color=FAINT, ms=3,
-        label=f"all rows at their own time (dashed: speed × {age:.0f} ms)",
-        rasterized=True,
-    )  # fmt: skip
-    over_speed.plot(
-        gathered("fresh_speed_rad_s"), mrad * gathered("fresh_error_rad"), "o", color=RED, ms=3.5,
-        mec="white", mew=0.3, label="fresh rows when they were measured",
-    )  # fmt: skip
-    reach = np.array([-1.0, 1.0]) * np.max(np.abs(gathered("row_speed_rad_s")), initial=0.0)
+    rows = f"all rows at their own time (dashed: speed × {age:.0f} ms)"
+    _residuals_over_speed(over_speed, found, 1.0, rows)
+    fastest = np.max([np.max(np.abs(t.row_speed_rad_s), initial=0.0) for t in found], initial=0.0)
+    reach = np.array([-1.0, 1.0]) * fastest
     over_speed.plot(reach, -age * reach, color=INK, lw=1.2, ls=(0, (4, 2)))
     over_speed.set_xlabel("speed of the model [rad/s]")
     over_speed.set_ylabel("reading − model [mrad]")
     start = 0.0
     for n, track in enumerate(found):
         over_time.plot(
-            start + track.fresh_time_s, mrad * track.fresh_error_rad, ".", color=RED, ms=4
+            start + track.fresh_time_s, 1e3 * track.fresh_error_rad, ".", color=RED, ms=4
         )
         if track.frequency_hz > 0 and len(found) <= 12:
             over_time.text(
@@ -297,6 +335,42 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
     over_time.set_ylabel("fresh − model [mrad]")
     figure.legend(*over_speed.get_legend_handles_labels(), loc="outside upper left", ncols=1)
     return figure
+
+
+@styled
+def residual_grid(found: Mapping[str, list[Track]]) -> Figure:
+    """Fresh and raw residuals over speed, of every joint beside the others.
+
+    Parameters
+    ----------
+    found : dict of joint to list of Track
+        From `sysid.report.figure_data.tracks`.
+    """
+    figure, grid = axes_grid(len(found), 3, 1.75)
+    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+        _residuals_over_speed(axes, own, 0.7, "all rows at their own time")
+        axes.set_title(joint)
+        if n % 3 == 0:
+            axes.set_ylabel("reading − model [mrad]")
+        if n >= len(grid) - 3:
+            axes.set_xlabel("speed of the model [rad/s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+def _residuals_over_speed(axes: Axes, found: list[Track], size: float, rows: str) -> None:
+    def gathered(name: str) -> NDArray:
+        return np.concatenate([getattr(t, name) for t in found])
+
+    axes.plot(
+        gathered("row_speed_rad_s"), 1e3 * gathered("row_error_rad"), ".", color=FAINT,
+        ms=3 * size, label=rows, rasterized=True, gid="part:raw",
+    )  # fmt: skip
+    axes.plot(
+        gathered("fresh_speed_rad_s"), 1e3 * gathered("fresh_error_rad"), "o", color=RED,
+        ms=3.5 * size, mec="white", mew=0.3, label="fresh rows when they were measured",
+        rasterized=True, gid="part:fresh",
+    )  # fmt: skip
 
 
 @styled

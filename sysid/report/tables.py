@@ -7,12 +7,15 @@ in SI units; the columns say which of them the page shows, and in which unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from markupsafe import Markup
 
 from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.common.results import flat, plain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
@@ -93,7 +96,11 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
     rows = [
         {"joint": joint, "transfer_function": fit.name, "parameter": name}
         | flat(plain(p))
-        | {"chi2_per_dof": fit.chi2_per_dof}
+        | {
+            "chi2_per_dof": fit.chi2_per_dof,
+            "unit": unit_of(name),
+            "at_bound": name in fit.at_bound,
+        }
         for joint, response in responses.items()
         for fit in response.transfer_functions.values()
         for name, p in fit.parameters.items()
@@ -103,7 +110,7 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
         text("form", "transfer_function"),
         Column("parameter", _of_form, "words"),
         Column(f"value {_LEVEL}", _value_cell),
-        Column("unit", lambda row: unit_of(row["parameter"]), "words"),
+        text("unit", "unit"),
         number("misfit, χ²/dof", "chi2_per_dof"),
     )
     return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))
@@ -183,6 +190,63 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
     return Table("parameters", "Parameters", columns, tuple(rows))
 
 
+def parameter_matrix(parameters: Table) -> Table:
+    """`parameter_table` with a row per parameter and a column per joint; it has no file."""
+
+    def cell(row: Row) -> str:
+        factor, _ = _SMALL_UNITS.get(row["unit"], (1.0, row["unit"]))
+        value, _, more = _value_cell(row, factor).replace(",", " (").partition(" (")
+        shown = Markup("{}<small>{}</small>").format(value, more.rstrip(")").strip())
+        if row["identified"] == "no":
+            shown = Markup('<span class="undecided" title="{}">{}</span>').format(row["why"], shown)
+        return shown
+
+    def name(row: Row) -> str:
+        _, unit = _SMALL_UNITS.get(row["unit"], (1.0, row["unit"]))
+        return f"{_readable(row['parameter'], row['part'])} [{unit}]"
+
+    return _matrix(f"Parameters {_LEVEL}", "parameter", parameters.rows, name, cell)
+
+
+_SMALL_UNITS = {"s": (1e3, "ms"), "rad": (1e3, "mrad"), "kg·m²": (1e7, "g·cm²"), "1": (100.0, "%")}
+
+
+def model_matrix(models: Table) -> Table:
+    """Error on unseen frequencies (fresh readings) per model and joint; it has no file."""
+
+    def cell(row: Row) -> str:
+        unseen = _digits(row["rmse_leave_one_frequency_out_rad"], 1, 1e3)
+        fresh = _digits(row["rmse_fresh_rad"], 1, 1e3)
+        chosen = "<b>{}</b><small>{}</small>" if row["is_chosen"] else "{}<small>{}</small>"
+        return Markup(chosen).format(unseen, fresh)
+
+    title = (
+        "RMS error on unseen frequencies, below it on fresh readings of the fit [mrad]; "
+        "the chosen model is bold"
+    )
+    return _matrix(title, "model", models.rows, lambda row: model_name(row["model"]), cell)
+
+
+def _matrix(
+    title: str,
+    heading: str,
+    rows: Sequence[Row],
+    name: Callable[[Row], str],
+    cell: Callable[[Row], str],
+) -> Table:
+    """Rows of several joints side by side, one column per joint."""
+    joints = list(dict.fromkeys(row["joint"] for row in rows))
+    lines: dict[str, Row] = {}
+    for row in rows:
+        lines.setdefault(name(row), {})[row["joint"]] = cell(row)
+    columns = (
+        Column(heading, lambda row: row[heading], "key"),
+        *(Column(joint, lambda row, joint=joint: row.get(joint, "–")) for joint in joints),
+    )
+    made = tuple({heading: line} | cells for line, cells in lines.items())
+    return Table("", title, columns, made)
+
+
 def _readable(name: str, part: str) -> str:
     """A parameter's name without its unit, in words."""
     for end in ("_nm_s_per_rad", "_nm_per_rad", "_kg_m2", "_rad_s", "_rad", "_nm", "_s"):
@@ -192,11 +256,18 @@ def _readable(name: str, part: str) -> str:
     return name.replace("_", " ") + (" / armature" if part == "ratios to armature" else "")
 
 
-def _value_cell(row: Row) -> str:
-    value, low, high = row["value"], row["low"], row["high"]
+def _value_cell(row: Row, factor: float = 1.0) -> str:
+    value, low, high = (None if row[k] is None else factor * row[k] for k in _ENDS)
+    assert value is not None
+    if row.get("at_bound") or (row.get("why") or "").startswith("on its bound"):
+        return f"{_significant(value)}, a bound of the fit"
     if low is None or high is None or low == high:
         return _significant(value)
-    return f"{_significant(value)} ({_significant(low)} … {_significant(high)})"
+    end = "∞" if row["unit"] == "rad/s" and high >= NO_SPEED_LIMIT_RAD_S else _significant(high)
+    return f"{_significant(value)} ({_significant(low)} … {end})"
+
+
+_ENDS = ("value", "low", "high")
 
 
 def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str]) -> Table:

@@ -1,4 +1,4 @@
-"""A page in headless Chromium: does it fit, are its pictures whole, is the console silent?"""
+"""A page in headless Chromium: does it fit, are its pictures drawn, is the console silent?"""
 
 from __future__ import annotations
 
@@ -20,8 +20,14 @@ f.onload = () => {{
   o.textContent = JSON.stringify({{
     content: d.documentElement.scrollWidth, view: d.documentElement.clientWidth,
     dark: dark.matches, paper: f.contentWindow.getComputedStyle(d.body).backgroundColor,
-    broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length,
-    images: d.images.length,
+    drawings: d.querySelectorAll('main svg.drawing').length,
+    empty: [...d.querySelectorAll('main svg.drawing')].filter(
+      s => !s.closest('details:not([open])') && s.getBoundingClientRect().height < 50).length,
+    hides: [...d.querySelectorAll('.toggles input')].every(i => {{
+      i.click();
+      const part = d.querySelector('.' + i.id.replace('show-', 'part-'));
+      return f.contentWindow.getComputedStyle(part).display === 'none';
+    }}),
   }});
 }};</script></body>"""
 
@@ -43,7 +49,8 @@ def looks_right(page: Path, scratch: Path, width: int, dark: bool) -> None:
     assert said, done.stdout[-500:] + done.stderr[-500:]
     found = json.loads(said.group(1).replace("&quot;", '"'))
     assert found["content"] <= found["view"] <= width
-    assert found["images"] > 0 and found["broken"] == 0
+    assert found["drawings"] > 0 and found["empty"] == 0
+    assert found["hides"]
     assert found["dark"] is dark
     assert (found["paper"] == "rgb(255, 255, 255)") is not dark
     assert ":CONSOLE" not in done.stderr

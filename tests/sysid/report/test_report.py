@@ -29,7 +29,7 @@ from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report import figures
+from pupper_sysid.sysid.report import figures, tables
 from pupper_sysid.sysid.report.advice import advice
 from pupper_sysid.sysid.report.figure_data import (
     LONGEST_RUN,
@@ -192,18 +192,78 @@ def rows_of(written, name: str) -> list[dict[str, str]]:
 
 def test_the_page_asks_for_nothing_but_itself(page, written):
     loads = [
-        v for _, a in page.tags for k, v in a.items() if k in ("src", "srcset", "data", "action")
-    ]
-    links = [a["href"] or "" for _, a in page.tags if "href" in a]
-    assert loads and all(v is not None and v.startswith("data:image/png;base64,") for v in loads)
-    assert links and all(link.startswith("#") for link in links)
-    assert "url(" not in (html := written.path.read_text(encoding="utf-8"))
+        v for _, a in page.tags for k, v in a.items()
+        if k in ("src", "srcset", "data", "action", "href", "xlink:href")
+    ]  # fmt: skip
+    inside = ("data:image/png;base64,", "#")
+    assert loads and all(v is not None and v.startswith(inside) for v in loads)
+    html = written.path.read_text(encoding="utf-8")
+    assert not re.search(r"url\((?!#)", html)
     assert "@import" not in html
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
 
 
+def test_ids_occur_once_and_every_reference_has_its_id(page, written):
+    ids = [a["id"] for _, a in page.tags if "id" in a]
+    assert len(ids) == len(set(ids))
+    html = written.path.read_text(encoding="utf-8")
+    used = set(re.findall(r"url\(#([^)]+)\)", html))
+    links = [link for _, a in page.tags if (link := a.get("href") or a.get("xlink:href"))]
+    used |= {link.removeprefix("#") for link in links if link.startswith("#")}
+    assert used and used <= set(ids)
+
+
+def test_parts_of_the_overlay_can_be_hidden_and_details_are_folded(page):
+    shown = {a["class"] for tag, a in page.tags if tag == "g" and "class" in a}
+    boxes = {a["id"] for tag, a in page.tags if tag == "input"}
+    assert boxes == {f"show-{part}" for part in figures.OVERLAY_PARTS}
+    assert shown == {f"part-{part}" for part in figures.OVERLAY_PARTS}
+    assert any(tag == "details" for tag, _ in page.tags)
+
+
+def test_colours_of_drawings_follow_the_page(written):
+    html = written.path.read_text(encoding="utf-8")
+    body = html[html.index("<main>") :]
+    assert "var(--drawing-blue" in body and "var(--ink" in body
+    plain = set(re.findall(r"(?<!, )#[0-9a-f]{6}\b", body))
+    assert plain <= {"#fdfdfd", "#111111"}, "letters on bars only"
+
+
+def test_a_page_of_many_joints_has_one_panel_each_and_one_column_each(tmp_path):
+    names = [f"{leg}_{kind}" for leg in ("LF", "RF") for kind in ("hip", "thigh", "calf")]
+    results, recordings = {n: result_of(n) for n in names}, [recording_of()]
+    found = Findings(
+        recordings=recordings, results=results, calibration=to_calibration(results, recordings, 0)
+    )
+    made = found.write(tmp_path)
+    page = Page(made.path.read_text(encoding="utf-8"))
+    assert {"overlay", "residuals"} <= {p.stem for p in made.figures}
+    assert sum(tag == "details" for tag, _ in page.tags) == 1 + len(names)
+    assert not any(tag == "details" and "open" in a for tag, a in page.tags)
+    assert page.text.count("Only two frequencies.") == 1  # said once for all joints
+
+
+def test_a_bound_is_shown_as_one():
+    known = to_calibration({"LF_thigh": result_of()}, [recording_of()], 0)
+    table = tables.parameter_table(known, ["LF_thigh"])
+    row = dict(table.rows[0], why="on its bound, 30: the recording does not limit it on that side")
+    value = next(c for c in table.columns if c.heading.startswith("value"))
+    assert value.show(row).endswith("a bound of the fit")
+    limit = next(r for r in table.rows if r["parameter"] == "velocity_limit_rad_s")
+    assert value.show(limit | {"high": 1000.0}).endswith("… ∞)")
+
+
+def test_a_negative_age_is_explained(tmp_path):
+    late = replace(result_of().lag, stale_lag_s=-0.002)
+    results, recordings = {"LF_thigh": result_of(lag=late)}, [recording_of()]
+    found = Findings(
+        recordings=recordings, results=results, calibration=to_calibration(results, recordings, 0)
+    )
+    assert "younger than the row" in found.write(tmp_path).path.read_text(encoding="utf-8")
+
+
 def test_every_link_of_the_contents_has_its_section(page):
-    anchors = {a["href"] for tag, a in page.tags if tag == "a"}
+    anchors = {a["href"] for tag, a in page.tags if tag == "a" and "href" in a}
     assert anchors == {f"#{a['id']}" for tag, a in page.tags if tag == "section"}
 
 
@@ -226,9 +286,9 @@ def test_the_doctors_verdict_is_on_the_page_in_sentences(page):
 
 
 def test_every_figure_has_words_for_those_who_cannot_see_it(page, written):
-    images = [a for tag, a in page.tags if tag == "img"]
+    images = [a for tag, a in page.tags if tag == "svg"]
     assert len(images) == len(written.figures)
-    assert all(len(a["alt"] or "") > 20 for a in images)
+    assert all(len(a["aria-label"] or "") > 20 for a in images)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written.figures)
     assert [p.stem for p in written.drawings] == [p.stem for p in written.figures]
 
@@ -279,7 +339,7 @@ def test_model_csv_scores_candidates_and_presets_and_marks_the_chosen_one(writte
 
 
 def test_the_page_says_whom_the_raw_score_would_have_chosen(page):
-    assert "On LF_thigh it prefers preset “paper”." in page.text
+    assert "It prefers preset “paper” on LF_thigh." in page.text
 
 
 def test_parameter_csv_carries_intervals_and_identifiability(written):
