@@ -108,6 +108,11 @@ def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[
     return start, start + longest_s
 
 
+def within(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:
+    """Which times lie within a stretch, its ends included."""
+    return (time >= start) & (time <= stop)
+
+
 def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
     """At most `count` tracks, spread over their frequencies, slowest first."""
     order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)

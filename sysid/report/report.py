@@ -1,25 +1,21 @@
 """Report: all findings about a robot's servos as one page that opens anywhere.
 
 `write_report` examines and calibrates recordings and makes a folder with `report.html`, its figures
-as PNG and SVG, and its tables as CSV (`common.page`). `sections` builds the page from findings that
-were computed elsewhere.
+as PNG and SVG, and its tables as CSV (`common.page`). `write_findings` makes the page of findings
+that were computed elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite, versions
-from pupper_sysid.common.joints import share_sentences
-from pupper_sysid.common.page import Fold, Picture, Section, Table, WrittenPage, write_page
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.page import WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
-from pupper_sysid.sysid.identify.search import PREFERRED
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -29,53 +25,12 @@ from pupper_sysid.sysid.recordings.joints import (
     joint_trials,
 )
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report import figures, tables
-from pupper_sysid.sysid.report.advice import advice
-from pupper_sysid.sysid.report.figure_data import Track, hold_runs, tracks
-from pupper_sysid.sysid.report.tables import MODEL_NAMES
+from pupper_sysid.sysid.report.sections import Findings, sections
 
 if TYPE_CHECKING:  # they bring libraries that a page does not need
-    from pupper_sysid.sysid.compare.comparison import Comparison
-    from pupper_sysid.sysid.doctor.examination import Examination
-    from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
     from pupper_sysid.sysid.servo_fit.result import ServoFit
 
 PAGE = "report.html"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Findings:
-    """Results that a report shows.
-
-    Attributes
-    ----------
-    recordings : sequence of Recording
-        From which all was computed.
-    results : dict of joint to JointCalibrationResult
-    calibration : Calibration
-        Has at least the joints of `results`; the parameter table shows its numbers.
-    examinations : sequence of (str, Examination)
-        Name of each recording and its examination.
-    responses : dict of joint to FrequencyResponse
-        Of joints with tones.
-    comparison : Comparison, optional
-        Of servo models.
-    """
-
-    recordings: Sequence[Recording]
-    results: Mapping[str, JointCalibrationResult]
-    calibration: Calibration
-    examinations: Sequence[tuple[str, Examination]] = ()
-    responses: Mapping[str, FrequencyResponse] = field(default_factory=dict)
-    comparison: Comparison | None = None
-
-    def write(self, folder: Path, force: bool = False) -> WrittenPage:
-        """Write the page, its figures and its tables; errors as for `write_page`."""
-        more = len(self.recordings) - 1
-        title = f"Servo report: {self.recordings[0].name}" + (f" and {more} more" if more else "")
-        made = self.calibration
-        subtitle = f"{made.robot} · {', '.join(self.results)} · {made.created}"
-        return write_page(folder / PAGE, title, subtitle, sections(self), force)
 
 
 def write_report(
@@ -161,7 +116,16 @@ def write_report(
         recordings=recordings, results=results, examinations=examinations, responses=responses,
         calibration=calibration or results.calibration, comparison=comparison,
     )  # fmt: skip
-    return found.write(Path(folder), force)
+    return write_findings(found, Path(folder), force)
+
+
+def write_findings(found: Findings, folder: Path, force: bool = False) -> WrittenPage:
+    """Write the page of findings, its figures and its tables; errors as for `write_page`."""
+    more = len(found.recordings) - 1
+    title = f"Servo report: {found.recordings[0].name}" + (f" and {more} more" if more else "")
+    made = found.calibration
+    subtitle = f"{made.robot} · {', '.join(found.results)} · {made.created}"
+    return write_page(folder / PAGE, title, subtitle, sections(found), force)
 
 
 def _refuse_foreign(
@@ -177,274 +141,3 @@ def _refuse_foreign(
         )
     for joint in joints:
         calibration.joint(joint)
-
-
-def sections(found: Findings) -> list[Section]:
-    """All sections of the page, in order: first what holds for all joints, then joint by joint."""
-    results = found.results
-    runs = {joint: made for joint, result in results.items() if (made := tracks(result))}
-    made = [_summary(results), _lag(results), _doctor(found), _free_runs(results, runs)]
-    parameters = tables.parameter_table(found.calibration, list(results))
-    made += [_parameters(found, parameters), _models(results), _holds(found), _bode(found)]
-    if found.comparison:
-        from pupper_sysid.sysid.report.servo_section import servo_section
-
-        made.append(servo_section(found.comparison))
-    next_steps = advice(results, found.calibration, found.examinations)
-    made += [
-        _joints(found, runs, parameters),
-        Section("next", "What to record next", findings=[("", text) for text in next_steps]),
-        _provenance(found),
-    ]
-    return [s for s in made if s.text or s.findings or s.figures or s.tables or s.folds]
-
-
-# --------------------------------------------------------------------------------- sections
-
-
-def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
-    return Section(
-        "found",
-        "What was found",
-        findings=[(joint, str(r.lag)) for joint, r in results.items()],
-        notes=[
-            "Raw lag: from a command's row to the position's row, as a cross-correlation of the "
-            "log measures it. Only the servo's own part belongs to a simulated actuator; stale "
-            "feedback belongs to the observation.",
-        ],
-    )
-
-
-def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
-    picture = Picture(
-        "lag_budget",
-        "Lag budget: the time from sending a command to the row in which its motion is read. The "
-        "black line is the raw lag, which is the sum.",
-        figures.lag_budget_figure({joint: r.lag for joint, r in results.items()}),
-    )
-    notes = shared({joint: r.lag.warnings for joint, r in results.items()})
-    if any(r.lag.stale_lag_s < _NEGATIVE_S for r in results.values()):
-        notes.append(
-            "Stale readings with a negative lag: these positions were read after the time stamp of "
-            "their row, so they are younger than the row, not older."
-        )
-    by_estimator = tables.estimator_table(results)
-    return Section(
-        "lag", "Lag budget", figures=[picture], tables=[tables.lag_table(results)],
-        folds=[Fold(by_estimator.title, tables=[by_estimator])], files=[by_estimator], notes=notes,
-    )  # fmt: skip
-
-
-_NEGATIVE_S = -5e-5
-
-
-def shared(by_joint: Mapping[str, Sequence[str]]) -> list[str]:
-    """Sentences of joints, each once, behind the names of all joints that it holds for."""
-    bare = {joint: [t.removeprefix(f"{joint}: ") for t in own] for joint, own in by_joint.items()}
-    return [f"{names}: {text}" for names, text in share_sentences(bare)]
-
-
-def _doctor(found: Findings) -> Section:
-    said: dict[str, list[str]] = {}
-    for _, examination in found.examinations:
-        for name, joint in examination.joints.items():
-            if name in found.results:
-                sentences = (f"{joint.verdict}.", *joint.reasons)
-                said.setdefault(name, []).extend(t[:1].upper() + t[1:] for t in sentences)
-    texts: dict[str, list[str]] = {}
-    for names, sentence in share_sentences(said):
-        texts.setdefault(names, []).append(sentence)
-    return Section(
-        "doctor", "Are the recordings usable?",
-        findings=[(names, " ".join(sentences)) for names, sentences in texts.items()],
-        tables=[tables.doctor_table(found.examinations, list(found.results))],
-    )  # fmt: skip
-
-
-def _free_runs(
-    results: Mapping[str, JointCalibrationResult], runs: Mapping[str, list[Track]]
-) -> Section:
-    """Overlays and residuals of DelayedPD, a panel per joint."""
-    text = "DelayedPD runs freely from rest: its input is commands only, never a reading."
-    pictures = []
-    if len(runs) == 1:
-        ((joint, own),) = runs.items()
-        pictures = [_overlay(results[joint], own), _residuals(results[joint], own)]
-    elif runs:
-        pictures = [
-            Picture("overlay", _OVERLAY, figures.overlay_grid(runs), wide=True),
-            Picture("residuals", _RESIDUALS, figures.residual_grid(runs), wide=True),
-        ]
-    return Section(
-        "overlays", "Command, model, readings", text=[text] if pictures else [],
-        toggles=figures.OVERLAY_PARTS if pictures else {}, figures=pictures,
-    )  # fmt: skip
-
-
-_OVERLAY = (
-    "The grey steps are the readings as logged; the dots are the fresh readings at the time they "
-    "were measured. The model is scored on those."
-)
-_RESIDUALS = (
-    "The error of rows at their own time is proportional to speed: that is the age of stale "
-    "readings; fresh rows have no such error."
-)
-
-
-def _overlay(result: JointCalibrationResult, runs: list[Track]) -> Picture:
-    drawn = figures.overlay_figure(result, runs)
-    return Picture(f"overlay_{result.joint}", f"{result.joint}: {_OVERLAY}", drawn)
-
-
-def _residuals(result: JointCalibrationResult, runs: list[Track]) -> Picture:
-    words = f"{result.joint}, above: {_RESIDUALS} Below, the residuals of fresh rows."
-    drawn = figures.residual_figure(result, runs)
-    return Picture(f"residuals_{result.joint}", words, drawn)
-
-
-def _joints(found: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
-    """Everything about each joint, folded."""
-    models = tables.model_table(found.results)
-    by_frequency = tables.frequency_table(found.results)
-    forms = tables.transfer_table(found.responses)
-    folds = []
-    for joint, result in found.results.items():
-        own = runs.get(joint, [])
-        drawn = [_overlay(result, own), _residuals(result, own)] if own and len(runs) > 1 else []
-        shown = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
-        folds.append(
-            Fold(
-                joint, figures=drawn, tables=[t for t in shown if t.rows],
-                opened=len(found.results) == 1,
-            )
-        )  # fmt: skip
-    return Section(
-        "joints", "Joint by joint", folds=folds, files=[models, by_frequency, forms, parameters]
-    )
-
-
-def _holds(found: Findings) -> Section:
-    held = {}
-    for joint, result in found.results.items():
-        examined = [e.joints[joint] for _, e in found.examinations if joint in e.joints]
-        if examined:
-            held[joint] = hold_runs(
-                [e.hold_histogram for e in examined],
-                [e.loop_period_s for e in examined],
-                result.lag.feedback,
-            )
-    pictures = []
-    if held:
-        text = (
-            "For how many rows each reading stayed the same while its joint moved. A sensor that "
-            "is read afresh each time has all its runs at 1."
-        )
-        drawn = figures.hold_histogram_figure(held)
-        pictures.append(Picture("holds", text, drawn, wide=len(held) > 3))
-    return Section("holds", "How long readings are held", figures=pictures)
-
-
-def _bode(found: Findings) -> Section:
-    pictures = []
-    if found.responses:
-        text = (
-            "Frequency response from the held command to the motion, from fresh readings, with "
-            "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too low."
-        )
-        pictures.append(Picture("bode", text, figures.bode_figure(found.responses)))
-    return Section(
-        "bode", "Frequency response", figures=pictures,
-        findings=share_sentences(
-            {
-                joint: [f"−3 dB bandwidth {response.bandwidth_text}."]
-                for joint, response in found.responses.items()
-            }
-        ),
-        notes=[
-            "A transfer function has neither friction nor limits, so the delay of its form is not "
-            "the dead time of the servo, which stands under Parameters. The forms stand under each "
-            "joint.",
-        ] if found.responses else [],
-    )  # fmt: skip
-
-
-def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
-    misled: dict[str, list[str]] = {}
-    for joint, result in results.items():
-        if (best := _best_by_raw_score(result)) != result.model:
-            misled[joint] = [tables.model_name(best)]
-    preferred = [f"It prefers {model} on {names}." for names, model in share_sentences(misled)]
-    return Section(
-        "models",
-        "Models",
-        text=[
-            "Errors are root mean squares of free runs. Fresh: against fresh readings when they "
-            "were measured. Unseen frequency: the same on tones left out of the fit; the model "
-            f"best at that is chosen ({MODEL_NAMES[PREFERRED]} where it comes within 5 %, because "
-            "simulators run it). Presets are published settings, scored the same way.",
-        ],
-        tables=[tables.model_matrix(tables.model_table(results))],
-        notes=[
-            "The raw score takes every row as measured when it was logged. Held readings then "
-            "count as errors, no model can get below them, and a model with too much delay is "
-            "best: do not choose by it. " + " ".join(preferred),
-        ],
-    )
-
-
-def _best_by_raw_score(result: JointCalibrationResult) -> str:
-    scores = {name: r.scores.rmse_raw_rad for name, r in result.candidate_models.items()}
-    scores |= {name: s.rmse_raw_rad for name, s in result.presets.items()}
-    return min(scores, key=lambda name: scores[name])
-
-
-def _parameters(found: Findings, parameters: Table) -> Section:
-    scale = found.calibration.joint(next(iter(found.results))).actuator.scale
-    return Section(
-        "parameters",
-        "Parameters",
-        text=[
-            f"Torques follow from one anchor: {scale.anchor}, {scale.value_nm:g} N·m "
-            f"({scale.source}). “Ratio only” means that the recording gives this number divided by "
-            "the armature, and the anchor gives the rest. Numbers in italics are not identified; "
-            "the reason stands under each joint.",
-        ],
-        tables=[tables.parameter_matrix(parameters)],
-        notes=shared(
-            {
-                joint: [w for w in r.warnings if w not in r.lag.warnings]
-                for joint, r in found.results.items()
-            }
-        ),
-    )
-
-
-def _provenance(found: Findings) -> Section:
-    recordings, calibration = found.recordings, found.calibration
-    rows = tuple(
-        {
-            "recording": r.path.name if r.path else r.name,
-            "sha256": r.sha256,
-            "joints": " ".join(r.joints),
-            "rows": len(r.table),
-            "loop_period_s": r.loop_period_s,
-        }
-        for r in recordings
-    )
-    columns = (
-        tables.text("recording", "recording"),
-        tables.number("rows", "rows", 0),
-        tables.number("loop, ms", "loop_period_s", 2, 1e3),
-        tables.text("SHA-256", "sha256"),
-    )
-    made_with = ", ".join(f"{name} {version}" for name, version in versions().items())
-    return Section(
-        "provenance",
-        "Where this comes from",
-        text=[
-            f"Calibration of {calibration.robot}, {calibration.created}, seed {calibration.seed}. "
-            f"Made with {made_with}.",
-        ],
-        tables=[Table("recordings", "Recordings", columns, rows)],
-        notes=[*(w for r in recordings for w in r.warnings), *calibration.notes],
-    )

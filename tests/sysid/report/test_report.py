@@ -29,7 +29,7 @@ from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report import figures, tables
+from pupper_sysid.sysid.report import figures, free_run_figures, tables
 from pupper_sysid.sysid.report.advice import advice
 from pupper_sysid.sysid.report.figure_data import (
     LONGEST_RUN,
@@ -38,7 +38,8 @@ from pupper_sysid.sysid.report.figure_data import (
     tracks,
     window,
 )
-from pupper_sysid.sysid.report.report import Findings
+from pupper_sysid.sysid.report.report import write_findings
+from pupper_sysid.sysid.report.sections import Findings
 from support.browser import looks_right, needs_chromium
 
 HOSTILE = '<script>alert("x")</script>&lt;'
@@ -155,7 +156,7 @@ def write(folder, name: str = "sweep", force: bool = False):
         recordings=recordings, results=results, calibration=calibration,
         examinations=[(name, examined(name))], responses={"LF_thigh": response_of()},
     )  # fmt: skip
-    return found.write(folder, force)
+    return write_findings(found, folder, force)
 
 
 class Page(HTMLParser):
@@ -216,8 +217,8 @@ def test_ids_occur_once_and_every_reference_has_its_id(page, written):
 def test_parts_of_the_overlay_can_be_hidden_and_details_are_folded(page):
     shown = {a["class"] for tag, a in page.tags if tag == "g" and "class" in a}
     boxes = {a["id"] for tag, a in page.tags if tag == "input"}
-    assert boxes == {f"show-{part}" for part in figures.OVERLAY_PARTS}
-    assert shown == {f"part-{part}" for part in figures.OVERLAY_PARTS}
+    assert boxes == {f"show-{part}" for part in free_run_figures.OVERLAY_PARTS}
+    assert shown == {f"part-{part}" for part in free_run_figures.OVERLAY_PARTS}
     assert any(tag == "details" for tag, _ in page.tags)
 
 
@@ -235,7 +236,7 @@ def test_a_page_of_many_joints_has_one_panel_each_and_one_column_each(tmp_path):
     found = Findings(
         recordings=recordings, results=results, calibration=to_calibration(results, recordings, 0)
     )
-    made = found.write(tmp_path)
+    made = write_findings(found, tmp_path)
     page = Page(made.path.read_text(encoding="utf-8"))
     assert {"overlay", "residuals"} <= {p.stem for p in made.figures}
     assert sum(tag == "details" for tag, _ in page.tags) == 1 + len(names)
@@ -259,7 +260,9 @@ def test_a_negative_age_is_explained(tmp_path):
     found = Findings(
         recordings=recordings, results=results, calibration=to_calibration(results, recordings, 0)
     )
-    assert "younger than the row" in found.write(tmp_path).path.read_text(encoding="utf-8")
+    assert "younger than the row" in write_findings(found, tmp_path).path.read_text(
+        encoding="utf-8"
+    )
 
 
 def test_every_link_of_the_contents_has_its_section(page):
@@ -434,9 +437,9 @@ def test_predicted_hold_runs_follow_from_poll_and_loss():
 def test_letters_in_figures_are_nine_points_or_more():
     drawn = [
         figures.lag_budget_figure({"LF_thigh": result_of().lag}),
-        figures.overlay_figure(result_of()),
+        free_run_figures.overlay_figure(result_of()),
         figures.hold_histogram_figure({"LF_thigh": hold_runs([(50, 50)], [LOOP_S], LATTICE)}),
-        figures.residual_figure(result_of()),
+        free_run_figures.residual_figure(result_of()),
     ]
     for figure in drawn:
         sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]
@@ -516,7 +519,7 @@ def test_numbers_that_are_none_are_dashes_on_the_page_and_empty_in_csv(tmp_path)
     results, recordings = {"LF_thigh": result_of(lag=budget)}, [recording_of()]
     calibration = to_calibration(results, recordings, 0)
     found = Findings(recordings=recordings, results=results, calibration=calibration)
-    made = found.write(tmp_path)
+    made = write_findings(found, tmp_path)
     (row,) = rows_of(made, "lag_budget")
     assert row["feedback_poll_period_s"] == row["feedback_loss"] == ""
     assert not re.search(r">\s*-?(nan|inf|None)\s*<", made.path.read_text(encoding="utf-8"))
