@@ -30,6 +30,7 @@ from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, load_run
 from pupper_sysid.policies.walks.rollouts import Rollout
+from pupper_sysid.sim.walking.config import Curriculum
 from reproduction.claims import NotTestable
 
 KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
@@ -105,7 +106,8 @@ def gather(
     task = load_run(run_folder).task if run_folder and (run_folder / RUN_FILE).is_file() else None
     return PolicyEvidence(
         name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s),
-        task.curriculum.on if task else None, task.terrain if task else None, walk, gait,
+        task.curriculum != Curriculum() if task else None,
+        task.terrain if task else None, walk, gait,
         step("orbits", lambda: orbits(policy, trial)),
         step("delay", lambda: delay_curve(policy, trial, _EXTRA_DELAYS_MS)),
         step("ablation", lambda: ablation(policy, trial, ("all joints",))),

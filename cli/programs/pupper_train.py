@@ -27,7 +27,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import Kind
-from pupper_sysid.policies.train.run_file import Run, preset
+from pupper_sysid.policies.train.run_file import Run, Start, preset
 from pupper_sysid.sim.walking.servo_ranges import check_actuator
 
 DESCRIPTION = """Train a walking policy in a simulator that moves like the measured robot.
@@ -47,6 +47,9 @@ class Options:
     """Kind of network; sets --architecture.* to sizes that suit it."""
     preset: Preset = "fast"
     """`fast`: sizes, task and rewards for a few cores; `paper`, `release`: as published."""
+    start: Start = "imitation"
+    """`imitation`: learn to continue a trot, then improve it; `scratch`: find a walk from nothing.
+    The published presets always start from nothing."""
     name: str | None = None
     """Name of the run's folder in runs/; by default policy, date and time."""
     resume: Path | None = None
@@ -67,11 +70,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _parse(given: list[str]) -> Options:
-    """Options; --preset and --policy set the defaults of the others."""
-    start = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind))
+    """Options; --preset, --policy and --start set the defaults of the others."""
+    start = _choice(given, "--start", Start)
+    begun = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind), start)
     return parse(
         Options, given, "pupper-train", DESCRIPTION,
-        default=Options(start), config=(tyro.conf.FlagCreatePairsOff,),
+        default=Options(begun), config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
 
 
@@ -169,8 +173,9 @@ def _bar() -> Iterator:
                 what = f"difference to the trot {now.row['difference']:.3f}"
             else:
                 what = (
-                    f"reward {now.row['reward'] * 50:.2f}/s, "
-                    f"falls {now.row['falls_per_1000_steps']:.2f} per 1,000 steps"
+                    f"score {now.row['score']:.2f}, reward {now.row['reward'] * 50:.2f}/s, "
+                    f"std {now.row['std']:.3f}, rate {now.row['learning_rate']:.1e}, "
+                    f"KL {now.row['kl']:.3f}, clipped {100 * now.row['clip_fraction']:.0f} %"
                 )
             label = {"imitation": "first gait", "ppo": "PPO"}[now.phase]
             left = f"{now.left_s / 60:.0f} min left"

@@ -7,15 +7,23 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from pupper_sysid.policies.network.exploration import (
+    MLPActor,
+    PersistentGaussian,
+    RNNActor,
+    TransformerActor,
+)
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
-from pupper_sysid.policies.network.transformer import TransformerModel
 
 
 def build(
-    architecture: Architecture, observations: TensorDict, hyper: Hyperparameters
+    architecture: Architecture,
+    observations: TensorDict,
+    hyper: Hyperparameters,
+    control_step_s: float,
 ) -> tuple[MLPModel, MLPModel]:
     """Actor and critic.
 
@@ -25,27 +33,34 @@ def build(
     observations : TensorDict
         An example, for the sizes.
     hyper : Hyperparameters
+    control_step_s : float
+        Time between two actions, over which the noise of exploration decays.
     """
     actor_groups = ["policy"]
     if architecture.kind == "mlp-actions":
         actor_groups.append("actions")
-    critic_groups = ["policy"] + (["privileged"] if architecture.privileged_critic else [])
+    critic_groups = ["policy", "noise"]
+    if architecture.privileged_critic:
+        critic_groups.append("privileged")
     groups = {"actor": actor_groups, "critic": critic_groups}
     common: dict[str, Any] = {"activation": "elu", "obs_normalization": hyper.normalise}
+    explore = hyper.exploration
     gaussian = {
-        "class_name": "GaussianDistribution", "init_std": hyper.initial_std, "std_type": "log",
+        "class_name": PersistentGaussian, "init_std": explore.std[0],
+        "least_std": explore.std[1] if explore.learned else 1e-6, "learn_std": explore.learned,
+        "correlation": explore.correlation(control_step_s),
     }  # fmt: skip
     own = common | {"hidden_dims": list(architecture.hidden), "distribution_cfg": gaussian}
     actions = 12
     if architecture.kind in ("lstm", "gru"):
-        actor: MLPModel = RNNModel(
+        actor: MLPModel = RNNActor(
             observations, groups, "actor", actions, rnn_type=architecture.kind,
             rnn_hidden_dim=architecture.memory, **own,
         )  # fmt: skip
     elif architecture.kind == "transformer":
-        actor = TransformerModel(observations, groups, "actor", actions, **own)
+        actor = TransformerActor(observations, groups, "actor", actions, **own)
     else:
-        actor = MLPModel(observations, groups, "actor", actions, **own)
+        actor = MLPActor(observations, groups, "actor", actions, **own)
     critic = MLPModel(
         observations, groups, "critic", 1, hidden_dims=list(architecture.critic_hidden), **common
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import tyro
@@ -36,6 +37,42 @@ class Architecture:
 
 
 @dataclass(frozen=True)
+class Exploration:
+    """Noise of the actions while a policy learns."""
+
+    std: tuple[float, float] = (0.05, 0.04)
+    """Standard deviation at the start and at the end; 1 is `action_scale` radians. A learned one
+    starts at the first and never falls below the second."""
+    anneal_m_samples: tuple[float, float] = (0.0, 20.0)
+    """Millions of samples between which it falls, by equal factors."""
+    persistence_s: float = 0.3
+    """Time constant of the noise's correlation; 0 for white noise. Noise that lasts moves joints
+    out of the dead band of their friction."""
+    by_dead_band: bool = True
+    """Whether joints of larger dead band (friction over stiffness) get more noise in proportion."""
+    learned: bool = False
+    """Whether the standard deviation is learned instead of scheduled, as published."""
+
+    def __post_init__(self):
+        if not min(self.std) > 0:
+            raise InputError("learner.exploration.std must be positive.")
+        if not self.persistence_s >= 0:
+            raise InputError("learner.exploration.persistence_s must be 0 or more.")
+
+    def correlation(self, control_step_s: float) -> float:
+        """Of the noise from one control step to the next."""
+        if self.persistence_s == 0:
+            return 0.0
+        return math.exp(-control_step_s / self.persistence_s)
+
+    def std_at(self, samples: float) -> float:
+        """Scheduled standard deviation after so many samples."""
+        (first, last), (begin, end) = self.std, self.anneal_m_samples
+        share = (1e-6 * samples - begin) / max(end - begin, 1e-9)
+        return first * (last / first) ** min(max(share, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
 class Hyperparameters:
     """Of PPO; the same table for all architectures."""
 
@@ -46,26 +83,33 @@ class Hyperparameters:
     minibatches: int = 4
     """Parts of the data per pass."""
     learning_rate: float = 1e-5
-    """At the start, small enough to keep an imitated gait; then adapted to the KL divergence."""
+    """Of the policy, at the start; then adapted to the KL divergence."""
+    learning_rates: tuple[float, float] = (1e-6, 1e-3)
+    """Smallest and largest learning rate of the policy."""
+    critic_learning_rate: float = 1e-3
+    """Of the critic."""
     desired_kl: float = 0.01
-    """KL divergence per update that the learning rate aims at."""
+    """KL divergence per update that the policy's learning rate aims at, of actions given the noise
+    before."""
+    critic_warmup: int = 0
+    """First updates in which only the critic learns."""
     discount: float = 0.99
     """γ."""
     gae_lambda: float = 0.95
     """λ of the generalised advantage estimate."""
     clip: float = 0.2
     """Of the probability ratio and of the change of the value."""
-    entropy: float = 0.0005
-    """Weight of the entropy."""
+    entropy: float = 0.0
+    """Weight of the entropy; without effect unless the standard deviation is learned."""
     value_weight: float = 0.5
     """Weight of the value's error."""
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
-    initial_std: float = 0.015
-    """Standard deviation of the actions at the start. Larger noise shakes dry friction in the
-    servos loose: the policy would learn to walk on servos without it."""
+    exploration: Exploration = field(default_factory=Exploration)
     normalise: bool = True
     """Whether observations are normalised by their running mean and deviation."""
+    freeze_normaliser: bool = False
+    """Whether that mean and deviation stay what they were at the start of PPO."""
     mixed_precision: bool = False
     """Whether updates are computed in bfloat16; worth it where the processor has it (avx512_bf16,
     amx)."""

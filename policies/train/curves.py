@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
+from pupper_sysid.common.reading.numbers import whole
 
+LARGEST_BYTES = 100e6
+"""Of a table of curves."""
 PROGRESS, IMITATION = "progress.csv", "imitation.csv"
 
 
@@ -95,8 +100,14 @@ def _drop_rows(path: Path, last: int) -> None:
     """Keep a table's header and its rows up to update `last`."""
     if not path.exists():
         return
-    with path.open(newline="") as file:
-        header, *rows = file.readlines() or [""]
-    kept = [r for r in rows if r.split(",")[0].isdigit() and int(r.split(",")[0]) <= last]
+    header, *rows = read_text(path, LARGEST_BYTES).splitlines(keepends=True) or [""]
+    kept = [row for row in rows if _update(row) <= last]
     if kept != rows:
         write_text(path, "".join([header, *kept]), force=True)
+
+
+def _update(row: str) -> float:
+    """Number of a row's update; infinite where there is none."""
+    with suppress(ValueError):
+        return whole(row.split(",")[0])
+    return math.inf

@@ -38,9 +38,8 @@ def imitate(learner: Learner, how: Imitation, round_: int) -> float:
         for _ in range(learner.hyper.steps_per_environment):
             teacher = torch.from_numpy(teacher_actions(env).astype(np.float32))
             targets.append(teacher)
-            actions = ppo.act(learner.observations)
-            noise = actions - ppo.actor.output_mean
-            actions = torch.where(led[:, None], teacher + noise, actions)
+            actions = learner.act()
+            actions = torch.where(led[:, None], teacher + learner.env.noise, actions)
             learner.observations, rewards, dones, extras = learner.env.step(actions)
             ppo.process_env_step(learner.observations, rewards, dones, extras)
         ppo.compute_returns(learner.observations)

@@ -1,5 +1,8 @@
-"""PPO of rsl_rl, with three additions in thin subclasses.
+"""PPO of rsl_rl, with additions in thin subclasses.
 
+- Noise of the actions persists (`policies.network.exploration`); its size is scheduled.
+- After each update the KL divergence and the share of clipped ratios are measured at the first step
+  of its data; the policy's learning rate follows the former. The critic has a rate of its own.
 - At a time-out the value of the state reached is added, not that of the state before it.
 - A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
   rate, random numbers, recurrent state, environments with their delay lines, the last observation
@@ -27,15 +30,19 @@ from pupper_sysid.common.border import refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_bytes
 from pupper_sysid.policies.network.actor_critic import build
+from pupper_sysid.policies.network.exploration import PersistentGaussian
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 _PARTS = (
     "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
     "learning_rate", "iteration", "torch_rng", "hidden", "observations", "environment", "more",
 )  # fmt: skip
+
+
+_TOO_FAR, _TOO_NEAR, _FACTOR = 2.0, 0.5, 1.3
 
 
 class TerminalPPO(PPO):
@@ -55,6 +62,44 @@ class TerminalPPO(PPO):
             rewards = rewards.clone()
             rewards[late] += self.gamma * reached[:, 0]
         super().process_env_step(obs, rewards, dones, {})
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """The first step of an update's data, to compare the policy before and after."""
+
+    observations: TensorDict
+    hidden: Any
+    actions: torch.Tensor
+    log_prob: torch.Tensor
+    parameters: tuple[torch.Tensor, ...]
+
+    @classmethod
+    def of(cls, ppo: PPO) -> _Probe:
+        stored = ppo.storage
+        saved = stored.saved_hidden_state_a
+        assert stored.distribution_params is not None
+        hidden = None if saved is None else tuple(h[0].clone() for h in saved)
+        if hidden is not None and len(hidden) == 1:
+            hidden = hidden[0]
+        return cls(
+            stored.observations[0].clone(), hidden, stored.actions[0].clone(),
+            stored.actions_log_prob[0, :, 0].clone(),
+            tuple(p[0].clone() for p in stored.distribution_params),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def compare(self, ppo: PPO) -> dict[str, float]:
+        """KL divergence of the policy now from that of the data, and share of clipped ratios."""
+        actor = ppo.actor
+        kept = actor.get_hidden_state()
+        actor.reset(hidden_state=self.hidden)
+        actor(self.observations, stochastic_output=True)
+        actor.reset(hidden_state=kept)
+        kl = actor.get_kl_divergence(self.parameters, actor.output_distribution_params)
+        ratio = torch.exp(actor.get_output_log_prob(self.actions) - self.log_prob)
+        clipped = (ratio - 1.0).abs() > ppo.clip_param
+        return {"kl": float(kl.mean()), "clip_fraction": float(clipped.float().mean())}
 
 
 @dataclass(frozen=True)
@@ -123,12 +168,14 @@ class Learner:
     ):
         self.env, self.architecture, self.hyper = env, architecture, hyper
         self.ranks = ranks or Ranks()
+        self.iteration, self.exact = 0, True
         # the networks of all ranks start alike; their samples must differ
         torch.manual_seed(seed)
         # at different steps, so that not all episodes end in the same update
         env.episode_length_buf = torch.randint(0, env.max_episode_length, (env.num_envs,))
         self.observations = env.get_observations()
-        actor, critic = build(architecture, self.observations, hyper)
+        task = env.env.config
+        actor, critic = build(architecture, self.observations, hyper, task.control_step_s)
         # a recurrent policy's minibatches are whole environments
         if actor.is_recurrent and env.num_envs < hyper.minibatches:
             raise InputError(
@@ -150,35 +197,112 @@ class Learner:
             num_mini_batches=hyper.minibatches, clip_param=hyper.clip, gamma=hyper.discount,
             lam=hyper.gae_lambda, value_loss_coef=hyper.value_weight, entropy_coef=hyper.entropy,
             learning_rate=hyper.learning_rate, max_grad_norm=hyper.gradient_norm,
-            desired_kl=hyper.desired_kl, use_mixed_precision=hyper.mixed_precision,
-            multi_gpu_cfg=group,
+            schedule="fixed", use_mixed_precision=hyper.mixed_precision, multi_gpu_cfg=group,
         )  # fmt: skip
+        self.fresh_optimiser()
+        env.env.processes = self.ranks.size
+        self._joint_share = torch.ones(env.num_actions)
+        if hyper.exploration.by_dead_band:
+            self._joint_share = torch.from_numpy(env.env.servos.dead_band_share).float()
+        self._explore()
         if group:
             self.ppo.broadcast_parameters()
             torch.manual_seed(seed + 1000 * self.ranks.rank)
-        self.iteration, self.exact = 0, True
 
     @property
     def actor(self) -> MLPModel:
         """The policy's network."""
         return self.ppo.actor
 
+    @property
+    def samples(self) -> int:
+        """Control steps of all robots of all processes in PPO so far."""
+        return self.iteration * self.hyper.steps_per_environment * self._robots
+
+    @property
+    def _robots(self) -> int:
+        return self.env.num_envs * self.ranks.size
+
+    @property
+    def std(self) -> float:
+        """Mean standard deviation of the actions' noise."""
+        return float(self._noise.whole_std.mean())
+
+    @property
+    def _noise(self) -> PersistentGaussian:
+        noise = self.actor.distribution
+        assert isinstance(noise, PersistentGaussian)
+        return noise
+
+    def fresh_optimiser(self) -> None:
+        """Begin with PPO's learning rates, without memory of earlier gradients."""
+        hyper, ppo = self.hyper, self.ppo
+        ppo.optimizer = torch.optim.Adam(
+            [
+                {"params": list(ppo.actor.parameters()), "lr": hyper.learning_rate},
+                {"params": list(ppo.critic.parameters()), "lr": hyper.critic_learning_rate},
+            ]
+        )
+        ppo.learning_rate = hyper.learning_rate
+
+    def _explore(self) -> None:
+        """Set the noise's size where it is scheduled."""
+        explore = self.hyper.exploration
+        if not explore.learned:
+            self._noise.set_std(explore.std_at(self.samples) * self._joint_share)
+
+    def act(self) -> torch.Tensor:
+        """Actions with noise on the last observation, for one step of the environment."""
+        actions = self.ppo.act(self.observations)
+        self.env.noise = actions - self._noise.centre
+        return actions
+
     def rollout(self, watch=None) -> None:
         """Act for the steps of one update; `watch(rewards, dones, extras)` is called for each."""
+        self._explore()
         with torch.inference_mode():
             for _ in range(self.hyper.steps_per_environment):
-                actions = self.ppo.act(self.observations)
-                self.observations, rewards, dones, extras = self.env.step(actions)
+                self.observations, rewards, dones, extras = self.env.step(self.act())
                 self.ppo.process_env_step(self.observations, rewards, dones, extras)
                 if watch:
                     watch(rewards, dones, extras)
             self.ppo.compute_returns(self.observations)
 
     def update(self) -> dict[str, float]:
-        """Update policy and critic on the data of `rollout`; mean losses."""
-        losses = self.ppo.update()
+        """Update policy and critic on the data of `rollout`.
+
+        Returns
+        -------
+        dict of str to float
+            Mean losses, `kl` and `clip_fraction`.
+        """
+        ppo, hyper = self.ppo, self.hyper
+        actor_learns = self.iteration >= hyper.critic_warmup
+        for parameter in ppo.actor.parameters():
+            parameter.requires_grad_(actor_learns and parameter is not self._fixed_std)
+        if hyper.freeze_normaliser:
+            for network in (ppo.actor, ppo.critic):
+                network.obs_normalizer.until = 0  # pyright: ignore[reportArgumentType]
+        probe = _Probe.of(ppo)
+        losses = ppo.update()
         self.iteration += 1
-        return losses
+        found = {name: self.ranks.mean(value) for name, value in probe.compare(ppo).items()}
+        if actor_learns:
+            self._adapt(found["kl"])
+        return losses | found
+
+    @property
+    def _fixed_std(self) -> torch.Tensor | None:
+        return None if self.hyper.exploration.learned else self._noise.log_std_param
+
+    def _adapt(self, kl: float) -> None:
+        """Let the policy's learning rate follow the divergence of an update."""
+        ppo, (least, most) = self.ppo, self.hyper.learning_rates
+        if kl > _TOO_FAR * self.hyper.desired_kl:
+            ppo.learning_rate = max(ppo.learning_rate / _FACTOR, least)
+        elif kl < _TOO_NEAR * self.hyper.desired_kl:
+            ppo.learning_rate = min(ppo.learning_rate * _FACTOR, most)
+        ppo.optimizer.param_groups[0]["lr"] = ppo.learning_rate
 
     # ------------------------------------------------------------------------- checkpoints
 
@@ -288,6 +412,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
         raise InputError(f"{path} is not a checkpoint of pupper-train.")
+    if content.get("schema_version") == 1:
+        raise InputError(
+            f"{path} is of an older version of pupper-train, whose exploration was another: this "
+            "one cannot go on with it. Its policies can be played and evaluated; train anew."
+        )
     refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)
     missing = [part for part in _PARTS if part not in content]
     if missing:

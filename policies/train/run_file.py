@@ -20,17 +20,25 @@ from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import Place
 from pupper_sysid.policies.network.hyperparameters import (
     Architecture,
+    Exploration,
     Hyperparameters,
     Imitation,
     Kind,
 )
-from pupper_sysid.sim.walking.config import PRESETS, Observation, Walking
+from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
+
+Start = Literal["imitation", "scratch"]
+"""How a policy comes to its first gait."""
 
 RUN_SCHEMA = "pupper-run"
-RUN_VERSION = 1
+RUN_VERSION = 2
 RUN_FILE = "run.yaml"
-_DROPPED: dict[type, set[str]] = {Observation: {"privileged_critic"}}
-"""Settings that changed nothing; older files have them."""
+_DROPPED: dict[type, set[str]] = {
+    Observation: {"privileged_critic"},
+    Hyperparameters: {"initial_std"},
+    Curriculum: {"on", "stages", "stage_steps", "easiest", "action_scale"},
+}
+"""Settings of older files that say nothing of how a policy walks."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +72,51 @@ class Run:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
 
 
-def preset(name: Literal["fast", "paper", "release"], kind: Kind) -> Run:
+def preset(
+    name: Literal["fast", "paper", "release"], kind: Kind, start: Start = "imitation"
+) -> Run:
     """Complete settings for one kind of policy.
 
-    `fast` suits a few cores; `paper` and `release` follow the published sizes.
+    `fast` suits a few cores; `paper` and `release` follow the published sizes and always start from
+    nothing.
     """
-    task = PRESETS[name]
     if name == "fast":
-        # without a memory, reading the gait's phase off one action takes a wide network
-        hidden = (512, 256, 128) if kind in ("mlp", "mlp-actions") else (128, 64)
-        memory = 64
-        return Run(architecture=Architecture(kind, hidden, memory, (256, 128, 64)), task=task)
+        return _first_gait_imitated(kind) if start == "imitation" else _from_scratch(kind)
     wide = (512, 256, 128)
     return Run(
-        architecture=Architecture(kind, wide, 128, wide, privileged_critic=False), task=task,
+        architecture=Architecture(kind, wide, 128, wide, privileged_critic=False),
+        task=PRESETS[name],
         learner=Hyperparameters(
-            epochs=5, learning_rate=1e-3, value_weight=1.0, initial_std=1.0, normalise=False,
+            epochs=5, learning_rate=1e-3, value_weight=1.0, normalise=False,
+            exploration=Exploration((1.0, 1e-6), persistence_s=0.0, by_dead_band=False,
+                                    learned=True),
             entropy=0.0025 if kind == "mlp" else 0.005,
         ),
         imitation=Imitation(iterations=0), environments=4096, iterations=20_000, minutes=1e6,
+    )  # fmt: skip
+
+
+def _first_gait_imitated(kind: Kind) -> Run:
+    # without a memory, reading the gait's phase off one action takes a wide network
+    hidden = (512, 256, 128) if kind in ("mlp", "mlp-actions") else (128, 64)
+    return Run(
+        architecture=Architecture(kind, hidden, 64, (256, 128, 64)), task=PRESETS["fast"],
+        learner=Hyperparameters(
+            desired_kl=0.003, critic_warmup=30, freeze_normaliser=True, learning_rate=3e-5,
+            exploration=Exploration((0.05, 0.04), (0.0, 20.0), 0.3),
+        ),
+        environments=2048,
+    )  # fmt: skip
+
+
+def _from_scratch(kind: Kind) -> Run:
+    return Run(
+        architecture=Architecture(kind, (128, 64), 64, (128, 64)), task=PRESETS["scratch"],
+        learner=Hyperparameters(
+            steps_per_environment=20, learning_rate=1e-3, desired_kl=0.02,
+            exploration=Exploration((0.5, 0.04), (2.0, 20.0), 0.08),
+        ),
+        imitation=Imitation(iterations=0), environments=1024, iterations=2500, minutes=90.0,
     )  # fmt: skip
 
 

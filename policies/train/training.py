@@ -3,7 +3,8 @@
 `train` begins or resumes one. Its folder holds `run.yaml` (settings, seed, hashes, versions),
 `progress.csv` and TensorBoard events (one row per update), `last.pt` and `best.pt` (checkpoints,
 see `policies.train.learner`), and `policy_last/`, `policy_best/` (see
-`policies.network.policy_file`).
+`policies.network.policy_file`). The best has the highest score so far (`policies.train.selection`),
+imitation alone included.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
 from pupper_sysid.policies.train.imitation import imitate
 from pupper_sysid.policies.train.learner import Learner, Ranks
 from pupper_sysid.policies.train.run_file import Run, refuse_taken, resume_run, save_run
+from pupper_sysid.policies.train.selection import Judge
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 
 LAST, BEST = "last.pt", "best.pt"
 _SAVE_EVERY = 10
+_JUDGE_EVERY = 50
 _GRACE_S = 0.7
-_SMOOTHED = 0.1  # weight of the newest update in the mean reward that decides what is best
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,13 @@ class _Session:
         self.folder, self.watch = folder, watch
         self.run = run
         self.learner = make_learner(self.run, self.ranks)
+        env = self.learner.env.env
+        self.judge = Judge(
+            run.task, env.servos, run.seed, threads_of(run, self.ranks),
+            servo_model_of(run.actuator, run.task.control_step_s), action_history(run, env.servos),
+        )  # fmt: skip
         self.counters: dict[str, Any] = {
-            "elapsed_s": 0.0, "imitated": 0, "smooth": None, "best": None,
+            "elapsed_s": 0.0, "imitated": 0, "best": None, "scores": {},
         }  # fmt: skip
         if resumed:
             self.counters = self.learner.load(folder / _rank_file(LAST, self.ranks))
@@ -179,7 +186,7 @@ class _Session:
             self.refuse_nan(before, [error])
             self.counters["imitated"] += 1
             if self.counters["imitated"] == rounds:
-                _fresh_optimiser(learner)
+                learner.fresh_optimiser()
             self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
             if self.counters["imitated"] % _SAVE_EVERY == 0:
                 self.save(LAST)
@@ -189,6 +196,9 @@ class _Session:
         if self.counters["imitated"] < self.run.imitation.iterations:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
+        if not self.counters["scores"]:
+            self.counters["scores"] = self.judge(learner.actor)
+            self.keep_best()  # of imitation alone, so that PPO must be better
         self.phase_began = time.monotonic()
         while learner.iteration < self.run.iterations and not self.ranks.any(
             stop_requested() or time.monotonic() - self.started >= 60 * self.run.minutes
@@ -202,39 +212,39 @@ class _Session:
             self.refuse_nan(before, losses.values())
             row = episodes.row() | {
                 "value_loss": losses["value"],
-                "entropy": losses["entropy"],
-                "std": float(learner.actor.output_std.detach().mean()),
+                "kl": losses["kl"],
+                "clip_fraction": losses["clip_fraction"],
+                "std": learner.std,
                 "learning_rate": learner.ppo.learning_rate,
                 "nan_resets": learner.env.env.nan_resets,
-                "samples": self.samples,
+                "samples": learner.samples,
                 "collect_s": collected - begun,
                 "update_s": ended - collected,
             }
-            smooth, reward = self.counters["smooth"], self.ranks.mean(row["reward"])
-            self.counters["smooth"] = (
-                reward if smooth is None else smooth + _SMOOTHED * (reward - smooth)
+            judged = learner.iteration % _JUDGE_EVERY == 0
+            if judged:
+                self.counters["scores"] = self.judge(learner.actor)
+            self.report(
+                "ppo", learner.iteration, self.run.iterations, row | self.counters["scores"]
             )
-            self.report("ppo", learner.iteration, self.run.iterations, row)
+            if judged:
+                self.keep_best()
             if learner.iteration % _SAVE_EVERY == 0:
-                best = self.counters["best"]
-                if best is None or self.counters["smooth"] > best:
-                    self.counters["best"] = self.counters["smooth"]
-                    self.save(BEST)
-                    self.write_policy("policy_best")
-                self.save(LAST)  # after that, or a resumed run would not know its best
+                self.save(LAST)  # after the best, or a resumed run would not know its best
+
+    def keep_best(self) -> None:
+        """Save the policy if it walks better than those before."""
+        score, best = self.ranks.mean(self.counters["scores"]["score"]), self.counters["best"]
+        if best is None or score > best:
+            self.counters["best"] = score
+            self.save(BEST)
+            self.write_policy("policy_best")
 
     def finish(self) -> None:
         """Write the last policy, and end the curves."""
         self.write_policy("policy_last")
         if self.writer:
             self.writer.close()
-
-    @property
-    def samples(self) -> int:
-        """Control steps of all robots of all processes in PPO so far."""
-        env = self.learner.env
-        per_update = self.learner.hyper.steps_per_environment * env.num_envs * self.ranks.size
-        return self.learner.iteration * per_update
 
     def save(self, name: str) -> None:
         """Write a checkpoint."""
@@ -247,7 +257,7 @@ class _Session:
         servos = self.learner.env.env.servos
         about = {
             "iteration": self.learner.iteration, "imitation_rounds": self.counters["imitated"],
-            "reward": self.counters["smooth"], "seed": self.run.seed, "samples": self.samples,
+            **self.counters["scores"], "seed": self.run.seed, "samples": self.learner.samples,
             "elapsed_s": self.counters["elapsed_s"],
         }  # fmt: skip
         write_policy(
@@ -295,15 +305,6 @@ class _Session:
 def _rank_file(name: str, ranks: Ranks) -> str:
     """Name of a rank's checkpoint; each rank has its own environments."""
     return name if ranks.rank == 0 else name.replace(".pt", f".rank{ranks.rank}.pt")
-
-
-def _fresh_optimiser(learner: Learner) -> None:
-    """Replace the optimiser of the imitation by one with PPO's learning rate."""
-    ppo = learner.ppo
-    ppo.optimizer = torch.optim.Adam(
-        [*ppo.actor.parameters(), *ppo.critic.parameters()], lr=learner.hyper.learning_rate
-    )
-    ppo.learning_rate = learner.hyper.learning_rate
 
 
 @contextmanager

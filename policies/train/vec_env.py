@@ -1,8 +1,9 @@
 """WalkingVecEnv: `sim.walking.env.PupperEnv` with the contract that rsl_rl's learner expects.
 
 Observation groups: `policy` is the observation of 60 numbers, `privileged` the true state for the
-critic, and `actions` the last `action_history` actions, newest first: with them the delayed system
-is Markov again (the paper's augmented state). Tensors are copies, since the learner keeps them.
+critic, `noise` the noise of the last action (see `policies.network.exploration`), and `actions` the
+last `action_history` actions, newest first: with them the delayed system is Markov again (the
+paper's augmented state). Tensors are copies, since the learner keeps them.
 """
 
 from __future__ import annotations
@@ -24,6 +25,11 @@ class WalkingVecEnv:
     env : PupperEnv
     action_history : int
         How many past actions the group `actions` holds; 0 leaves the group out.
+
+    Attributes
+    ----------
+    noise : Tensor, shape (n, 12)
+        Of the last action; to be set before `step`. An episode begins with none.
     """
 
     num_actions = 12
@@ -35,6 +41,7 @@ class WalkingVecEnv:
         self.cfg: dict[str, Any] = {}
         self._past = np.zeros((env.environments, action_history, self.num_actions))
         self._past[:] = env.action[:, None]
+        self.noise = torch.zeros(env.environments, self.num_actions)
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -47,7 +54,7 @@ class WalkingVecEnv:
 
     def get_observations(self) -> TensorDict:
         """Observations of the present state, without a step."""
-        return self._groups(*self.env.observe(), self._past)
+        return self._groups(*self.env.observe(), self._past, self.noise)
 
     def step(
         self, actions: torch.Tensor
@@ -58,7 +65,7 @@ class WalkingVecEnv:
         -------
         observations, rewards, dones, extras
             `extras` has `terminal_ids` and `terminal_observations` of the environments whose time
-            was up, and `terms`, the reward terms.
+            was up, `terms`, the reward terms, and `facts`, what happened.
         """
         found = self.env.step(actions.detach().cpu().numpy())
         ended = self._past
@@ -66,14 +73,18 @@ class WalkingVecEnv:
             ended = np.concatenate([actions.cpu().numpy()[:, None], self._past[:, :-1]], axis=1)
             self._past = ended.copy()
             self._past[found.done] = self.env.action[found.done][:, None]
-        late = found.terminal["ids"]
-        extras: dict[str, Any] = {"terms": found.terms, "terminal_ids": torch.from_numpy(late)}
+        late, noise = found.terminal["ids"], self.noise
+        self.noise = noise * torch.from_numpy(~found.done)[:, None]
+        extras: dict[str, Any] = {
+            "terms": found.terms, "facts": found.facts, "terminal_ids": torch.from_numpy(late),
+        }  # fmt: skip
         if len(late):
             extras["terminal_observations"] = self._groups(
-                found.terminal["observation"], found.terminal["privileged"], ended[late]
-            )
+                found.terminal["observation"], found.terminal["privileged"], ended[late],
+                noise[torch.from_numpy(late)],
+            )  # fmt: skip
         return (
-            self._groups(found.observation, found.privileged, self._past),
+            self._groups(found.observation, found.privileged, self._past, self.noise),
             torch.from_numpy(found.reward.astype(np.float32)),
             torch.from_numpy(found.done),
             extras,
@@ -82,7 +93,9 @@ class WalkingVecEnv:
     @property
     def state(self) -> dict[str, Any]:
         """The whole state, for `restore`."""
-        return self.env.state | {"past_actions": self._past.copy()}
+        return self.env.state | {
+            "past_actions": self._past.copy(), "noise": self.noise.numpy().copy(),
+        }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> bool:
         """Go back to a `state`; whether exactly, see `PupperEnv.restore`.
@@ -94,14 +107,14 @@ class WalkingVecEnv:
         """
         own = dict(state)
         past = own.pop("past_actions", self._past)
+        noise = own.pop("noise", self.noise.numpy())
         exact = self.env.restore(own)
-        self._past[:] = past
+        self._past[:], self.noise = past, torch.from_numpy(np.array(noise, np.float32))
         return exact
 
-    def _groups(self, observation, privileged, past) -> TensorDict:
+    def _groups(self, observation, privileged, past, noise: torch.Tensor) -> TensorDict:
         groups = {"policy": observation, "privileged": privileged}
         if past.shape[1]:
             groups["actions"] = past.reshape(len(past), -1).astype(np.float32)
-        return TensorDict(
-            {k: torch.from_numpy(v) for k, v in groups.items()}, batch_size=[len(observation)]
-        )
+        tensors = {k: torch.from_numpy(v) for k, v in groups.items()}
+        return TensorDict(tensors | {"noise": noise}, batch_size=[len(observation)])

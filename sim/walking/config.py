@@ -7,7 +7,7 @@ published task (observation with the true speed of the trunk, wide commands, pub
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from pupper_sysid.common.errors import InputError
@@ -86,25 +86,59 @@ class Randomisation:
 
 
 @dataclass(frozen=True)
+class Ramp:
+    """A factor that changes with the samples of a training, linearly between two points."""
+
+    first: float = 1.0
+    """Until `begin`."""
+    last: float = 1.0
+    """From `end` on."""
+    begin: float = 0.0
+    """Millions of samples."""
+    end: float = 0.0
+    """Millions of samples."""
+
+    def at(self, samples: float) -> float:
+        """The factor after so many samples."""
+        share = (1e-6 * samples - self.begin) / max(self.end - self.begin, 1e-9)
+        return self.first + (self.last - self.first) * min(max(share, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
 class Curriculum:
-    """Grow from easy to full: delay, penalties, action scale and commands, in equal stages."""
+    """From easy to full, as a training goes on: factors on parts of the task; 1 is the task."""
 
-    on: bool = False
-    """Whether the task grows; otherwise it is full from the start."""
-    stages: int = 4
-    """How many stages, the last one full."""
-    stage_steps: int = 2400
-    """Control steps (of every environment) per stage."""
-    easiest: float = 0.25
-    """Share of delay, penalties and commands in the first stage."""
-    action_scale: float = 0.6
-    """Share of the action scale in the first stage."""
+    commands: Ramp = Ramp()
+    """On commanded speeds."""
+    delay: Ramp = Ramp()
+    """On dead times and on their jitter."""
+    push: Ramp = Ramp()
+    """On the speed that a push gives."""
+    penalties: Ramp = Ramp()
+    """On rewards of negative weight."""
+    guides: Ramp = Ramp()
+    """On the rewards that lead to a first gait: `progress`, `turn_progress` and `gait`."""
+    linear_sigma: Ramp = Ramp()
+    """On the widths of the speed's tracking terms."""
+    angular_sigma: Ramp = Ramp()
+    """On the widths of the turn rate's tracking terms."""
 
-    def level(self, step: int) -> float:
-        """0 in the first stage, 1 in the last."""
-        if not self.on or self.stages < 2:
-            return 1.0
-        return min(step // self.stage_steps, self.stages - 1) / (self.stages - 1)
+    def at(self, samples: float) -> Level:
+        """All factors after so many samples."""
+        return Level(**{f.name: getattr(self, f.name).at(samples) for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Level:
+    """Factors of a `Curriculum` at one time."""
+
+    commands: float = 1.0
+    delay: float = 1.0
+    push: float = 1.0
+    penalties: float = 1.0
+    guides: float = 1.0
+    linear_sigma: float = 1.0
+    angular_sigma: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -184,8 +218,33 @@ _PUBLISHED = Walking(
     rewards=RELEASE,
 )
 
+_SCRATCH = Walking(
+    physics_step_s=0.004,
+    commands=Commands(every_s=4.0, standing=0.1),
+    randomisation=Randomisation(on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5),
+    curriculum=Curriculum(
+        commands=Ramp(0.6, 1.0, 1.0, 4.0),
+        push=Ramp(0.0, 1.0, 8.0, 16.0),
+        penalties=Ramp(0.25, 1.0, 3.0, 12.0),
+        guides=Ramp(1.0, 0.35, 4.0, 16.0),
+        linear_sigma=Ramp(2.5, 1.0, 2.0, 12.0),
+        angular_sigma=Ramp(3.0, 1.0, 2.0, 12.0),
+    ),
+    rewards=Rewards(
+        progress=3.0, turn_progress=1.5, alive=0.1, gait=1.0, flight=-1.0, short_swing=-2.0,
+        shortest_swing=0.12, tracking_shape="gaussian",
+        base_linear_velocity=1.0, linear_sigma=0.1, base_angular_velocity=2.0, angular_sigma=0.5,
+        stride_linear_velocity=2.0, stride_linear_sigma=0.05,
+        stride_angular_velocity=2.0, stride_angular_sigma=0.2,
+        base_orientation=-2.0, base_motion=-1.0, foot_slip=-1.0, joint_position=-0.3,
+        action_rate=-0.05, action_jerk=-0.02,
+    ),
+)  # fmt: skip
+"""Settings with which a walk is found from nothing; see `benchmarks/README.md`."""
+
 PRESETS = {
     "fast": Walking(),
+    "scratch": _SCRATCH,
     "paper": replace(_PUBLISHED, rewards=PAPER),
     "release": _PUBLISHED,
 }

@@ -82,6 +82,10 @@ class PupperEnv:
         The physics: positions, velocities, the servos that were drawn.
     steps, nan_resets : int
         Control steps since the start; simulations that became NaN, and were drawn anew.
+    processes : int
+        That train together: the curriculum counts the samples of all.
+    level : Level
+        Factors of the curriculum now.
 
     Raises
     ------
@@ -139,8 +143,9 @@ class PupperEnv:
             self.robots.linked,
         )  # fmt: skip
         self.nan_resets = 0
-        self.steps = 0
-        self.level = config.curriculum.level(0)
+        self.steps, self.processes = 0, 1
+        self.level = config.curriculum.at(0)
+        self._rewards = self._rewards_now()
 
         def zeros(*shape: int) -> Array:
             return np.zeros((n, *shape))
@@ -189,7 +194,7 @@ class PupperEnv:
         self.earlier_action, self.last_action = self.last_action, self.action
         self.action = np.array(action, float)
         before = self.robots.joint_velocity.copy()
-        self.robots.draw_latency(self._easy(self.level), self.rng)
+        self.robots.draw_latency(self.level.delay, self.rng)
         moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)
@@ -207,7 +212,7 @@ class PupperEnv:
             timed_out |= away > self.ground.half_size_m - _EDGE_M
         timed_out &= ~(now.fallen | broken)
         done = now.fallen | broken | timed_out
-        self.level = config.curriculum.level(self.steps)
+        self._grow()
         late = np.flatnonzero(timed_out)
         terminal: dict[str, NDArray] = {"ids": late}
         if len(late):
@@ -224,7 +229,7 @@ class PupperEnv:
 
     def set_points(self, action: Array) -> Array:
         """Joint set-points [rad] of actions, shape (n, 12), within the joint limits."""
-        target = action * self._scale()
+        target = action * self.config.action_scale
         target += self.default
         return np.clip(target, self._low, self._high, out=target)
 
@@ -266,8 +271,21 @@ class PupperEnv:
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
         for rng, own in zip((self.rng, self._readings.rng), json.loads(state["rng"]), strict=True):
             rng.bit_generator.state = own
-        self.level = self.config.curriculum.level(self.steps)
+        self._grow()
         return exact
+
+    def _grow(self) -> None:
+        """Go on to the present level of the curriculum."""
+        level = self.config.curriculum.at(self.steps * self.environments * self.processes)
+        if level != self.level:
+            self.level = level
+            self._rewards = self._rewards_now()
+
+    def _rewards_now(self) -> walking_rewards.Rewards:
+        level = self.level
+        return walking_rewards.narrowed(
+            self.config.rewards, level.linear_sigma, level.angular_sigma
+        )
 
     # ------------------------------------------------------------------------- one step
 
@@ -283,7 +301,8 @@ class PupperEnv:
         if len(due):
             self._draw_commands(due)
         self._until_push -= span
-        pushed, most = np.flatnonzero(self._until_push <= 0), config.randomisation.push_m_s
+        pushed = np.flatnonzero(self._until_push <= 0)
+        most = self.level.push * config.randomisation.push_m_s
         push = np.zeros((0, 2))
         if len(pushed):
             push = self.rng.uniform(-most, most, (len(pushed), 2))
@@ -308,6 +327,7 @@ class PupperEnv:
         now.fallen[rows] = fallen
         facts = {name: value[rows] for name, value in now.facts.items()}
         np.greater(moved.touch, _FOOT_N, out=facts["contact"])
+        np.logical_and(facts["contact"], self._air[rows] > 0, out=facts["landed"])
         self._count_swings(rows, facts["contact"])
         at, facts["foot_height_m"][:] = robots.feet(rows)
         foot_speed = at - self._foot_at[rows]
@@ -328,7 +348,9 @@ class PupperEnv:
         for name in ("air_s", "contact_s", "last_air_s", "last_contact_s"):
             facts[name][:] = getattr(self, f"_{name.removesuffix('_s')}")[rows]
         step = walking_rewards.Step(**facts)
-        terms = walking_rewards.weighted(step, self.config.rewards, self._easy(self.level))
+        terms = walking_rewards.weighted(
+            step, self._rewards, self.level.penalties, self.level.guides
+        )
         for name, term in terms.items():
             whole = now.terms.setdefault(name, np.empty(self.environments))
             np.multiply(term, span, out=whole[rows])
@@ -361,7 +383,7 @@ class PupperEnv:
     # ------------------------------------------------------------------------- a new episode
 
     def _restart(self, ids: NDArray[np.intp]) -> None:
-        self.robots.draw(ids, self._easy(self.level), self.rng)
+        self.robots.draw(ids, self.level.delay, self.rng)
         self._draw_commands(ids)
         start, speed = draw_pose(self.config.randomisation, self.trot, self.command[ids], self.rng)
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
@@ -375,13 +397,13 @@ class PupperEnv:
         for times in (self._air, self._contact, self._last_air, self._last_contact):
             times[ids] = 0.0
         self.episode_step[ids] = 0
-        relative = (start - self.default) / self._scale()
+        relative = (start - self.default) / self.config.action_scale
         for action in (self.action, self.last_action, self.earlier_action):
             action[ids] = relative
 
     def _draw_commands(self, ids: NDArray[np.intp]) -> None:
         commands, n = self.config.commands, len(ids)
-        self.command[ids] = draw_commands(commands, n, self._easy(self.level), self.rng)
+        self.command[ids] = draw_commands(commands, n, self.level.commands, self.rng)
         self._until_command[ids] = self.rng.exponential(commands.every_s, n)
 
     # ------------------------------------------------------------------------- what is seen
@@ -429,12 +451,3 @@ class PupperEnv:
     def _read(self, rows: slice | NDArray[np.intp]) -> Array:
         """Joint angles as the controller reads them."""
         return self.robots.from_servo(self._readings.position[rows])
-
-    def _scale(self) -> float:
-        share = self.config.curriculum.action_scale
-        return self.config.action_scale * (share + (1 - share) * self.level)
-
-    def _easy(self, level: float) -> float:
-        """Share of delay, penalties and commands at a level of the curriculum."""
-        easiest = self.config.curriculum.easiest
-        return easiest + (1 - easiest) * level

@@ -42,6 +42,8 @@ class Step:
         Time that each foot has been in the air, on the ground; 0 if it is not.
     last_air_s, last_contact_s : ndarray, shape (n, 4)
         Duration of the last swing and stance.
+    landed : ndarray of bool, shape (n, 4)
+        Feet that came down in this step.
     stride_velocity : ndarray, shape (n, 3)
         Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
     foot_height_m, foot_speed_m_s : ndarray, shape (n, 4)
@@ -64,6 +66,7 @@ class Step:
     contact_s: Array
     last_air_s: Array
     last_contact_s: Array
+    landed: NDArray[np.bool_]
     foot_height_m: Array
     foot_speed_m_s: Array
     stride_velocity: Array
@@ -100,8 +103,18 @@ class Rewards:
     """Published: the speed term grows by this per m/s above `fast_above`."""
     fast_above: float = 0.15
     """Speed above which `fast_bonus` counts [m/s]."""
+    progress: float = 0.0
+    """Speed along the command over the commanded speed: pays from the first step on."""
+    turn_progress: float = 0.0
+    """The same of the turn rate."""
     alive: float = 0.5
     """Be upright."""
+    flight: float = 0.0
+    """No foot on the ground."""
+    short_swing: float = 0.0
+    """Feet that come down after less than `shortest_swing`, by the share that was missing."""
+    shortest_swing: float = 0.1
+    """For `short_swing` [s]."""
     air_time: float = 0.0
     """Published: long swings and stances while moving, all feet down while standing."""
     air_time_most: float = 0.25
@@ -195,6 +208,34 @@ def stride_linear_velocity(s: Step, p: Rewards) -> Array:
 def stride_angular_velocity(s: Step, p: Rewards) -> Array:
     """Tracking of the commanded turn rate on average over a stride, 0 to 1."""
     return _tracking(np.abs(s.command[:, 2] - s.stride_velocity[:, 2]), p.stride_angular_sigma, p)
+
+
+def progress(s: Step, p: Rewards) -> Array:
+    """Speed along the command over the commanded speed, -1 to 1; 0 without a command to travel."""
+    wanted, along = s.command[:, :2], (s.command[:, :2] * s.linear_velocity[:, :2]).sum(axis=1)
+    return _share(along, (wanted**2).sum(axis=1))
+
+
+def turn_progress(s: Step, p: Rewards) -> Array:
+    """Turn rate over the commanded one, -1 to 1; 0 without a command to turn."""
+    wanted = s.command[:, 2]
+    return _share(s.angular_velocity[:, 2] * wanted, wanted**2)
+
+
+def _share(along: Array, wanted: Array) -> Array:
+    whole = wanted > 1e-6
+    return np.clip(np.divide(along, wanted, out=np.zeros_like(along), where=whole), -1.0, 1.0)
+
+
+def flight(s: Step, p: Rewards) -> Array:
+    """1 while no foot is on the ground."""
+    return (~s.contact.any(axis=1)).astype(float)
+
+
+def short_swing(s: Step, p: Rewards) -> Array:
+    """Share of `shortest_swing` that was missing, summed over feet that have just come down."""
+    missing = np.maximum(1.0 - s.last_air_s / p.shortest_swing, 0.0)
+    return (s.landed * missing).sum(axis=1)
 
 
 def alive(s: Step, p: Rewards) -> Array:
@@ -305,24 +346,30 @@ TERMS = {
     f.__name__: f
     for f in (
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
-        stride_angular_velocity, alive, air_time, gait, foot_clearance,
-        swing_height, action_smoothness, action_rate, action_jerk, air_time_variance, base_motion,
-        base_orientation, foot_slip, joint_position, hip_abduction, joint_torques,
-        joint_acceleration, joint_velocity,
+        stride_angular_velocity, progress, turn_progress, alive, flight, short_swing, air_time,
+        gait, foot_clearance, swing_height, action_smoothness, action_rate, action_jerk,
+        air_time_variance, base_motion, base_orientation, foot_slip, joint_position,
+        hip_abduction, joint_torques, joint_acceleration, joint_velocity,
     )
 }  # fmt: skip
 """All terms by the name of their weight."""
 
 
-def weighted(step: Step, rewards: Rewards, penalties: float = 1.0) -> dict[str, Array]:
+GUIDES = ("progress", "turn_progress", "gait")
+"""Terms that lead to a first gait; a curriculum may fade them."""
+
+
+def weighted(
+    step: Step, rewards: Rewards, penalties: float = 1.0, guides: float = 1.0
+) -> dict[str, Array]:
     """Every term that counts, times its weight.
 
     Parameters
     ----------
     step : Step
     rewards : Rewards
-    penalties : float
-        Factor on negative weights, for a curriculum.
+    penalties, guides : float
+        Factors on negative weights and on those of `GUIDES`, for a curriculum.
 
     Returns
     -------
@@ -331,9 +378,23 @@ def weighted(step: Step, rewards: Rewards, penalties: float = 1.0) -> dict[str, 
     found = {}
     for name, term in TERMS.items():
         weight = getattr(rewards, name)
+        factor = penalties if weight < 0 else guides if name in GUIDES else 1.0
         if weight:
-            found[name] = (weight * penalties if weight < 0 else weight) * term(step, rewards)
+            found[name] = weight * factor * term(step, rewards)
     return found
+
+
+def narrowed(rewards: Rewards, linear: float, angular: float) -> Rewards:
+    """The same with the widths of the tracking terms times a factor."""
+    if linear == angular == 1.0:
+        return rewards
+    return replace(
+        rewards,
+        linear_sigma=linear * rewards.linear_sigma,
+        stride_linear_sigma=linear * rewards.stride_linear_sigma,
+        angular_sigma=angular * rewards.angular_sigma,
+        stride_angular_sigma=angular * rewards.stride_angular_sigma,
+    )
 
 
 def _tracking(error: Array, sigma: float, p: Rewards) -> Array:

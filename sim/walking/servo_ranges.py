@@ -70,6 +70,13 @@ class ServoRanges:
         """Longest dead time that can be drawn [s]."""
         return float(self.high["dead_time_s"].max())
 
+    @property
+    def dead_band_share(self) -> NDArray[np.float64]:
+        """Friction over stiffness of each joint, relative to their mean; 1 without friction."""
+        band = self.value["friction_loss"] / self.value["stiffness"]
+        mean = band.mean()
+        return band / mean if mean > 0 else np.ones_like(band)
+
     def later(self, extra_s: ArrayLike) -> ServoRanges:
         """The same servos, every dead time longer by `extra_s` [s], one or twelve; none below 0."""
         moved = {}

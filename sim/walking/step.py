@@ -76,4 +76,4 @@ def empty_facts(
         "earlier_action": earlier_action.copy(),
     }  # fmt: skip
     found |= {name: np.empty((len(command), size)) for name, size in _COLUMNS.items()}
-    return found | {"contact": np.empty((len(command), FEET), bool)}
+    return found | {name: np.empty((len(command), FEET), bool) for name in ("contact", "landed")}

@@ -36,7 +36,7 @@ def tiny_run(kind: str = "mlp", **changes) -> Run:
 
 def observations(count: int, generator: torch.Generator) -> TensorDict:
     """Made-up observations of `count` robots, in the groups of `WalkingVecEnv`."""
-    sizes = {"policy": 60, "privileged": PRIVILEGED, "actions": 12 * HISTORY}
+    sizes = {"policy": 60, "privileged": PRIVILEGED, "actions": 12 * HISTORY, "noise": 12}
     return TensorDict(
         {k: torch.randn(count, size, generator=generator) for k, size in sizes.items()},
         batch_size=[count],
@@ -48,8 +48,9 @@ def networks(kind: str, seed: int = 0):
     torch.manual_seed(seed)
     hyper = Hyperparameters()
     actor, critic = build(
-        Architecture(kind, (32, 16), 24, (16,)), observations(2, torch.Generator()), hyper
-    )
+        Architecture(kind, (32, 16), 24, (16,)), observations(2, torch.Generator()), hyper,
+        control_step_s=0.02,
+    )  # fmt: skip
     with torch.no_grad():
         for parameter in (*actor.parameters(), *critic.parameters()):
             parameter += 0.1 * torch.randn_like(parameter)

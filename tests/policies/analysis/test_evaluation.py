@@ -10,7 +10,7 @@ import pytest
 from pupper_sysid.policies.analysis import evaluation
 from pupper_sysid.policies.analysis.evaluation import _share, evaluate, summary, walk
 from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, evaluation_task
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import Curriculum, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 CALIBRATION = str(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
@@ -111,7 +111,7 @@ def test_intervals_are_over_episodes():
 def test_an_evaluation_has_no_pushes_no_curriculum_and_gentle_starts():
     task = evaluation_task(Walking())
     assert task.randomisation.push_m_s == 0 and task.randomisation.on_the_move == 0
-    assert not task.curriculum.on and task.commands == RANDOM
+    assert task.curriculum == Curriculum() and task.commands == RANDOM
     assert task.episode_s == Walking().episode_s
     assert task.physics == "evaluation"
 

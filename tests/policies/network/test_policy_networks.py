@@ -201,7 +201,7 @@ def test_only_the_network_with_past_actions_sees_them():
     for kind in ALL_KINDS:
         actor, critic = networks(kind)
         assert actor.obs_groups == ["policy"] + ["actions"] * (kind == "mlp-actions")
-        assert critic.obs_groups == ["policy", "privileged"]
+        assert critic.obs_groups == ["policy", "noise", "privileged"]
 
 
 # ------------------------------------------------------------------------------ other files

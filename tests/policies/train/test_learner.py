@@ -65,7 +65,17 @@ def test_after_a_time_out_past_actions_begin_anew_but_the_terminal_ones_are_thos
 
 
 def test_without_history_there_is_no_group_of_actions():
-    assert set(walkers(4, 0).get_observations().keys()) == {"policy", "privileged"}
+    assert set(walkers(4, 0).get_observations().keys()) == {"policy", "privileged", "noise"}
+
+
+def test_noise_is_observed_and_a_new_episode_begins_without():
+    env = walkers(episode_steps=2, history=0)
+    env.noise = torch.full((3, 12), 0.3)
+    assert act(env, 0.0)[0]["noise"].eq(0.3).all()
+    env.noise = torch.full((3, 12), 0.2)
+    seen, _, dones, extras = act(env, 0.0)
+    assert dones.all() and seen["noise"].eq(0.0).all()
+    assert extras["terminal_observations"]["noise"].eq(0.2).all()
 
 
 def test_observations_that_were_handed_out_do_not_change_with_the_next_step():

@@ -152,7 +152,7 @@ def test_after_a_power_cut_nothing_is_repeated_in_the_curves_and_the_best_stays_
     kept = read_checkpoint(cut / LAST)
     assert kept["iteration"] == 10, "a checkpoint every ten updates"
     best = read_checkpoint(cut / "best.pt")
-    assert kept["more"]["best"] == best["more"]["best"] == best["more"]["smooth"]
+    assert kept["more"]["best"] == best["more"]["scores"]["score"]
     assert len(rows(cut / PROGRESS)) == 13
     with (cut / PROGRESS).open("a") as file:
         file.write("14,0.1")  # half a row: the power went while it was written
@@ -420,7 +420,7 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(tmp_path, change, word
 @pytest.mark.parametrize(
     "text",
     ["", "a: [", "- 1", "schema: pupper-run", "\x00", "[" * 1200,
-     "schema: pupper-run\nschema_version: 2\nsettings: {}",
+     "schema: pupper-run\nschema_version: 3\nsettings: {}",
      "schema: pupper-run\nschema_version: 1\nsettings: 3",
      "!!python/object/apply:os.mkdir [made]"],
 )  # fmt: skip
@@ -433,9 +433,16 @@ def test_a_damaged_run_file_is_refused_and_nothing_in_it_is_run(tmp_path, monkey
     assert not (tmp_path / "made").exists()
 
 
-def test_a_setting_that_older_files_have_and_that_changed_nothing_is_passed_over(tmp_path):
-    old = with_settings(tmp_path, "task", "observation", "privileged_critic", False)
-    assert load_run(old) == tiny_run()
+@pytest.mark.parametrize(
+    "setting",
+    [
+        ("task", "observation", "privileged_critic", False),
+        ("task", "curriculum", "stage_steps", 2400),
+        ("learner", "initial_std", 0.015),
+    ],
+)
+def test_a_setting_of_older_files_that_says_nothing_of_the_walk_is_passed_over(tmp_path, setting):
+    assert load_run(with_settings(tmp_path, *setting)) == tiny_run()
 
 
 @pytest.mark.parametrize(("name", "sees"), [("fast", True), ("paper", False), ("release", False)])
@@ -445,7 +452,7 @@ def test_whether_the_critic_sees_the_truth_is_the_architectures_alone(name, sees
 
 
 def test_a_newer_run_file_is_told_to_need_an_upgrade(tmp_path):
-    (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 2\nsettings: {}")
+    (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 3\nsettings: {}")
     with pytest.raises(InputError, match="newer version.*Upgrade pupper-sysid"):
         load_run(tmp_path)
 
@@ -590,7 +597,7 @@ def two(tmp_path_factory):
 def test_two_processes_stop_at_the_same_update_though_one_alone_was_told_to(two):
     assert [c["iteration"] for c in two] == [2, 2]
     assert [c["more"]["imitated"] for c in two] == [2, 2]
-    assert two[0]["more"]["smooth"] == two[1]["more"]["smooth"], "so they agree on what is best"
+    assert two[0]["more"]["best"] == two[1]["more"]["best"], "they agree on what is best"
 
 
 def test_two_processes_learn_one_policy_from_different_robots(two):

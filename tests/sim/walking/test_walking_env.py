@@ -25,7 +25,9 @@ from pupper_sysid.sim.robot.mini_pupper import (
 from pupper_sysid.sim.walking.config import (
     Commands,
     Curriculum,
+    Level,
     Observation,
+    Ramp,
     Randomisation,
     Walking,
 )
@@ -722,36 +724,55 @@ def test_pushes_set_the_horizontal_speed_within_their_range_at_their_times():
 # ------------------------------------------------------------------------------------ curriculum
 
 
-def test_the_curriculum_rises_in_equal_stages():
-    stages = Curriculum(on=True, stages=3, stage_steps=10)
-    assert [stages.level(s) for s in (0, 9, 10, 19, 20, 999)] == [0, 0, 0.5, 0.5, 1, 1]
-    assert Curriculum(on=False).level(0) == 1.0
+def test_a_ramp_is_linear_between_its_ends():
+    ramp = Ramp(0.6, 1.0, begin=1.0, end=3.0)
+    assert [ramp.at(s) for s in (0, 1e6, 2e6, 3e6, 9e6)] == pytest.approx([0.6, 0.6, 0.8, 1, 1])
+    assert Curriculum().at(0) == Curriculum().at(1e9) == Level()
 
 
-def test_the_curriculum_eases_delay_commands_penalties_and_action_scale():
-    rewards = only(alive=1.0, action_rate=-1.0)
+def test_the_curriculum_changes_delay_commands_penalties_guides_and_widths():
+    rewards = only(
+        alive=1.0, action_rate=-1.0, progress=2.0, base_linear_velocity=1.0, linear_sigma=0.1,
+        tracking_shape="exponential",
+    )  # fmt: skip
+    eased = Ramp(0.25, 1.0, begin=2e-6, end=3e-6)  # from the third sample on as it is
     config = replace(
         QUIET,
         rewards=rewards,
         commands=Commands((0.2, 0.2), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0),
-        curriculum=Curriculum(on=True, stages=2, stage_steps=3, easiest=0.25, action_scale=0.6),
-    )
-    env = make(with_delay(0.04, 0.04), config)
+        curriculum=Curriculum(
+            commands=eased, delay=eased, penalties=eased, guides=eased,
+            linear_sigma=replace(eased, first=2.0),
+        ),
+    )  # fmt: skip
+    env = make(with_delay(0.04, 0.04), config, 1)
 
     def facts() -> tuple[float, float, float, float]:
         env.reset()
         delay, forward = drawn_field(env, "actuator_delay")[0, 0], env.command[0, 0]
-        terms = env.step(still(env) + 0.1).terms
-        hip = env.robots.batch.bind("ctrl")[0, 0]
-        return delay, forward, terms["action_rate"][0], hip
+        found = env.step(still(env) + 0.1)
+        speed = found.facts.linear_velocity[0, :2]
+        away = np.hypot(forward - speed[0], speed[1])
+        width = -away / np.log(found.terms["base_linear_velocity"][0] / SPAN)
+        guide = found.terms["progress"][0] / (SPAN * np.clip(speed[0] / forward, -1, 1))
+        assert guide == pytest.approx(0.5 if env.steps == 1 else 2.0)
+        return delay, forward, found.terms["action_rate"][0], width
 
     full = -1.0 * 12 * 0.1**2 * SPAN
-    assert env.level == 0.0
-    assert facts() == pytest.approx((0.01, 0.05, 0.25 * full, 0.6 * 0.5 * 0.1))
+    assert env.level.commands == 0.25
+    assert facts() == pytest.approx((0.01, 0.05, 0.25 * full, 0.2))
     env.step(still(env))
     env.step(still(env))
-    assert env.level == 1.0
-    assert facts() == pytest.approx((0.04, 0.2, full, 0.5 * 0.1))
+    assert env.level == Level()
+    assert facts() == pytest.approx((0.04, 0.2, full, 0.1))
+
+
+def test_the_curriculum_counts_the_samples_of_all_processes():
+    config = replace(QUIET, curriculum=Curriculum(commands=Ramp(0.0, 1.0, 0.0, 8e-6)))
+    env = make(with_delay(0.0, 0.0), config, 2)
+    env.processes = 2
+    env.step(still(env))
+    assert env.level.commands == pytest.approx(0.5)
 
 
 # -------------------------------------------------------------------------------------- refusals

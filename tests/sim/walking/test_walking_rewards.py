@@ -31,6 +31,7 @@ SIZES = {
     "contact_s": 4,
     "last_air_s": 4,
     "last_contact_s": 4,
+    "landed": 4,
     "foot_height_m": 4,
     "foot_speed_m_s": 4,
 }
@@ -41,7 +42,7 @@ E1 = np.exp(-1.0)
 def step(**known) -> Step:
     """One robot, all zeros but what is given."""
     values: dict[str, Any] = {f.name: np.zeros((1, SIZES.get(f.name, 12))) for f in fields(Step)}
-    values["contact"] = np.zeros((1, 4), bool)
+    values |= {name: np.zeros((1, 4), bool) for name in ("contact", "landed")}
     for name, value in known.items():
         values[name][:] = value
     return Step(**values)
@@ -60,6 +61,39 @@ EXPONENTIAL = replace(
     P, tracking_shape="exponential", linear_sigma=0.1, angular_sigma=0.2, fast_bonus=0.0
 )
 GAUSSIAN = replace(EXPONENTIAL, tracking_shape="gaussian")
+
+
+def test_progress_is_the_share_of_the_commanded_speed_along_the_command():
+    s = step(command=(0.12, -0.16, 0.0), linear_velocity=(0.06, -0.08, 9.0))
+    assert wr.progress(s, P)[0] == pytest.approx(0.5)
+    assert wr.progress(step(command=FORWARD, linear_velocity=(-1.0, 0, 0)), P)[0] == -1.0
+    assert wr.progress(step(linear_velocity=(1.0, 0, 0)), P)[0] == 0.0
+    turning = step(command=(0, 0, -0.4), angular_velocity=(0, 0, -0.1))
+    assert wr.turn_progress(turning, P)[0] == pytest.approx(0.25)
+    assert wr.turn_progress(step(angular_velocity=(0, 0, 1.0)), P)[0] == 0.0
+
+
+def test_flight_is_all_feet_up_and_short_swings_count_where_they_end():
+    assert wr.flight(step(), P)[0] == 1.0
+    assert wr.flight(step(contact=(False, True, False, False)), P)[0] == 0.0
+    p = replace(P, shortest_swing=0.1)
+    s = step(landed=(True, True, False, True), last_air_s=(0.025, 0.2, 0.0, 0.05))
+    assert wr.short_swing(s, p)[0] == pytest.approx(0.75 + 0.5)
+
+
+def test_a_curriculum_fades_guides_alone_and_widens_what_tracks():
+    s = step(command=FORWARD, linear_velocity=(0.2, 0, 0), action=1.0)
+    p = replace(P, progress=2.0)
+    whole, faded = weighted(s, p), weighted(s, p, guides=0.5)
+    assert faded["progress"][0] == 0.5 * whole["progress"][0]
+    assert {k: v[0] for k, v in faded.items() if k not in wr.GUIDES} == {
+        k: v[0] for k, v in whole.items() if k not in wr.GUIDES
+    }
+    wide = wr.narrowed(p, 2.0, 3.0)
+    assert (wide.linear_sigma, wide.stride_linear_sigma) == (
+        2 * p.linear_sigma, 2 * p.stride_linear_sigma
+    )  # fmt: skip
+    assert wide.angular_sigma == 3 * p.angular_sigma and wide.progress == p.progress
 
 
 def test_speed_is_tracked_by_the_exponential_of_the_horizontal_error():

@@ -1,0 +1,118 @@
+"""Which policy of a training is best: walks without noise, on a seed and robots of their own.
+
+The reward of a training says little about that: noise is in it, and a curriculum changes its terms.
+`Judge` lets the policy walk as in an evaluation, always from the same starts on the same robots.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rsl_rl.models import MLPModel
+
+from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.policies.walks.conditions import evaluation_task
+from pupper_sysid.policies.walks.tracking import planar_velocity
+from pupper_sysid.servo_models.joint_arrays import JointArrays
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+_SEED = 1_000_003
+_SECONDS, _IGNORED = 5.0, 0.2
+_COMMANDS = np.array(
+    [
+        [0.15, 0, 0], [-0.15, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0.4], [0, 0, -0.4],
+        [0.1, 0.05, 0], [0.1, 0, 0.3], [-0.1, 0, 0.3], [0.1, 0, -0.3], [0.05, 0, 0], [0, 0, 0],
+    ]
+)  # fmt: skip
+_EACH = 4
+_STANDING = np.abs(_COMMANDS).mean(axis=0)  # errors of a robot that stands [m/s, m/s, rad/s]
+
+
+class Judge:
+    """Scores a policy, the same walks each time.
+
+    Parameters
+    ----------
+    task : Walking
+        Of the training.
+    servos : ServoRanges
+    seed : int
+        Of the training; robots, starts and terrain are others.
+    threads : int
+    servo_model : JointArrays, optional
+    action_history : int
+        As for `WalkingVecEnv`.
+    """
+
+    def __init__(
+        self,
+        task: Walking,
+        servos: ServoRanges,
+        seed: int,
+        threads: int,
+        servo_model: JointArrays | None = None,
+        action_history: int = 0,
+    ):
+        # longer than it walks, so that no episode ends but by a fall
+        seconds = min(_SECONDS, task.episode_s)
+        task = evaluation_task(task, 2 * seconds)
+        self._steps = round(seconds / task.control_step_s)
+        robots = _EACH * len(_COMMANDS)
+        env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
+        self._command = np.repeat(_COMMANDS, _EACH, axis=0)
+        env.set_command(self._command)
+        self._env = WalkingVecEnv(env, action_history)
+        self._start = self._env.state
+
+    def __call__(self, actor: MLPModel) -> dict[str, float]:
+        """Walk for 5 s (at most an episode) with the mean of the policy's actions.
+
+        Returns
+        -------
+        dict of str to float
+            `score`: 1 without errors, 0 for a robot that stands, less with falls. It is 1 minus the
+            errors relative to standing (mean of those at each instant and of those of the mean
+            velocity) minus the share of falls. Beside it `score_falls`, the mean absolute errors
+            `score_vx_m_s`, `score_vy_m_s` and `score_yaw_rad_s`, and `score_turn`, the turn rate
+            over the commanded one where robots are to turn on the spot.
+        """
+        env = self._env
+        env.restore(self._start)
+        kept = actor.get_hidden_state()
+        actor.reset()
+        first = round(_IGNORED * self._steps)
+        alive, velocity, up = np.ones(env.num_envs, bool), [], []
+        with torch.inference_mode():
+            observations = env.get_observations()
+            for _ in range(self._steps):
+                observations, _, dones, extras = env.step(actor(observations))
+                alive &= ~dones.numpy()
+                velocity.append(planar_velocity(extras["facts"]))
+                up.append(alive.copy())
+                actor.reset(dones)
+        actor.reset(hidden_state=kept)
+        return _scored(np.array(velocity)[first:], np.array(up)[first:], self._command)
+
+
+def _scored(
+    velocity: NDArray[np.float64], up: NDArray[np.bool_], command: NDArray[np.float64]
+) -> dict[str, float]:
+    fell = ~up[-1]
+    # a robot that fell has the errors of one that stands, from then on
+    shown = np.where(up[..., None], velocity, 0.0)
+    instant = np.abs(shown - command).mean(axis=(0, 1))
+    mean = np.abs(shown.mean(axis=0) - command).mean(axis=0)
+    relative = 0.5 * (instant + mean) / _STANDING
+    turning = (command[:, 2] != 0) & (command[:, :2] == 0).all(axis=1)
+    turn = shown.mean(axis=0)[turning, 2] / command[turning, 2]
+    return {
+        "score": float(1.0 - relative.mean() - fell.mean()),
+        "score_falls": float(fell.mean()),
+        "score_vx_m_s": float(instant[0]),
+        "score_vy_m_s": float(instant[1]),
+        "score_yaw_rad_s": float(instant[2]),
+        "score_turn": float(turn.mean()),
+    }

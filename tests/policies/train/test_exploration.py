@@ -1,0 +1,158 @@
+"""Exploration that persists, its likelihood and schedule, and which policy is kept."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.network.exploration import PersistentGaussian
+from pupper_sysid.policies.network.hyperparameters import Exploration, Hyperparameters
+from pupper_sysid.policies.train.learner import Ranks
+from pupper_sysid.policies.train.selection import Judge
+from pupper_sysid.policies.train.training import make_learner
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.tiny_training import CALIBRATION, tiny_run
+
+STEP_S = 0.02
+
+
+def explored(correlation: float, std: float, steps: int, robots: int = 4000) -> torch.Tensor:
+    """Noise of `steps` steps, shape (steps, robots)."""
+    torch.manual_seed(0)
+    noise = PersistentGaussian(1, correlation, init_std=std, learn_std=False)
+    before, found = torch.zeros(robots, 1), []
+    for _ in range(steps):
+        noise.noise_before = before
+        noise.update(torch.full((robots, 1), 7.0))
+        before = noise.sample() - noise.centre
+        found.append(before[:, 0])
+    return torch.stack(found)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_noise_has_its_standard_deviation_and_correlation(correlation):
+    noise = explored(correlation, 0.3, 60)
+    assert noise[-1].std().item() == pytest.approx(0.3, rel=0.05)
+    between = np.corrcoef(noise[-1], noise[-2])[0, 1]
+    assert between == pytest.approx(correlation, abs=0.04)
+
+
+def test_the_likelihood_is_that_of_the_action_given_the_noise_before():
+    noise = PersistentGaussian(2, 0.6, init_std=0.5, learn_std=False)
+    noise.noise_before = torch.tensor([[0.1, -0.2]])
+    noise.update(torch.tensor([[1.0, 2.0]]))
+    action = torch.tensor([[1.3, 2.1]])
+    sd = math.sqrt(1 - 0.36) * 0.5
+    by_hand = sum(
+        -0.5 * ((a - m) / sd) ** 2 - math.log(sd * math.sqrt(2 * math.pi))
+        for a, m in ((1.3, 1.06), (2.1, 1.88))
+    )
+    assert noise.log_prob(action).item() == pytest.approx(by_hand, rel=1e-5)
+
+
+def test_the_standard_deviation_falls_by_equal_factors_between_two_points():
+    explore = Exploration((0.4, 0.1), (1.0, 3.0), 0.1)
+    assert [explore.std_at(1e6 * m) for m in (0, 1, 2, 3, 9)] == pytest.approx(
+        [0.4, 0.4, 0.2, 0.1, 0.1]
+    )
+    assert explore.correlation(STEP_S) == pytest.approx(math.exp(-0.2))
+    assert replace(explore, persistence_s=0.0).correlation(STEP_S) == 0.0
+    with pytest.raises(InputError, match="std must be positive"):
+        Exploration((0.0, 0.1))
+
+
+def test_joints_of_larger_dead_band_get_more_noise():
+    servos = servo_ranges(CALIBRATION)
+    share = servos.dead_band_share
+    assert share.mean() == pytest.approx(1.0) and share.std() > 0
+    band = servos.value["friction_loss"] / servos.value["stiffness"]
+    assert np.argmax(share) == np.argmax(band)
+    learner = make_learner(tiny_run(), Ranks())
+    assert learner.std == pytest.approx(learner.hyper.exploration.std[0], rel=1e-5)
+    assert (servo_ranges("ideal").dead_band_share == 1.0).all()
+
+
+def learning(**changes):
+    made = make_learner(tiny_run(learner=replace(tiny_run().learner, **changes)), Ranks())
+    made.rollout()
+    return made
+
+
+def weights(network) -> dict[str, torch.Tensor]:
+    return {k: v.clone() for k, v in network.state_dict().items()}
+
+
+def changed(before: dict[str, torch.Tensor], network) -> set[str]:
+    now = network.state_dict()
+    return {k.split(".")[0] for k, v in before.items() if not torch.equal(v, now[k])}
+
+
+def test_first_only_the_critic_learns_and_then_the_policy_too():
+    learner = learning(critic_warmup=1, learning_rate=1e-3, learning_rates=(1e-6, 1e-2))
+    actor, critic = weights(learner.ppo.actor), weights(learner.ppo.critic)
+    found = learner.update()
+    assert changed(actor, learner.ppo.actor) == {"obs_normalizer"}
+    assert "mlp" in changed(critic, learner.ppo.critic)
+    assert learner.ppo.learning_rate == 1e-3, "nothing is adapted before the policy learns"
+    actor = weights(learner.ppo.actor)
+    learner.rollout()
+    found = learner.update()
+    assert "mlp" in changed(actor, learner.ppo.actor) and found["kl"] > 0
+
+
+def test_a_frozen_normaliser_stays_and_a_scheduled_deviation_is_not_learned():
+    learner = learning(freeze_normaliser=True, learning_rate=1e-3)
+    actor = weights(learner.ppo.actor)
+    learner.update()
+    assert changed(actor, learner.ppo.actor) == {"mlp"}
+
+
+@pytest.mark.parametrize(("rate", "goes"), [(3e-2, "down"), (1e-7, "up")])
+def test_the_learning_rate_follows_the_divergence_within_its_ends(rate, goes):
+    learner = learning(
+        learning_rate=rate, learning_rates=(1e-7, 3e-2), desired_kl=1e-3, freeze_normaliser=True
+    )  # fmt: skip
+    found = learner.update()
+    if goes == "down":
+        assert found["kl"] > 2e-3 and learner.ppo.learning_rate < rate
+        assert found["clip_fraction"] > 0
+    else:
+        assert found["kl"] < 5e-4 and learner.ppo.learning_rate > rate
+    rates = [group["lr"] for group in learner.ppo.optimizer.param_groups]
+    assert rates == [learner.ppo.learning_rate, Hyperparameters().critic_learning_rate]
+
+
+def test_a_policy_is_judged_without_noise_and_always_on_the_same_walks():
+    learner = make_learner(tiny_run(), Ranks())
+    env = learner.env.env
+    judge = Judge(Walking(episode_s=0.4), env.servos, 0, 1)
+    first = judge(learner.actor)
+    before = env.state
+    torch.manual_seed(5)
+    assert judge(learner.actor) == first
+    assert all(np.array_equal(before[k], v) for k, v in env.state.items())
+    with torch.no_grad():
+        learner.actor.mlp[-1].bias += 0.5
+    assert judge(learner.actor) != first
+
+
+def test_a_robot_that_stands_scores_about_nothing_and_one_that_falls_less():
+    learner = make_learner(tiny_run(), Ranks())
+    judge = Judge(Walking(), learner.env.env.servos, 0, 1)
+    last = learner.actor.mlp[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.zero_()
+    standing = judge(learner.actor)
+    assert standing["score"] == pytest.approx(0.0, abs=0.1) and standing["score_falls"] == 0
+    assert standing["score_turn"] == pytest.approx(0.0, abs=0.1)
+    with torch.no_grad():
+        last.bias.copy_(torch.tensor([2.0, 2.0, 2.0] * 2 + [-2.0, -2.0, 0.0] * 2))
+    fallen = judge(learner.actor)
+    assert fallen["score_falls"] > 0.5 and fallen["score"] < -0.4
