@@ -10,7 +10,9 @@ from pupper_sysid.common.joints import LEGS
 from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position, limits
 from pupper_sysid.sim.robot.trot import Trot
 
-TROT = Trot(frequency_hz=2.5, lift_m=0.020, duty=0.6, gain=1.0, turn_gain=1.0)
+TROT = Trot(
+    frequency_hz=2.5, lift_m=0.020, duty=0.6, gain=1.0, turn_gain=1.0, turn_dead_band_rad_s=0.0
+)
 STEP_S = 0.02
 COMMANDS = {
     "forward": (0.2, 0.0, 0.0),
@@ -110,6 +112,23 @@ def test_feet_do_not_jump_at_touch_down_or_lift_off():
 def test_a_duty_that_cannot_be_is_refused(duty):
     with pytest.raises(InputError, match="trot.duty"):
         Trot(duty=duty)
+
+
+def test_a_turn_gets_the_dead_band_on_top_unless_feet_step_sideways():
+    def stroke(command: tuple[float, float, float]) -> float:
+        plain, banded = (
+            feet(
+                Trot(turn_gain=1.0, turn_dead_band_rad_s=band).joints(
+                    np.zeros(1), along(command, 1)
+                )
+            )
+            for band in (0.0, 0.13)
+        )
+        return float(np.ptp((banded - NEUTRAL)[0, :, 1]) / np.ptp((plain - NEUTRAL)[0, :, 1]))
+
+    assert stroke((0.0, 0.0, 0.4)) == pytest.approx(1 + 0.13 / 0.4, rel=1e-3)
+    assert stroke((0.15, 0.0, -0.2)) == pytest.approx(1 + 0.13 / 0.2, rel=1e-2)
+    assert stroke((0.0, 0.08, 0.4)) == pytest.approx(1.0)
 
 
 def test_gain_lengthens_the_stroke_in_proportion():
