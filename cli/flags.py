@@ -22,6 +22,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 _OTHER_NAMES = {"frequencies": "freqs", "address": "bus", "workers": "jobs"}
+_OF_EVERY_PROGRAM = {"read_limit": "--read-limit"}
 """Options with a name of their own, by the library's argument (without its unit)."""
 
 _ARGUMENT = re.compile(r"`([a-z][a-z0-9_]*)(?:=('?)([^`']*)\2)?`")
@@ -41,7 +42,7 @@ def forget() -> None:
 
 def spell(text: str) -> str:
     """`text` with the arguments in back-quotes replaced by the running command's options."""
-    known = _flags.get({})
+    known = _OF_EVERY_PROGRAM | dict(_flags.get({}))
 
     def flag(found: re.Match[str]) -> str:
         name = _UNIT.sub("", found[1])

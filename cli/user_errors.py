@@ -3,7 +3,7 @@
 A termination signal ends a program at once (143 after SIGTERM), as the system does by default; its
 worker processes end with it. Programs that hold a robot call `end_politely`, which stops them as
 Ctrl-C does. An error is one sentence; `--debug` shows the traceback. The options that every
-program has are here: `--debug`, `--version` and `--install-completion`.
+program has are here: `--debug`, `--read-limit`, `--version` and `--install-completion`.
 """
 
 from __future__ import annotations
@@ -22,14 +22,18 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli.flags import forget, remember, spell
+from pupper_sysid.cli.numerals import NUMERALS
 from pupper_sysid.cli.terminal import err, out
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import versions
+from pupper_sysid.common.reading.budget import reading_up_to
+from pupper_sysid.common.reading.numbers import decimal
 
 _COMPLETIONS = {
     "bash": ".local/share/bash-completion/completions/{}",
     "zsh": ".zfunc/_{}",
 }
+_READ_LIMIT = "--read-limit"
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 _OF_THE_SYSTEM = (
@@ -65,7 +69,7 @@ def parse(
 
     `keywords` are further ones of `tyro.cli`.
     """
-    given = {"config": CONFIG, "description": description} | keywords
+    given = {"config": CONFIG, "description": description, "registry": NUMERALS} | keywords
     parsed = tyro.cli(options, args=arguments, prog=program, **given)
     remember(parsed)
     seed = getattr(parsed, "seed", 0)
@@ -115,14 +119,16 @@ def _signalled() -> int:
 
 @contextmanager
 def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
-    """Yield the arguments without `--debug`; an exception inside becomes a sentence."""
+    """Yield the arguments without those of every program; an exception becomes a sentence."""
     debug = "--debug" in arguments
     try:
         if "--version" in arguments:
             _print_version(program)
         if "--install-completion" in arguments:
             arguments = _completion(program)
-        yield [a for a in arguments if a != "--debug"]
+        times, rest = _read_limit([a for a in arguments if a != "--debug"])
+        with reading_up_to(times):
+            yield rest
         sys.stdout.flush()
         if code := _signalled():  # it ended as after Ctrl-C, with everything done
             sys.exit(code)
@@ -151,6 +157,23 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     finally:
         _stop_no_more()
         forget()
+
+
+def _read_limit(arguments: Sequence[str]) -> tuple[float, list[str]]:
+    """Factor of `--read-limit`, and the other arguments."""
+    rest, times = list(arguments), 1.0
+    for k in [k for k, a in enumerate(rest) if a.partition("=")[0] == _READ_LIMIT][::-1]:
+        name, found, value = rest[k].partition("=")
+        given = [value] if found else rest[k + 1 : k + 2]
+        try:
+            times = decimal(given[0])
+        except (IndexError, ValueError):
+            raise InputError(
+                f"{name} needs a number: how many times the usual limits of reading to allow, "
+                f"such as {name} 4."
+            ) from None
+        del rest[k : k + (1 if found else 2)]
+    return times, rest
 
 
 def _of_the_system(error: OSError) -> str:

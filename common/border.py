@@ -21,9 +21,13 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.strict_yaml import Place, load, place_text, printable
+from pupper_sysid.common.reading.budget import allowed, refuse_more
+from pupper_sysid.common.reading.content import content
+from pupper_sysid.common.strict_yaml import MAX_DEPTH, Place, load, place_text, printable
 
 LARGEST_BYTES = 2_000_000
+MOST_VALUES = 5_000_000
+"""Of a JSON text: values, names and brackets."""
 
 UNIT_OF_SUFFIX = {
     "counts_per_rad": "counts/rad",
@@ -44,6 +48,7 @@ _UNITS = (
     "rad_s|deg_s|rpm|rad|deg|degrees|mrad|ms|us|s|hz|steps|percent"
 )
 _UNIT_ENDING = re.compile(rf"_({_UNITS})$", re.IGNORECASE)
+_JSON_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"')
 
 _WANTED = {
     "string_type": "text (in quotes if it looks like a number)",
@@ -69,7 +74,7 @@ def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "
     ----------
     path : Path
     largest_bytes : float
-        Larger files are refused without being read.
+        Larger files are refused without being read (`common.reading.budget` raises it).
     remedy : str
         What to do, as a sentence; by default, to check the file's name.
 
@@ -78,20 +83,7 @@ def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "
     InputError
         If the file is missing, no regular file, larger, or cannot be read.
     """
-    try:
-        if not path.exists():
-            raise InputError(f"{path} does not exist. {remedy or 'Check the name.'}")
-        if not path.is_file():  # a pipe or a device never ends
-            raise InputError(f"{path} is not a file. {remedy or 'Give the name of a file.'}")
-        if path.stat().st_size > largest_bytes:
-            raise InputError(
-                f"{path} is larger than {largest_bytes / 1e6:g} MB, and no such file of this "
-                f"project is. {remedy or 'Check that it is the file you meant.'}"
-            )
-        return path.read_bytes()
-    except (OSError, ValueError) as error:  # a name with a null character is a ValueError
-        said = getattr(error, "strerror", None) or error
-        raise InputError(f"{path} cannot be read: {said}. {remedy}".rstrip()) from error
+    return content(path, largest_bytes, remedy)
 
 
 def read_text(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> str:
@@ -145,8 +137,10 @@ def parse_json(text: str, name: str, remedy: str = "") -> Any:
     Raises
     ------
     InputError
-        If it is not JSON.
+        If it is not JSON, has too many values, or is nested too deeply.
     """
+    refuse_more(name, sum(map(text.count, ",:[{")), MOST_VALUES, "values", remedy)
+    refuse_more(name, _depth(text), MAX_DEPTH, "levels of nesting", remedy)
     try:
         return json.loads(text)
     except RecursionError:
@@ -154,6 +148,23 @@ def parse_json(text: str, name: str, remedy: str = "") -> Any:
     except ValueError as error:
         what = str(error)
     raise InputError(f"{name} is not JSON: {what}. {remedy}".rstrip())
+
+
+def _depth(text: str) -> int:
+    """Levels of brackets in JSON text; 0 where they are certainly few."""
+    if text.count("[") + text.count("{") <= allowed(MAX_DEPTH):
+        return 0
+    found = _levels(text)
+    return found if found <= allowed(MAX_DEPTH) else _levels(_JSON_TEXT.sub("", text))
+
+
+def _levels(text: str) -> int:
+    import numpy as np
+
+    data = np.frombuffer(text.encode(errors="replace"), np.uint8)
+    data = data[(data == ord("[")) | (data == ord("{")) | (data == ord("]")) | (data == ord("}"))]
+    steps = np.where((data == ord("[")) | (data == ord("{")), 1, -1)
+    return int(np.cumsum(steps).max(initial=0))
 
 
 # --------------------------------------------------------------------------- schema and version

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import tempfile
 import threading
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.reading.content import open_regular
 
 PACKAGE = "pupper-sysid"
 
@@ -20,8 +22,21 @@ _SYNC_S = 1.0  # at most this much is lost with the power
 
 
 def refuse_overwrite(path: Path, force: bool = False) -> None:
-    """Raise unless `path` is free, or `force` was given."""
-    if path.exists() and not force:
+    """Raise unless `path` is free, or a file and `force` was given.
+
+    Devices, pipes and sockets are never replaced.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be written: {getattr(error, 'strerror', None) or error}."
+        ) from error
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} is there and is not a file. Choose another name.")
+    if not force:
         raise FileExistsRefusal(
             f"{path} exists already. Choose another name, or set `force=True` to replace it."
         )
@@ -160,8 +175,15 @@ class SyncedText:
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of the file at `path`."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """Hexadecimal SHA-256 of the file at `path`.
+
+    Raises
+    ------
+    InputError
+        If it is no regular file, or cannot be read.
+    """
+    with open_regular(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def versions(*more: str) -> dict[str, str]:

@@ -16,8 +16,10 @@ import yaml
 from yaml.composer import Composer
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
 
 MAX_DEPTH = 20
+MOST_NODES = 100_000
 
 Place = tuple[str | int, ...]
 """Where a value stands in a file: keys and list indices from the top."""
@@ -64,7 +66,7 @@ class StrictLoader(_Loader):
     def __init__(self, text: str, name: str = "the text"):
         super().__init__(text)
         self.name, self.lines = name, dict[Place, int]()
-        self._depth = 0
+        self._depth = self._nodes = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """The next node, unless it is of a kind that is refused."""
@@ -83,8 +85,10 @@ class StrictLoader(_Loader):
         if tag is not None:
             raise InputError(f"{where} uses a YAML tag ({printable(tag)}). Write the plain value.")
         if self._depth > MAX_DEPTH:
-            raise InputError(f"{where} is nested deeper than {MAX_DEPTH} levels. Check the file.")
-        self._depth += 1
+            refuse_more(where, self._depth, MAX_DEPTH, "levels of nesting", exact=False)
+        if self._nodes > MOST_NODES:
+            refuse_more(self.name, self._nodes, MOST_NODES, "values", exact=False)
+        self._depth, self._nodes = self._depth + 1, self._nodes + 1
         node = super().compose_node(parent, index)  # pyright: ignore[reportArgumentType]
         self._depth -= 1
         return node
@@ -147,6 +151,8 @@ def load(text: str, name: str = "the text") -> tuple[Any, dict[Place, int]]:
     try:
         loader = StrictLoader(text, name)
         return loader.get_single_data(), loader.lines
+    except RecursionError:
+        raise InputError(f"{name} is nested too deeply. Check the file.") from None
     except yaml.YAMLError as error:
         what = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
         if what == "but found another document":

@@ -153,7 +153,10 @@ def test_pages_name_commands_and_options_that_exist():
                 break
             command.append(words.pop(0))
         assert command or not known or words[0].startswith("-"), f"{page.name}: {line}"
-        shown = docs_conf.help_text(module, *command) + " --version --install-completion --debug"
+        shown = (
+            docs_conf.help_text(module, *command)
+            + " --version --install-completion --debug --read-limit"
+        )
         for word in words:
             if word.startswith("--"):
                 option = word.split("=")[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, RED, WIDTH_IN, axes_column, styled
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.page import Column, Picture, Section, Table
+from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.analysis.evaluation import Evaluation, Figures, Standing
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.train.curves import PROGRESS
+from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run
 
 ERRORS = {
@@ -146,12 +147,12 @@ def _curves(path: Path) -> dict[str, np.ndarray] | None:
     """Columns of `progress.csv`; None if there is none."""
     if not path.exists():
         return None
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    try:
-        return {k: np.array([float(r[k]) for r in rows]) for k in ("samples", *_CURVES)}
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{path}: this is no progress of a training; move it away.") from None
+    remedy = "Move it away for a page without the training."
+    found = read_table(path, read_text(path, LARGEST_BYTES, remedy), strict=False).numbers
+    lacking = [name for name in ("samples", *_CURVES) if name not in found]
+    if lacking:
+        raise InputError(f"{path} has no numbers called {lacking[0]}. {remedy}")
+    return {name: found[name] for name in ("samples", *_CURVES)}
 
 
 @styled

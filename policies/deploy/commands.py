@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
+from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.csv_table import column_names, read_table
 
 Commands = Callable[[float], NDArray[np.float64] | None]
 """Forward and sideways speed [m/s] and turn rate [rad/s] by time since the first tick [s]; None to
@@ -44,20 +45,21 @@ def script(path: Path) -> Commands:
     InputError
         If the file cannot be read, or a row is no command.
     """
-    try:
-        table = pd.read_csv(path, comment="#")
-    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{path} is no readable CSV file of commands: {error}.") from error
-    if tuple(table.columns) != COLUMNS or not len(table):
+    text = read_text(path)
+    if tuple(column_names(path, text)) != COLUMNS:
         raise InputError(f"{path}: it needs rows with the columns {','.join(COLUMNS)}.")
-    rows = table.apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    table = read_table(path, text)
+    if table.cut or not len(table):
+        raise InputError(f"{path} has no rows, or its last one is cut short.")
+    rows = np.stack([table.numbers[name] for name in COLUMNS], axis=-1)
     bad = np.flatnonzero(
         ~np.isfinite(rows).all(axis=1) | (np.abs(rows[:, 1:]) > _LARGEST).any(axis=1)
         | ~(rows[:, 0] > 0)
     )  # fmt: skip
     if len(bad):
         raise InputError(
-            f"{path}, row {bad[0] + 1}: seconds must be positive and speeds within ±{_LARGEST:g}."
+            f"{path}, line {table.line[bad[0]]}: seconds must be positive and speeds within "
+            f"±{_LARGEST:g}."
         )
     ends = np.cumsum(rows[:, 0])
 

@@ -8,26 +8,32 @@ reason of the end; a log without it was cut short.
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
-from pupper_sysid.common.border import parse_json, read_text, refuse_other_version
+from pupper_sysid.common.border import parse_json, read_text, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.reading.csv_table import (
+    column_names,
+    comments_of,
+    one_line_end,
+    read_table,
+)
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
 from pupper_sysid.policies.deploy.filters import Rest
 from pupper_sysid.sim.walking.observation import OBSERVATION_SIZE
 
 TITLE = "# pupper-sysid walk"
 SCHEMA_VERSION = 1
-_LARGEST_BYTES = 4e9  # about a day
+_LARGEST_BYTES = 1e9
 
 _AXES = ("x", "y", "z")
 _COMMAND = ("forward_m_s", "left_m_s", "turn_rad_s")
@@ -91,6 +97,29 @@ class Walk:
     """Reason of the end; None if the log was cut short."""
 
 
+_Three = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class _Rest(BaseModel):
+    """The IMU at rest, as a header has it."""
+
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+    gravity: _Three
+    bias_rad_s: _Three
+
+
+class _Start(BaseModel):
+    """The part of a header that begins a replay; other keys are kept."""
+
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+    rest: _Rest
+    start_rad: Annotated[
+        list[float], Field(min_length=len(JOINT_NAMES), max_length=len(JOINT_NAMES))
+    ]
+
+
 def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:
     """The part of a header that `read_walk` needs."""
     return {
@@ -107,13 +136,13 @@ def read_walk(path: Path) -> Walk:
     InputError
         If it is none, or damaged.
     """
-    text = read_text(path, _LARGEST_BYTES)
-    lines = text[: text.rfind("\n") + 1].splitlines()
-    if not lines or lines[0] != TITLE:
+    text = one_line_end(read_text(path, _LARGEST_BYTES))
+    text = text[: text.rfind("\n") + 1]  # the last line may be cut short
+    if text.partition("\n")[0] != TITLE:
         raise InputError(f"{path} is no log of a walk; pupper-deploy writes them.")
     header: dict[str, Any] = {}
     ended = None
-    for line in lines[1:]:
+    for _, line in comments_of(path, text)[1:]:
         key, colon, value = line.removeprefix("# ").partition(": ")
         if not line.startswith("# ") or not colon:
             continue
@@ -122,16 +151,13 @@ def read_walk(path: Path) -> Walk:
             continue
         header[key] = parse_json(value, f"{path}: its header's {key}", "Was it edited?")
     refuse_other_version(path, header.get("schema_version"), SCHEMA_VERSION)
-    rows = [row for row in csv.reader(line for line in lines if not line.startswith("#"))]
-    if not rows or tuple(rows[0]) != COLUMNS:
+    if tuple(column_names(path, text)) != COLUMNS:
         raise InputError(f"{path}: its columns are not those of a walk. Was it edited?")
-    try:
-        numbers = np.array([[float(x) for x in row] for row in rows[1:]]).reshape(-1, len(COLUMNS))
-        rest = header["rest"]
-        begin = Rest(np.array(rest["gravity"], float), np.array(rest["bias_rad_s"], float))
-        start = np.array(header["start_rad"], float).reshape(len(JOINT_NAMES))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: a row or its header is damaged: {error}.") from error
+    known = validated(_Start, header, f"{path}, header")
+    begin = Rest(np.array(known.rest.gravity), np.array(known.rest.bias_rad_s))
+    start = np.array(known.start_rad)
+    table = read_table(path, text)
+    numbers = np.stack([table.numbers[name] for name in COLUMNS], axis=-1)
     place = {name: i for i, name in enumerate(COLUMNS)}
 
     def columns(names: tuple[str, ...]) -> NDArray[np.float64]:

@@ -134,7 +134,7 @@ class ServoCard(Part):
     """Recordings of our own fit, by name and hash."""
     scores: Annotated[tuple[Score, ...], Field(strict=False)] = ()
     """Errors of the numbers on recordings."""
-    date: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")]
+    date: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$")]
     """Day on which the numbers were read from the source, or fitted: year-month-day."""
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Notes for the reader, in sentences."""

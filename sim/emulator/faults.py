@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.hardware.feetech.frames import Frame
 
 ANSWER_KINDS = (
@@ -73,7 +74,7 @@ class BusFaults:
         for part in filter(None, (piece.strip() for piece in text.split(","))):
             kind, _, rate = part.partition("=")
             try:
-                rates[kind] = float(rate)
+                rates[kind] = decimal(rate)
             except ValueError:
                 raise InputError(
                     f"`faults`: '{part}' is not kind=probability, such as lost=0.02."

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.results import Result, derived
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds
@@ -124,7 +125,7 @@ def parse_goal(text: str) -> Goal:
     if found[3] not in _UNITS:
         raise InputError(f"`until`: '{text}' has no unit of time; {form}.")
     try:
-        half = float(found[2]) * _UNITS[found[3]]
+        half = decimal(found[2]) * _UNITS[found[3]]
     except ValueError:
         raise InputError(f"`until`: '{found[2]}' is not a number; {form}.") from None
     if not LEAST_HALF_WIDTH_S < half <= 1:

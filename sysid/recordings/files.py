@@ -19,8 +19,9 @@ import numpy as np
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
+from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.importers.recognise import read_content, read_folder
-from pupper_sysid.sysid.recordings.importers.shared.log import Log
+from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, Log
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -29,7 +30,6 @@ from pupper_sysid.sysid.recordings.table import (
     REQUIRED_COLUMNS,
     SCHEMA_VERSION,
     TITLE,
-    check,
     check_metadata,
     comment,
     parse,
@@ -38,7 +38,6 @@ from pupper_sysid.sysid.recordings.table import (
 FOLDER = Path("recordings")
 
 _ADVICE = "; what is there can be continued with `resume`"
-_LARGEST_BYTES = 500e6
 
 
 def load(path: Path | str, options: LogOptions | None = None) -> Recording:
@@ -113,9 +112,7 @@ def read_bytes(path: Path) -> bytes:
     """Content of a recording file; an unreadable, empty or huge file is refused."""
     if not path.exists():
         raise InputError(f"{path} does not exist. Check the name, or run a sweep first.")
-    if path.is_file() and path.stat().st_size > _LARGEST_BYTES:
-        raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB; split it by joint.")
-    data = border.read_bytes(path, _LARGEST_BYTES)
+    data = border.read_bytes(path, LARGEST_BYTES)
     if not data.strip():
         raise InputError(f"{path} is empty: the recording never started. Record it again.")
     return data

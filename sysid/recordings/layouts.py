@@ -14,6 +14,7 @@ metadata say so.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,9 @@ import pandas as pd
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.shared.times import PAUSE_S, READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_columns
@@ -44,7 +47,7 @@ def convert(
         If the columns belong to no known layout.
     """
     options = options or LogOptions()
-    columns = set(parsed.table.columns)
+    columns = {*parsed.table.columns, *parsed.faults}
     if {"send_time_s", "read_time_s"} & columns and not options.command:
         require(path, parsed.table, REQUIRED_COLUMNS)
         options.refuse("recording of this project", ())
@@ -82,7 +85,7 @@ def _table(parsed: Parsed) -> Table:
     numbers, texts = {}, {}
     for name in parsed.table.columns:
         values = parsed.table[name]
-        if name in parsed.faults or not pd.api.types.is_numeric_dtype(values):
+        if not pd.api.types.is_numeric_dtype(values):
             texts[str(name)] = [str(v) for v in values]
         else:
             numbers[str(name)] = values.to_numpy(float)
@@ -121,12 +124,16 @@ def _sweep(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, An
     # a new tone or another joint starts a trial, and the clock again
     changed = (np.diff(table["freq_hz"].to_numpy()) != 0) | (np.diff(index) != 0)
     restarted = changed | (np.diff(time) < -0.5)
-    trial = np.concatenate([[0], np.cumsum(restarted)])
-    shift, last = np.zeros(len(time)), 0.0
-    for n in np.unique(trial):
-        rows = trial == n
-        shift[rows] = last - np.nanmin(time[rows]) if n else 0.0
-        last = float(np.nanmax(time[rows]) + shift[rows][0]) + PAUSE_S
+    starts = np.concatenate([[0], 1 + np.flatnonzero(restarted)])
+    refuse_more(path, len(starts), MOST_TRIALS, "trials", "Split it by joint or by trial.")
+    trial, shift, last = np.zeros(len(time)), np.zeros(len(time)), 0.0
+    for n, (start, stop) in enumerate(pairwise([*starts, len(time)])):
+        own = time[start:stop]
+        if not np.isfinite(own).any():  # `check` leaves rows without a time out
+            continue
+        trial[start:stop] = n
+        shift[start:stop] = last - np.nanmin(own) if n else 0.0
+        last = float(np.nanmax(own) + shift[start]) + PAUSE_S
     pose = np.array([DEFAULT_POSE[name] for name in names])
     tidy = pd.DataFrame(
         {
@@ -146,7 +153,9 @@ def _sweep(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, An
 
 def _playback(path: Path | str, parsed: Parsed) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
     table = parsed.table
-    joints = [j for j in JOINT_NAMES if f"{j}_command_rad" in table.columns]
+    joints = [
+        j for j in JOINT_NAMES if {f"{j}_command_rad", f"{j}_position_rad"} & {*table.columns}
+    ]
     parts = []
     for joint in joints:
         require(path, table, (f"{joint}_command_rad", f"{joint}_position_rad"))

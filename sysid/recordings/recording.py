@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
+from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.shared.times import READ_AFTER_SEND_S
@@ -32,7 +33,6 @@ from pupper_sysid.sysid.recordings.table import (
     TEXT_COLUMNS,
     TITLE,
     Parsed,
-    check,
     check_metadata,
     comment,
     comments,

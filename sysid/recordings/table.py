@@ -1,11 +1,11 @@
-"""Validation of recordings: CSV text to a table of numbers, or an error that names the place."""
+"""Recording files as tables of numbers and a header, or an error that names the place."""
 
 from __future__ import annotations
 
-import csv
 import difflib
 import json
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,9 +16,15 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.common.reading.csv_table import (
+    CsvTable,
+    column_names,
+    comments_of,
+    numbers_of,
+    read_table,
+)
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.shared.log import MOST_CELLS
+from pupper_sysid.sysid.recordings.importers.wide import JOINT_COLUMNS
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -30,13 +36,12 @@ OPTIONAL_COLUMNS = (
     "position_count", "voltage_v", "temperature_c", "load", "p_gain", "torque_enabled",
 )  # fmt: skip
 
-_LEAST_ROWS = 20
-_MANY_REPEATED = 0.1  # of the rows
-_SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
-_LARGEST_RAD = 2 * np.pi + 0.5  # no joint of a legged robot turns further
+LARGEST_RAD = 2 * np.pi + 0.5
+"""Largest angle: no joint of a legged robot turns further."""
+LARGEST_COUNT = 2**31
+"""Largest number of a trial, and largest count of an encoder."""
 _FINEST_RAD, _COARSEST_RAD = 1e-7, 0.2  # of a count
 _FARTHEST_ZERO_RAD = 100.0  # angle of count 0: a servo of several turns
-_LARGEST_COUNT = 2**31
 TEXT_COLUMNS = ("joint", "signal")
 
 
@@ -46,7 +51,7 @@ def _a_count(quantum_rad: float) -> float:
     return quantum_rad
 
 
-_Angle = Annotated[float, Field(ge=-_LARGEST_RAD, le=_LARGEST_RAD)]
+_Angle = Annotated[float, Field(ge=-LARGEST_RAD, le=LARGEST_RAD)]
 _Zero = Annotated[float, Field(ge=-_FARTHEST_ZERO_RAD, le=_FARTHEST_ZERO_RAD)]
 _Quantum = Annotated[float, Field(ge=0, le=_COARSEST_RAD), AfterValidator(_a_count)]
 
@@ -90,7 +95,8 @@ class Parsed:
         Numbers, but for the columns of text; empty cells are NaN.
     warnings : list of str
     faults : dict of str to str
-        Columns of other projects' logs that hold text, and the sentence on the first such cell.
+        Columns of other projects' logs that are not in the table, for they hold text, and the
+        sentence on the first such cell.
     """
 
     metadata: dict[str, Any]
@@ -105,149 +111,46 @@ def parse(path: Path, text: str) -> Parsed:
     Raises
     ------
     InputError
-        For ragged rows, text where a number belongs, a broken or newer header.
+        For ragged rows, text where a number belongs, a broken or newer header, or more than is
+        read (`common.reading.budget`).
     """
-    lines = text.splitlines()
-    metadata = header(path, lines)
-    warnings: list[str] = []
-    rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
-    if not rows:
+    columns = column_names(path, text)
+    if not columns:
+        header(path, text)
         raise InputError(f"{path} has no rows: the recording never started. Record it again.")
-    columns = [c.strip() for c in next(csv.reader([rows[0][1]]))]
     if len(columns) == 1 and ";" in columns[0]:
         raise InputError(
-            f"{path}, line {rows[0][0]}: cells are separated by semicolons. Save it with commas "
+            f"{path}, its column names: cells are separated by semicolons. Save it with commas "
             "between cells and points in numbers."
         )
-    if len(set(columns)) != len(columns):
-        raise InputError(f"{path}, line {rows[0][0]}: a column name stands twice. Rename one.")
     ours = "send_time_s" in columns
     strict = ours or "motor_idx" in columns
-    if not ours and len(columns) * len(rows) > MOST_CELLS:
-        raise InputError(f"{path} has more than {MOST_CELLS:,} cells. Split it by joint.")
-    body = rows[1:]
-    cancelled = _cancelled(lines, columns, body) if ours else []
-    for trial, first, last in cancelled:
+    texts = [c for c in columns if c in TEXT_COLUMNS or c.lower() in JOINT_COLUMNS]
+    # killed in the middle of a line: of ours the last one has no end
+    found = read_table(path, text, texts, strict, whole_lines=ours)
+    entries = _entries(path, text, found.comments)
+    metadata = _metadata(path, entries)
+    warnings: list[str] = []
+    keep = np.ones(len(found), bool)
+    for trial, rows in _cancelled(path, found, entries) if ours else []:
         warnings.append(
             f"trial {trial} was interrupted and recorded again; the second one is used."
         )
-        body = [(n, line) for n, line in body if not first <= n <= last]
-    # line by line: a stray quote must not swallow the lines behind it
-    cells = [_cells(path, n, line) for n, line in body]
-    numbers = [n for n, _ in body]
-    # killed in the middle of a line: the last one has no end, or too few cells
-    cut = bool(cells) and (len(cells[-1]) < len(columns) or (ours and not text.endswith("\n")))
-    if cut:
-        cells, numbers = cells[:-1], numbers[:-1]
+        keep[rows] = False
+    if found.cut:
         warnings.append("its last line was cut short and has been left out.")
-    for n, row in zip(numbers, cells, strict=True):
-        if len(row) != len(columns):
-            raise InputError(
-                f"{path}, line {n}: {len(row)} cells where the header names {len(columns)} "
-                "columns; command and position must have the same number of values. Mend or "
-                "remove the line."
-            )
-    if lines[0].startswith(TITLE) and "completed" not in metadata:
+    if text.startswith(TITLE) and "completed" not in metadata:
         warnings.append("it was not recorded to its end; what is there is used.")
-    if not cells:
+    if not len(found):
         raise InputError(f"{path} has column names but no rows. Record it again.")
     data: dict[str, Any] = {}
-    faults: dict[str, str] = {}
-    for k, name in enumerate(columns):
-        own = [row[k] for row in cells]
-        try:
-            data[name] = _column(path, name, own, numbers)
-        except InputError as error:
-            if strict:
-                raise
-            data[name], faults[name] = own, str(error)
-    return Parsed(metadata, pd.DataFrame(data), warnings, faults)
-
-
-def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Refuse or repair a tidy table.
-
-    Parameters
-    ----------
-    path : Path or str
-        Name of the source, for messages.
-    table : pandas.DataFrame
-
-    Returns
-    -------
-    table : pandas.DataFrame
-    warnings : list of str
-        One sentence per repair.
-
-    Raises
-    ------
-    InputError
-        If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
-    """
-    warnings: list[str] = []
-    if strange := strange_joint(table["joint"].to_list()):
-        raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
-    needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
-    lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
-    if lost.any():
-        warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
-        table = table.loc[~lost]
-    numbers = table["trial"].to_numpy(float)
-    if (np.abs(numbers) >= _LARGEST_COUNT).any() or (numbers % 1 != 0).any():
-        raise InputError(f"{path}, column trial: trials are counted by whole numbers.")
-    counts = np.abs(table["position_count"].to_numpy(float)) if "position_count" in table else []
-    if np.any(np.asarray(counts) >= _LARGEST_COUNT):
-        raise InputError(f"{path}, column position_count: a value is larger than any encoder's.")
-    position = table["position_rad"].to_numpy(float)
-    missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
-    if missing == 1.0:
-        raise InputError(
-            f"{path}, column position_rad: no row has a position, so the bus never answered. "
-            "Check power and wiring, then record again."
-        )
-    if missing > 0:
-        warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
-    for column in ("command_rad", "position_rad"):
-        _refuse_degrees(path, column, table[column].to_numpy())
-    again = table.duplicated(["joint", "trial", "send_time_s"])
-    if again.mean() > _MANY_REPEATED:
-        raise InputError(
-            f"{path}, column send_time_s: {100 * again.mean():.0f} % of the rows repeat a time "
-            "stamp of their trial: a clock too coarse, or two logs in one. Record with a clock of "
-            "1 ms or finer, and give each pass its own trial number."
-        )
-    if again.any():
-        warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
-        table = table.loc[~again]
-    short: list[tuple[str, float]] = []
-    for _, rows in table.groupby(["joint", "trial"], sort=False):
-        joint, trial = rows["joint"].iloc[0], rows["trial"].iloc[0]
-        for column in ("send_time_s", "read_time_s"):
-            back = np.flatnonzero(np.diff(rows[column].to_numpy()) < 0)
-            if len(back):
-                raise InputError(
-                    f"{path}, column {column}: time runs backwards in trial {trial:g} of {joint}, "
-                    f"after {rows[column].iloc[back[0]]:.4f} s. Sort the rows, or give each pass "
-                    "its own trial number."
-                )
-        tones = rows["frequency_hz"].dropna().unique()
-        if len(tones) > 1:
-            raise InputError(
-                f"{path}, column frequency_hz: trial {trial:g} of {joint} has {tones[0]:g} and "
-                f"{tones[1]:g} Hz. Give each frequency its own trial number."
-            )
-        if len(rows) < _SHORTEST_TRIAL:
-            short.append((joint, trial))
-            warnings.append(f"trial {trial:g} of {joint} is too short to use and was left out.")
-        elif len(rows) < _LEAST_ROWS:
-            warnings.append(f"trial {trial:g} of {joint} has only {len(rows)} rows.")
-    usable = ~pd.MultiIndex.from_arrays([table["joint"], table["trial"]]).isin(short)
-    if usable.sum() < _LEAST_ROWS:
-        raise InputError(
-            f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed. "
-            "Record for longer."
-        )
-    return table.loc[usable].reset_index(drop=True), warnings
+    for name in columns:
+        if name in found.texts:
+            data[name] = _numbered(path, name, found)
+        elif name in found.numbers:
+            data[name] = found.numbers[name]
+    table = pd.DataFrame(data)
+    return Parsed(metadata, table if keep.all() else table.loc[keep], warnings, found.faults)
 
 
 def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
@@ -264,7 +167,7 @@ def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> 
     )
 
 
-def header(path: Path, lines: list[str]) -> dict[str, Any]:
+def header(path: Path, text: str) -> dict[str, Any]:
     """Validated entries of a file's comment lines.
 
     Raises
@@ -272,17 +175,29 @@ def header(path: Path, lines: list[str]) -> dict[str, Any]:
     InputError
         If a value is not JSON or not of its type, or a newer version wrote the file.
     """
-    metadata: dict[str, Any] = {}
-    for n, line in enumerate(lines, 1):
+    return _metadata(path, _entries(path, text, comments_of(path, text)))
+
+
+def _entries(path: Path, text: str, lines: list[tuple[int, str]]) -> list[tuple[int, str, Any]]:
+    """Line, name and value of the entries in comment lines."""
+    found = []
+    # the last line of a file may be cut short
+    last = lines[-1][0] if lines and text.endswith(lines[-1][1]) else None
+    for n, line in lines:
         if not line.startswith("# ") or ": " not in line:
             continue
         key, _, value = line[2:].partition(": ")
-        name = f"{path}, line {n}: the value of '{key}'"
+        name = f"{path}, line {n}: the value of '{printable(key)[:60]}'"
         try:
-            metadata[key.strip()] = parse_json(value, name, "Mend or remove the line.")
+            found.append((n, key.strip(), parse_json(value, name, "Mend or remove the line.")))
         except InputError:
-            if lines[0].startswith(TITLE) and n < len(lines):
+            if text.startswith(TITLE) and n != last:
                 raise
+    return found
+
+
+def _metadata(path: Path, entries: list[tuple[int, str, Any]]) -> dict[str, Any]:
+    metadata = {key: value for _, key, value in entries}
     check_metadata(path, metadata)
     return metadata
 
@@ -309,62 +224,38 @@ def comment(key: str, value: Any) -> str:
     return f"# {key}: " + re.sub("[\x85\u2028\u2029]", lambda m: f"\\u{ord(m[0]):04x}", text)
 
 
-def _cells(path: Path, number: int, line: str) -> list[str]:
-    try:
-        return next(csv.reader([line], strict=True))
-    except csv.Error:
-        raise InputError(
-            f"{path}, line {number}: a quotation mark is not closed. Mend or remove the line."
-        ) from None
-
-
 def _cancelled(
-    lines: list[str], columns: list[str], rows: list[tuple[int, str]]
-) -> list[tuple[int, int, int]]:
-    """Trial, first and last line of rows that a later line `# resumed` cancels."""
-    found = []
-    at = columns.index("trial") if "trial" in columns else -1
-    for n, line in enumerate(lines, 1):
-        if at < 0 or not line.startswith("# resumed: "):
+    path: Path, found: CsvTable, entries: list[tuple[int, str, Any]]
+) -> list[tuple[int, slice]]:
+    """Trials, and their rows, that a later line `# resumed` cancels."""
+    resumed: dict[int, int] = {}
+    for n, key, value in entries:
+        if key != "resumed":
             continue
-        try:
-            trial = int(json.loads(line.partition(": ")[2])["trial"])
-        except (ValueError, KeyError, TypeError, RecursionError):
-            continue
-        void = [
-            k for k, row in rows
-            if k < n and len(cells := row.split(",")) > at and cells[at] == str(trial)
-        ]  # fmt: skip
-        if void:
-            found.append((trial, void[0], void[-1]))
-    return found
-
-
-def _column(path: Path, name: str, cells: list[str], numbers: list[int]) -> Any:
-    if name in TEXT_COLUMNS:
-        return [c.strip() for c in cells]
-    values, shown = np.full(len(cells), np.nan), printable(name)[:60]
-    for k, cell in enumerate(cells):
-        text = cell.strip()
-        if text == "":
-            continue
-        try:
-            values[k] = float(text)
-        except ValueError:
+        trial = value.get("trial") if isinstance(value, dict) else None
+        if type(trial) is not int or abs(trial) >= LARGEST_COUNT:
             raise InputError(
-                f"{path}, line {numbers[k]}, column {shown}: '{printable(text[:40])}' is not a "
-                "number. Mend the cell, or leave it empty if there was no reading."
-            ) from None
-        if np.isinf(values[k]):
-            raise InputError(f"{path}, line {numbers[k]}, column {shown}: the value is infinite.")
-    return values
+                f"{path}, line {n}: resumed names no trial by a whole number. Mend or remove the "
+                "line."
+            )
+        resumed[trial] = n
+    if not resumed or "trial" not in found.numbers:
+        return []
+    order = np.argsort(found.numbers["trial"], kind="stable")  # rows of a trial in their order
+    trials = found.numbers["trial"][order]
+    cancelled = []
+    for trial, n in resumed.items():
+        own = order[np.searchsorted(trials, trial) : np.searchsorted(trials, trial, "right")]
+        own = own[found.line[own] < n]
+        if len(own):
+            cancelled.append((trial, slice(own[0], own[-1] + 1)))
+    return cancelled
 
 
-def _refuse_degrees(path: Path | str, column: str, values: np.ndarray) -> None:
-    largest = float(np.nanmax(np.abs(values)))
-    if largest > _LARGEST_RAD:
-        raise InputError(
-            f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
-            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533, or "
-            "convert the log with `pupper-sysid import --unit deg` (counts:4096, …)."
-        )
+def _numbered(path: Path, name: str, found: CsvTable) -> Any:
+    """A column of text; as numbers where a column of joints numbers them."""
+    cells = found.texts[name]
+    if name not in TEXT_COLUMNS:
+        with suppress(InputError):
+            return numbers_of(path, name, cells, found.line)
+    return cells

@@ -20,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, TrialPlan, plan
 from pupper_sysid.sysid.sweep.waveforms import FASTEST_OF_MINIMUM_JERK, after, lift, strokes
@@ -86,8 +87,8 @@ def parse_load(text: str) -> PendulumLoad | None:
             name, unit = _MORE[key]
             if not value.endswith(unit):
                 raise ValueError
-            values[name] = float(value.removesuffix(unit))
-        load = PendulumLoad(mass_kg=float(found[1]), length_m=float(found[2]), **values)
+            values[name] = decimal(value.removesuffix(unit))
+        load = PendulumLoad(mass_kg=decimal(found[1]), length_m=decimal(found[2]), **values)
         if not load.gravity_nm > 0:
             raise ValueError
     except (ValueError, KeyError):
@@ -108,7 +109,7 @@ def parse_gains(text: str) -> list[int]:
         If one is no value of the register.
     """
     words = [word.strip() for word in text.split(",")]
-    gains = [int(word) if word.isdecimal() else 0 for word in words]
+    gains = [int(word) if word.isascii() and word.isdecimal() else 0 for word in words]
     if any(not _GAINS[0] <= gain <= _GAINS[1] for gain in gains) or len(set(gains)) < len(gains):
         raise InputError(
             f"`gains`: '{text}' are no P gains; write values of the register, {_GAINS[0]} to "

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.sysid.sweep.waveforms import (
     Offset,
     after,
@@ -249,9 +250,9 @@ def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
         span, _, step_text = part.partition(":")
         low_text, dash, high_text = span.partition("-")
         try:
-            low = float(low_text)
-            high = float(high_text) if dash else low
-            step = float(step_text) if step_text else 1.0
+            low = decimal(low_text)
+            high = decimal(high_text) if dash else low
+            step = decimal(step_text) if step_text else 1.0
         except ValueError:
             raise InputError(
                 f"`frequencies`: '{part}' is not a frequency in Hz. Write 1-10, 1-10:0.5 or 1,2,4."

@@ -8,18 +8,23 @@ policy holds its own. A column `loop` (as in a recorded playback) makes each of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
+from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, TrialPlan
 
 _LARGEST_RAD = 2 * np.pi
+_LARGEST_BYTES = 100e6
+_MOST_LOOPS = 1000
 
 
 def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
@@ -36,33 +41,33 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     InputError
         If the file cannot be read, lacks a column, or has values that are not angles or times.
     """
-    try:
-        table = pd.read_csv(path, comment="#")
-    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{path} is not a readable CSV file of commands: {error}.") from error
-    columns = {}
+    table = read_table(path, read_text(path, _LARGEST_BYTES), strict=False)
+    columns: dict[str, str] = {}
     for joint in JOINT_NAMES:
         for name in (f"{joint}_command_rad", joint):
-            if name in table and joint not in columns:
+            if name in table.columns and joint not in columns:
                 columns[joint] = name
     moving = [j for j in JOINT_NAMES if j in (columns if joints is None else joints)]
     missing = [j for j in moving if j not in columns]
-    if "time_s" not in table or not moving or missing or not len(table):
+    if "time_s" not in table.columns or not moving or missing or not len(table):
         wanted = f"{(missing or ['LF_hip'])[0]}_command_rad"
         raise InputError(
             f"{path} is not a file of commands: it needs rows with columns time_s and {wanted}; "
             f"it has {len(table)} rows of {', '.join(map(str, table.columns[:8]))}."
         )
-    used = ["time_s", *(columns[j] for j in moving), *(["loop"] if "loop" in table else [])]
-    numbers = np.stack(
-        [np.asarray(pd.to_numeric(table[c], errors="coerce"), float) for c in used], axis=-1
-    )
-    bad = np.argwhere(~np.isfinite(numbers))
+    if table.cut:
+        raise InputError(f"{path}: its last line is cut short. Copy it again, or remove the line.")
+    used = [n for n in ("time_s", *(columns[j] for j in moving), "loop") if n in table.columns]
+    fault = next((table.faults[name] for name in used if name in table.faults), None)
+    if fault:
+        raise InputError(fault)
+    numbers = np.stack([table.numbers[name] for name in used], axis=-1)
+    bad = np.argwhere(np.isnan(numbers))
     if len(bad):
         row, column = bad[0]
         raise InputError(
-            f"{path}: column {used[column]}, data row {row + 1} is not a number; "
-            "every command and time must be one."
+            f"{path}, line {table.line[row]}, column {used[column]} is empty; every command and "
+            "time must be a number."
         )
     numbers, loops = numbers[:, : len(moving) + 1], numbers[:, len(moving) + 1 :]
     largest = float(np.abs(numbers[:, 1:]).max())
@@ -73,8 +78,12 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     loops = loops[:, 0] if loops.size else np.zeros(len(table))
     first = numbers[0, 1:]
     trials = []
-    for loop in pd.unique(loops):
-        part = numbers[loops == loop]
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(loops) != 0]))
+    refuse_more(path, len(starts), _MOST_LOOPS, "loops")
+    if len(np.unique(loops)) < len(starts):
+        raise InputError(f"{path}, column loop: the rows of a loop must follow one another.")
+    for start, stop in pairwise([*starts, len(numbers)]):
+        part = numbers[start:stop]
         time, command = part[:, 0] - part[0, 0], part[:, 1:]
         if len(time) < 2 or not (np.diff(time) > 0).all():
             raise InputError(f"{path}: time_s must increase from row to row within a loop.")

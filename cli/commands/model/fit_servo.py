@@ -13,6 +13,7 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.reading.numbers import whole
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
@@ -184,6 +185,6 @@ def _free_folder() -> Path:
 
 def _numbers(option: str, text: str) -> list[int]:
     try:
-        return [int(part) for part in text.split(",")]
+        return [whole(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{option} is '{text}'; write loop numbers with commas: 0,1.") from None

@@ -18,6 +18,7 @@ import yaml
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
+from pupper_sysid.common.reading.numbers import whole
 from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.feetech.registers import BAUD_RATES, SCS0009, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
@@ -250,12 +251,13 @@ def _parse_registers(text: str) -> tuple[tuple[str, int], ...]:
     found = []
     for part in filter(None, text.split(",")):
         name, _, value = (piece.strip() for piece in part.partition("="))
-        if name not in REGISTERS or not value.isdecimal() or int(value) > 65_535:
+        number = whole(value) if value.isascii() and value.isdecimal() else -1
+        if name not in REGISTERS or not 0 <= number <= 65_535:
             raise InputError(
                 f"--registers: '{part}' sets no register that acts here; write p=16, and of these: "
                 f"{', '.join(REGISTERS)}."
             )
-        found.append((name, int(value)))
+        found.append((name, number))
     return tuple(found)
 
 
@@ -266,11 +268,15 @@ def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
     ids: list[int] = []
     for part in (piece.strip() for piece in text.split(",")):
         low, dash, high = part.partition("-")
-        if not low.isdecimal() or (dash and not high.isdecimal()):
-            raise InputError(f"--ids: '{part}' is no id. Write 1-12 or 4,5,6.")
-        ids += range(int(low), int(high if dash else low) + 1)
-    wrong = [i for i in ids if i not in known]
-    if wrong or not ids:
+        try:
+            first, last = whole(low), whole(high if dash else low)
+        except ValueError:
+            raise InputError(f"--ids: '{part}' is no id. Write 1-12 or 4,5,6.") from None
+        if not min(known) <= first <= last <= max(known):
+            ids = []
+            break
+        ids += range(first, last + 1)
+    if not ids or not set(ids) <= set(known):
         raise InputError(
             f"--ids {text}: the emulated robot has the ids {min(known)} to {max(known)}."
         )

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.border import parse_json
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS
 from pupper_sysid.sysid.recordings.importers.parquet import read_columns
 from pupper_sysid.sysid.recordings.importers.shared.log import (
-    MOST_CELLS,
     Log,
     joint_names,
     number,
@@ -58,13 +59,12 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         If `meta/info.json` or the data are not as described.
     """
     info_path = folder / "meta" / "info.json"
-    data_paths = sorted((folder / "data").rglob("*.parquet"))[: _MOST_FILES + 1]
+    data_paths = sorted((folder / "data").rglob("*.parquet"))
     if not data_paths:
         raise InputError(
             f"{folder} is a LeRobot dataset without data/**/*.parquet. Fetch its data folder, too."
         )
-    if len(data_paths) > _MOST_FILES:
-        raise InputError(f"{folder} has more than {_MOST_FILES} data files. Give a part of it.")
+    refuse_more(folder, len(data_paths), _MOST_FILES, "data files", "Give a part of it.")
     contents, digest = read_files(folder, [info_path, *data_paths])
     info = parse_json(text_of(info_path, contents[info_path]), str(info_path))
     names = _names(info_path, info)
@@ -75,8 +75,8 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         read_columns(p, contents[p], [_ACTION, _STATE, "episode_index", "frame_index"])
         for p in data_paths
     ]
-    if sum(part[_STATE].size for part in parts) > MOST_CELLS:
-        raise InputError(f"{folder} has more than {MOST_CELLS:,} values. Give a part of it.")
+    values = sum(part[_STATE].size for part in parts)
+    refuse_more(folder, values, MOST_CELLS, "values", "Give a part of it.")
     columns = {key: _joined(folder, key, [part[key] for part in parts]) for key in parts[0]}
     commands, positions = (
         _chosen(folder, columns[key], names[key], names["joints"]) for key in (_ACTION, _STATE)

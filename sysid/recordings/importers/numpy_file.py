@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, MOST_COLUMNS, Log
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_COLUMNS
+from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, Log
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
 
@@ -36,11 +38,8 @@ def read_npz(path: Path, data: bytes, options: LogOptions) -> Log:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             inside = archive.infolist()
         size = sum(member.file_size for member in inside)
-        if len(inside) > MOST_COLUMNS or size > LARGEST_BYTES:
-            raise InputError(
-                f"{path} unpacks to {len(inside)} arrays and {size / 1e6:.0f} MB; at most "
-                f"{MOST_COLUMNS} and {LARGEST_BYTES / 1e6:.0f} MB are read. Split it."
-            )
+        refuse_more(f"{path}, unpacked,", len(inside), MOST_COLUMNS, "arrays", "Split it.")
+        refuse_more(f"{path}, unpacked,", size, LARGEST_BYTES, "bytes", "Split it.")
         with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
             arrays = {name: loaded[name] for name in loaded.files}
     except InputError:

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.shared.log import MOST_CELLS, MOST_COLUMNS, Log
+from pupper_sysid.sysid.recordings.importers.shared.log import Log
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
 
@@ -56,8 +58,7 @@ def columns_of(path: Path, data: bytes) -> dict[str, bool]:
     """
     pa = _library(path)
     schema = _open(path, data).schema_arrow
-    if len(schema) > MOST_COLUMNS:
-        raise InputError(f"{path} has {len(schema)} columns; at most {MOST_COLUMNS} are read.")
+    refuse_more(path, len(schema), MOST_COLUMNS, "columns", "Split the log.")
 
     def numeric(kind: Any) -> bool:
         if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
@@ -85,8 +86,7 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         raise InputError(
             f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(known)[:300]}."
         )
-    if _values(path, file, names) > MOST_CELLS:
-        raise InputError(f"{path} has more than {MOST_CELLS:,} values. Split the log.")
+    refuse_more(path, _values(path, file, names), MOST_CELLS, "values", "Split the log.")
     try:
         table = file.read(columns=list(names), use_threads=False)
         return {name: _array(path, name, table.column(name)) for name in names}

@@ -20,6 +20,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.ros_files import (
     Raw,
@@ -37,7 +39,6 @@ from pupper_sysid.sysid.recordings.importers.ros_messages import (
 )
 from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
 from pupper_sysid.sysid.recordings.importers.shared.log import (
-    MOST_CELLS,
     Log,
     joint_names,
     read_files,
@@ -218,8 +219,7 @@ def _topics(path: Path, raw: Sequence[Raw]) -> dict[str, _Topic]:
                 "it again."
             ) from error
         values += len(message.positions)
-        if values > MOST_CELLS:
-            raise InputError(f"{path} has more than {MOST_CELLS:,} positions. Split it.")
+        refuse_more(path, values, MOST_CELLS, "positions", "Split it.", exact=False)
         own = found.setdefault(topic, _Topic(kind))
         if message.positions:
             own.log_ns.append(log_ns)

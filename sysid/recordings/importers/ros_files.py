@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import allowed, refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.ros_messages import KINDS, plain_type
 from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES
@@ -34,8 +35,7 @@ def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
     found: list[Raw] = []
     for message in messages:
         found.append(message)
-        if len(found) > _MOST_MESSAGES:
-            raise InputError(f"{path} has more than {_MOST_MESSAGES:,} messages. Split it.")
+        refuse_more(path, len(found), _MOST_MESSAGES, "messages", "Split it.", exact=False)
     return found
 
 
@@ -66,15 +66,13 @@ def mcap_messages(path: Path, data: bytes, warnings: list[str]) -> Iterator[Raw]
         ) from None
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    left = LARGEST_BYTES
+    left = int(allowed(LARGEST_BYTES))
     try:
-        stream = StreamReader(
-            io.BytesIO(data), emit_chunks=True, record_size_limit=int(LARGEST_BYTES)
-        )
+        stream = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=left)
         for record in stream.records:
             inside: Sequence[Any] = [record]
             if isinstance(record, Chunk):
-                record.data = _unpacked(path, record.compression, record.data, int(left))
+                record.data = _unpacked(path, record.compression, record.data, left)
                 record.compression = ""
                 left -= len(record.data)
                 inside = breakup_chunk(record)
@@ -111,10 +109,8 @@ def _unpacked(path: Path, compression: str, data: bytes, most: int) -> bytes:
     else:
         found = data
     if len(found) > most:
-        raise InputError(
-            f"{path} unpacks to more than {LARGEST_BYTES / 1e6:.0f} MB. Keep the topics of joints "
-            "only (`mcap filter`)."
-        )
+        refuse_more(f"{path}, unpacked,", allowed(LARGEST_BYTES) + 1, LARGEST_BYTES, "bytes",
+                    "Keep the topics of joints only (`mcap filter`).", exact=False)  # fmt: skip
     return found
 
 

@@ -24,10 +24,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
 from pupper_sysid.sysid.recordings.importers.shared.log import (
-    MOST_CELLS,
     Log,
     joint_names,
     read_files,
@@ -116,8 +118,7 @@ def _serial_turns(
 def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times [s] and positions, shape (rows, joints), of one of the two tables."""
     text = text_of(path, data)
-    if text.count("\n") * joints > MOST_CELLS:
-        raise InputError(f"{path} has more than {MOST_CELLS:,} values. Split the log.")
+    refuse_more(path, text.count("\n") * joints, MOST_CELLS, "values", "Split the log.")
     reader = csv.reader(io.StringIO(text))
     header = [cell.strip() for cell in next(reader, [])]
     lacking = [c for c in ("timestamp", "positions") if c not in header]
@@ -136,7 +137,7 @@ def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], N
         except csv.Error as error:
             raise InputError(f"{path}, line {reader.line_num}: {error}. Mend the line.") from error
         if cells:
-            times.append(_value(path, reader.line_num, cells, at, float, "a time"))
+            times.append(_value(path, reader.line_num, cells, at, decimal, "a time"))
             wanted = f"a list of {joints} numbers, one per joint of {_JOINTS}"
             values.append(
                 _value(path, reader.line_num, cells, where, lambda c: _list(c, joints), wanted)

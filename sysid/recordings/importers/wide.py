@@ -23,10 +23,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.shared.log import (
-    MOST_CELLS,
-    MOST_COLUMNS,
+    MOST_JOINTS,
     Log,
     bare_name,
     joint_names,
@@ -56,7 +57,8 @@ POSITIONS = (
 )  # fmt: skip
 _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz")
-_JOINTS = ("joint", "joint_name", "motor", "motor_name", "name")
+JOINT_COLUMNS = ("joint", "joint_name", "motor", "motor_name", "name")
+"""Columns that may name the joint of a row, in lower case."""
 _NUMBERED = ("motor_idx", "motor_id", "joint_idx", "joint_id", "servo_id", "id")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
 _ENDING = r"(?:[_\s]?[(\[]?(?<![a-z])(rad|radians|deg|degrees|counts|ticks|raw)[)\]]?)?"
@@ -110,10 +112,8 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         If no time, or no joint with command and position, can be found; the message says what is
         missing.
     """
-    if len(table.names) > MOST_COLUMNS or sum(map(len, table.columns.values())) > MOST_CELLS:
-        raise InputError(
-            f"{path} has more than {MOST_COLUMNS:,} columns or {MOST_CELLS:,} cells. Split it."
-        )
+    refuse_more(path, len(table.names), MOST_COLUMNS, "columns", "Split it by joint.")
+    refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
     pairs = _pairs(path, table, options)
     time_name = _time(path, table, options)
     time_s, warnings = seconds(time_name, _numbers(path, table, time_name))
@@ -304,17 +304,24 @@ def _first(table: Table, names: Sequence[str]) -> str | None:
 def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
     """Rows by joint, where a column names or numbers it."""
     texts = {n.lower(): n for n in table.texts}
-    for name in _JOINTS:
+    for name in JOINT_COLUMNS:
         if name in texts:
-            values = np.array([str(v).strip() for v in table.texts[texts[name]]])
-            return {str(v): values == v for v in dict.fromkeys(values.tolist()) if v}
+            codes, found = pd.factorize(np.array(table.texts[texts[name]], object))
+            refuse_more(f"{path}, column {name}", len(found), MOST_JOINTS, "joints")
+            joints: dict[str, NDArray[np.bool_]] = {}
+            for code, value in enumerate(found):
+                if own := str(value).strip():
+                    joints[own] = joints.get(own, False) | (codes == code)
+            return joints
     name = _first(table, _NUMBERED)
     if name is None:
         return {}
     numbers = _numbers(path, table, name)
-    if len(np.unique(numbers)) > 1000:
+    known = np.unique(numbers[np.isfinite(numbers)])
+    if len(known) > 1000:
         return {}
-    return {f"motor_{v:g}": numbers == v for v in np.unique(numbers[np.isfinite(numbers)])}
+    refuse_more(f"{path}, column {name}", len(known), MOST_JOINTS, "joints")
+    return {f"motor_{v:g}": numbers == v for v in known}
 
 
 def _long(

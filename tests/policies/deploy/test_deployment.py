@@ -126,7 +126,9 @@ def test_a_log_cut_short_is_a_log_up_to_there(policy, tmp_path, cut):
         (lambda t: t.replace("schema_version: 1", "schema_version: 9"), "schema_version"),
         (lambda t: t.replace("elapsed_s,", "elapsed,", 1), "columns"),
         (lambda t: t.replace("# rest: ", "# rest: {", 1), "rest is not JSON"),
-        (lambda t: t.replace("# start_rad: [", "# start_rad: [1, ", 1), "damaged"),
+        (lambda t: t.replace("# start_rad: [", "# start_rad: [1, ", 1), "start_rad is"),
+        (lambda t: t.replace("# start_rad: [", "# start_rad: [1e400, ", 1), "start_rad"),
+        (lambda t: t.replace("\n0.", "\n٠.", 1), "is not a number"),
     ],
 )  # fmt: skip
 def test_a_damaged_log_is_refused_in_a_sentence(policy, tmp_path, change, says):
@@ -327,12 +329,13 @@ def test_a_script_gives_one_command_after_the_other_and_then_stops(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "no readable"),
+        ("", "columns"),
         ("a,b\n1,2\n", "columns"),
         ("seconds,forward_m_s,left_m_s,turn_rad_s\n", "rows"),
-        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0,0,0\n-1,0,0,0\n", "row 2"),
-        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,x,0,0\n", "row 1"),
-        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,90,0,0\n", "row 1"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0,0,0\n-1,0,0,0\n", "line 3"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,x,0,0\n", "line 2, column forward_m_s: 'x'"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,90,0,0\n", "line 2"),
+        ("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0,0,0\n1,0,0\n", "cut short"),
     ],
 )
 def test_a_script_that_is_none_is_refused(tmp_path, text, says):

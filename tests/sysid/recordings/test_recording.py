@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +32,20 @@ def write(tmp_path, lines, header=HEADER, top=("# pupper-sysid recording", "# sc
     return path
 
 
-def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_thread():
+def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_thread(tmp_path, monkeypatch):
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
     before = threading.active_count()
+    opened = Path.open
+    monkeypatch.setattr(
+        Path,
+        "open",
+        lambda path, *how, **more: opened(
+            Path("/dev/full") if path.name == "a.csv" else path, *how, **more
+        ),
+    )
     with pytest.raises(InputError, match="No space left"):
-        RecordingWriter(Path("/dev/full"), {}, force=True)
+        RecordingWriter(tmp_path / "a.csv", {})
     assert threading.active_count() == before
 
 
@@ -142,6 +151,62 @@ def test_files_that_are_no_recording_are_refused(tmp_path, content, said):
     path.write_bytes(content)
     with pytest.raises(InputError, match=said):
         load(path)
+
+
+@pytest.mark.parametrize(
+    "entry", ['{"trial": Infinity}', '{"trial": 1e400}', '{"trial": 0.5}', '{"trial": true}',
+              '{"trial": "0"}', '{"trial": 10000000000}', "[0]", "null", "0"]
+)  # fmt: skip
+def test_a_resumption_of_no_trial_is_refused(tmp_path, entry):
+    path = write(tmp_path, [*rows(), f"# resumed: {entry}", *rows(trial=1)])
+    with pytest.raises(InputError, match="line 44: resumed names no trial"):
+        load(path)
+
+
+def test_a_trial_that_was_resumed_counts_from_there(tmp_path):
+    path = write(tmp_path, [*rows(), *rows(30, trial=1), '# resumed: {"trial": 1}',
+                            *rows(25, trial=1)])  # fmt: skip
+    recording = load(path)
+    assert [len(t.send_time_s) for t in recording.trials("LF_hip")] == [40, 25]
+    assert sum("trial 1 was interrupted" in w for w in recording.warnings) == 1
+
+
+@pytest.mark.parametrize("digits", ["0_1", "٠", "０.１", "1e-0_1"])
+def test_numbers_are_decimal_numerals_in_ascii(tmp_path, digits):
+    with pytest.raises(InputError, match="line 7, column position_rad: '.*' is not a number"):
+        load(write(tmp_path, changed(3, "position_rad", digits)))
+
+
+def test_trials_are_counted_by_whole_numbers(tmp_path):
+    with pytest.raises(InputError, match="column trial: trials are counted by whole numbers"):
+        load(write(tmp_path, [*rows(trial="0.25"), *rows(trial="0.75")]))
+
+
+def test_a_log_with_positions_only_says_which_column_is_missing(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("time_s,loop,LF_hip_position_rad\n" + "0.1,0,0.1\n" * 40)
+    with pytest.raises(InputError, match="column LF_hip_command_rad is missing"):
+        load(path)
+
+
+@pytest.mark.parametrize(("each", "says"), [(1, "trials; at most 50,000"), (2, "0 usable rows")])
+def test_very_many_trials_are_answered_at_once(tmp_path, each, says):
+    lines = [f"{k},{k}.001,{k // each},LF_hip,1.0,0.1,0.1" for k in range(60_000)]
+    started = time.process_time()
+    with pytest.raises(InputError, match=says):
+        load(write(tmp_path, lines))
+    assert time.process_time() - started < 4
+
+
+def test_an_import_whose_trials_change_with_each_row_is_answered_at_once(tmp_path):
+    path = tmp_path / "sweep.csv"
+    lines = ["time_s,phase,amp_rad,freq_hz,motor_idx,signal,command_rad,actual_rad"]
+    lines += [f"{k},0,0.3,{k},1,0,0.1,0.1" for k in range(60_000)]
+    path.write_text("\n".join(lines) + "\n")
+    started = time.process_time()
+    with pytest.raises(InputError, match="trials"):
+        load(path)
+    assert time.process_time() - started < 4
 
 
 def test_a_file_of_a_newer_version_is_refused(tmp_path):

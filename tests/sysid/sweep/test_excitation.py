@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -238,8 +240,11 @@ def test_playback_holds_each_recorded_command_until_the_next(tmp_path):
     [
         ({"time_s": [0.0, 1.0]}, "LF_hip_command_rad"),
         ({"LF_hip": [0.0, 1.0]}, "time_s"),
-        ({"time_s": [0.0, 1.0], "LF_hip": [0.0, np.nan]}, "row 2"),
-        ({"time_s": [0.0, 1.0], "LF_hip": ["0", "zero"]}, "row 2"),
+        ({"time_s": [0.0, 1.0], "LF_hip": [0.0, np.nan]}, "line 3, column LF_hip is empty"),
+        ({"time_s": [0.0, 1.0], "LF_hip": ["0", "zero"]}, "line 3, column LF_hip: 'zero' is not"),
+        ({"time_s": [0.0, 1.0], "LF_hip": ["0", "4_1"]}, "'4_1' is not a number"),
+        ({"time_s": [0.0, 1.0, 2.0], "LF_hip": [0, 0, 0], "loop": [0, 1, 0]}, "follow one another"),
+        ({"time_s": range(2000), "LF_hip": [0] * 2000, "loop": range(2000)}, "2,000 loops"),
         ({"time_s": [0.0, 1.0], "LF_hip": [0.0, 45.0]}, "radians"),
         ({"time_s": [1.0, 0.0], "LF_hip": [0.0, 0.1]}, "increase"),
         ({"time_s": [1.0], "LF_hip": [0.0]}, "increase"),
@@ -249,6 +254,21 @@ def test_playback_holds_each_recorded_command_until_the_next(tmp_path):
 def test_unusable_command_files_are_refused_by_place(tmp_path, columns, said):
     with pytest.raises(InputError, match=said):
         playback(write(tmp_path / "bad.csv", **columns))
+
+
+def test_a_command_file_that_was_cut_short_is_refused(tmp_path):
+    path = write(tmp_path / "cut.csv", time_s=[0.0, 1.0, 2.0], LF_hip=[0.0, 0.1, 0.2])
+    path.write_text(path.read_text()[:-5])
+    with pytest.raises(InputError, match="cut short"):
+        playback(path)
+
+
+@pytest.mark.parametrize("name", ["fifo", "device"])
+def test_a_command_file_that_never_ends_is_refused_at_once(tmp_path, name):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    with pytest.raises(InputError, match="is not a file"):
+        playback(tmp_path / name)
 
 
 def test_a_missing_or_binary_command_file_is_refused(tmp_path):

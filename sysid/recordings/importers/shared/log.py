@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.strict_yaml import printable
 
 LARGEST_BYTES = 500e6
 """Largest log that is read, of all its files."""
-MOST_CELLS = 20_000_000
-"""Largest number of rows times columns of a log's table."""
-MOST_COLUMNS = 2_000
+MOST_TRIALS = 50_000
+"""Of all joints together."""
 MOST_JOINTS = 200
 
 _ENDINGS = re.compile(r"[._/](pos|position)$", re.IGNORECASE)
@@ -84,8 +84,7 @@ def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
     >>> joint_names("log", ["shoulder pan.pos", "2nd/wrist"])
     ['shoulder_pan', 'joint_2nd_wrist']
     """
-    if len(given) > MOST_JOINTS:
-        raise InputError(f"{path} has {len(given)} joints; at most {MOST_JOINTS} are read.")
+    refuse_more(path, len(given), MOST_JOINTS, "joints", "Name those to read with `joints`.")
     found = []
     for name in given:
         text = re.sub(r"[^A-Za-z0-9]+", "_", bare_name(str(name))).strip("_")
@@ -148,12 +147,12 @@ def read_files(root: Path, files: Iterable[Path]) -> tuple[dict[Path, bytes], st
         If one cannot be read, or all together are too large.
     """
     found: dict[Path, bytes] = {}
-    left, digest = LARGEST_BYTES, hashlib.sha256()
+    total, digest = 0, hashlib.sha256()
+    remedy = "Give a part of the log, or split it by joint or by episode."
     for path in sorted(files):
-        found[path] = border.read_bytes(
-            path, left, "Give a part of the log, or split it by joint or by episode."
-        )
-        left -= len(found[path])
+        found[path] = border.read_bytes(path, LARGEST_BYTES, remedy)
+        total += len(found[path])
+        refuse_more(root, total, LARGEST_BYTES, "bytes", remedy, exact=False)
         digest.update(f"{path.relative_to(root).as_posix()}\0{len(found[path])}\0".encode())
         digest.update(found[path])
     return found, digest.hexdigest()

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 
 READ_AFTER_SEND_S = 0.0005
@@ -92,6 +94,11 @@ def one_after_another(
     """Trial number of each row, and times with trials that start again put after one another.
 
     A trial is a run of rows of one number in `trial`; a step back in time starts one, too.
+
+    Raises
+    ------
+    InputError
+        If there are too many trials.
     """
     number = np.zeros(len(stamp)) if trial is None else trial
     with np.errstate(invalid="ignore"):
@@ -99,6 +106,7 @@ def one_after_another(
     runs = np.cumsum(new)
     shifted, last = stamp.astype(float).copy(), -np.inf
     starts = np.flatnonzero(np.concatenate([[True], new[1:]]))
+    refuse_more("The log", len(starts), MOST_TRIALS, "trials", "Check its times, or split it.")
     for start, end in zip(starts, [*starts[1:], len(stamp)], strict=True):
         own = shifted[start:end]
         if not np.isfinite(own).any():

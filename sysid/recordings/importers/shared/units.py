@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.strict_yaml import printable
 
 COUNT_RAD = 2 * np.pi / 4096
@@ -114,7 +115,7 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     if word in ("rad", "deg") and not value:
         return Unit(1.0 if word == "rad" else np.pi / 180)
     try:
-        size = float(value)
+        size = decimal(value)
     except ValueError:
         size = 0.0
     if word == "counts" and 2 <= size <= 2**31:

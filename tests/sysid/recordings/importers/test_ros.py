@@ -298,7 +298,7 @@ def test_damaged_and_other_databases_are_refused(tmp_path):
 
 def test_a_chunk_that_unpacks_to_more_than_the_budget_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros_files.LARGEST_BYTES", 2e4)
-    with pytest.raises(InputError, match="unpacks to more than"):
+    with pytest.raises(InputError, match="unpacked, has more than 20,000 bytes"):
         load(written(tmp_path / "a.mcap", messages()))
 
 

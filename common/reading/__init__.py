@@ -1,0 +1,1 @@
+"""Reading of files that may be hostile: content, budgets, numbers, tables."""

@@ -1,0 +1,368 @@
+"""CSV text as columns of numbers, in blocks of lines: exact, and fast where the text is plain.
+
+    table = read_table(path, text, texts={"joint"})
+    table.numbers["time_s"], table.texts["joint"], table.line
+
+The first line that is no comment (`# …`) names the columns. Plain blocks are converted by pandas'
+parser, which rounds as Python does; a block in which it finds anything else is read again line by
+line, strictly, so that a fault is named with its place.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import allowed, refuse_more
+from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.strict_yaml import printable
+
+MOST_ROWS = 5_000_000
+MOST_COLUMNS = 2_000
+MOST_CELLS = 40_000_000
+MOST_COMMENTS = 10_000
+LONGEST_CELL = 100_000
+LONGEST_COMMENT = 1_000_000
+
+# from 3.1 on, pandas rounds as Python does and deprecates the argument
+_OLD_PANDAS = tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1)
+_EXACTLY: dict[str, Any] = {"float_precision": "round_trip"} if _OLD_PANDAS else {}
+_SPLIT = "Split it by joint or by time."
+_BLOCK = 4_000_000  # characters
+_COMMENT = re.compile(r"^#.*$", re.MULTILINE)
+_QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
+
+
+@dataclass
+class CsvTable:
+    """Columns of a CSV text.
+
+    Attributes
+    ----------
+    columns : list of str
+        All names, in the order of the text.
+    numbers : dict of str to ndarray, shape (rows,)
+        Empty cells are NaN.
+    texts : dict of str to list of str
+        Columns that were asked for as text.
+    faults : dict of str to str
+        Other columns that hold text, and the sentence on the first such cell.
+    line : ndarray of int, shape (rows,)
+        Line of each row, from 1.
+    comments : list of (int, str)
+        Comment lines, numbered.
+    cut : bool
+        Whether the last row was incomplete and has been left out.
+    """
+
+    columns: list[str]
+    numbers: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    texts: dict[str, list[str]] = field(default_factory=dict)
+    faults: dict[str, str] = field(default_factory=dict)
+    line: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    comments: list[tuple[int, str]] = field(default_factory=list)
+    cut: bool = False
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+
+def read_table(
+    path: Path | str,
+    text: str,
+    texts: Collection[str] = (),
+    strict: bool = True,
+    whole_lines: bool = False,
+) -> CsvTable:
+    """Columns of CSV text.
+
+    A last row with too few cells is left out, since its writer was interrupted.
+
+    Parameters
+    ----------
+    path : Path or str
+        For messages.
+    text : str
+    texts : collection of str
+        Columns that hold text.
+    strict : bool
+        Refuse text in other columns, rather than name it in `faults`.
+    whole_lines : bool
+        Leave a last line out, too, that does not end.
+
+    Raises
+    ------
+    InputError
+        If two columns have the same name, a row has another number of cells, a cell is no number,
+        or a limit of reading is passed.
+    """
+    text = one_line_end(text)
+    refuse_more(path, text.count("\n"), MOST_ROWS + 2 * MOST_COMMENTS, "lines", _SPLIT)
+    found, first, at = _opening(path, text)
+    rows = text.count("\n", at)
+    refuse_more(path, rows, MOST_ROWS, "rows", _SPLIT)
+    refuse_more(path, rows * len(found.columns), MOST_CELLS, "cells", _SPLIT)
+    end = len(text)
+    if whole_lines and not text.endswith("\n"):
+        end = max(text.rfind("\n") + 1, at)
+        last = text[end:].strip()
+        found.cut = bool(last) and last[0] != "#"
+    blocks = _Blocks(path, found, texts, strict)
+    while at < end:
+        stop = end if at + _BLOCK >= end else text.find("\n", at + _BLOCK, end) + 1 or end
+        first += blocks.add(text[at:stop], first, last=stop == end)
+        at = stop
+    blocks.finish()
+    return found
+
+
+def one_line_end(text: str) -> str:
+    """`text` with the line ends of other systems made one."""
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def column_names(path: Path | str, text: str) -> list[str]:
+    """Names of the columns of CSV text; empty if it has none.
+
+    Raises
+    ------
+    InputError
+        As `read_table`.
+    """
+    return _opening(path, one_line_end(text))[0].columns
+
+
+def comments_of(path: Path | str, text: str) -> list[tuple[int, str]]:
+    """Comment lines of CSV text, numbered from 1.
+
+    Raises
+    ------
+    InputError
+        If there are too many, or one is too long.
+    """
+    return _comments(path, one_line_end(text), 1, [])
+
+
+def _comments(
+    path: Path | str, text: str, first: int, known: list[tuple[int, str]]
+) -> list[tuple[int, str]]:
+    """Comment lines of text that begins at line `first`, which follow the `known` ones."""
+    found: list[tuple[int, str]] = []
+    if text[:1] != "#" and "\n#" not in text:
+        return found
+    n, at = first, 0
+    for match in _COMMENT.finditer(text):
+        n, at = n + text.count("\n", at, match.start()), match.start()
+        found.append((n, match[0]))
+        refuse_more(path, len(known) + len(found), MOST_COMMENTS, "comment lines", exact=False)
+        refuse_more(f"{path}, line {n}", len(match[0]), LONGEST_COMMENT, "characters")
+    return found
+
+
+def _opening(path: Path | str, text: str) -> tuple[CsvTable, int, int]:
+    """Comments and names of the columns; line and place in the text of what follows."""
+    at, n, stop = 0, 1, 0
+    while at < len(text):
+        stop = text.find("\n", at)
+        stop = len(text) if stop < 0 else stop
+        if text[at] != "#" and text[at:stop].strip():
+            break
+        at, n = stop + 1, n + 1
+        if n > allowed(MOST_COMMENTS):  # blank lines, too
+            refuse_more(path, n, MOST_COMMENTS, "lines before its column names", exact=False)
+    comments = _comments(path, text[:at], 1, [])
+    if at >= len(text):
+        return CsvTable([], comments=comments), n, len(text)
+    line = text[at:stop]
+    refuse_more(path, line.count(",") + 1, MOST_COLUMNS, "columns", _SPLIT)
+    names = [name.strip() for name in _cells(path, n, line)]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}, line {n}: a column name stands twice. Rename one.")
+    return CsvTable(names, comments=comments), n + 1, min(stop + 1, len(text))
+
+
+class _Blocks:
+    """Blocks of lines, one after another, as columns of one table."""
+
+    def __init__(self, path: Path | str, found: CsvTable, texts: Collection[str], strict: bool):
+        self._path, self._found, self._strict = path, found, strict
+        self._lines: list[NDArray[np.int64]] = []
+        self._numbers: dict[str, list[NDArray[np.float64]]] = {}
+        self._known: dict[str, str] = {}  # each text once, however often it stands there
+        for name in found.columns:
+            if name in texts:
+                found.texts[name] = []
+            else:
+                self._numbers[name] = []
+
+    def add(self, block: str, first: int, last: bool) -> int:
+        """Take a block of lines that begins at line `first`; how many lines it has."""
+        count = block.count("\n")
+        comments = _comments(self._path, block, first, self._found.comments)
+        self._found.comments += comments
+        plain = _QUOTED.sub(r"\1", block) if '"' in block else block
+        plain, lines = _bare(plain, first, [n for n, _ in comments])
+        if len(lines) and not self._plain(plain, lines):
+            self._strictly(block, first, last)
+        return count
+
+    def finish(self) -> None:
+        """Put the blocks together."""
+        self._found.line = np.concatenate([np.zeros(0, np.int64), *self._lines])
+        for name in list(self._numbers):
+            self._found.numbers[name] = np.concatenate([np.zeros(0), *self._numbers.pop(name)])
+
+    def _plain(self, block: str, lines: NDArray[np.int64]) -> bool:
+        """Take lines of decimal numerals and of texts without quotes; or do not."""
+        found = self._found
+        if '"' in block or not _rectangular(block, len(found.columns)):
+            return False
+        numeric = {n: name in self._numbers for n, name in enumerate(found.columns)
+                   if name not in found.faults}  # fmt: skip
+        kinds: Any = {n: float if number else str for n, number in numeric.items()}
+        try:
+            read = pd.read_csv(
+                io.StringIO(block), header=None, index_col=False, usecols=list(kinds), dtype=kinds,
+                na_values=[""], keep_default_na=False, skip_blank_lines=False,
+                quoting=csv.QUOTE_NONE, engine="c", low_memory=False, **_EXACTLY,
+            )  # fmt: skip
+        except (ValueError, OverflowError):  # pandas' own errors are ValueErrors
+            return False
+        numbers = {n: read[n].to_numpy(float) for n, number in numeric.items() if number}
+        if len(read) != len(lines) or any(np.isinf(v).any() for v in numbers.values()):
+            return False
+        for n, number in numeric.items():
+            name = found.columns[n]
+            if number:
+                self._numbers[name].append(numbers[n])
+            else:
+                codes, cells = pd.factorize(read[n].fillna(""))
+                own = [self._text(str(cell)) for cell in cells]
+                found.texts[name] += [own[code] for code in codes.tolist()]
+        self._lines.append(lines)
+        return True
+
+    def _strictly(self, block: str, first: int, last: bool) -> None:
+        """Take a block line by line, or refuse it with the place of its fault."""
+        path, found = self._path, self._found
+        given = [
+            (n, line) for n, line in enumerate(block.split("\n"), first)
+            if line[:1] != "#" and line.strip()
+        ]  # fmt: skip
+        # line by line: a stray quote must not swallow the lines behind it
+        rows = [_cells(path, n, line) for n, line in given]
+        lines = [n for n, _ in given]
+        if last and rows and len(rows[-1]) < len(found.columns):
+            found.cut = True
+            rows, lines = rows[:-1], lines[:-1]
+        for n, row in zip(lines, rows, strict=True):
+            if len(row) != len(found.columns):
+                raise InputError(
+                    f"{path}, line {n}: {len(row)} cells where the header names "
+                    f"{len(found.columns)} columns; command and position must have the same "
+                    "number of values. Mend or remove the line."
+                )
+        self._lines.append(np.array(lines, np.int64))
+        for k, name in enumerate(found.columns):
+            cells = [row[k] for row in rows]
+            if name in found.texts:
+                found.texts[name] += [self._text(cell) for cell in cells]
+            elif name in self._numbers:
+                try:
+                    self._numbers[name].append(numbers_of(path, name, cells, lines))
+                except InputError as error:
+                    if self._strict:
+                        raise
+                    found.faults[name] = str(error)
+                    del self._numbers[name]
+
+    def _text(self, cell: str) -> str:
+        cell = cell.strip()
+        return self._known.setdefault(cell, cell)
+
+
+def numbers_of(
+    path: Path | str, name: str, cells: Sequence[str], lines: Sequence[int] | NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Numbers of a column's cells; an empty one is NaN.
+
+    Parameters
+    ----------
+    path : Path or str
+    name : str
+        Of the column.
+    cells : sequence of str
+    lines : sequence of int
+        Of the cells, for messages.
+
+    Raises
+    ------
+    InputError
+        If a cell is no number, or infinite.
+    """
+    values, shown = np.full(len(cells), np.nan), printable(name)[:60]
+    for k, cell in enumerate(cells):
+        if not (text := cell.strip()):
+            continue
+        try:
+            values[k] = decimal(text)
+        except ValueError:
+            raise InputError(
+                f"{path}, line {lines[k]}, column {shown}: '{printable(text[:40])}' is not a "
+                "number. Mend the cell, or leave it empty if there was no reading."
+            ) from None
+        if np.isinf(values[k]):
+            raise InputError(f"{path}, line {lines[k]}, column {shown}: the value is infinite.")
+    return values
+
+
+def _bare(block: str, first: int, comments: Sequence[int]) -> tuple[str, NDArray[np.int64]]:
+    """A block without its comments and blank lines, and the lines that are left."""
+    lines = np.arange(first, first + block.count("\n") + (not block.endswith("\n")))
+    gone = list(comments)
+    if comments:
+        block = _COMMENT.sub("", block)
+    if "\n\n" in block or block[:1] == "\n":
+        ends = np.flatnonzero(np.frombuffer(block.encode(), np.uint8) == ord("\n"))
+        gone = [*gone, *(first + np.flatnonzero(np.diff(ends, prepend=-1) == 1)).tolist()]
+        block = re.sub("\n\n+", "\n", block).removeprefix("\n")
+    if gone:
+        lines = np.setdiff1d(lines, gone)
+    return block, lines
+
+
+def _rectangular(block: str, columns: int) -> bool:
+    """Whether each line of a block has the same number of cells."""
+    data = np.frombuffer((block if block.endswith("\n") else f"{block}\n").encode(), np.uint8)
+    ends = np.flatnonzero(data == ord("\n"))
+    commas = np.flatnonzero(data == ord(","))
+    if len(commas) != len(ends) * (columns - 1):
+        return False
+    before = np.searchsorted(commas, ends)
+    return bool((before == (columns - 1) * np.arange(1, len(ends) + 1)).all())
+
+
+def _cells(path: Path | str, number: int, line: str) -> list[str]:
+    most = int(allowed(LONGEST_CELL))
+    if len(line) > most:
+        csv.field_size_limit(max(most, 131_072))
+        longest = max(map(len, line.split(",")))
+        refuse_more(f"{path}, line {number}: a cell", longest, LONGEST_CELL, "characters")
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        if "limit" in str(error):
+            refuse_more(f"{path}, line {number}: a cell", len(line), LONGEST_CELL, "characters")
+        raise InputError(
+            f"{path}, line {number}: a quotation mark is not closed. Mend or remove the line."
+        ) from None

@@ -1,0 +1,150 @@
+"""Validation of tidy rows: what is no servo's recording is refused, small faults are mended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
+
+_LEAST_ROWS = 20
+_MANY_REPEATED = 0.1  # of the rows
+_SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
+_FEW_TRIALS = 10  # that are named one by one
+
+
+def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Refuse or repair a tidy table.
+
+    Parameters
+    ----------
+    path : Path or str
+        Name of the source, for messages.
+    table : pandas.DataFrame
+
+    Returns
+    -------
+    table : pandas.DataFrame
+    warnings : list of str
+        One sentence per repair.
+
+    Raises
+    ------
+    InputError
+        If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
+    """
+    warnings: list[str] = []
+    if strange := strange_joint(table["joint"].unique().tolist()):
+        raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
+    needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
+    lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
+    if lost.any():
+        warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
+        table = table.loc[~lost]
+    _refuse_odd_numbers(path, table)
+    position = table["position_rad"].to_numpy(float)
+    missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
+    if missing == 1.0:
+        raise InputError(
+            f"{path}, column position_rad: no row has a position, so the bus never answered. "
+            "Check power and wiring, then record again."
+        )
+    if missing > 0:
+        warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
+    for column in ("command_rad", "position_rad"):
+        _refuse_degrees(path, column, table[column].to_numpy())
+    again = table.duplicated(["joint", "trial", "send_time_s"])
+    if again.mean() > _MANY_REPEATED:
+        raise InputError(
+            f"{path}, column send_time_s: {100 * again.mean():.0f} % of the rows repeat a time "
+            "stamp of their trial: a clock too coarse, or two logs in one. Record with a clock of "
+            "1 ms or finer, and give each pass its own trial number."
+        )
+    if again.any():
+        warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
+        table = table.loc[~again]
+    own = table.groupby(["joint", "trial"], sort=False).ngroup().to_numpy()
+    rows = np.bincount(own)
+    refuse_more(path, len(rows), MOST_TRIALS, "trials", "Split it by joint or by trial.")
+    first = table.iloc[np.unique(own, return_index=True)[1]]  # a row of each trial
+    _refuse_disorder(path, table, own)
+    warnings += _short(first, rows)
+    usable = rows[own] >= _SHORTEST_TRIAL
+    if usable.sum() < _LEAST_ROWS:
+        raise InputError(
+            f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed. "
+            "Record for longer."
+        )
+    return table.loc[usable].reset_index(drop=True), warnings
+
+
+def _refuse_odd_numbers(path: Path | str, table: pd.DataFrame) -> None:
+    """Refuse trials that are no whole numbers, and counts that no encoder has."""
+    trial = table["trial"].to_numpy(float)
+    if (np.abs(trial) >= LARGEST_COUNT).any() or (trial % 1 != 0).any():
+        raise InputError(f"{path}, column trial: trials are counted by whole numbers.")
+    count = table["position_count"].to_numpy(float) if "position_count" in table else np.zeros(0)
+    if np.any(np.abs(count) >= LARGEST_COUNT):
+        raise InputError(f"{path}, column position_count: a value is larger than any encoder's.")
+
+
+def _refuse_degrees(path: Path | str, column: str, values: NDArray[np.float64]) -> None:
+    largest = float(np.nanmax(np.abs(values)))
+    if largest > LARGEST_RAD:
+        raise InputError(
+            f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
+            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533, or "
+            "convert the log with `pupper-sysid import --unit deg` (counts:4096, …)."
+        )
+
+
+def _refuse_disorder(path: Path | str, table: pd.DataFrame, own: NDArray[np.int64]) -> None:
+    """Refuse trials whose time runs backwards, or that have several frequencies.
+
+    `own` is the number of each row's trial.
+    """
+    order = np.argsort(own, kind="stable")
+    same = np.diff(own[order]) == 0
+    for column in ("send_time_s", "read_time_s"):
+        time = table[column].to_numpy(float)[order]
+        back = np.flatnonzero((np.diff(time) < 0) & same)
+        if len(back):
+            joint, trial = table[["joint", "trial"]].iloc[order[back[0]]]
+            raise InputError(
+                f"{path}, column {column}: time runs backwards in trial {trial:g} of {joint}, "
+                f"after {time[back[0]]:.4f} s. Sort the rows, or give each pass its own trial "
+                "number."
+            )
+    tones = table["frequency_hz"].groupby(own).nunique().to_numpy()
+    if (tones > 1).any():
+        rows = table.loc[own == np.argmax(tones > 1)]
+        joint, trial = rows[["joint", "trial"]].iloc[0]
+        found = rows["frequency_hz"].dropna().unique()
+        raise InputError(
+            f"{path}, column frequency_hz: trial {trial:g} of {joint} has {found[0]:g} and "
+            f"{found[1]:g} Hz. Give each frequency its own trial number."
+        )
+
+
+def _short(first: pd.DataFrame, rows: NDArray[np.int64]) -> list[str]:
+    """Sentences on trials with few rows; `first` has a row of each trial, `rows` their numbers."""
+    found = []
+    for few, each, all_of_them in (
+        (rows < _SHORTEST_TRIAL, "is too short to use and was left out",
+         "are too short to use and were left out"),
+        ((rows >= _SHORTEST_TRIAL) & (rows < _LEAST_ROWS), "has only {} rows",
+         f"have fewer than {_LEAST_ROWS} rows"),
+    ):  # fmt: skip
+        if few.sum() > _FEW_TRIALS:
+            found.append(f"{few.sum()} trials {all_of_them}.")
+            continue
+        own = zip(first.loc[few, "joint"], first.loc[few, "trial"], rows[few], strict=True)
+        found += [f"trial {trial:g} of {joint} {each.format(n)}." for joint, trial, n in own]
+    return found
