@@ -72,6 +72,8 @@ class RobotBatch:
         See `sim.walking.env.PupperEnv`.
     extra_dead_time_s : float or ndarray, shape (n,)
         Added to every dead time of a robot [s].
+    extra_jitter_s : ndarray, shape (n,), optional
+        Added to the command jitter of a robot [s].
 
     Attributes
     ----------
@@ -100,6 +102,7 @@ class RobotBatch:
         threads: int,
         servo_model: JointArrays | None,
         extra_dead_time_s: float | Array = 0.0,
+        extra_jitter_s: Array | None = None,
     ):
         servos = servos.in_steps_of(config.physics_step_s)
         self.config, self.servos, self.ground = config, servos, ground
@@ -108,8 +111,13 @@ class RobotBatch:
             self._check_servo_model(servo_model)
             servo_model.reset(np.zeros((environments, len(JOINT_NAMES))))
         self._extra_s = np.broadcast_to(extra_dead_time_s, environments)
+        # with an extra jitter of 0, too, robots draw what they draw beside others that have some
+        self._added_jitter = extra_jitter_s is not None
+        self._jitter_s = np.zeros(environments) + servos.command_jitter_s
+        if extra_jitter_s is not None:
+            self._jitter_s += extra_jitter_s
         longest_s = servos.longest_dead_time_s + float(self._extra_s.max())
-        longest_s += _LATEST * servos.command_jitter_s
+        longest_s += _LATEST * float(self._jitter_s.max())
         # every buffer holds the longest delay that can be drawn
         longest = {
             name: replace(own, dead_time_s=np.array(longest_s))
@@ -200,13 +208,16 @@ class RobotBatch:
         """Draw how late each robot's next commands are; nothing is drawn without jitter.
 
         One latency per robot: a frame carries the commands of all its servos. Its mean is in the
-        dead time.
+        dead time. With an added jitter, no servo goes back to a command before its latest.
         """
-        jitter = self.servos.command_jitter_s * delay_share
-        if jitter > 0:
-            late = jitter * (np.minimum(rng.exponential(1.0, self.environments), _LATEST) - 1.0)
+        if (self._added_jitter or self.servos.command_jitter_s > 0) and delay_share > 0:
+            late = np.minimum(rng.exponential(1.0, self.environments), _LATEST) - 1.0
+            late *= self._jitter_s * delay_share
             delay = np.maximum(self.drawn["dead_time_s"] + late[:, None], 0.0)
-            self._fields["actuator_delay"][:] = delay
+            now = self._fields["actuator_delay"]
+            if self._added_jitter:
+                delay = np.minimum(delay, now + self.config.control_step_s)
+            now[:] = delay
 
     def step(self, target: Array) -> Iterator[Moved]:
         """Let one control step pass under joint set-points [rad], shape (n, 12).
@@ -255,6 +266,23 @@ class RobotBatch:
         return raised
 
     # ------------------------------------------------------------------------- a new robot
+
+    def field(self, name: str) -> Array:
+        """Live values of a field of `mujoco.MjModel` for each robot, shape (n, …).
+
+        After writing masses or inertias, call `batch.set_const`. A new episode draws friction,
+        servos and the trunk's mass anew.
+        """
+        if name not in self._fields:
+            self._fields[name] = self.batch.expand(name)
+        return self._fields[name]
+
+    def move(self, ids: NDArray[np.intp], place: Array) -> None:
+        """Move robots, as they stand, to places x, y on the ground [m], shape (len(ids), 2)."""
+        rise = self._highest_under(place) - self._highest_under(self.qpos[ids, :2])
+        self.qpos[ids, :2] = place
+        self.qpos[ids, 2] += rise
+        self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
     def draw(self, ids: NDArray[np.intp], delay_share: float, rng: np.random.Generator) -> None:
         """Draw servos, friction and payload of some robots; dead times times `delay_share`."""

@@ -1,14 +1,15 @@
-"""The ground: flat, rough, hills, troughs and steps, as MJCF and as heights.
+"""The ground: flat, rough, hills, troughs, steps and stairs, as MJCF and as heights.
 
 Simulations of a batch do not see each other, so one field of tiles serves all of them; a robot
 starts on a tile and its episode ends (as a time-out) before the field does. Sizes follow the
 paper's terrain: tiles of 8 m, 5 cm between heights, rough ground of 1 to 2 cm, slopes up to 8.5°.
 Steps (not in the paper) are 3 to 10 mm high and rise, as all of a field of heights, over 5 cm.
+Stairs (neither) are of boxes, so that their edges are sharp: three square pyramids on a plane.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.sim.robot.mini_pupper import FLAT_GROUND
 
-Terrain = Literal["flat", "rough", "slopes", "troughs", "steps", "mixed"]
+Terrain = Literal["flat", "rough", "slopes", "troughs", "steps", "stairs", "mixed"]
 
 TILE_M, SPACING_M = 8.0, 0.05
 _NEAR_M = 0.15  # how far a robot reaches from the middle of its trunk, legs below the knee aside
@@ -25,6 +26,9 @@ _PLATFORM_M = 0.6
 _ROUGH_M = (0.01, 0.02)
 _STEEPEST = 0.15
 _TREAD_M, _RISER_M = 0.3, (0.003, 0.01)  # up to what a foot is lifted in the reference trot
+STAIRS_M = {0.005: (-6.0, 0.0), 0.01: (0.0, 0.0), 0.015: (6.0, 0.0)}
+"""Middle of the pyramid (x, y) by the height of its steps [m]."""
+_LEVELS = 7
 _TILES = {
     "rough": ("rough",) * 4,
     "slopes": ("slope",) * 4,
@@ -46,12 +50,15 @@ class Ground:
         Heights [m] at `SPACING_M`, row along y; None for a plane.
     half_size_m : float
         Distance of its edge from the origin; infinite for a plane.
+    boxes : ndarray, shape (k, 4)
+        Square boxes on a plane: x and y of the middle, half of the width, height of the top [m].
     """
 
     xml: str
     assets: str
     heights: NDArray[np.float64] | None
     half_size_m: float
+    boxes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
 
     def height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Height [m] at positions [m], as MuJoCo sees it; at the edge beyond the edge.
@@ -59,7 +66,7 @@ class Ground:
         Each square between four heights is two triangles, which meet where x and y grow together.
         """
         if self.heights is None:
-            return np.zeros(np.broadcast_shapes(x.shape, y.shape))
+            return self._highest_box(x, y, 0.0)
         most = len(self.heights) - 1
         column = np.clip((x + self.half_size_m) / SPACING_M, 0, most - 1e-6)
         row = np.clip((y + self.half_size_m) / SPACING_M, 0, most - 1e-6)
@@ -77,12 +84,22 @@ class Ground:
         """An upper bound of the heights [m] within 15 cm of positions [m]."""
         highest = self._highest
         if highest is None:
-            return 0.0
+            return self._highest_box(x, y, _NEAR_M) if len(self.boxes) else 0.0
         column, row = (
             np.clip((at + self.half_size_m) / SPACING_M, 0, len(highest) - 1).astype(int)
             for at in (x, y)
         )
         return highest[row, column]
+
+    def _highest_box(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], near_m: float
+    ) -> NDArray[np.float64]:
+        """Height of the highest box [m] at positions, or within `near_m` of them."""
+        found = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        for at_x, at_y, half, top in self.boxes:
+            over = np.maximum(np.abs(x - at_x), np.abs(y - at_y)) <= half + near_m
+            np.maximum(found, top, out=found, where=over)
+        return found
 
     @cached_property
     def _highest(self) -> NDArray[np.float64] | None:
@@ -109,6 +126,8 @@ def make_ground(kind: Terrain, rng: np.random.Generator) -> Ground:
     """Ground of one kind, its random parts drawn from `rng`."""
     if kind == "flat":
         return Ground(FLAT_GROUND, "", None, np.inf)
+    if kind == "stairs":
+        return _stairs()
     count = round(TILE_M / SPACING_M)
     tiles = [_tile(name, count, rng) for name in _TILES[kind]]
     heights = np.block([[tiles[0], tiles[1]], [tiles[2], tiles[3]]])
@@ -124,6 +143,23 @@ def make_ground(kind: Terrain, rng: np.random.Generator) -> Ground:
         'material="grid" contype="0" conaffinity="1"/>'
     )
     return Ground(xml, assets, heights, half)
+
+
+def _stairs() -> Ground:
+    """Pyramids of stairs at `STAIRS_M`."""
+    boxes = np.array(
+        [
+            (*middle, _PLATFORM_M / 2 + (_LEVELS - 1 - k) * _TREAD_M, (k + 1) * riser)
+            for riser, middle in STAIRS_M.items()
+            for k in range(_LEVELS)
+        ]
+    )
+    geoms = "".join(
+        f'<geom type="box" pos="{x} {y} {top / 2}" size="{half} {half} {top / 2}" '
+        'material="grid" contype="0" conaffinity="1"/>'
+        for x, y, half, top in boxes.tolist()
+    )
+    return Ground(FLAT_GROUND + geoms, "", None, np.inf, boxes)
 
 
 def _depth(heights: NDArray[np.float64]) -> float:

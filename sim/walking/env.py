@@ -73,6 +73,8 @@ class PupperEnv:
         Added to every dead time of a robot [s].
     twins : Twins, optional
         Which robots are the same one; by default all differ.
+    extra_jitter_s : ndarray, shape (n,), optional
+        Added to the jitter of a robot's commands, a standard deviation [s].
 
     Attributes
     ----------
@@ -125,6 +127,7 @@ class PupperEnv:
         servo_model: JointArrays | None = None,
         extra_dead_time_s: float | Array = 0.0,
         twins: Twins | None = None,
+        extra_jitter_s: Array | None = None,
     ):
         if environments < 1:
             raise InputError(f"There are {environments} environments; at least 1 is needed.")
@@ -133,8 +136,9 @@ class PupperEnv:
         # terrain is the same for every run of a seed, whatever the number of environments
         self.ground = make_ground(config.terrain, np.random.default_rng([seed, 1]))
         self.robots = RobotBatch(
-            config, servos, self.ground, environments, threads, servo_model, extra_dead_time_s
-        )
+            config, servos, self.ground, environments, threads, servo_model, extra_dead_time_s,
+            extra_jitter_s,
+        )  # fmt: skip
         self.default, (self._low, self._high) = default_pose(), limits()
         self.trot = config.trot
         n = environments

@@ -9,7 +9,7 @@ import pytest
 
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
-from pupper_sysid.sim.robot.terrain import SPACING_M, TILE_M, Ground, make_ground
+from pupper_sysid.sim.robot.terrain import SPACING_M, STAIRS_M, TILE_M, Ground, make_ground
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 KINDS = ("flat", "rough", "slopes", "troughs", "steps", "mixed")
@@ -125,3 +125,24 @@ def test_the_same_random_numbers_give_the_same_ground_and_others_another():
     np.testing.assert_array_equal(heights_of(ground_of("mixed")), heights_of(ground_of("mixed")))
     other = heights_of(make_ground("mixed", np.random.default_rng(4)))
     assert (other != heights_of(ground_of("mixed"))).any()
+
+
+def test_stairs_are_where_rays_hit_them_and_rise_by_their_steps_over_nothing():
+    ground = ground_of("stairs")
+    model = simulated(ground)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 10.0  # the robot out of the way
+    mujoco.mj_forward(model, data)
+    x, y = np.random.default_rng(0).uniform((-9.0, -3.0), (9.0, 3.0), (300, 2)).T
+    hit = np.zeros(1, np.int32)
+    below = [
+        3.0 - mujoco.mj_ray(model, data, [*at, 3.0], [0.0, 0.0, -1.0], None, 1, -1, hit, None)
+        for at in zip(x, y, strict=True)
+    ]
+    np.testing.assert_allclose(ground.height(x, y), below, atol=1e-9)
+    assert (ground.highest_near(x, y) >= ground.height(x, y)).all()
+    for riser, (middle, side) in STAIRS_M.items():
+        out = middle + np.linspace(0.0, 3.0, 100_000)
+        rises = -np.diff(ground.height(out, np.full_like(out, side)))
+        np.testing.assert_allclose(rises[rises > 0], riser)  # each between two neighbours
+        assert (rises > 0).sum() == 7 and ground.highest_near(out, out * 0).max() == 7 * riser
