@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ from pupper_sysid.sysid.compare.readings import (
     shown,
     with_ages,
 )
-from pupper_sysid.sysid.compare.runs import compare_runs, refuse_missing_joints
+from pupper_sysid.sysid.compare.runs import RunComparison, compare_runs, refuse_missing_joints
 from pupper_sysid.sysid.compare.under_load import needs_runs
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
@@ -52,15 +51,13 @@ from pupper_sysid.sysid.recordings.joints import (
     chosen_joints,
     usable_trials,
 )
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.result import ServoFit
 from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
-
-if TYPE_CHECKING:
-    pass
 
 
 def compare(
@@ -103,10 +100,91 @@ def compare(
     trials = usable_trials(recordings, names)
     calibrations = _calibrations(models)
     if needs_runs(recordings, names, list(calibrations.values())):
-        return compare_runs(recordings, models, calibrations, names, seed, lattices)
+        found = compare_runs(recordings, calibrations, names, seed, lattices)
+        return _with_learned(found, recordings, models, names, readings, seed, lattices)
     data = merged_groups(servo_data(recordings, names, readings, seed, lattices))
+    opened, fitted_to = _opened(models, data, recordings)
+    notes = [text for joint in names for text in cautions(joint, trials[joint])] + fitted_to
+    if presets := [str(given) for given in models if str(given) in PRESETS]:
+        notes.append(
+            f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
+            "age of readings, too, that age counts twice here."
+        )
+    known = {name: found.calibration for name, found in opened.items() if found.calibration}
+    rules = reading_rules(data, ", ".join(r.name for r in recordings), known)
+    data = with_ages(data, rules)
+    made, tracks = _scored(opened, data, seed)
+    tracks[LINEAR], errors = _linear(data, seed)
+    made[LINEAR] = ComparedModel.scored(ModelScores.of(errors, seed), {}, {})
+    return Comparison(
+        models=made,
+        readings=rules,
+        persistence_rmse_rad=scores.persistence(data, everything),
+        repeatability_rad=scores.repeatability(data, everything),
+        time_step_s=data.period_s, notes=tuple(notes), data=data, tracks=tracks,
+        bands={name: found.band for name, found in opened.items() if found.band},
+    )  # fmt: skip
+
+
+def _with_learned(
+    found: RunComparison,
+    recordings: Sequence[Recording],
+    models: Sequence[str | Path | Calibration | ServoFit],
+    joints: Sequence[str],
+    readings: str,
+    seed: int,
+    lattices: Mapping[str, PollLattice] | None,
+) -> RunComparison:
+    """A comparison under load with the models of fit-servo and the linear filter beside.
+
+    They know neither gain nor load: each run is predicted from its commands alone.
+    """
+    learned = [m for m in models if isinstance(m, ServoFit) or _is_folder(m)]
+    try:
+        data = merged_groups(servo_data(recordings, joints, readings, seed, lattices))
+        baseline = _linear(data, seed)[1]
+    except InputError as error:
+        if learned:
+            raise
+        note = f"No linear filter beside, it cannot be fitted to these runs: {error}"
+        return replace(found, notes=(*found.notes, note))
+    opened, notes = _opened(learned, data, recordings)
+    if learned and needs_runs(recordings, joints, []):
+        notes.append(f"{', '.join(opened)}: knows neither the load nor the P gain of a run.")
+    made, _ = _scored(opened, data, seed)
+    made[LINEAR] = ComparedModel.scored(ModelScores.of(baseline, seed), {}, {})
+    return replace(found, models=found.models | made, notes=(*found.notes, *notes))
+
+
+def _is_folder(given: str | Path | Calibration) -> bool:
+    return not isinstance(given, Calibration) and Path(given).is_dir()
+
+
+def _scored(
+    opened: Mapping[str, _Opened], data: ServoData, seed: int
+) -> tuple[dict[str, ComparedModel], dict[str, scores.Tracks]]:
+    """Scores and free runs of models on the same readings."""
+    made: dict[str, ComparedModel] = {}
+    tracks: dict[str, scores.Tracks] = {}
+    for name, found in opened.items():
+        own = as_rows(data, found.of_rows)
+        track, offset = run_with_offset(found.run(own), own)
+        errors = scores.errors(found.model, track, own, everything)
+        made[name] = ComparedModel.scored(
+            ModelScores.of(errors, seed), offset, age_spread_rad(track, own)
+        )
+        tracks[name] = shown(track, own)
+    return made, tracks
+
+
+def _opened(
+    models: Sequence[str | Path | Calibration | ServoFit],
+    data: ServoData,
+    recordings: Sequence[Recording],
+) -> tuple[dict[str, _Opened], list[str]]:
+    """Models by label, and which of them were fitted to one of the recordings."""
     opened: dict[str, _Opened] = {}
-    notes = [text for joint in names for text in cautions(joint, trials[joint])]
+    notes = []
     inputs = {r.sha256: r.name for r in recordings}
     for given in models:
         found = _open(given, data)
@@ -121,34 +199,7 @@ def compare(
             for h in found.fitted_to
             if h in inputs
         ]
-    if presets := [str(given) for given in models if str(given) in PRESETS]:
-        notes.append(
-            f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
-            "age of readings, too, that age counts twice here."
-        )
-    known = {name: found.calibration for name, found in opened.items() if found.calibration}
-    rules = reading_rules(data, ", ".join(r.name for r in recordings), known)
-    data = with_ages(data, rules)
-    made: dict[str, ComparedModel] = {}
-    tracks: dict[str, scores.Tracks] = {}
-    for name, found in opened.items():
-        own = as_rows(data, found.of_rows)
-        track, offset = run_with_offset(found.run(own), own)
-        errors = scores.errors(found.model, track, own, everything)
-        made[name] = ComparedModel.scored(
-            ModelScores.of(errors, seed), offset, age_spread_rad(track, own)
-        )
-        tracks[name] = shown(track, own)
-    tracks[LINEAR], errors = _linear(data, seed)
-    made[LINEAR] = ComparedModel.scored(ModelScores.of(errors, seed), {}, {})
-    return Comparison(
-        models=made,
-        readings=rules,
-        persistence_rmse_rad=scores.persistence(data, everything),
-        repeatability_rad=scores.repeatability(data, everything),
-        time_step_s=data.period_s, notes=tuple(notes), data=data, tracks=tracks,
-        bands={name: found.band for name, found in opened.items() if found.band},
-    )  # fmt: skip
+    return opened, notes
 
 
 def _calibrations(
@@ -159,7 +210,7 @@ def _calibrations(
     for given in models:
         if isinstance(given, Calibration):
             calibration, called = given, ""
-        elif isinstance(given, ServoFit) or Path(given).is_dir():
+        elif isinstance(given, ServoFit) or _is_folder(given):
             continue
         elif not _is_calibration(given):
             raise InputError(_unknown(given))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +30,6 @@ from pupper_sysid.sysid.recordings.joints import (
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData
-from pupper_sysid.sysid.servo_fit.result import ServoFit
 from pupper_sysid.sysid.servo_fit.scores import ModelScores
 
 if TYPE_CHECKING:
@@ -86,18 +84,12 @@ def _has(calibration: Calibration, joint: str) -> bool:
 
 def compare_runs(
     recordings: Sequence[Recording],
-    models: Sequence[str | Path | Calibration | ServoFit],
     calibrations: Mapping[str, Calibration],
     joints: Sequence[str],
     seed: int,
     lattices: Mapping[str, PollLattice] | None,
 ) -> RunComparison:
     """`compare` where trials differ in gain, load or torque."""
-    if len(calibrations) < len(models):
-        raise InputError(
-            "These recordings tell of a load or of several P gains, which only calibrations and "
-            "servo cards know. Leave out folders of fit-servo."
-        )
     notes = []
     inputs = {r.sha256: r.name for r in recordings}
     for name, calibration in calibrations.items():

@@ -20,6 +20,8 @@ from pupper_sysid.sysid.loaded.calibrate import loaded_joints
 from pupper_sysid.sysid.loaded.runs import prepare
 from pupper_sysid.sysid.loaded.structures import Scales, Structure
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.servo_fit.fit import fit_servo
+from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 MASS_KG, LENGTH_M = 0.4, 0.12
 TRUE = LoadedServoParameters(
@@ -114,13 +116,42 @@ def test_a_calibration_predicts_a_gain_it_has_not_seen(tmp_path: Path):
     path = tmp_path / "knee.yaml"
     calibration().save(path)
     found = compare([recording(16.0, 1), recording(16.0, 2)], [path], "knee")
-    (label,) = found.models
-    assert "knee.yaml" in label
+    label, linear = found.models
+    assert "knee.yaml" in label and linear == LINEAR
     plain = found.to_dict()["models"][label]
     for part in (plain["mean"], plain["joints"]["knee"]):
         for name in ("mae_raw_rad", "mae_held_rad", "rmse_raw_rad", "rmse_held_rad"):
             assert part[name] < 1.5e-3, name  # a count is 1.5 mrad
     assert any("lies between recorded gains, 8 and 32" in note for note in found.notes)
+
+
+def test_a_network_stands_beside_a_servo_under_load_on_the_same_rows(tmp_path: Path):
+    calibration().save(tmp_path / "knee.yaml")
+    seen = [recording(16.0, 4), recording(16.0, 5)]
+    fit_servo(seen, "knee", arch="fir").save(tmp_path / "fir")
+    unseen = recording(16.0, 6)
+    found = compare(unseen, [tmp_path / "knee.yaml", tmp_path / "fir"], "knee")
+    physical, learned, linear = found.models.values()
+    assert any("fir" in label.lower() for label in found.models)
+    # the linear filter is fitted to other stretches of the same run, behind gaps
+    rows = [len(m.errors["knee"].raw) for m in (physical, learned, linear)]
+    assert rows[0] == rows[1] > rows[2]
+    assert physical.mean.mae_raw_rad < 0.2 * learned.mean.mae_raw_rad, "it knows of the drop"
+    assert any("neither the load nor the P gain" in note for note in found.notes)
+    again = compare([unseen, seen[0]], [tmp_path / "fir"], "knee")
+    assert any("too small" in note for note in again.notes)
+
+
+def test_runs_of_several_rates_have_no_linear_filter_and_a_note_says_why(tmp_path: Path):
+    calibration().save(tmp_path / "knee.yaml")
+    slow = recording(16.0, 2)
+    table = slow.table.assign(
+        send_time_s=1.5 * slow.table["send_time_s"], read_time_s=1.5 * slow.table["read_time_s"]
+    )
+    slow = Recording.from_frame(table, metadata=slow.metadata, name="slow")
+    found = compare([recording(16.0, 1), slow], [tmp_path / "knee.yaml"], "knee")
+    assert LINEAR not in found.models
+    assert any("No linear filter" in n and "different rates" in n for n in found.notes)
 
 
 def test_a_calibration_of_one_gain_is_told_from_one_of_any(tmp_path: Path):
