@@ -70,7 +70,8 @@ class WalkingVecEnv:
         found = self.env.step(actions.detach().cpu().numpy())
         ended = self._past
         if self._past.shape[1]:
-            ended = np.concatenate([actions.cpu().numpy()[:, None], self._past[:, :-1]], axis=1)
+            # of a missed tick, the one before stays
+            ended = np.concatenate([found.facts.action[:, None], self._past[:, :-1]], axis=1)
             self._past = ended.copy()
             self._past[found.done] = self.env.action[found.done][:, None]
         late, noise = found.terminal["ids"], self.noise

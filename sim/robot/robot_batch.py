@@ -43,6 +43,7 @@ from pupper_sysid.sim.robot.servo_mjcf import (
 )
 from pupper_sysid.sim.robot.terrain import Ground
 from pupper_sysid.sim.walking.config import Randomisation, Walking
+from pupper_sysid.sim.walking.differences import Bodies
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]
@@ -83,6 +84,8 @@ class RobotBatch:
         The servos of each robot, by field of `DelayedPDParameters`.
     friction, payload_kg : ndarray, shape (n,)
         Of the feet on the ground; added to the trunk.
+    bodies : Bodies
+        What else differs from the model.
     linked : tuple of int
         Servos that turn their joint and the one before it.
 
@@ -117,7 +120,7 @@ class RobotBatch:
         if extra_jitter_s is not None:
             self._jitter_s += extra_jitter_s
         longest_s = servos.longest_dead_time_s + float(self._extra_s.max())
-        longest_s += _LATEST * float(self._jitter_s.max())
+        longest_s += _LATEST * float(self._jitter_s.max()) * config.differences.command_jitter[1]
         # every buffer holds the longest delay that can be drawn
         longest = {
             name: replace(own, dead_time_s=np.array(longest_s))
@@ -138,7 +141,7 @@ class RobotBatch:
         on_tendons = _CALVES.tolist() if config.knee == "linkage" else []
         self._dof_of = {i: 6 + i for i in joints if i not in on_tendons}
         self._tendon_of = {i: k for k, i in enumerate(on_tendons)}
-        names = (*BATCH_FIELDS, "geom_friction", "body_mass")
+        names = (*BATCH_FIELDS, "geom_friction", "body_mass", "body_ipos")
         names += TENDON_FIELDS if on_tendons else ()
         self._fields = {name: self.batch.expand(name) for name in names}
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
@@ -158,6 +161,7 @@ class RobotBatch:
         self._warnings = self.batch.warning.copy()
         self.drawn = {f: np.zeros((environments, len(JOINT_NAMES))) for f in servos.value}
         self.friction, self.payload_kg = np.zeros(environments), np.zeros(environments)
+        self.bodies = Bodies(config.differences, environments)
         self.linked: tuple[int, ...] = tuple(on_tendons)
         cut = round(_FIRST_PART * environments)
         whole = self.batch.nthread == 1 or environments < _MANY
@@ -212,7 +216,7 @@ class RobotBatch:
         """
         if (self._added_jitter or self.servos.command_jitter_s > 0) and delay_share > 0:
             late = np.minimum(rng.exponential(1.0, self.environments), _LATEST) - 1.0
-            late *= self._jitter_s * delay_share
+            late *= self._jitter_s * self.bodies.jitter * delay_share
             delay = np.maximum(self.drawn["dead_time_s"] + late[:, None], 0.0)
             now = self._fields["actuator_delay"]
             if self._added_jitter:
@@ -228,7 +232,7 @@ class RobotBatch:
         """
         start, control = self.joints.copy(), None
         if self.servo_model is None:
-            self._control[:] = self.to_servo(target)
+            self._control[:] = self.to_servo(target) + self.bodies.zero_rad
         else:
             control = self._predicted(self.servo_model, target)
         if self._worker is None:
@@ -251,7 +255,8 @@ class RobotBatch:
     def _predicted(self, model: JointArrays, target: Array) -> Array:
         """Controls of each physics step, from the positions that a servo model predicts."""
         before, steps = self._control.copy(), self.config.substeps
-        predicted = np.asarray(model.step(self.to_servo(target) - self._bend), float)
+        servo = self.to_servo(target) + self.bodies.zero_rad
+        predicted = np.asarray(model.step(servo - self._bend), float)
         joints = self.from_servo(predicted + self._bend)
         after = self.to_servo(np.clip(joints, self._low, self._high))
         share = np.arange(1, steps + 1)[:, None] / steps
@@ -289,19 +294,22 @@ class RobotBatch:
         random = self.config.randomisation
         drawn = self.servos.draw(len(ids), random.torque_scale, rng)
         drawn["dead_time_s"] = (drawn["dead_time_s"] + self._extra_s[ids, None]) * delay_share
+        self.bodies.draw(ids, drawn, rng)
         for name, value in drawn.items():
             self.drawn[name][ids] = value
         self.friction[ids] = rng.uniform(*random.friction, len(ids))
         self.payload_kg[ids] = rng.uniform(*random.payload_kg, len(ids))
-        self._write(ids)
+        self.write(ids)
 
-    def _write(self, ids: NDArray[np.intp]) -> None:
-        """Give some robots what was drawn for them."""
+    def write(self, ids: NDArray[np.intp]) -> None:
+        """Give some robots what `drawn`, `friction`, `payload_kg` and `bodies` hold for them."""
         drawn, fields = {k: v[ids] for k, v in self.drawn.items()}, self._fields
         write_servos(fields, ids, drawn, self._dof_of, self._tendon_of)
         fields["geom_friction"][ids[:, None], self._feet_geoms, 0] = self.friction[ids, None]
         mass = self.model.body_mass[self._trunk] + self.payload_kg[ids]
         fields["body_mass"][ids, self._trunk] = mass
+        centre = self.model.body_ipos[self._trunk] + self.bodies.centre_m[ids]
+        fields["body_ipos"][ids, self._trunk] = centre
         self.batch.set_const(ids)
 
     def place(
@@ -360,6 +368,7 @@ class RobotBatch:
         """Everything that changes, as copies, for an exact restart."""
         found: dict[str, Any] = {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
         found |= {"friction": self.friction.copy(), "payload_kg": self.payload_kg.copy()}
+        found |= {f"bodies.{k}": v.copy() for k, v in self.bodies.state.items()}
         found |= {"batch.state": self.batch.state.copy()}
         found |= {"robot": self._hash, "knee": self.config.knee}
         if self.servo_model is not None:
@@ -385,7 +394,9 @@ class RobotBatch:
         for k, v in self.drawn.items():
             v[:] = state[f"drawn.{k}"]
         self.friction[:], self.payload_kg[:] = state["friction"], state["payload_kg"]
-        self._write(np.arange(self.environments))
+        for k, v in self.bodies.state.items():
+            v[:] = state[f"bodies.{k}"]
+        self.write(np.arange(self.environments))
         self.batch.state[:] = state["batch.state"]
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
         # forward changes what warm-starts the solver

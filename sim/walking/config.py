@@ -14,6 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.sim.robot.mini_pupper import Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.differences import TYPICAL, Differences
 from pupper_sysid.sim.walking.rewards import DEFAULT, PAPER, RELEASE, Rewards
 
 EVALUATION_STEP_S = 0.002
@@ -36,8 +37,12 @@ class Commands:
     """Share of commands along one of the three axes only."""
     every_s: float = 5.0
     """Mean time between two commands (exponential)."""
+    dead_band: tuple[float, float] = (0.015, 0.05)
+    """Speed [m/s] and turn rate [rad/s] below which a command means: stand."""
 
     def __post_init__(self):
+        if not min(self.dead_band) >= 0:
+            raise InputError("commands.dead_band must be 0 or more.")
         for name in ("forward_m_s", "sideways_m_s", "yaw_rad_s"):
             _check_range("commands", name, getattr(self, name))
 
@@ -165,6 +170,8 @@ class Walking:
     commands: Commands = field(default_factory=Commands)
     observation: Observation = field(default_factory=Observation)
     randomisation: Randomisation = field(default_factory=Randomisation)
+    differences: Differences = field(default_factory=Differences)
+    """Of robots from their model; off in evaluations, whose conditions are their own."""
     curriculum: Curriculum = field(default_factory=Curriculum)
     rewards: Rewards = DEFAULT
     trot: Trot = field(default_factory=Trot)
@@ -184,11 +191,11 @@ class Walking:
                 raise InputError(f"commands.{name} must be between 0 and 1.")
 
     def evaluated(self) -> Walking:
-        """The same task in the physics of evaluation."""
+        """The same task in the physics of evaluation, on robots that are as their model."""
         step = self.physics_step_s
         if step > EVALUATION_STEP_S:
             step = self.control_step_s / math.ceil(self.control_step_s / EVALUATION_STEP_S - 1e-6)
-        return replace(self, physics="evaluation", physics_step_s=step)
+        return replace(self, physics="evaluation", physics_step_s=step, differences=Differences())
 
     @property
     def substeps(self) -> int:
@@ -212,7 +219,9 @@ def _check_range(part: str, name: str, ends: tuple[float, float], least: float =
 
 
 _PUBLISHED = Walking(
-    commands=Commands((-0.35, 0.35), (-0.35, 0.35), (-0.30, 0.30), 0.25, 0.0, 10.0),
+    commands=Commands(
+        (-0.35, 0.35), (-0.35, 0.35), (-0.30, 0.30), 0.25, 0.0, 10.0, dead_band=(0.0, 0.0)
+    ),
     observation=Observation(base_velocity="true"),
     randomisation=Randomisation(torque_scale=(1.0, 1.0), push_m_s=0.5, on_the_move=0.0),
     rewards=RELEASE,
@@ -222,6 +231,7 @@ _SCRATCH = Walking(
     physics_step_s=0.004,
     commands=Commands(every_s=4.0, standing=0.1),
     randomisation=Randomisation(on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5),
+    differences=TYPICAL,
     curriculum=Curriculum(
         commands=Ramp(0.6, 1.0, 1.0, 4.0),
         push=Ramp(0.0, 1.0, 8.0, 16.0),
@@ -243,7 +253,7 @@ _SCRATCH = Walking(
 """Settings with which a walk is found from nothing; see `benchmarks/README.md`."""
 
 PRESETS = {
-    "fast": Walking(),
+    "fast": Walking(differences=TYPICAL),
     "scratch": _SCRATCH,
     "paper": replace(_PUBLISHED, rewards=PAPER),
     "release": _PUBLISHED,

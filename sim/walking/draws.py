@@ -19,7 +19,15 @@ def draw_commands(commands: Commands, count: int, share: float, rng: np.random.G
     alone = rng.random(count) < commands.single
     found[alone] *= np.eye(3)[rng.integers(0, 3, count)][alone]
     found[rng.random(count) < commands.standing] = 0.0
-    return found
+    return at_rest(commands, found)
+
+
+def at_rest(commands: Commands, command: Array) -> Array:
+    """Commands (n, 3) with those within the dead band as 0: stand."""
+    speed, turn = commands.dead_band
+    small = np.linalg.norm(command[:, :2], axis=1) < speed
+    small &= np.abs(command[:, 2]) < turn
+    return np.where(small[:, None], 0.0, command)
 
 
 def draw_pose(

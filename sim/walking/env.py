@@ -23,8 +23,9 @@ from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking import rewards as walking_rewards
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.draws import draw_commands, draw_pose
+from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
 from pupper_sysid.sim.walking.held_readings import HeldReadings
+from pupper_sysid.sim.walking.imu import Imu
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
     OBSERVATION_SIZE,
@@ -34,7 +35,6 @@ from pupper_sysid.sim.walking.observation import (
     observed,
     privileged_of,
 )
-from pupper_sysid.sim.walking.older_states import of_today
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from pupper_sysid.sim.walking.step import StepResult, Unfinished, empty_facts
@@ -144,8 +144,9 @@ class PupperEnv:
         n = environments
         self._readings = HeldReadings(
             servos.feedback, n, config.physics_step_s, generator([seed, 2], twins),
-            self.robots.linked,
+            self.robots.linked, config.differences.poll_period[0],
         )  # fmt: skip
+        self._imu = Imu(config.differences, n, config.control_step_s)
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
         self.level = config.curriculum.at(0)
@@ -197,6 +198,9 @@ class PupperEnv:
         self.steps += 1
         self.earlier_action, self.last_action = self.last_action, self.action
         self.action = np.array(action, float)
+        if config.differences.missed_ticks:
+            missed = self.rng.random(self.environments) < config.differences.missed_ticks
+            self.action[missed] = self.last_action[missed]
         before = self.robots.joint_velocity.copy()
         self.robots.draw_latency(self.level.delay, self.rng)
         moving = self.robots.step(self.set_points(self.action))
@@ -239,7 +243,7 @@ class PupperEnv:
 
     def set_command(self, command: NDArray[np.floating]) -> None:
         """Give all robots a command, shape (3,) or (n, 3), until the end of their episodes."""
-        self.command[:] = command
+        self.command[:] = at_rest(self.config.commands, np.atleast_2d(np.asarray(command, float)))
         self._until_command[:] = np.inf
 
     @property
@@ -247,6 +251,7 @@ class PupperEnv:
         """Everything that changes, as arrays and strings; `restore` takes it back exactly."""
         found = self.robots.state
         found |= {f"readings.{k}": v.copy() for k, v in self._readings.state.items()}
+        found |= {f"imu.{k}": v.copy() for k, v in self._imu.state.items()}
         found |= {name: getattr(self, name).copy() for name in _ARRAYS}
         found["counters"] = np.array([self.nan_resets, self.steps])
         rngs = (self.rng, self._readings.rng)
@@ -264,12 +269,13 @@ class PupperEnv:
         InputError
             If it is of another number of environments or another robot.
         """
-        state = of_today(state, VELOCITY_STEPS + 1)
         if differ := sorted(state.keys() ^ self.state.keys()):
             raise InputError(f"they differ in {differ[0]}. Resume with the settings of the run.")
         exact = self.robots.restore(state)
         for k, v in self._readings.state.items():
             v[:] = state[f"readings.{k}"]
+        for k, v in self._imu.state.items():
+            v[:] = state[f"imu.{k}"]
         for name in _ARRAYS:
             getattr(self, name)[:] = state[name]
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
@@ -332,6 +338,8 @@ class PupperEnv:
         facts = {name: value[rows] for name, value in now.facts.items()}
         np.greater(moved.touch, _FOOT_N, out=facts["contact"])
         np.logical_and(facts["contact"], self._air[rows] > 0, out=facts["landed"])
+        np.greater(self._contact[rows], 0, out=facts["lifted"])
+        np.logical_and(facts["lifted"], ~facts["contact"], out=facts["lifted"])
         self._count_swings(rows, facts["contact"])
         at, facts["foot_height_m"][:] = robots.feet(rows)
         foot_speed = at - self._foot_at[rows]
@@ -364,6 +372,7 @@ class PupperEnv:
             robots.push(ids, now.push[first:last])
             qvel = robots.qvel[rows]
             velocity = own_velocity(qpos, qvel)
+        self._imu.advance(rows, qvel[:, 3:6], gravity)
         noise = None if now.noise is None else now.noise[rows]
         self._look(
             rows,
@@ -391,9 +400,11 @@ class PupperEnv:
         self._draw_commands(ids)
         start, speed = draw_pose(self.config.randomisation, self.trot, self.command[ids], self.rng)
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
-        self._readings.reset(ids, self.robots.to_servo(start))
+        bodies = self.robots.bodies
+        self._readings.reset(ids, self.robots.to_servo(start), bodies.poll[ids])
         self._seen[:, ids] = self._read(ids)
         qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
+        self._imu.reset(ids, qvel[:, 3:6], gravity_direction(qpos), self.rng)
         self._average[ids, :2] = own_velocity(qpos, qvel)[:, :2]
         self._average[ids, 2] = qvel[:, 5]
         self._foot_at[ids] = self.robots.feet(ids)[0]
@@ -401,7 +412,8 @@ class PupperEnv:
         for times in (self._air, self._contact, self._last_air, self._last_contact):
             times[ids] = 0.0
         self.episode_step[ids] = 0
-        relative = (start - self.default) / self.config.action_scale
+        command = self.robots.from_servo(self.robots.to_servo(start) - bodies.zero_rad[ids])
+        relative = (command - self.default) / self.config.action_scale
         for action in (self.action, self.last_action, self.earlier_action):
             action[ids] = relative
 
@@ -432,11 +444,13 @@ class PupperEnv:
         angle = self._seen[newest, rows]
         moved = angle - self._seen[(newest + 1) % len(self._seen), rows]
         moved /= VELOCITY_STEPS * self.config.control_step_s
+        bodies = self.robots.bodies
+        rate, down = self._imu.read(rows, qvel[:, 3:6], gravity)
+        effort = self._readings.load[rows] * bodies.effort[rows, None]
         observation = observed(
             [
-                velocity if true else np.zeros((len(qpos), 3)), qvel[:, 3:6], gravity,
-                self.command[rows], angle - self.default, moved, self._readings.load[rows],
-                self.action[rows],
+                velocity if true else np.zeros((len(qpos), 3)), rate, down,
+                self.command[rows], angle - self.default, moved, effort, self.action[rows],
             ],
             noise, observation,
         )  # fmt: skip
@@ -446,12 +460,27 @@ class PupperEnv:
             [
                 velocity, qpos[:, 7:] - self.default, qvel[:, 6:], height[:, None],
                 self._air[rows], self._contact[rows], self.robots.friction[rows, None],
-                self.robots.drawn["dead_time_s"][rows], left[:, None],
+                self.robots.drawn["dead_time_s"][rows], *self._differing(rows), left[:, None],
             ],
             privileged,
         )  # fmt: skip
         return observation, privileged
 
+    def _differing(self, rows: slice | NDArray[np.intp]) -> list[Array]:
+        """What was drawn for robots, as the critic sees it."""
+        robots, imu, bodies = self.robots, self._imu, self.robots.bodies
+        stiffness = robots.drawn["stiffness"][rows] / self.servos.value["stiffness"]
+        speed = robots.drawn["velocity_limit"][rows] / self.servos.value["velocity_limit"]
+        return [
+            robots.payload_kg[rows, None], bodies.centre_m[rows],
+            stiffness.reshape(len(stiffness), FEET, -1).mean(axis=2),
+            speed.mean(axis=1, keepdims=True), bodies.zero_rad[rows], imu.mounting_rad[rows],
+            imu.bias_rad_s[rows],
+            np.stack([imu.latency_s[rows], imu.period_s[rows]], axis=1),
+            np.stack([bodies.poll[rows], bodies.jitter[rows], bodies.effort[rows]], axis=1),
+        ]  # fmt: skip
+
     def _read(self, rows: slice | NDArray[np.intp]) -> Array:
         """Joint angles as the controller reads them."""
-        return self.robots.from_servo(self._readings.position[rows])
+        position = self._readings.position[rows] - self.robots.bodies.zero_rad[rows]
+        return self.robots.from_servo(position)

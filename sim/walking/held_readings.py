@@ -32,6 +32,8 @@ class HeldReadings:
     rng : numpy.random.Generator
     linked : sequence of int
         Servos that turn their joint and the one before it, so that they read the sum of both.
+    shortest_period : float
+        Least factor on a robot's periods that `reset` is given.
 
     Attributes
     ----------
@@ -50,7 +52,9 @@ class HeldReadings:
         physics_step_s: float,
         rng: np.random.Generator,
         linked: Sequence[int] = (),
+        shortest_period: float = 1.0,
     ):
+        self._shortest = shortest_period
         self._period = np.array([f.poll_period_s for f in feedback])
         self._loss = np.array([f.loss for f in feedback])
         quantum = np.array([f.quantum_rad for f in feedback])
@@ -74,10 +78,25 @@ class HeldReadings:
             "load": self.load, "age_s": self.age_s,
         }  # fmt: skip
 
-    def reset(self, ids: NDArray[np.intp], position: NDArray[np.float64]) -> None:
-        """Start robots `ids` at rest at `position` [rad], shape (len(ids), servos)."""
+    def reset(
+        self,
+        ids: NDArray[np.intp],
+        position: NDArray[np.float64],
+        period: NDArray[np.float64] | float = 1.0,
+    ) -> None:
+        """Start robots `ids` at rest.
+
+        Parameters
+        ----------
+        ids : ndarray of int
+        position : ndarray, shape (len(ids), servos)
+            [rad]
+        period : ndarray, shape (len(ids),), or float
+            Factor on the periods of their polls.
+        """
         servos = len(self._period)
         wander = 1.0 + _DRIFT * self.rng.standard_normal((len(ids), 1))
+        wander *= np.broadcast_to(period, len(ids))[:, None]
         self._lattice[ids] = self._period * wander
         first = self.rng.random((len(ids), 1)) + np.arange(servos) / servos
         self._next[ids] = self._lattice[ids] * (first % 1.0)
@@ -94,7 +113,7 @@ class HeldReadings:
         """
         rounds = 0
         if not self._direct.all():
-            shortest = self._period[~self._direct].min() * (1 - 6 * _DRIFT)
+            shortest = self._period[~self._direct].min() * (1 - 6 * _DRIFT) * self._shortest
             rounds = int(steps * self._step / shortest) + 1
         return self.rng.random((len(self.position), rounds, 2, len(self._period)))
 

@@ -79,25 +79,32 @@ def observed(
     return whole
 
 
-PRIVILEGED_SIZE = 50
+PRIVILEGED_SIZE = 82
 
 
 def privileged_of(
     parts: Sequence[NDArray[np.floating]], out: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """What a critic in the simulator may know of n robots, shape (n, 50).
+    """What a critic in the simulator may know of n robots, shape (n, 82).
 
     Parameters
     ----------
     parts : sequence of ndarray, each of shape (n, k)
         Velocity of the trunk in its own frame [m/s], joint angles from the default pose [rad] and
         velocities [rad/s], height above the ground [m], times of each foot in the air and on the
-        ground [s], friction, dead times [s], share of the episode that is left.
-    out : ndarray of float32, shape (n, 50), optional
+        ground [s], friction, dead times [s], added mass [kg],
+        shift of the centre of mass [m], strength of the legs and of the battery relative to the
+        model, errors of the joints' zeros [rad], rotation of the IMU [rad], errors of its rates
+        [rad/s], ages of its newest sample and of its samples [s], factor on the readings' periods
+        and on the commands' jitter, whether efforts are read, share of the episode that is left.
+    out : ndarray of float32, shape (n, 82), optional
         Where to write it.
     """
-    velocity, angle, speed, height, air, stance, friction, dead_time, left = parts
+    velocity, angle, speed, height, air, stance, friction, dead_time, *differs, left = parts
+    mass, centre, legs, battery, zero, turn, bias, age, factors = differs
     if out is None:
         out = np.empty((len(velocity), PRIVILEGED_SIZE), np.float32)
     scaled = [velocity, angle, 0.1 * speed, 10 * height, air, stance.clip(0, 1), friction]
-    return np.concatenate([*scaled, 10 * dead_time, left], axis=1, out=out)
+    scaled += [10 * dead_time, 10 * mass, 100 * centre, legs, battery, 20 * zero, 20 * turn]
+    scaled += [20 * bias, 50 * age, factors, left]
+    return np.concatenate(scaled, axis=1, out=out)

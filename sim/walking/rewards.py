@@ -42,8 +42,8 @@ class Step:
         Time that each foot has been in the air, on the ground; 0 if it is not.
     last_air_s, last_contact_s : ndarray, shape (n, 4)
         Duration of the last swing and stance.
-    landed : ndarray of bool, shape (n, 4)
-        Feet that came down in this step.
+    landed, lifted : ndarray of bool, shape (n, 4)
+        Feet that came down, or left the ground, in this step.
     stride_velocity : ndarray, shape (n, 3)
         Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
     foot_height_m, foot_speed_m_s : ndarray, shape (n, 4)
@@ -67,6 +67,7 @@ class Step:
     last_air_s: Array
     last_contact_s: Array
     landed: NDArray[np.bool_]
+    lifted: NDArray[np.bool_]
     foot_height_m: Array
     foot_speed_m_s: Array
     stride_velocity: Array
@@ -115,6 +116,11 @@ class Rewards:
     """Feet that come down after less than `shortest_swing`, by the share that was missing."""
     shortest_swing: float = 0.1
     """For `short_swing` [s]."""
+    short_stance: float = 0.0
+    """Feet that leave the ground after less than `shortest_stance`, by the share that was
+    missing."""
+    shortest_stance: float = 0.15
+    """For `short_stance` [s]."""
     air_time: float = 0.0
     """Published: long swings and stances while moving, all feet down while standing."""
     air_time_most: float = 0.25
@@ -238,6 +244,12 @@ def short_swing(s: Step, p: Rewards) -> Array:
     return (s.landed * missing).sum(axis=1)
 
 
+def short_stance(s: Step, p: Rewards) -> Array:
+    """Share of `shortest_stance` that was missing, summed over feet that have just left."""
+    missing = np.maximum(1.0 - s.last_contact_s / p.shortest_stance, 0.0)
+    return (s.lifted * missing).sum(axis=1)
+
+
 def alive(s: Step, p: Rewards) -> Array:
     """1."""
     return np.ones(len(s.command))
@@ -346,10 +358,10 @@ TERMS = {
     f.__name__: f
     for f in (
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
-        stride_angular_velocity, progress, turn_progress, alive, flight, short_swing, air_time,
-        gait, foot_clearance, swing_height, action_smoothness, action_rate, action_jerk,
-        air_time_variance, base_motion, base_orientation, foot_slip, joint_position,
-        hip_abduction, joint_torques, joint_acceleration, joint_velocity,
+        stride_angular_velocity, progress, turn_progress, alive, flight, short_swing,
+        short_stance, air_time, gait, foot_clearance, swing_height, action_smoothness,
+        action_rate, action_jerk, air_time_variance, base_motion, base_orientation, foot_slip,
+        joint_position, hip_abduction, joint_torques, joint_acceleration, joint_velocity,
     )
 }  # fmt: skip
 """All terms by the name of their weight."""

@@ -19,6 +19,7 @@ _COLUMNS = {
     "last_air_s": FEET, "last_contact_s": FEET, "foot_height_m": FEET, "foot_speed_m_s": FEET,
     "stride_velocity": 3,
 }  # fmt: skip
+_FLAGS = ("contact", "landed", "lifted")
 
 
 @dataclass(frozen=True)
@@ -76,4 +77,4 @@ def empty_facts(
         "earlier_action": earlier_action.copy(),
     }  # fmt: skip
     found |= {name: np.empty((len(command), size)) for name, size in _COLUMNS.items()}
-    return found | {name: np.empty((len(command), FEET), bool) for name in ("contact", "landed")}
+    return found | {name: np.empty((len(command), FEET), bool) for name in _FLAGS}

@@ -32,6 +32,7 @@ SIZES = {
     "last_air_s": 4,
     "last_contact_s": 4,
     "landed": 4,
+    "lifted": 4,
     "foot_height_m": 4,
     "foot_speed_m_s": 4,
 }
@@ -42,7 +43,7 @@ E1 = np.exp(-1.0)
 def step(**known) -> Step:
     """One robot, all zeros but what is given."""
     values: dict[str, Any] = {f.name: np.zeros((1, SIZES.get(f.name, 12))) for f in fields(Step)}
-    values |= {name: np.zeros((1, 4), bool) for name in ("contact", "landed")}
+    values |= {name: np.zeros((1, 4), bool) for name in ("contact", "landed", "lifted")}
     for name, value in known.items():
         values[name][:] = value
     return Step(**values)
@@ -73,12 +74,15 @@ def test_progress_is_the_share_of_the_commanded_speed_along_the_command():
     assert wr.turn_progress(step(angular_velocity=(0, 0, 1.0)), P)[0] == 0.0
 
 
-def test_flight_is_all_feet_up_and_short_swings_count_where_they_end():
+def test_flight_is_all_feet_up_and_short_swings_and_stances_count_where_they_end():
     assert wr.flight(step(), P)[0] == 1.0
     assert wr.flight(step(contact=(False, True, False, False)), P)[0] == 0.0
     p = replace(P, shortest_swing=0.1)
     s = step(landed=(True, True, False, True), last_air_s=(0.025, 0.2, 0.0, 0.05))
     assert wr.short_swing(s, p)[0] == pytest.approx(0.75 + 0.5)
+    p = replace(P, shortest_stance=0.2)
+    s = step(lifted=(True, True, False, False), last_contact_s=(0.05, 0.3, 0.0, 0.05))
+    assert wr.short_stance(s, p)[0] == pytest.approx(0.75)
 
 
 def test_a_curriculum_fades_guides_alone_and_widens_what_tracks():

@@ -1,0 +1,237 @@
+"""What differs between robots and their model: each setting does what it names, and no more."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sim.walking.config import PRESETS, Commands, Observation, Randomisation, Walking
+from pupper_sysid.sim.walking.differences import TYPICAL, Differences
+from pupper_sysid.sim.walking.draws import at_rest
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.held_readings import HeldReadings
+from pupper_sysid.sim.walking.imu import Imu
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+
+MEASURED = "data/samples/calibrated.yaml"
+STILL = Randomisation(
+    friction=(0.8, 0.8), payload_kg=(0.0, 0.0), torque_scale=(1.0, 1.0), joint_rad=0.0,
+    joint_rad_s=0.0, base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
+    push_m_s=0.0, on_the_move=0.0,
+)  # fmt: skip
+SPAN = 0.02
+
+
+def make(actuator: str = "ideal", count: int = 40, **differences) -> PupperEnv:
+    task = Walking(
+        randomisation=STILL, observation=Observation(noise=False),
+        differences=Differences(**differences),
+    )  # fmt: skip
+    return PupperEnv(task, servo_ranges(actuator), count, seed=3, threads=1)
+
+
+def stand(env: PupperEnv, steps: int) -> np.ndarray:
+    """The last observation of robots that stand in their default pose."""
+    for _ in range(steps):
+        found = env.step(np.zeros((env.environments, 12))).observation
+    return found
+
+
+def test_a_wrong_zero_is_in_commands_and_readings_alike():
+    env = make(joint_zero_rad=0.05)
+    seen = stand(env, 50)
+    zero = env.robots.bodies.zero_rad
+    assert np.abs(zero).max() <= 0.05 and zero.std() > 0.02  # of a uniform draw: 0.029
+    wrong = env.robots.to_servo(env.robots.joints) - env.robots.to_servo(env.default)
+    # stiff servos of 20 N·m/rad give way by milliradians under the robot's weight
+    np.testing.assert_allclose(wrong, zero, atol=0.01)
+    np.testing.assert_allclose(seen[:, PARTS["joint_position_relative"]], 0.0, atol=0.01)
+
+
+def test_a_robot_that_misses_every_tick_keeps_its_first_set_points():
+    env = make(missed_ticks=1.0)
+    for _ in range(5):
+        found = env.step(np.full((40, 12), 0.3))
+    np.testing.assert_allclose(found.observation[:, PARTS["last_action"]], 0.0, atol=1e-6)
+    np.testing.assert_allclose(env.robots.joints - env.default, 0.0, atol=0.01)
+
+
+def test_a_robot_that_misses_some_ticks_repeats_the_action_before():
+    env = make(missed_ticks=0.25, count=400)
+    env.step(np.full((400, 12), 0.1))
+    before = env.action.copy()
+    env.step(np.full((400, 12), 0.2))
+    missed = (env.action == before).all(axis=1)
+    assert 0.15 < missed.mean() < 0.35  # five standard deviations
+    assert (env.action[~missed] == 0.2).all()
+
+
+def imu(**settings) -> Imu:
+    return Imu(Differences(**settings), 3, SPAN)
+
+
+def ramp(time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """A rate that grows by 1 rad/s², level."""
+    return np.full((3, 3), time_s), np.tile([0.0, 0.0, -1.0], (3, 1))
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.005, 0.02, 0.033])
+def test_a_late_imu_reports_what_was_so_much_earlier(latency_s):
+    own, rng = imu(imu_latency_s=(latency_s, latency_s)), np.random.default_rng(0)
+    own.reset(np.arange(3), *ramp(0.0), rng)
+    for k in range(1, 9):
+        own.advance(slice(0, 3), *ramp(k * SPAN))
+        rate, gravity = own.read(slice(None), *ramp(k * SPAN))
+        np.testing.assert_allclose(rate, max(k * SPAN - latency_s, 0.0), atol=1e-12)
+        np.testing.assert_allclose(gravity, ramp(0.0)[1])
+
+
+def test_samples_of_a_slow_imu_are_a_period_apart():
+    own, rng = imu(imu_period_s=(0.03, 0.03)), np.random.default_rng(1)
+    own.reset(np.arange(3), *ramp(0.0), rng)
+    sampled = []
+    for k in range(1, 40):
+        own.advance(slice(0, 3), *ramp(k * SPAN))
+        rate = own.read(slice(None), *ramp(k * SPAN))[0][:, 0]
+        sampled.append(rate.copy())
+        assert ((rate > k * SPAN - 0.03 - 1e-9) & (rate <= k * SPAN + 1e-9)).all()
+    steps = np.diff(np.array(sampled[3:]), axis=0)
+    whole = np.round(steps / 0.03)
+    np.testing.assert_allclose(steps, 0.03 * whole, atol=1e-9)
+    assert set(whole.ravel()) == {0.0, 1.0}  # 20 ms per step: every third step has no new sample
+
+
+def test_an_imu_mounted_askew_sees_tilted_gravity_and_biased_rates():
+    own = imu(imu_mounting_rad=0.05, gyro_bias_rad_s=0.03)
+    own.reset(np.arange(3), *ramp(0.0), np.random.default_rng(2))
+    rate, gravity = own.read(slice(None), *ramp(0.0))
+    np.testing.assert_array_equal(rate, own.bias_rad_s)
+    assert (own.bias_rad_s != 0).all() and np.abs(own.bias_rad_s).max() <= 0.03
+    # a pitch of +θ of the IMU brings its x axis down: gravity has a part along it
+    expected = np.stack([-own.mounting_rad[:, 1] * -1.0, own.mounting_rad[:, 0] * -1.0], axis=1)
+    np.testing.assert_allclose(gravity[:, :2], expected, atol=2e-4)  # θ³/6 and cos θ
+    np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 1.0)
+
+
+def test_the_observation_has_the_imu_s_readings():
+    env = make(imu_mounting_rad=0.1)
+    seen = stand(env, 30)
+    tilt = seen[:, PARTS["projected_gravity"]][:, :2]
+    level = stand(make(), 30)[:, PARTS["projected_gravity"]][:, :2]
+    np.testing.assert_allclose(tilt[:, 0] - level[:, 0], env._imu.mounting_rad[:, 1], atol=0.01)
+    assert np.abs(tilt).max() > 0.05
+
+
+def test_a_low_battery_takes_stiffness_torque_and_speed_together():
+    env = make(MEASURED, battery=(0.5, 0.5))
+    servos = env.servos
+    for name in ("stiffness", "effort_limit", "velocity_limit"):
+        assert (env.robots.drawn[name] <= 0.5 * servos.high[name] * 1.0001).all()
+        assert (env.robots.drawn[name] >= 0.5 * servos.low[name] * 0.9999).all()
+    for name in ("friction_loss", "damping", "armature"):
+        assert (env.robots.drawn[name] >= servos.low[name] * 0.9999).all()
+
+
+def test_one_leg_of_a_share_of_robots_is_weak():
+    env = make("paper", 400, weak_leg_share=0.5, weak_leg=(0.3, 0.3))
+    share = env.robots.drawn["effort_limit"] / env.servos.value["effort_limit"]
+    legs = share.reshape(400, 4, 3)
+    weak = np.isclose(legs, 0.3).all(axis=2)
+    assert set(weak.sum(axis=1)) == {0, 1}
+    assert 0.375 < weak.any(axis=1).mean() < 0.625  # five standard deviations
+    np.testing.assert_allclose(legs[~weak], 1.0)
+    assert weak.any(axis=0).all()
+
+
+def test_the_centre_of_mass_moves_in_the_physics():
+    env = make(centre_of_mass_m=(0.01, 0.0, 0.02))
+    trunk = env.robots.model.body("trunk").id
+    at = env.robots.field("body_ipos")[:, trunk] - env.robots.model.body_ipos[trunk]
+    np.testing.assert_allclose(at, env.robots.bodies.centre_m, atol=1e-12)
+    assert (at[:, 1] == 0).all() and np.abs(at[:, 0]).max() <= 0.01 and at[:, 2].std() > 0.008
+
+
+def test_some_robots_have_no_effort_readings():
+    env = make(count=200, without_effort=0.4)
+    effort = stand(env, 20)[:, PARTS["joint_effort"]]
+    none = (effort == 0).all(axis=1)
+    assert 0.23 < none.mean() < 0.57
+    np.testing.assert_array_equal(none, env.robots.bodies.effort == 0)
+
+
+def test_a_robot_of_longer_rounds_is_read_more_rarely():
+    feedback = servo_ranges(MEASURED).feedback
+    ages = []
+    for factor in (1.0, 2.0):
+        readings = HeldReadings(
+            feedback, 200, 0.002, np.random.default_rng(0), shortest_period=min(factor, 1.0)
+        )
+        readings.reset(np.arange(200), np.zeros((200, 12)), np.full(200, factor))
+        seen = []
+        for _ in range(60):
+            readings.advance(
+                np.zeros((200, 12)), np.zeros((200, 10, 12)), np.zeros((200, 10, 12)),
+                readings.chances(10),
+            )  # fmt: skip
+            seen.append(readings.age_s.mean())
+        ages.append(np.mean(seen[20:]))
+    # the age of a poll that never fails is half a period; losses add whole ones
+    assert ages[1] == pytest.approx(2 * ages[0], rel=0.05)
+
+
+def test_commands_within_the_dead_band_mean_stand():
+    given = np.array([[0.01, 0.0, 0.04], [0.01, 0.011, 0.0], [0.01, 0.0, 0.06], [0.1, 0.0, 0.0]])
+    commands = Commands(dead_band=(0.0145, 0.05))
+    expected = given.copy()
+    expected[0] = 0.0
+    np.testing.assert_array_equal(at_rest(commands, given), expected)
+    env = make()
+    env.set_command(np.array([0.01, 0.0, 0.0]))
+    assert (env.command == 0).all()
+
+
+def test_the_critic_sees_what_was_drawn():
+    env = make(MEASURED, **{f.name: getattr(TYPICAL, f.name) for f in fields(Differences)})
+    seen = env.observe()[1]
+    bodies, imu = env.robots.bodies, env._imu
+    sight = {tuple(np.round(column, 5)) for column in seen.T}
+    for truth in (
+        20 * bodies.zero_rad, 100 * bodies.centre_m, 20 * imu.mounting_rad, 20 * imu.bias_rad_s,
+        50 * imu.latency_s[:, None], 50 * imu.period_s[:, None], bodies.poll[:, None],
+        bodies.jitter[:, None], bodies.effort[:, None],
+    ):  # fmt: skip
+        for column in truth.T:
+            assert column.std() > 0
+            assert tuple(np.round(column.astype(np.float32), 5)) in sight
+
+
+def test_robots_with_all_differences_go_on_exactly_from_a_saved_state():
+    task = PRESETS["scratch"]
+    env, other = (
+        PupperEnv(task, servo_ranges(MEASURED), 6, seed=seed, threads=1) for seed in (0, 5)
+    )
+    rng = np.random.default_rng(1)
+    actions = rng.uniform(-0.3, 0.3, (8, 6, 12))
+    for action in actions[:4]:
+        env.step(action)
+    assert other.restore(env.state)
+    for action in actions[4:]:
+        a, b = env.step(action), other.step(action)
+        np.testing.assert_array_equal(a.observation, b.observation)
+        np.testing.assert_array_equal(a.privileged, b.privileged)
+
+
+def test_evaluated_robots_are_as_their_model():
+    assert replace(Walking(), differences=TYPICAL).evaluated().differences == Differences()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"missed_ticks": 1.5}, {"battery": (1.2, 0.8)}, {"joint_zero_rad": -0.1}]
+)
+def test_ranges_that_cannot_be_drawn_from_are_refused(wrong):
+    with pytest.raises(InputError, match="differences"):
+        Differences(**wrong)
