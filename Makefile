@@ -30,7 +30,7 @@ links: setup
 	mkdir -p $(VENV)/links/pupper_sysid
 	ln -sfn ../../../api/__init__.py $(VENV)/links/pupper_sysid/__init__.py
 	ln -sfn ../../../api/py.typed $(VENV)/links/pupper_sysid/py.typed
-	for room in common servo_models hardware sysid sim policies cli; do \
+	for room in common data servo_models hardware sysid sim policies cli; do \
 		ln -sfn ../../../$$room $(VENV)/links/pupper_sysid/$$room; done
 
 setup: $(VENV)/.installed

@@ -81,14 +81,13 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
     """A program's help: its commands, by group, one line each."""
     group_width = 2 + max(len(c.group) for c in commands.values())
     width = 2 + max(map(len, commands))
-    lines, last = [f"usage: {program} COMMAND [OPTIONS]", description.strip()], None
+    usage = f"usage: {program} COMMAND [OPTIONS]   (COMMAND --help lists options)"
+    lines, last = [usage, description.strip()], None
     for word, (group, summary, *_) in commands.items():
         shown = "" if group == last else group
         lines.append(f"{shown:{group_width}}{word:{width}}{summary}")
         last = group
-    return "\n".join(
-        [*lines, "COMMAND --help lists options; --install-completion sets up the shell."]
-    )
+    return "\n".join(lines)
 
 
 def words(commands: Mapping[str, Command]) -> list[str]:

@@ -19,12 +19,13 @@ shifted by a stored calibration. A map of one frame is refused by a bus of the o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,10 @@ Linkage = Literal["parallel knee", "none"]
 _FILE = ConfigDict(
     extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
 )
+
+
+_SCALE_FACTOR = 2.0
+"""By how much a scale may differ from one turn per whole range; 1,024 counts may be 300°."""
 
 
 class JointEntry(BaseModel):
@@ -101,9 +106,25 @@ class JointMapFile(BaseModel):
     frame: Frame
     counts: Literal[1024, 4096]
     """Counts of the encoder's whole range; the centre is half of it."""
+    servo: Annotated[str, Field(min_length=1, max_length=60)] | None = None
+    """Manufacturer's model name of the servos, such as STS3215; its data sheet gives the torques
+    their scale."""
     linkage: Linkage
     source: str
     joints: dict[str, JointEntry] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _scales(self) -> JointMapFile:
+        # every limit of the guard is in radians: a wrong scale would stretch them all
+        whole = self.counts / (2 * math.pi)
+        for joint, entry in self.joints.items():
+            if not 1 / _SCALE_FACTOR <= entry.counts_per_rad / whole <= _SCALE_FACTOR:
+                raise ValueError(
+                    f"{joint}: counts_per_rad is {entry.counts_per_rad:.4g}, but a servo of "
+                    f"{self.counts} counts a turn has {whole:.4g}, and all limits scale with it. "
+                    "Measure it with `pupper-sysid calibrate-joints`"
+                )
+        return self
 
     @model_validator(mode="after")
     def _names_and_ids(self) -> JointMapFile:
@@ -263,6 +284,11 @@ class JointMap:
             "rest_pose_rad": {j: float(x) for j, x in zip(names, self.rest_pose(), strict=True)},
         }
 
+    def servo_setups(self) -> dict[str, dict[str, Any]]:
+        """By joint, what a recording's header says of its servo; empty where nothing is known."""
+        model = self.file.servo
+        return {joint: {"model": model} for joint in self.joint_names} if model else {}
+
     def save(self, path: Path, force: bool = False) -> None:
         """Write the map as YAML.
 
@@ -272,6 +298,8 @@ class JointMap:
             If the file exists and `force` is not set.
         """
         data = self.file.model_dump(by_alias=True)
+        if self.file.servo is None:
+            del data["servo"]
         for entry in data["joints"].values():
             for name in ("limits_counts", "limits_rad"):
                 entry[name] = list(entry[name])

@@ -40,6 +40,7 @@ _SUMMARIES = {
         "report": "Write figures and tables as one HTML page.",
         "export": "Convert for MuJoCo, Isaac Lab, Newton, CSV …",
         "servo": "List, show and compare servo cards.",
+        "samples": "Copy sample recordings, policies and models here.",
     },
 }
 _HOLD_BUS = {"scan", "monitor", "calibrate-joints", "emulate", "sweep"}

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.training import make_env, make_learner
@@ -30,7 +31,7 @@ from pupper_sysid.sim.walking.env import PupperEnv
 SLICE_S = 0.2
 _SLICES, _ROUNDS = 25, 3
 _STRIDE = 100  # steps of the trot after which its actions are used again
-_SAMPLE = Path(__file__).resolve().parents[2] / "data" / "samples" / "calibrated.yaml"
+_SAMPLE = SAMPLES / "calibrated.yaml"
 
 
 class Paces:

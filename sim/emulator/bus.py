@@ -177,7 +177,8 @@ class EmulatedBus:
     def servo_setups(self) -> dict[str, dict[str, Any]]:
         """By joint, what a recording's header says of its servo; empty where nothing is known."""
         plant: Any = self._plant
-        return getattr(plant, "servo_setups", lambda joints: {})(self.joint_names)
+        own = self.robot.joint_map.servo_setups()
+        return own | getattr(plant, "servo_setups", lambda joints: {})(self.joint_names)
 
     def register(self, joint: str, name: str) -> int:
         """Present value of a register; see `hardware.bus.RegisterBus`."""

@@ -10,12 +10,13 @@ statistics of twelve recordings.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.servo_models.cards.data_sheet import data_sheet
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 
@@ -198,6 +199,17 @@ def draw_robot(
 
 
 def directly_read(joint_map: JointMap) -> RobotSpec:
-    """Spec of servos on a serial line: every reading is fresh, none is lost."""
-    quantum = float(1 / joint_map.counts_per_rad().max())
-    return RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=quantum)
+    """Spec of servos on a serial line: every reading is fresh, none is lost.
+
+    Torque and speed are those of the servo's data sheet, where the map names it; the ratios to the
+    inertia stay those of the Mini Pupper's servos.
+    """
+    spec = RobotSpec(
+        poll_period_s=0.0, loss=0.0, quantum_rad=float(1 / joint_map.counts_per_rad().max())
+    )
+    sheet = data_sheet(joint_map.file.servo or "")
+    if sheet is None:
+        return spec
+    rating = sheet.at()
+    speed = rating.no_load_speed_rad_s or spec.velocity_limit_rad_s
+    return replace(spec, stall_torque_nm=rating.stall_torque_nm, velocity_limit_rad_s=speed)

@@ -61,7 +61,7 @@ def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
     counts, span = SERVOS[servo]
     data = {
         "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "name": path.stem, "frame": "raw",
-        "counts": counts, "linkage": "none",
+        "counts": counts, "servo": servo.upper(), "linkage": "none",
         "source": f"made from {path.name} for {servo} servos; ids, centres and signs are guesses",
         "joints": {
             hinge.name: _entry(path, hinge, k + 1, counts, counts / span)

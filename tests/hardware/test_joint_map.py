@@ -294,6 +294,8 @@ def put(joint: str, **fields):
         (put("LF_hip", neutral_rad=np.nan), r"joints.LF_hip.neutral_rad is nan. Write a finite"),
         (put("LF_hip", limits_rad=(-np.inf, 1.0)), r"joints.LF_hip.limits_rad\[0\] is -inf. Write"),
         (put("LF_hip", counts_per_rad=0.0), r"joints.LF_hip.counts_per_rad is 0.0; it must"),
+        (put("LF_hip", counts_per_rad=1750.0), r"LF_hip: counts_per_rad is 1750, but a servo of"),
+        (put("LF_hip", counts_per_rad=17.5), r"LF_hip: counts_per_rad is 17.5, but a servo of"),
         (put("LF_hip", counts_per_rad="175"), r"joints.LF_hip.counts_per_rad is the text .175."),
         (put("LF_hip", sign=0), r"joints.LF_hip.sign is 0. Write 1 or -1"),
         (put("LF_hip", id=254), r"joints.LF_hip.id is 254; it must be"),
