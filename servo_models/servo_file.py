@@ -32,6 +32,7 @@ from pupper_sysid.common.border import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.common.reading.tensors import refuse_large_header
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
@@ -214,6 +215,7 @@ def load_servo_model(
             f"{folder / WEIGHTS} is not the file that {CONTRACT} describes (its SHA-256 differs): "
             "it was cut short, changed or exchanged. Copy the whole folder again, or fit again."
         )
+    refuse_large_header(folder / WEIGHTS, data)
     try:
         parameters = load_tensors(data)
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -329,7 +331,7 @@ def _read_contract(folder: Path) -> Contract:
             f"{folder} holds no servo model ({CONTRACT} is missing). "
             "Make one with `pupper-sysid fit-servo`."
         )
-    found = read_json(path, _LARGEST_BYTES, _AGAIN)
+    found = read_json(path, remedy=_AGAIN)
     if not isinstance(found, dict) or found.get("schema") != SCHEMA:
         raise InputError(f"{path} is no servo model's contract. Give a folder of `fit-servo`.")
     refuse_other_version(path, found.get("schema_version"), SCHEMA_VERSION)

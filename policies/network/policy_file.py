@@ -32,6 +32,7 @@ from pupper_sysid.common.border import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.reading.tensors import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
 from pupper_sysid.sim.walking.observation import OBSERVATION, VELOCITY_STEPS
@@ -133,15 +134,25 @@ class Policy:
             own._run = torch.jit.freeze(traced)
         return own
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Actions, shape (n, 12), for observations (n, 60)."""
+    def act(self, observation: np.ndarray, missed: np.ndarray | None = None) -> np.ndarray:
+        """Actions, shape (n, 12), for observations (n, 60).
+
+        The states of `missed` robots, a mask of shape (n,), stay as they are: their control tick
+        was missed, and their action is meaningless.
+        """
         seen = np.concatenate([observation, self._past.reshape(len(observation), -1)], axis=1)
         with torch.inference_mode():
             action, *state = self._run(torch.from_numpy(seen.astype(np.float32)), *self._state)
+        before, past = self._state, self._past
         self._state = tuple(s.clone() for s in state)
         found = action.numpy()
-        if self._past.shape[1]:
-            self._past = np.concatenate([found[:, None], self._past[:, :-1]], axis=1)
+        if past.shape[1]:
+            self._past = np.concatenate([found[:, None], past[:, :-1]], axis=1)
+        if missed is not None and missed.any():
+            kept = torch.from_numpy(missed)[:, None]  # states are (layers, n, size)
+            pairs = zip(before, self._state, strict=True)
+            self._state = tuple(torch.where(kept, old, new) for old, new in pairs)
+            self._past = np.where(missed[:, None, None], past, self._past)
         return found
 
 
@@ -192,7 +203,7 @@ def load_policy(folder: Path) -> Policy:
     for file in (path, weights):
         if not file.is_file():
             raise InputError(f"{folder} holds no policy: there is no {file.name} in it.")
-    found = read_json(path, _LARGEST_BYTES, _AGAIN)
+    found = read_json(path, remedy=_AGAIN)
     if isinstance(found, dict):
         refuse_other_version(path, found.get("schema_version"), VERSION)
     contract = validated(Contract, found, path, remedy="copy the whole folder again")
@@ -202,12 +213,17 @@ def load_policy(folder: Path) -> Policy:
     data = read_bytes(weights, _LARGEST_BYTES, _AGAIN)
     if hashlib.sha256(data).hexdigest() != contract.weights_sha256:
         raise InputError(f"{weights} is not the file that {path.name} describes. Copy both again.")
-    network = PolicyNetwork(
-        contract.kind, contract.observation_size, tuple(contract.hidden), contract.memory,
-        contract.normalise,
-    )  # fmt: skip
+    refuse_large_header(weights, data)
+    about = (contract.kind, contract.observation_size, tuple(contract.hidden), contract.memory,
+             contract.normalise)  # fmt: skip
+    with torch.device("meta"):  # shapes only: a contract may ask for any amount of memory
+        shapes = {name: value.shape for name, value in PolicyNetwork(*about).state_dict().items()}
     try:
-        network.take(load_tensors(data))
+        arrays = load_tensors(data)
+        if any(arrays[name].shape != shape for name, shape in shapes.items()):
+            raise RuntimeError("a shape is another")
+        network = PolicyNetwork(*about)
+        network.take(arrays)
     except (SafetensorError, KeyError, RuntimeError) as error:
         raise InputError(
             f"{weights} does not fit {path.name}: weights of another shape."

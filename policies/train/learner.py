@@ -26,16 +26,19 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from pupper_sysid.common.border import refuse_other_version
+from pupper_sysid.common.border import read_bytes, refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_bytes
+from pupper_sysid.common.reading.tensors import LARGEST_CHECKPOINT, refuse_bomb
 from pupper_sysid.policies.network.actor_critic import build
 from pupper_sysid.policies.network.exploration import PersistentGaussian
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
+from pupper_sysid.policies.train.mirror import MirrorImages, mirrored
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
 CHECKPOINT_VERSION = 2
+_ANOTHER = "Resume from another checkpoint of the run."
 _PARTS = (
     "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
     "learning_rate", "iteration", "torch_rng", "hidden", "observations", "environment", "more",
@@ -199,11 +202,20 @@ class Learner:
             learning_rate=hyper.learning_rate, max_grad_norm=hyper.gradient_norm,
             schedule="fixed", use_mixed_precision=hyper.mixed_precision, multi_gpu_cfg=group,
         )  # fmt: skip
+        if hyper.mirror:
+            if actor.is_recurrent:
+                raise InputError(
+                    f"A policy of kind {architecture.kind} cannot learn from mirror images. Give "
+                    "`learner.mirror` as False."
+                )
+            self.ppo.symmetry = MirrorImages()
         self.fresh_optimiser()
         env.env.processes = self.ranks.size
         self._joint_share = torch.ones(env.num_actions)
         if hyper.exploration.by_dead_band:
             self._joint_share = torch.from_numpy(env.env.servos.dead_band_share).float()
+        if hyper.mirror:  # or an image would have another likelihood than its original
+            self._joint_share = 0.5 * (self._joint_share + mirrored(self._joint_share).abs())
         self._explore()
         if group:
             self.ppo.broadcast_parameters()
@@ -404,11 +416,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise InputError(f"{path} does not exist. Give the folder of a run that has a checkpoint.")
+    data = read_bytes(path, LARGEST_CHECKPOINT, _ANOTHER)
+    refuse_bomb(path, data, _ANOTHER)
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
         raise InputError(
-            f"{path} is damaged and cannot be read. Resume from another checkpoint of the run."
+            f"{path} is damaged and cannot be read. {_ANOTHER}"
         ) from error
     if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
         raise InputError(f"{path} is not a checkpoint of pupper-train.")
@@ -420,5 +434,5 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)
     missing = [part for part in _PARTS if part not in content]
     if missing:
-        raise InputError(f"{path} has no {missing[0]}. Resume from another checkpoint of the run.")
+        raise InputError(f"{path} has no {missing[0]}. {_ANOTHER}")
     return content

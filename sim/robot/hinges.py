@@ -18,7 +18,7 @@ from pupper_sysid.common.errors import InputError
 
 _LARGEST_BYTES = 50_000_000
 _MEMORY_BYTES = 2 << 30
-_TIME_S = 20
+_TIME_S = 10
 _ADVICE = "Give an MJCF or URDF that MuJoCo's viewer opens, with its meshes beside it."
 
 

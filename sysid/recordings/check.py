@@ -17,6 +17,7 @@ from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
 _LEAST_ROWS = 20
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
+_LATEST_S = 1e11
 _FEW_TRIALS = 10  # that are named one by one
 
 
@@ -86,7 +87,14 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
 
 
 def _refuse_odd_numbers(path: Path | str, table: pd.DataFrame) -> None:
-    """Refuse trials that are no whole numbers, and counts that no encoder has."""
+    """Refuse times, trials and counts that are none."""
+    for column in ("send_time_s", "read_time_s"):
+        latest = np.abs(table[column].to_numpy(float)).max(initial=0.0)
+        if latest > _LATEST_S:
+            raise InputError(
+                f"{path}, column {column}: times reach {latest:.4g} s, three thousand years. "
+                "Write them in seconds."
+            )
     trial = table["trial"].to_numpy(float)
     if (np.abs(trial) >= LARGEST_COUNT).any() or (trial % 1 != 0).any():
         raise InputError(f"{path}, column trial: trials are counted by whole numbers.")

@@ -41,7 +41,8 @@ def read_npz(path: Path, data: bytes, options: LogOptions) -> Log:
         refuse_more(f"{path}, unpacked,", len(inside), MOST_COLUMNS, "arrays", "Split it.")
         refuse_more(f"{path}, unpacked,", size, LARGEST_BYTES, "bytes", "Split it.")
         with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
-            arrays = {name: loaded[name] for name in loaded.files}
+            found = {name: loaded[name] for name in loaded.files}
+            arrays = {k: v for k, v in found.items() if isinstance(v, np.ndarray)}
     except InputError:
         raise
     except Exception as error:  # a damaged archive raises whatever zlib, zipfile and NumPy do

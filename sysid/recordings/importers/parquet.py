@@ -14,9 +14,18 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
+from pupper_sysid.common.reading.csv_table import (
+    LONGEST_CELL,
+    MOST_CELLS,
+    MOST_COLUMNS,
+    MOST_ROWS,
+)
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.shared.log import Log
+from pupper_sysid.sysid.recordings.importers.shared.log import (
+    LARGEST_BYTES,
+    MOST_JOINTS,
+    Log,
+)
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
 
@@ -34,7 +43,7 @@ def read_parquet(path: Path, data: bytes, options: LogOptions) -> Log:
     """
     columns = columns_of(path, data)
     arrays = read_columns(path, data, [name for name, numeric in columns.items() if numeric])
-    texts = _texts(path, data, [name for name in columns if name in ("joint", "motor")])
+    texts = _texts(path, data)
     return read_table(path, Table(expanded(arrays, list(options.joints)), texts), options, LAYOUT)
 
 
@@ -86,7 +95,9 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         raise InputError(
             f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(known)[:300]}."
         )
-    refuse_more(path, _values(path, file, names), MOST_CELLS, "values", "Split the log.")
+    values, unpacked = _sizes(path, file, names)
+    refuse_more(path, values, MOST_CELLS, "values", "Split the log.")
+    refuse_more(f"{path}, unpacked,", unpacked, LARGEST_BYTES, "bytes", "Split the log.")
     try:
         table = file.read(columns=list(names), use_threads=False)
         return {name: _array(path, name, table.column(name)) for name in names}
@@ -94,8 +105,8 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
 
 
-def _values(path: Path, file: Any, names: Sequence[str]) -> int:
-    """How many numbers the columns of these names say they have."""
+def _sizes(path: Path, file: Any, names: Sequence[str]) -> tuple[int, int]:
+    """How many numbers, and bytes, the columns of these names say they have."""
     meta = file.metadata
     try:
         chunks = [
@@ -104,21 +115,45 @@ def _values(path: Path, file: Any, names: Sequence[str]) -> int:
             for c in range(meta.num_columns)
         ]
         own = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
-        return sum(c.num_values for c in own)
+        return sum(c.num_values for c in own), sum(c.total_uncompressed_size for c in own)
     except (OSError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is a damaged parquet file: {_first(error)}.") from error
 
 
-def _texts(path: Path, data: bytes, names: Sequence[str]) -> dict[str, list[str]]:
-    """Columns of text."""
-    table = _open(path, data).read(columns=list(names), use_threads=False) if names else None
-    return {name: [str(v) for v in table.column(name).to_pylist()] for name in names if table}
+def _texts(path: Path, data: bytes) -> dict[str, list[str]]:
+    """Columns of text that name joints: each text once, however often a row has it."""
+    pa = _library(path)
+
+    def textual(kind: Any) -> bool:
+        kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+        return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+
+    schema = _open(path, data).schema_arrow
+    names = [f.name for f in schema if f.name in ("joint", "motor") and textual(f.type)]
+    if not names:
+        return {}
+    file = _open(path, data, names)
+    refuse_more(path, file.metadata.num_rows, MOST_ROWS, "rows", "Split the log.")
+    found: dict[str, list[str]] = {}
+    try:
+        table = file.read(columns=names, use_threads=False)
+        for name in names:
+            found[name] = []
+            for chunk in table.column(name).chunks:
+                refuse_more(f"{path}, column {name}", len(chunk.dictionary), MOST_JOINTS, "joints")
+                texts = [*(str(t)[:LONGEST_CELL] for t in chunk.dictionary.to_pylist()), "None"]
+                codes = chunk.indices.fill_null(len(texts) - 1).to_numpy()
+                found[name] += [texts[k] for k in codes.tolist()]
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
+    return found
 
 
-def _open(path: Path, data: bytes) -> Any:
+def _open(path: Path, data: bytes, texts: Sequence[str] = ()) -> Any:
+    """The file; columns named `texts` come as dictionaries."""
     pa = _library(path)
     try:
-        return pa.parquet.ParquetFile(pa.BufferReader(data))
+        return pa.parquet.ParquetFile(pa.BufferReader(data), read_dictionary=list(texts) or None)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(
             f"{path} is not a parquet file, or is cut off: {_first(error)}. Fetch it again."

@@ -39,6 +39,7 @@ from pupper_sysid.sysid.recordings.importers.ros_messages import (
 )
 from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
 from pupper_sysid.sysid.recordings.importers.shared.log import (
+    MOST_JOINTS,
     Log,
     joint_names,
     read_files,
@@ -293,6 +294,8 @@ def _times(topic: _Topic, one_clock: bool) -> tuple[NDArray[np.int64], str]:
 def _by_joint(topic: _Topic, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Positions over the messages by joint; `names` where the messages have none."""
     found: dict[str, NDArray[np.float64]] = {}
+    every = {joint for message in topic.messages for joint in message.names}
+    refuse_more("A topic of the log", len(every), MOST_JOINTS, "joints")
     for k, message in enumerate(topic.messages):
         for joint, value in zip(message.names or names, message.positions, strict=False):
             if joint not in found:

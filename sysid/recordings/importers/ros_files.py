@@ -6,6 +6,7 @@ import io
 import sqlite3
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,10 @@ SQLITE = b"SQLite format 3\0"
 Raw = tuple[str, str, int, bytes]
 """Topic, type, log time [ns] and content of a message."""
 
-_MOST_MESSAGES = 3_000_000
+_MOST_MESSAGES = 1_000_000
+_MOST_TOPICS = 10_000
+_MOST_STEPS = 1e9  # of SQLite's machine; a message takes some twenty
+_STEPS = 100_000  # between two looks at them
 
 
 def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
@@ -33,8 +37,12 @@ def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
         If there are too many.
     """
     found: list[Raw] = []
+    total = 0
     for message in messages:
         found.append(message)
+        total += len(message[3])
+        # a database may say of one place that it is the content of many messages
+        refuse_more(path, total, LARGEST_BYTES, "bytes", "Split it.", exact=False)
         refuse_more(path, len(found), _MOST_MESSAGES, "messages", "Split it.", exact=False)
     return found
 
@@ -123,11 +131,23 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
         If it is no such database.
     """
     address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+    steps = 0.0
+
+    def enough() -> bool:
+        nonlocal steps
+        steps += _STEPS
+        return steps > allowed(_MOST_STEPS)
+
     try:
-        with sqlite3.connect(address, uri=True) as database:
+        with closing(sqlite3.connect(address, uri=True)) as database:
+            database.execute("PRAGMA trusted_schema = OFF")
+            database.set_progress_handler(enough, _STEPS)
+            _refuse_computed(database)
             topics = {
-                int(n): (str(name), plain_type(str(kind)))
-                for n, name, kind in database.execute("SELECT id, name, type FROM topics")
+                int(n): (str(name)[:1000], plain_type(str(kind)[:1000]))
+                for n, name, kind in database.execute(
+                    f"SELECT id, name, type FROM topics LIMIT {_MOST_TOPICS}"
+                )
             }
             wanted = [n for n, (_, kind) in topics.items() if kind in KINDS]
             marks = ",".join("?" * len(wanted[:500]))
@@ -136,9 +156,24 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
                 wanted[:500],
             ):
                 topic, kind = topics[n]
-                yield topic, kind, int(time_ns), bytes(data)
+                if type(time_ns) is not int or not isinstance(data, bytes):
+                    raise ValueError("a message is no bytes with a time")
+                yield topic, kind, time_ns, data
     except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:
         raise InputError(
             f"{path} is no readable rosbag2 database: {printable(str(error))[:120]}. Convert it "
             "with `ros2 bag convert` to MCAP."
         ) from error
+
+
+def _refuse_computed(database: sqlite3.Connection) -> None:
+    """Refuse tables that are views or programs: those may compute without end."""
+    for name in ("topics", "messages"):
+        found = database.execute(
+            "SELECT type, sql FROM sqlite_master WHERE name = ? COLLATE NOCASE", (name,)
+        ).fetchall()
+        hidden = database.execute(f"SELECT 1 FROM pragma_table_xinfo('{name}') WHERE hidden != 0")
+        tables = [kind == "table" and not str(sql).upper().startswith("CREATE VIRTUAL")
+                  for kind, sql in found]  # fmt: skip
+        if tables != [True] or hidden.fetchone():
+            raise ValueError(f"{name} is no plain table")

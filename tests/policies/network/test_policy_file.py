@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import resource
+import struct
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -280,3 +283,29 @@ def test_a_policy_for_one_robot_acts_with_the_same_bits_and_keeps_its_own_state(
     policy.reset(np.zeros((3, 12)))
     assert policy.act(np.zeros((3, 60), np.float32)).shape == (3, 12)
     assert own.act(seen).shape == (1, 12)
+
+
+def test_a_contract_that_asks_for_much_memory_is_refused_before_it_is_given(tmp_path):
+    folder = tmp_path / "policy"
+    write(folder)
+    rewrite_contract(folder, hidden=[8192] * 16)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="weights of another shape"):
+        load_policy(folder)
+    # 15 layers of 8192² weights would be 4 GB
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
+
+
+def test_a_list_of_a_million_tensors_is_refused_at_once(tmp_path):
+    folder = tmp_path / "policy"
+    write(folder)
+    tensors = ",".join(
+        f'"{k}":{{"dtype":"F32","shape":[0],"data_offsets":[0,0]}}' for k in range(10**6)
+    )
+    data = ("{" + tensors + "}").encode()
+    (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(data)) + data)
+    rewrite_contract(folder, weights_sha256=sha256(folder / WEIGHTS))
+    started = time.process_time()
+    with pytest.raises(InputError, match="its list of tensors, has"):
+        load_policy(folder)
+    assert time.process_time() - started < 2

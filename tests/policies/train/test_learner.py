@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -226,6 +227,17 @@ def refusal(path, run=None) -> str:
 
 def test_a_missing_checkpoint_is_refused(tmp_path):
     assert "does not exist" in refusal(tmp_path / "last.pt")
+
+
+def test_a_checkpoint_that_unpacks_to_gigabytes_is_not_unpacked(tmp_path):
+    path = tmp_path / "last.pt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("last/data/0", bytes(100_000_000))
+    with pytest.raises(InputError, match="is compressed, which torch's files are not"):
+        read_checkpoint(path)
+    path.write_bytes(pickle.dumps({"schema": "pupper-checkpoint"}))
+    with pytest.raises(InputError, match="is damaged"):
+        read_checkpoint(path)
 
 
 def test_a_checkpoint_of_another_kind_of_policy_is_refused_by_name(tmp_path):

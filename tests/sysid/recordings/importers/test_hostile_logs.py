@@ -5,6 +5,7 @@ import json
 import random
 import shutil
 import sys
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -132,3 +133,39 @@ def test_a_parquet_file_without_the_library_names_the_extra(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(InputError, match=r"Install pupper-sysid\[logs\]"):
         load(tmp_path / "log")
+
+
+def test_an_archive_without_arrays_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
+        archive.writestr("x.txt", b"hello")
+    with pytest.raises(InputError, match="no column is a command"):
+        load(tmp_path / "log.npz")
+
+
+def test_names_of_joints_in_parquet_take_the_memory_of_the_names_alone(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet as files
+
+    names = pa.DictionaryArray.from_arrays(np.tile(np.array([0, 1], np.int8), 60), ["knee", "hip"])
+    columns = {"time": np.repeat(TIME[:60], 2), "goal": np.repeat(WAVE[:60], 2),
+               "position": np.repeat(WAVE[:60], 2)}  # fmt: skip
+    files.write_table(pa.table(columns | {"joint": names}), tmp_path / "two.parquet")
+    assert load(tmp_path / "two.parquet").joints == ["hip", "knee"]
+    count = 10**6
+    names = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["x" * 10**6])
+    columns = {name: np.zeros(count) for name in columns}
+    files.write_table(pa.table(columns | {"joint": names}), tmp_path / "long.parquet")
+    tracemalloc.start()
+    with pytest.raises(InputError):
+        load(tmp_path / "long.parquet")
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()
+
+
+def test_times_that_are_no_seconds_are_refused(tmp_path):
+    made = table()
+    made["time_s"] = 1e12 * TIME
+    made = made.drop(columns=[c for c in made.columns if c in ("t", "time")])
+    made.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(InputError, match="times reach"):
+        load(tmp_path / "log.csv")

@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -322,3 +323,61 @@ def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mcap.stream_reader", None)
     with pytest.raises(InputError, match=r"Install pupper-sysid\[logs\]"):
         load(path)
+
+
+TOPICS = """CREATE TABLE topics(id INTEGER, name TEXT, type TEXT);
+INSERT INTO topics VALUES (0, '/joint_states', 'sensor_msgs/msg/JointState');
+"""
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        (f"{TOPICS}CREATE VIEW messages AS {ENDLESS} SELECT 0 AS topic_id, x AS timestamp, x AS "
+         "data FROM c WHERE x < 0", "messages is no plain table"),
+        (f"{TOPICS}CREATE TABLE messages(topic_id, timestamp, data AS (zeroblob(1000000000)))",
+         "messages is no plain table"),
+        (f"{TOPICS}CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
+         "messages is no plain table"),
+        (f"CREATE VIEW topics AS {ENDLESS} SELECT x AS id, 'a' AS name, 'b' AS type FROM c; "
+         "CREATE TABLE messages(topic_id, timestamp, data)", "topics is no plain table"),
+        (f"{TOPICS}CREATE TABLE messages(topic_id, timestamp, data); "
+         "INSERT INTO messages VALUES (0, 1, 100000000000)", "no bytes with a time"),
+        (f"{TOPICS}CREATE TABLE messages(topic_id, timestamp, data); "
+         "INSERT INTO messages VALUES (0, 1.5, x'00')", "no bytes with a time"),
+    ],
+)  # fmt: skip
+def test_a_database_is_read_but_computes_nothing(tmp_path, script, says):
+    with sqlite3.connect(tmp_path / "bag.db3") as database:
+        try:
+            database.executescript(script)
+        except sqlite3.OperationalError:
+            pytest.skip("this SQLite has no such tables")
+    started = time.process_time()
+    with pytest.raises(InputError, match=says):
+        load(tmp_path / "bag.db3")
+    assert time.process_time() - started < 1
+
+
+def test_a_database_that_takes_too_many_steps_is_given_up(tmp_path, monkeypatch):
+    with sqlite3.connect(tmp_path / "bag.db3") as database:
+        database.executescript(f"{TOPICS}CREATE TABLE messages(topic_id, timestamp, data);")
+        database.executemany(
+            "INSERT INTO messages VALUES (7, ?, x'00')", ((k,) for k in range(9999))
+        )
+    where = "pupper_sysid.sysid.recordings.importers.ros_files."
+    monkeypatch.setattr(f"{where}_MOST_STEPS", 1000)
+    monkeypatch.setattr(f"{where}_STEPS", 100)
+    with pytest.raises(InputError, match="interrupted"):
+        load(tmp_path / "bag.db3")
+
+
+def test_another_joint_in_each_message_is_refused(tmp_path, monkeypatch):
+    found = [
+        (topic, kind, log_ns, content | {"name": [f"j{k}", f"k{k}"]})
+        for k, (topic, kind, log_ns, content) in enumerate(messages("sensor_msgs/msg/JointState"))
+    ]
+    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros.MOST_JOINTS", 50)
+    with pytest.raises(InputError, match="has 200 joints; at most 50 joints are read"):
+        load(written(tmp_path / "a.mcap", found))

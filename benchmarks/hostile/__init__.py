@@ -1,0 +1,1 @@
+"""Hostile files, options and outputs for `benchmarks/file_campaign.py`."""
