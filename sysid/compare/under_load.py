@@ -9,7 +9,8 @@ to be held against all rows: where their value was measured (held), and as a bus
 A calibration with `under_load` predicts the run's P gain; another holds at its own gain, and is
 given the run's load. Where the load is known, no offset is taken out: command and reading share the
 encoder's zero, and droop is the model's to predict. Elsewhere the offset is that of the recording,
-as for `compare`.
+as for `compare`. So is the register that limits the set-point's acceleration: where a recording
+does not state it, a model that has such a limit runs with and without, and the better one counts.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.loaded_servo import COLUMNS, LoadedServoParameters
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
@@ -60,9 +62,8 @@ def needs_runs(
     recordings: Sequence[Recording], joints: Sequence[str], calibrations: Sequence[Calibration]
 ) -> bool:
     """Whether recordings or models tell of a load, so that each trial is a run of its own."""
-    for calibration in calibrations:
-        if any(j in calibration.joints and calibration.joints[j].under_load for j in joints):
-            return True
+    if any(_knows_load(calibration, j) for calibration in calibrations for j in joints):
+        return True
     trials = [t for r in recordings for j in joints for t in r.trials(j)]
     if any(t.load is not None or _limp(t) for t in trials):
         return True
@@ -71,6 +72,13 @@ def needs_runs(
         if len(gains) > 1:
             return True
     return False
+
+
+def _knows_load(calibration: Calibration, joint: str) -> bool:
+    try:
+        return calibration.joint(joint).under_load is not None  # a card has every joint
+    except InputError:
+        return False
 
 
 def _limp(trial: Trial) -> bool:
@@ -131,6 +139,7 @@ def predict(
     """
     servo = _Servo.of(calibration, joint)
     offset = dict.fromkeys((b.recording for b in runs), 0.0)
+    runs = with_ramps(calibration, joint, runs)
     tracks = [servo.track(b, 0.0) for b in runs]
     if all(b.offset_known for b in runs):
         return tracks, 0.0
@@ -143,6 +152,34 @@ def predict(
             offset[place] += float(np.median(np.concatenate(left)))
         tracks = [servo.track(b, offset[b.recording]) for b in runs]
     return tracks, float(np.mean(list(offset.values())))
+
+
+def with_ramps(calibration: Calibration, joint: str, runs: Sequence[BenchRun]) -> list[BenchRun]:
+    """The runs, with the set-point's acceleration free where readings fit that better.
+
+    For a calibration that limits it; a recording that states its register keeps it.
+    """
+    servo = _Servo.of(calibration, joint)
+    if not np.isfinite(servo.parameters.acceleration_limit):
+        return list(runs)
+    free = [
+        b if b.run.ramp_known else replace(b, run=replace(b.run, ramp_share=np.inf)) for b in runs
+    ]
+    found = list(runs)
+    for place in {b.recording for b in runs}:
+        own = [n for n, b in enumerate(runs) if b.recording == place]
+        spread = []
+        for tried in (runs, free):
+            left = [
+                b.run.sample_rad - at_steps(servo.track(b, 0.0), b.run.sample_step)
+                for b in (tried[n] for n in own)
+            ]
+            every = np.concatenate(left)
+            spread.append(float(np.mean(np.abs(every - np.median(every)))))
+        if spread[1] < spread[0]:
+            for n in own:
+                found[n] = free[n]
+    return found
 
 
 @dataclass(frozen=True)
@@ -162,7 +199,9 @@ class _Servo:
         if block is not None:
             gravity = block.gravity_nm.value if block.gravity_nm else 0.0
             hanging = block.hanging_rad.value if block.hanging_rad else 0.0
-            return cls(block.servo(dead_time), None, (gravity, hanging), np.inf)
+            slowest = own.actuator.velocity_limit_rad_s.value
+            limit = slowest if slowest < NO_SPEED_LIMIT_RAD_S else np.inf
+            return cls(block.servo(dead_time), None, (gravity, hanging), limit)
         pd = own.actuator.parameters.arrays()
         stall = min(float(pd["effort_limit"]), _NO_LIMIT_NM)
         parameters = LoadedServoParameters(
@@ -267,6 +306,19 @@ def notes(
                     f"{name}, {joint}: holds at one P gain; these runs have "
                     f"{', '.join(f'{g:g}' for g in gains)}."
                 )
+        freed = [
+            joint
+            for joint, own in runs.items()
+            if any(
+                np.isinf(b.run.ramp_share) and not b.run.ramp_known
+                for b in with_ramps(calibration, joint, own)
+            )
+        ]
+        if freed:
+            made.append(
+                f"{name}: its limit on the set-point's acceleration is taken out of runs of "
+                f"{', '.join(freed)}, which move as if a register had switched it off."
+            )
     return list(dict.fromkeys(made))
 
 

@@ -427,6 +427,13 @@ def _warnings(joint: str, found: LoadedFit) -> list[str]:
             f"friction of a motor torque of {_torque(found):.2g}"
             f"{' N·m' if found.known_load else ' rad/s²'}. `under_load` has the whole servo."
         )
+    free = [n + 1 for n, r in enumerate(found.runs) if np.isinf(r.ramp_share)]
+    if free and np.isfinite(float(servo["acceleration_limit"])):
+        made.append(
+            f"{joint}: the set-point's acceleration is limited, but not in run "
+            f"{', '.join(map(str, free))} of {len(found.runs)}. A register decides that "
+            "(`acceleration`), so it belongs to the recording, not to the servo."
+        )
     if not found.folds:
         made.append(f"{joint}: one run only, so no structure was tested on unseen motion.")
     return made

@@ -37,6 +37,7 @@ from pupper_sysid.sysid.loaded.preparation import (
     scales_of,
     shortened,
 )
+from pupper_sysid.sysid.loaded.ramps import settled
 from pupper_sysid.sysid.loaded.runs import Run, residuals
 from pupper_sysid.sysid.loaded.search import Fit, Problem
 from pupper_sysid.sysid.loaded.structures import Scales, Structure
@@ -175,15 +176,20 @@ def fit_loaded_joint(
     least = max(quantum(tuple(trials)) / 3, _LEAST_NOISE_RAD)
     short = shortened(runs)
     noise = (max(_FIRST_NOISE_RAD, least),) * len(runs)
-    for _ in range(2):
-        structure = Structure(("load friction",), scales)
-        rough = search.search(Problem(structure, short, noise), rng)[0]
-        noise = noise_of(structure, rough, short, least)
+    structure = Structure(PLAIN, scales)
+    rough = search.search(Problem(structure, short, noise), rng)[0]
+    noise = noise_of(structure, rough, short, least)
+    rough = search.search(Problem(structure, short, noise), rng)[0]
+    noise = noise_of(structure, rough, short, least)
+    scales, runs, noise = settled(rough, structure, runs, noise, least, rng)
+    ramp: tuple[str, ...] = ()
+    if np.isfinite(scales.acceleration_rad_s2):
+        ramp, short = ("acceleration",), runs  # what shows the limit may be at the end of a run
     tried: dict[tuple[str, ...], Fit] = {}
-    for features in LADDER:
+    for features in ((*f, *ramp) for f in LADDER):
         tried[features] = _whole(features, scales, short, noise, rng, tried)
     best = min(tried, key=lambda f: tried[f].cost)
-    for feature in ADDITIONS:
+    for feature in (f for f in ADDITIONS if f not in ramp):
         structure = Structure((*best, feature), scales)
         problem = Problem(structure, short, noise)
         start = structure.adopt(Structure(best, scales), tried[best].point[None])

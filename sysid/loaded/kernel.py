@@ -39,7 +39,9 @@ def _sin(x):
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, stop, track):
+def _simulate(
+    values, dead_time, who, run, p_gain, load, ramp_share, start, steps, pad, h, stop, track
+):
     """Positions of the candidates `who` after each step, into rows 1 … `steps` of `track`."""
     y, v, c, on = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
     g, rate = np.zeros(LANES), np.zeros(LANES)
@@ -60,13 +62,14 @@ def _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, s
         p[7, i] = 1.0 / (w[7] * w[7])
         p[10, i] = w[10] * inertia
         p[13, i] = p[3, i] * w[13]
+        p[16, i] = w[16] * ramp_share
         p[18, i] = load[2] + w[18]
         y[i] = start - w[19]
         g[i] = y[i]
         track[0, i] = y[i]
         friction = friction or w[6] + w[8] + w[9] + w[10] > 0.0
         firmware = firmware or w[14] + w[15] > 0.0
-        ramp = ramp or w[16] < NO_RAMP_RAD_S2
+        ramp = ramp or p[16, i] < NO_RAMP_RAD_S2
     for k in range(steps):
         volt = run[2, k + pad]
         for i in range(LANES):
@@ -110,7 +113,7 @@ def _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, s
 
 
 @njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
-def positions(values, dead_time, run, p_gain, load, start, pad, h, stop, out):
+def positions(values, dead_time, run, p_gain, load, ramp_share, start, pad, h, stop, out):
     """Simulate each candidate on one run.
 
     Parameters
@@ -124,6 +127,8 @@ def positions(values, dead_time, run, p_gain, load, start, pad, h, stop, out):
     p_gain : float
     load : ndarray, shape (3,)
         Inertia [kg·m²], gravity [N·m], hanging position [rad].
+    ramp_share : float
+        Largest acceleration of the set-point in this run over the servo's; inf where it has none.
     start : float
         Reading at rest before the run [rad].
     pad : int
@@ -138,14 +143,18 @@ def positions(values, dead_time, run, p_gain, load, start, pad, h, stop, out):
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
         used = fill_lanes(first, count, who)
-        _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, stop, track)
+        _simulate(
+            values, dead_time, who, run, p_gain, load, ramp_share, start, steps, pad, h, stop, track
+        )
         for k in range(steps + 1):
             for i in range(used):
                 out[k, first + i] = track[k, i] + values[first + i, OFFSET]
 
 
 @njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
-def residuals(values, dead_time, run, p_gain, load, start, step, reading, pad, h, stop, out):
+def residuals(
+    values, dead_time, run, p_gain, load, ramp_share, start, step, reading, pad, h, stop, out
+):
     """Model minus reading of each candidate on one run.
 
     Parameters as for `positions`, and
@@ -162,7 +171,9 @@ def residuals(values, dead_time, run, p_gain, load, start, step, reading, pad, h
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     for first in range(0, count, LANES):
         used = fill_lanes(first, count, who)
-        _simulate(values, dead_time, who, run, p_gain, load, start, steps, pad, h, stop, track)
+        _simulate(
+            values, dead_time, who, run, p_gain, load, ramp_share, start, steps, pad, h, stop, track
+        )
         for n in range(samples):
             row = min(int(step[n]), steps - 1)
             part = step[n] - row

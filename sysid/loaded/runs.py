@@ -51,6 +51,10 @@ class Run:
         Position of each row, NaN where missing.
     step_s : float
         Length of a physics step [s].
+    ramp_share : float
+        Largest acceleration of the set-point over the servo's: 1, or inf where it was not limited.
+    ramp_known : bool
+        Whether the recording states that (the register `acceleration`).
     """
 
     label: str
@@ -65,6 +69,8 @@ class Run:
     held_step: NDArray[np.float64]
     row_rad: NDArray[np.float64]
     step_s: float = TIME_STEP_S
+    ramp_share: float = 1.0
+    ramp_known: bool = False
 
     def with_samples(self, reading_rad: NDArray[np.float64]) -> Run:
         """The same run with other readings at the same times."""
@@ -112,12 +118,14 @@ def prepare(
         load = [own.inertia_kg_m2, own.gravity_nm, own.hanging_rad]
     gain = trial.p_gain if np.isfinite(trial.p_gain) else 1.0
     first = trial.position_rad[np.isfinite(trial.position_rad)][0]
+    register = trial.servo.registers.get("acceleration")
     return Run(
         _label(trial), gain, np.array(load), held, rest, float(first),
         to_step(reading.time_s[inside]), reading.position_rad[inside],
         to_step(trial.read_time_s),
         to_step(np.where(reading.held_time_s >= start, reading.held_time_s, np.nan)),
         trial.position_rad,
+        ramp_share=float("inf") if register == 0 else 1.0, ramp_known=register is not None,
     )  # fmt: skip
 
 
@@ -178,8 +186,9 @@ def residuals(
     for run in runs:
         out = np.empty((len(values), len(run.sample_step)))
         kernel.residuals(
-            columns, values[:, 0] / run.step_s, run.held, run.p_gain, run.load, run.start_rad,
-            run.sample_step, run.sample_rad, run.rest, run.step_s, -FRICTION_IMPEDANCE, out,
+            columns, values[:, 0] / run.step_s, run.held, run.p_gain, run.load, run.ramp_share,
+            run.start_rad, run.sample_step, run.sample_rad, run.rest, run.step_s,
+            -FRICTION_IMPEDANCE, out,
         )  # fmt: skip
         found.append(out)
     return found
@@ -206,8 +215,8 @@ def simulate(
     """Readings at the edges of the steps, shape (steps + 1, candidates) [rad]."""
     out = np.empty((run.held.shape[1] - run.rest + 1, len(columns)))
     kernel.positions(
-        columns, dead_time_s / run.step_s, run.held, run.p_gain, run.load, run.start_rad,
-        run.rest, run.step_s, -FRICTION_IMPEDANCE, out,
+        columns, dead_time_s / run.step_s, run.held, run.p_gain, run.load, run.ramp_share,
+        run.start_rad, run.rest, run.step_s, -FRICTION_IMPEDANCE, out,
     )  # fmt: skip
     return out
 

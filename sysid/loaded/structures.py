@@ -53,6 +53,8 @@ class Scales:
         Whether a run has the torque switched off.
     gravity : bool
         Whether an unknown gravity is fitted.
+    acceleration_rad_s2 : float
+        Limit on the set-point's acceleration that the runs show; NaN if none.
     """
 
     torque: float
@@ -61,6 +63,7 @@ class Scales:
     known_load: bool
     torque_off: bool = False
     gravity: bool = False
+    acceleration_rad_s2: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,7 @@ class Structure:
         if s.gravity:
             own.append(Parameter("gravity_sin", 0.0, -2 * torque, 2 * torque, 0.3 * torque))
             own.append(Parameter("gravity_cos", 0.0, -2 * torque, 2 * torque, 0.3 * torque))
+        ramp = s.acceleration_rad_s2 if np.isfinite(s.acceleration_rad_s2) else 60.0
         extra = {
             "load_friction_motor": Parameter("load_friction_motor", 0.1, 1e-4, 0.95, 2.0),
             "load_friction_load": Parameter("load_friction_load", 0.05, 1e-4, 0.95, 2.0),
@@ -115,7 +119,7 @@ class Structure:
                 "stribeck_friction", 0.05 * torque, 1e-5 * torque, 10 * torque, 2.0
             ),
             "stribeck_speed_rad_s": Parameter("stribeck_speed_rad_s", 0.1, 0.005, 3.0, 1.5),
-            "acceleration_limit": Parameter("acceleration_limit", 60.0, 1.0, 3000.0, 1.2),
+            "acceleration_limit": Parameter("acceleration_limit", ramp, 1.0, 3000.0, 1.2),
             "damping": Parameter("damping", 0.05 * torque, 1e-5 * torque, 200 * torque, 2.0),
             "dead_zone_rad": Parameter("dead_zone_rad", 0.003, 1e-4, 0.05, 1.0),
             "start_duty": Parameter("start_duty", 0.01, 1e-4, 0.2, 1.5),

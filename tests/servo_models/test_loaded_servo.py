@@ -84,7 +84,7 @@ def test_the_compiled_servo_is_the_one_in_numpy(servo: LoadedServoParameters, ra
     out = np.empty((steps + 1, 1))
     load = np.array([LOAD.inertia_kg_m2, LOAD.gravity_nm, LOAD.hanging_rad])
     kernel.positions(
-        row, np.array([0.0133 / STEP_S]), held, 16.0, load, start, rest, STEP_S,
+        row, np.array([0.0133 / STEP_S]), held, 16.0, load, 1.0, start, rest, STEP_S,
         -FRICTION_IMPEDANCE, out,
     )  # fmt: skip
     assert np.abs(out[1:, 0] - expected).max() < 1e-6

@@ -1,0 +1,118 @@
+"""Whether the set-point's acceleration was limited, and in which runs.
+
+A Feetech servo moves its set-point at a limited acceleration if a register says so: 254 is
+39 rad/s² at 4,096 counts a turn, 0 is no limit. Few logs state the register, and it may differ
+between the recordings of one servo, so it belongs to the recording. Slow motions do not show it,
+fast tones and jumps do. `settled` fits one limit that each run may have or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.loaded import search
+from pupper_sysid.sysid.loaded.errors import correlation, noise_of
+from pupper_sysid.sysid.loaded.runs import Run, residuals
+from pupper_sysid.sysid.loaded.search import Fit, Problem
+from pupper_sysid.sysid.loaded.structures import Scales, Structure
+
+_STARTS_RAD_S2 = (15.0, 40.0, 110.0)
+_SCANNED_RAD_S2 = np.geomspace(5.0, 150.0, 64)
+_TELLING_NATS = 20.0
+_TELLING_SHARE = 0.1
+"""Share of the cost that the limit must explain: less is what many a sluggish term would."""
+_ROUNDS = 2
+
+
+class EitherWay(Problem):
+    """A fit in which each run has the limit or not, whichever suits it better."""
+
+    def scaled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """As of `Problem`, for every candidate and run the better way."""
+        values = self.structure.decode(points)
+        both = [residuals(self.structure, values, way) for way in _ways(self.runs)]
+        chosen = []
+        for on, off, noise in zip(*both, self.noise_rad, strict=True):
+            on, off = on / noise, off / noise
+            better = _cost(on) <= _cost(off)
+            chosen.append(np.where(better[:, None], on, off))
+        return np.concatenate(chosen, axis=1)
+
+    def scanned(self, fit: Fit) -> Fit:
+        """The best local fit from the best limit at this point: the cost has many minima there."""
+        place = self.structure.names.index("acceleration_limit")
+        points = np.repeat(fit.point[None], len(_SCANNED_RAD_S2), axis=0)
+        points[:, place] = np.log(_SCANNED_RAD_S2)
+        best = points[np.argmin(self.costs(points))]
+        return search.refine(self, np.array([fit.point, best]))
+
+    def settle(self, fit: Fit) -> tuple[Run, ...]:
+        """The runs with the limit, or without."""
+        values = self.structure.decode(fit.point)[None]
+        on, off = _ways(self.runs)
+        left = [[_cost(r)[0] for r in residuals(self.structure, values, way)] for way in (on, off)]
+        return tuple(a if x <= y else b for a, b, x, y in zip(on, off, *left, strict=True))
+
+
+def settled(
+    start: Fit,
+    structure: Structure,
+    runs: tuple[Run, ...],
+    noise_rad: tuple[float, ...],
+    least_rad: float,
+    rng: np.random.Generator,
+) -> tuple[Scales, tuple[Run, ...], tuple[float, ...]]:
+    """Scales with the limit, the runs that have it or not, and their noise.
+
+    Parameters
+    ----------
+    start : Fit
+        Of `structure`, without a limit.
+    structure : Structure
+    runs : tuple of Run
+        `ramp_share` is kept where `ramp_known`.
+    noise_rad : tuple of float
+        Of each run.
+    least_rad : float
+        Least noise.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    scales, runs, noise_rad
+        As given where the runs do not show a limit.
+    """
+    plain = search.search(Problem(structure, runs, noise_rad), rng, start.point[None])[0]
+    limited = Structure((*structure.features, "acceleration"), structure.scales)
+    place = limited.names.index("acceleration_limit")
+    points = np.repeat(limited.adopt(structure, plain.point[None]), len(_STARTS_RAD_S2), axis=0)
+    points[:, place] = np.log(_STARTS_RAD_S2)
+    either = EitherWay(limited, runs, noise_rad)
+    fit = either.scanned(search.search(either, rng, points)[0])
+    gain = plain.cost - fit.cost
+    found = either.settle(fit)
+    nats = gain / correlation(limited, fit, found, noise_rad)
+    if nats < _TELLING_NATS or gain < _TELLING_SHARE * plain.cost:
+        return structure.scales, runs, noise_rad
+    for _ in range(_ROUNDS):
+        noise_rad = noise_of(limited, fit, found, least_rad)
+        either = EitherWay(limited, runs, noise_rad)
+        fit = either.scanned(fit)
+        found = either.settle(fit)
+    limit = float(limited.decode(fit.point)[place])
+    return replace(structure.scales, acceleration_rad_s2=limit), found, noise_rad
+
+
+def _ways(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+    """The runs with the limit, and without, where the recording does not state it."""
+    with_limit = [r if r.ramp_known else replace(r, ramp_share=1.0) for r in runs]
+    without = [r if r.ramp_known else replace(r, ramp_share=float("inf")) for r in runs]
+    return with_limit, without
+
+
+def _cost(scaled: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.sum(np.sqrt(1.0 + scaled**2) - 1.0, axis=1)
