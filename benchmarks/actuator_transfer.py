@@ -15,7 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import torch
 
-from pupper_sysid.policies.analysis.evaluation import summary, walk
+from pupper_sysid.policies.evaluation.evaluate import summary, walk
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.walks.conditions import evaluation_task
 from pupper_sysid.sim.walking.config import Walking

@@ -27,7 +27,7 @@ import torch
 import tyro
 
 from pupper_sysid.cli.policy_choice import policy_at, simulator
-from pupper_sysid.policies.analysis.evaluation import _Recorder
+from pupper_sysid.policies.evaluation.figures import Recorder
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import (
     DIRECTIONS,
@@ -75,7 +75,7 @@ def in_turns(policy: Policy, task: Walking, servos: ServoRanges, seconds: float)
     each = conditions(evaluation_task(task))
 
     def walk(some: list[Condition]) -> None:
-        walk_together(policy, servos, some, seconds, 0, 0, _Recorder)
+        walk_together(policy, servos, some, seconds, 0, 0, Recorder)
 
     def one_by_one() -> None:
         for condition in each:

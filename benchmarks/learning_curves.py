@@ -33,7 +33,7 @@ from pupper_sysid.common.figure_style import (
     save,
     styled,
 )
-from pupper_sysid.policies.analysis.evaluation import summary, walk
+from pupper_sysid.policies.evaluation.evaluate import summary, walk
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train.curves import IMITATION, PROGRESS
 from pupper_sysid.policies.train.run_file import Run, load_run

@@ -23,16 +23,20 @@ from pupper_sysid.sim.robot.terrain import Terrain
 
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
-    from pupper_sysid.policies.analysis.evaluation import Evaluation, Figures
+    from pupper_sysid.policies.evaluation.evaluate import Evaluation
+    from pupper_sysid.policies.evaluation.figures import Figures
 
 _FULL, _QUICK = (100, 20.0), (30, 10.0)  # episodes, seconds each
+_FULL_BATTERY, _QUICK_BATTERY = (40, 20.0), (10, 8.0)
 
-DESCRIPTION = """Falls and tracking errors of a policy, by direction, ground and added dead time.
+DESCRIPTION = """Falls and tracking errors of a policy, beside an open-loop trot and standing.
 
-Errors are mean absolute errors of the instantaneous velocity over whole episodes, with half the
-width of their 90 % interval. --quick answers within 20 s on two cores, and less surely.
+By direction, ground and added dead time; with --battery under pushes, on slopes and stairs, with
+loads, weak legs, missed ticks, late and jittered servos. Errors are of the velocity at every
+instant and of its mean over a stride; a robot that fell counts as one that stands until the end.
+--quick answers within 20 s on two cores (the battery within 60 s), and less surely.
 
-Example: pupper-eval runs/<name> --extra-delay-ms 0 40 80 --report report
+Example: pupper-eval runs/<name> --extra-delay-ms 40 80 --report report
 """
 
 
@@ -43,22 +47,26 @@ class Eval:
     policy: Annotated[Path, tyro.conf.Positional]
     """A run (`runs/<name>`) or a policy folder."""
     quick: bool = False
-    """Fewer and shorter episodes: 30 of 10 s. A first look, not for publication."""
+    """Fewer and shorter episodes: 30 of 10 s, of the battery 10 of 8 s. A first look, not for
+    publication."""
+    battery: bool = False
+    """The battery instead of directions, grounds and dead times: conditions under which robots
+    fall. About 8 minutes on two cores."""
     episodes: int | None = None
-    """Number of episodes with random commands (100, --quick 30); a fifth of that per direction,
-    half per ground and dead time."""
+    """Number of episodes with random commands (100, --quick 30); an eighth of that under each other
+    condition. Of the battery: under each (40, --quick 10)."""
     seconds: float | None = None
-    """Length of an episode (20, --quick 10)."""
+    """Length of an episode (20, --quick 10, of the battery 8)."""
     actuator: str | None = None
     """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
     feedback: str | None = None
     """`held`, `ideal` or a calibration instead of what it was trained with."""
-    terrain: tuple[Terrain, ...] = ("flat", "rough", "slopes", "troughs")
-    """Kinds of ground of the table."""
-    extra_delay_ms: tuple[float, ...] = (0.0, 40.0, 80.0)
-    """Added to every servo's dead time, for the table."""
+    terrain: tuple[Terrain, ...] = ("rough", "slopes", "troughs")
+    """Kinds of ground of the table, besides flat ground; not of the battery."""
+    extra_delay_ms: tuple[float, ...] = (40.0, 80.0)
+    """Added to every servo's dead time, for the table; not of the battery."""
     seed: int = 0
-    """Of commands, servos, friction and ground."""
+    """Of commands, servos, friction and ground; no training has the same ones."""
     threads: int = 0
     """Of the physics; 0 for all cores."""
     report: Path | None = None
@@ -76,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: Eval) -> None:
-    usual = _QUICK if options.quick else _FULL
+    quick, full = (_QUICK_BATTERY, _FULL_BATTERY) if options.battery else (_QUICK, _FULL)
+    usual = quick if options.quick else full
     episodes = usual[0] if options.episodes is None else options.episodes
     seconds = usual[1] if options.seconds is None else options.seconds
     if episodes < 1:
@@ -93,23 +102,24 @@ def _run(options: Eval) -> None:
         refuse_overwrite(page, options.force)  # before the work
     import torch
 
-    from pupper_sysid.policies.analysis.evaluation import evaluate
+    from pupper_sysid.policies.evaluation.battery import BATTERY, battery_robots
+    from pupper_sysid.policies.evaluation.evaluate import evaluate, table, usual_robots
 
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
     task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
     warn_of_fallbacks([servos])
-    task = replace(task, terrain="flat", episode_s=seconds)
+    cases = BATTERY if options.battery else table(options.terrain, options.extra_delay_ms)
+    robots = battery_robots(episodes) if options.battery else usual_robots(episodes)
     with terminal.share_progress("walking") as advance:
         found = evaluate(
-            policy, task, servos, episodes, options.seed, options.threads,
-            feedback=options.feedback or policy.contract.feedback, grounds=options.terrain,
-            extra_delays_ms=options.extra_delay_ms,
+            policy, replace(task, episode_s=seconds), servos, cases, robots, options.seed,
+            options.threads, feedback=options.feedback or policy.contract.feedback,
             progress=partial(advance, f"{episodes} episodes of {seconds:g} s and all conditions"),
         )  # fmt: skip
     if page:
         from pupper_sysid.common.page import write_page
-        from pupper_sysid.policies.analysis.walking_report import walking_sections
+        from pupper_sysid.policies.evaluation.report import walking_sections
 
         folder = run_folder(options.policy)
         sections = walking_sections(policy, run, folder, found)
@@ -117,7 +127,8 @@ def _run(options: Eval) -> None:
         name = options.policy.resolve().name
         write_page(page, title, f"{name}, seed {options.seed}", sections, options.force)
     if options.json:
-        print_json({"quick": options.quick} | found.to_dict() | ({"report": page} if page else {}))
+        about = {"quick": options.quick, "battery": options.battery}
+        print_json(about | found.to_dict() | ({"report": page} if page else {}))
         return
     _show(found, options.quick)
     if page:
@@ -125,47 +136,99 @@ def _run(options: Eval) -> None:
 
 
 def _show(found: Evaluation, quick: bool) -> None:
-    table = terminal.table(
-        f"{'Quick look: ' if quick else ''}{found.episodes} episodes of {found.episode_s:g} s, "
-        f"actuator {found.actuator}, feedback {found.feedback}; mean absolute errors ± half of "
-        "their 90 % interval",
-        "", "fell %", "vx m/s", "vy m/s", "yaw rad/s", "duty", "swing s", "slip m/s",
-    )  # fmt: skip
-    table.add_row("random commands", *_cells(found))
-    still = found.standing_still
-    errors = (still.mae_vx_m_s, still.mae_vy_m_s, still.mae_yaw_rad_s)
-    table.add_row("  a robot that stands", "–", *(number(x, 3) for x in errors), *(["–"] * 3))
-    for row in found.by_command:
-        command = ", ".join(f"{c:g}" for c in row.command)
-        table.add_row(f"{row.name} ({command})", *_cells(row))
-    for row in found.by_terrain:
-        table.add_row(f"ground: {row.terrain}", *_cells(row))
-    for row in found.by_extra_delay:
-        table.add_row(f"dead time +{row.extra_delay_ms:g} ms", *_cells(row))
-    out.print(table)
-    fell = found.intervals.fall_rate
-    rows = (found, *found.by_command, *found.by_terrain, *found.by_extra_delay)
+    first = found.conditions[0].policy
     err.print(
-        f"Falls under random commands: 90 % interval {100 * fell.low:.0f}–{100 * fell.high:.0f} %. "
-        "duty: share of time a foot is on the ground; slip: speed of feet on the ground. Rows are "
-        f"of {', '.join(map(str, sorted({row.episodes for row in rows})))} episodes; episode k has "
-        "the same robot in every row.",
+        f"{'Quick look: ' if quick else ''}{first.episodes} episodes of {found.episode_s:g} s, "
+        f"actuator {found.actuator}, feedback {found.feedback}. The trot is open-loop: it has a "
+        "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %.",
         soft_wrap=True,
     )
+    _show_falls(found)
+    _show_errors(found, "every instant", "")
+    _show_errors(found, "the mean over a stride", "stride_")
+    _show_directions(found)
 
 
-def _cells(row: Figures) -> list[str]:
-    own = row.intervals
-    return [
-        number(100 * row.fall_rate, 0),
-        *(_error(e) for e in (own.mae_vx_m_s, own.mae_vy_m_s, own.mae_yaw_rad_s)),
-        number(sum(row.duty) / len(row.duty), 2), number(row.swing_s, 2),
-        number(row.foot_slip_m_s, 3),
-    ]  # fmt: skip
+def _show_falls(found: Evaluation) -> None:
+    """Falls of all three, what the policy's feet do, and what came before the falls."""
+    shown = terminal.table(
+        "Falls, %, and what the policy's feet do", "", "policy", "trot", "standing", "duty",
+        "steps Hz", "slip m/s",
+    )  # fmt: skip
+    for row in found.conditions:
+        own = row.policy
+        shown.add_row(
+            row.name, *(_fallen(f) for f in (row.policy, row.trot, row.standing)),
+            number(sum(own.duty) / len(own.duty), 2), number(own.stride_hz, 1),
+            number(own.foot_slip_m_s, 3),
+        )  # fmt: skip
+    out.print(shown)
+    if not found.falls:
+        return
+    from pupper_sysid.policies.evaluation.falls import in_short
+
+    shown = terminal.table(
+        "Before falls: median time, median tilt 0.2 s before, usual side; pushed: a push in the "
+        "last second", "", "walker",
+        "falls", "at s", "tilt °", "to the", "tipped", "pushed",
+    )  # fmt: skip
+    for own in in_short(found.falls):
+        shown.add_row(
+            own.row, own.walker, str(own.falls), number(own.time_s, 1),
+            number(own.tilt_before_deg, 0), _SIDES[own.toward], str(own.tipped),
+            str(own.after_push),
+        )  # fmt: skip
+    out.print(shown)
+
+
+def _show_errors(found: Evaluation, of_what: str, prefix: str) -> None:
+    shown = terminal.table(
+        f"Mean absolute errors of {of_what}, mm/s and mrad/s: policy and trot", "",
+        "vx", "vy", "yaw", "trot vx", "vy", "yaw",
+    )  # fmt: skip
+    names = [f"{prefix}{name}" for name in ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")]
+    for row in found.conditions:
+        cells = [_error(getattr(f.intervals, n)) for f in (row.policy, row.trot) for n in names]
+        shown.add_row(row.name, *cells)
+    still = found.conditions[0].standing
+    standing = [_error(getattr(still.intervals, name)) for name in names]
+    shown.add_row("standing, random", *standing, *[""] * 3)
+    out.print(shown)
+
+
+def _show_directions(found: Evaluation) -> None:
+    rows = [row for row in found.conditions if row.group == "direction" and any(row.command or ())]
+    if not rows:
+        return
+    shown = terminal.table(
+        f"Speed over the commanded, %, and change of heading over {found.episode_s:g} s, °",
+        "", "m/s, rad/s", "policy", "trot", "policy °", "trot °",
+    )  # fmt: skip
+    for row in rows:
+        each = (row.policy.intervals, row.trot.intervals)
+        shown.add_row(
+            row.name, ", ".join(f"{c:g}" for c in row.command or ()),
+            *(_within(own.speed_share, 100) for own in each),
+            *(_within(own.heading_drift_deg, 1) for own in each),
+        )  # fmt: skip
+    out.print(shown)
+
+
+_SIDES = {"forward": "front", "backward": "rear", "left": "left", "right": "right"}
+
+
+def _fallen(figures: Figures) -> str:
+    own = figures.intervals.fall_rate
+    return f"{100 * own.value:.0f} ({100 * own.low:.0f}–{100 * own.high:.0f})"
 
 
 def _error(error: Interval) -> str:
-    return f"{number(error.value, 3)} ±{number(error.high - error.value, 3)}"
+    return _within(error, 1000)
+
+
+def _within(interval: Interval, scale: float) -> str:
+    half = scale * (interval.high - interval.value)
+    return f"{number(scale * interval.value, 0 if scale > 1 else 1)} ±{number(half, 0)}"
 
 
 if __name__ == "__main__":

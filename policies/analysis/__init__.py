@@ -1,1 +1,1 @@
-"""Evaluation and analysis of trained policies."""
+"""Analysis of trained policies: rhythm, robustness, what they make of their servos."""

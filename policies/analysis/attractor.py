@@ -22,9 +22,9 @@ from scipy.interpolate import CubicSpline
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, internal
-from pupper_sysid.policies.analysis import perturbations
 from pupper_sysid.policies.analysis.trial import NAN, Trial, moving_frequency, walking
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks import perturbations
 from pupper_sysid.policies.walks.rollouts import replay
 
 Array = NDArray[np.float64]

@@ -15,9 +15,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.policies.analysis import perturbations
 from pupper_sysid.policies.analysis.gait import correlation, steady
-from pupper_sysid.policies.analysis.perturbations import JOINTS
 from pupper_sysid.policies.analysis.trial import (
     NAN,
     Outcome,
@@ -28,7 +26,9 @@ from pupper_sysid.policies.analysis.trial import (
     walking,
 )
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks import perturbations
 from pupper_sysid.policies.walks.conditions import Change
+from pupper_sysid.policies.walks.perturbations import JOINTS
 from pupper_sysid.policies.walks.rollouts import Rollout, replay
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS

@@ -34,7 +34,8 @@ from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.trial import Trial
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import Condition, Moment, walk_together
+from pupper_sysid.policies.walks.conditions import Condition, Moment
+from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -346,7 +347,9 @@ class _Recorder:
             )
         )  # fmt: skip
 
-    def of(self, condition: Condition, robots: slice, steps: int) -> _Kept:
+    def of(
+        self, condition: Condition, robots: slice, steps: int, commands: Array
+    ) -> _Kept:
         force, speed, acceleration, along, alive = (
             np.stack([step[i][robots] for step in self._steps[:steps]]) for i in range(5)
         )

@@ -108,7 +108,10 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome(Result):
-    """Survival, tracking errors and gait of a walk; NaN where there is none."""
+    """Survival, tracking errors and gait of a walk; NaN where there is none.
+
+    In the errors, a robot that fell stands still until the end of the walk.
+    """
 
     survival: float = NAN
     """Share of robots that did not fall."""
@@ -123,7 +126,6 @@ class Outcome(Result):
 
 def outcome(rollout: Rollout) -> dict[str, float]:
     """Values of an `Outcome` by field; those of the gait are NaN if no robot walked long enough."""
-    alive = rollout.alive
     gaits = [
         (
             frequency(action, rollout.step_s).value,
@@ -136,7 +138,13 @@ def outcome(rollout: Rollout) -> dict[str, float]:
     means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [NAN] * 3
     return {
         "survival": 1.0 - float(rollout.fell.mean()),
-        **pooled_errors(rollout.velocity, np.array(rollout.command), alive),
+        **pooled_errors(
+            rollout.velocity,
+            np.array(rollout.command),
+            rollout.alive,
+            rollout.fell,
+            rollout.whole_steps,
+        ),
         **dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True)),
     }
 

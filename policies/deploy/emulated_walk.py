@@ -45,11 +45,12 @@ class WalkScore:
         self._commands.append(tick.senses.command)
 
     def summary(self) -> dict[str, Any]:
-        """Mean absolute errors and `mean_motion`; None before the first tick."""
+        """Mean absolute errors and `mean_motion` up to the last tick; None before the first."""
         if not self._moved:
             return dict.fromkeys((*ERRORS, "mean_motion"))
         moved, commands = (np.array(x)[:, None] for x in (self._moved, self._commands))
-        errors = tracking_errors(moved, commands, np.ones((len(moved), 1), bool))[0]
+        up, fell = np.ones((len(moved), 1), bool), np.zeros(1, bool)
+        errors = tracking_errors(moved, commands, up, fell)[0]
         return {**named(errors), "mean_motion": (moved[:, 0].sum(axis=0) / len(moved)).tolist()}
 
 

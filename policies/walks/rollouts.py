@@ -25,7 +25,8 @@ from torch.utils.hooks import RemovableHandle
 
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
-from pupper_sysid.policies.walks.conditions import Condition, Moment, walk_together
+from pupper_sysid.policies.walks.conditions import Condition, Moment
+from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
@@ -70,6 +71,8 @@ class Rollout:
     """Whether the robot has neither fallen nor left the ground's edge so far; shape (steps, n)."""
     fell: NDArray[np.bool_]
     """Whether it fell; one that left the ground's edge did not; shape (n,)."""
+    whole_steps: int = 0
+    """Control steps of the whole walk, of which the last are missing if no robot was up."""
 
     @property
     def action_rad(self) -> Array:
@@ -146,7 +149,7 @@ class _Recorder:
             }
         )  # fmt: skip
 
-    def of(self, condition: Condition, robots: slice, steps: int) -> Rollout:
+    def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Rollout:
         found = _stacked(self._steps[:steps], np.arange(robots.start, robots.stop))
         found["position"][..., 2] = np.unwrap(found["position"][..., 2], axis=0)
         inside = np.flatnonzero((self._whole >= robots.start) & (self._whole < robots.stop))
@@ -154,7 +157,8 @@ class _Recorder:
         task, command = condition.task, condition.command
         assert command is not None
         found["fell"] = self._fell[robots]
-        return Rollout(task.control_step_s, command, task.action_scale, **found)
+        whole = len(commands)
+        return Rollout(task.control_step_s, command, task.action_scale, **found, whole_steps=whole)
 
 
 def _stacked(steps: Sequence[dict[str, NDArray]], robots: NDArray[np.intp]) -> dict[str, NDArray]:

@@ -15,6 +15,7 @@ import yaml
 
 from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
 from pupper_sysid.common.results import plain
+from pupper_sysid.policies.evaluation.battery import BATTERY
 from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset
 from support.browser import looks_right
@@ -190,37 +191,72 @@ def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
     )  # fmt: skip
     assert code == 0
     found = json.loads(out)
-    errors = {"fall_rate", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s"}
-    assert found.keys() >= errors | {"episodes", "actuator", "feedback", "by_command"}
-    assert found["episodes"] == 5
     assert found["actuator"] == CALIBRATION and found["feedback"] == "held"
-    for row in found["by_command"]:
-        assert row.keys() >= errors | {"command"} and len(row["command"]) == 3
-    for row in (found, *found["by_command"]):
-        assert 0 <= row["fall_rate"] <= 1 and row["mae_vx_m_s"] > 0
-    assert [r["extra_delay_ms"] for r in found["by_extra_delay"]] == [0, 20]
-    assert [r["terrain"] for r in found["by_terrain"]] == ["flat"]
-    # the row without extra delay on flat ground is the same walk as that ground's
-    late, ground = found["by_extra_delay"][0], found["by_terrain"][0]
-    assert late["mae_vx_m_s"] == ground["mae_vx_m_s"] != found["by_extra_delay"][1]["mae_vx_m_s"]
+    assert not found["quick"] and not found["battery"] and found["episode_s"] == 2
+    names = [row["name"] for row in found["conditions"]]
+    # flat ground and no added dead time are those of the random commands
+    assert names[:2] == ["random commands", "forward"] and names[-1] == "dead time +20 ms"
+    assert not any(name.startswith("ground") for name in names)
+    for row in found["conditions"]:
+        assert row["command"] is None or len(row["command"]) == 3
+        for walker in ("policy", "trot", "standing"):
+            own = row[walker]
+            assert 0 <= own["fall_rate"] <= 1 and own["mae_vx_m_s"] > 0
+            assert own["intervals"]["fall_rate"]["value"] == own["fall_rate"]
+    first = found["conditions"][0]
+    assert [first[w]["episodes"] for w in ("policy", "trot", "standing")] == [5, 2, 2]
+    assert {f["walker"] for f in found["falls"]} <= {"policy", "trot", "standing"}
 
 
 def test_a_quick_look_is_smaller_and_says_so(capsys, trained, monkeypatch):
     arguments = (trained, "--quick", "--terrain", "flat", "--extra-delay-ms", "0")
-    assert pupper_eval._QUICK[0] < pupper_eval._FULL[0]
-    assert pupper_eval._QUICK[1] < pupper_eval._FULL[1]
+    for quick, full in (
+        (pupper_eval._QUICK, pupper_eval._FULL),
+        (pupper_eval._QUICK_BATTERY, pupper_eval._FULL_BATTERY),
+    ):
+        assert quick[0] < full[0] and quick[1] < full[1]
     monkeypatch.setattr(pupper_eval, "_QUICK", (2, 0.2))
     code, out, _ = run(capsys, pupper_eval, *arguments, "--json")
     found = json.loads(out)
-    assert code == 0 and found["quick"] and found["episodes"] == 2 and found["episode_s"] == 0.2
-    assert {row["episodes"] for row in found["by_command"]} == {1}
-    error = found["intervals"]["mae_vx_m_s"]
-    assert error["low"] < error["value"] == found["mae_vx_m_s"] < error["high"]
+    assert code == 0 and found["quick"] and found["episode_s"] == 0.2
+    own = found["conditions"][0]["policy"]
+    assert own["episodes"] == 2
+    assert {row["policy"]["episodes"] for row in found["conditions"][1:]} == {1}
+    error = own["intervals"]["mae_vx_m_s"]
+    assert error["low"] < error["value"] == own["mae_vx_m_s"] < error["high"]
     code, out, err = run(capsys, pupper_eval, *arguments, "--seconds", "0.1")
-    assert "Quick look: 2 episodes of 0.1 s" in out and "±" in out
-    assert "90 % interval 0–" in err and "episodes; episode k has the same robot" in err
+    assert "Quick look: 2 episodes of 0.1 s" in err and "±" in out
+    assert "intervals are of 90 %" in err
     said = refused(capsys, pupper_eval, trained, "--seconds", "0")
     assert "--seconds is 0.0; it must be a positive number" in said
+
+
+def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_before(
+    capsys, trained, monkeypatch
+):
+    monkeypatch.setattr(pupper_eval.out, "_width", 80)
+    code, out, _ = run(
+        capsys, pupper_eval, trained, "--battery", "--episodes", "2", "--seconds", "0.5"
+    )
+    assert code == 0
+    lines = out.splitlines()
+    assert max(map(len, lines)) <= 80
+    for case in BATTERY:
+        assert sum(line.startswith(case.name) for line in lines) >= 3
+    columns = [line for line in lines if line.split()[:3] == ["policy", "trot", "standing"]]
+    assert len(columns) == 1, "no title of a column is broken"
+    assert "Speed over the commanded" not in out
+    monkeypatch.setattr(pupper_eval, "_QUICK_BATTERY", (2, 3.4))
+    code, out, _ = run(capsys, pupper_eval, trained, "--battery", "--quick", "--json")
+    found = json.loads(out)
+    assert code == 0 and found["battery"] and found["quick"]
+    assert [row["name"] for row in found["conditions"][1:]] == [case.name for case in BATTERY]
+    assert found["falls"], "two robots fall at least once in 3.4 s of pushes of 1.2 m/s and slopes"
+    for fall in found["falls"]:
+        assert 0 < fall["time_s"] <= 3.4 and 0 <= fall["tilt_before_deg"] < 90
+        assert len(fall["command"]) == 3 and fall["row"] in {
+            row["name"] for row in found["conditions"]
+        }
 
 
 def test_an_evaluation_elsewhere_says_where(capsys, trained):
@@ -235,16 +271,16 @@ def test_an_evaluation_elsewhere_says_where(capsys, trained):
 
 def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
     arguments = (
-        trained, "--episodes", "1", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+        trained, "--episodes", "1", "--terrain", "rough", "--extra-delay-ms", "0", "--threads", "1",
         "--seconds", "2", "--report", tmp_path / "report",
     )  # fmt: skip
     code, out, err = run(capsys, pupper_eval, *arguments)
     assert code == 0, err
     page = tmp_path / "report" / "walking.html"
     text = page.read_text()
-    for name in ("random commands", "forward", "turn right", "ground: flat"):
+    for name in ("random commands", "forward", "turn right", "ground: rough"):
         assert name in out and name in text
-    assert "a robot that stands" in out and "How it was trained" in text
+    assert "standing, random" in out and "How it was trained" in text
     assert "learner.epochs" in text and CALIBRATION in text
     assert (tmp_path / "report" / "figures" / "training.png").stat().st_size > 2000
     if shutil.which("chromium"):

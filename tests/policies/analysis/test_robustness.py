@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.analysis import figures, perturbations
+from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.attractor import orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response
-from pupper_sysid.policies.analysis.perturbations import JOINTS
 from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
 from pupper_sysid.policies.analysis.trial import Trial, moving_frequency
+from pupper_sysid.policies.walks import perturbations
+from pupper_sysid.policies.walks.perturbations import JOINTS
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS

@@ -9,17 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.analysis.evaluation import _Recorder
-from pupper_sysid.policies.walks import conditions as module
+from pupper_sysid.policies.evaluation.figures import Recorder
+from pupper_sysid.policies.walks import together as module
 from pupper_sysid.policies.walks.conditions import (
     RANDOM,
     Condition,
-    _random_commands,
-    _shares,
     evaluation_task,
-    walk_together,
+    random_commands,
 )
+from pupper_sysid.policies.walks.together import _shares, walk_together
+from pupper_sysid.sim.robot.mini_pupper import default_pose
+from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 SERVOS = servo_ranges(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
@@ -44,7 +46,7 @@ class Stepping:
         return np.repeat(wave[None], len(observation), axis=0)
 
 
-def together(given, policy=None, seconds=0.5, threads=2, seed=3, recorder=_Recorder, **more):
+def together(given, policy=None, seconds=0.5, threads=2, seed=3, recorder=Recorder, **more):
     return walk_together(
         policy or Stepping(), SERVOS, given, seconds, seed, threads, recorder, **more
     )
@@ -77,7 +79,7 @@ def test_conditions_walked_together_are_those_walked_alone():
 def test_changed_observations_and_pushes_reach_the_robots_of_their_condition_only():
     seen, pushed = [], []
 
-    class Watching(_Recorder):
+    class Watching(Recorder):
         def keep(self, now):
             seen.append(now.observation.copy())
             super().keep(now)
@@ -100,8 +102,11 @@ def test_changed_observations_and_pushes_reach_the_robots_of_their_condition_onl
 
 def test_a_walk_ends_with_the_last_robot_of_its_condition():
     (fallen,) = together([Condition(TASK, 2)], Stepping(falls=True), seconds=2.0)
-    assert len(fallen.alive) < 60 and fallen.fell.all()
-    assert not fallen.alive[-1].any() and fallen.alive[-2].any()
+    up = fallen.alive.any(axis=1)
+    assert up.sum() < 60 and fallen.fell.all() and not up[-1]
+    # nothing is known of what was not simulated, but what was commanded
+    assert len(up) == 100 and not fallen.velocity[int(up.sum()) + 1 :].any()
+    assert fallen.command[-1].any()
 
 
 def test_progress_grows_to_its_end_and_an_error_or_interruption_ends_all_walks():
@@ -121,14 +126,14 @@ def test_progress_grows_to_its_end_and_an_error_or_interruption_ends_all_walks()
 
 
 def test_random_commands_are_new_every_five_seconds_and_within_their_ranges():
-    command = _random_commands(200, 1000, 0.02, 0)
+    command = random_commands(200, 1000, 0.02, 0)
     changes = (np.diff(command, axis=0) != 0).all(axis=-1).sum(axis=0)
     assert changes.mean() == pytest.approx(20.0 / RANDOM.every_s, rel=0.1)
     assert changes.var() == pytest.approx(changes.mean(), rel=0.3)  # exponential intervals
     for axis, ends in enumerate((RANDOM.forward_m_s, RANDOM.sideways_m_s, RANDOM.yaw_rad_s)):
         assert command[..., axis].min() == pytest.approx(ends[0], rel=0.02)
         assert command[..., axis].max() == pytest.approx(ends[1], rel=0.02)
-    np.testing.assert_array_equal(command[:, :5], _random_commands(200, 1000, 0.02, 0)[:, :5])
+    np.testing.assert_array_equal(command[:, :5], random_commands(200, 1000, 0.02, 0)[:, :5])
 
 
 def test_work_is_shared_evenly_with_one_environment_per_ground():
@@ -149,5 +154,44 @@ def test_robots_walk_on_the_learned_servos_that_were_given(monkeypatch, tmp_path
     monkeypatch.setattr(module, "PupperEnv", lambda *all_: given.extend(all_) or 1 / 0)
     servos = replace(servo_ranges("ideal"), source=str(tmp_path))
     with pytest.raises(ZeroDivisionError):
-        walk_together(None, servos, [Condition(TASK, 2)], 1.0, 3, 1, _Recorder)
+        walk_together(None, servos, [Condition(TASK, 2)], 1.0, 3, 1, Recorder)
     assert (model, str(tmp_path), 0.02) in given
+
+
+def test_robots_and_terrain_are_others_than_those_of_a_training_with_the_seed(monkeypatch):
+    seeds, made = [], module.PupperEnv
+
+    def kept(*given):
+        seeds.append(given[3])
+        return made(*given)
+
+    monkeypatch.setattr(module, "PupperEnv", kept)
+    together([Condition(ROUGH, 2)], seconds=0.04, seed=3)
+    assert seeds == [3 + module._SEED] and module._SEED > 1_000_000
+    ours, trainings = (PupperEnv(ROUGH, SERVOS, 2, s, 1) for s in (seeds[0], 3))
+    assert (ours.ground.heights != trainings.ground.heights).any()
+    assert (ours.robots.friction != trainings.robots.friction).all()
+
+
+def test_policy_trot_and_standing_robots_share_an_environment_and_differ_in_their_actions_only(
+    monkeypatch,
+):
+    monkeypatch.setattr(module, "_AT_A_TIME", 1)
+    actions = []
+
+    class Watching(Recorder):
+        def keep(self, now):
+            actions.append(now.action.copy())
+            super().keep(now)
+
+    given = [Condition(TASK, 2, (0.1, 0.0, 0.0), walker=w) for w in ("policy", "trot", "standing")]
+    found = together(given, seconds=0.4, threads=1, recorder=Watching)
+    own, trot, standing = np.split(np.array(actions), 3, axis=1)
+    np.testing.assert_allclose(own[:, 0, 3], 0.2 * np.sin(0.4 * np.arange(1, 21) + 3), rtol=1e-6)
+    assert not standing.any() and np.ptp(trot, axis=0).max() > 0.1
+    joints = Trot().joints(2 * np.pi * 3.25 * 0.02 * np.arange(20), np.tile([0.1, 0, 0], (20, 1)))
+    np.testing.assert_allclose(trot[:, 1] * TASK.action_scale + default_pose(), joints, atol=1e-6)
+    # the same robots before they have acted differently
+    firsts = np.array([walked.velocity[0] for walked in found])
+    assert np.ptp(firsts, axis=0).max() < 0.05
+    assert np.abs(found[1].velocity - found[2].velocity).max() > 0.05

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.analysis.evaluation import walk
 from pupper_sysid.policies.analysis.trial import outcome
+from pupper_sysid.policies.evaluation.evaluate import walk
 from pupper_sysid.policies.network.hyperparameters import Architecture
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import Policy, load_policy

@@ -1,0 +1,297 @@
+"""A page (`common.page`) about the training and the walk of a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pupper_sysid.common.border import read_text
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.figure_style import BLUE, FAINT, RED, WIDTH_IN, axes_column, styled
+from pupper_sysid.common.files import versions
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.page import Column, Picture, Section, Table
+from pupper_sysid.common.reading.csv_table import read_table
+from pupper_sysid.common.results import plain
+from pupper_sysid.policies.evaluation.evaluate import Evaluation, Row
+from pupper_sysid.policies.evaluation.falls import in_short
+from pupper_sysid.policies.evaluation.figures import Figures
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
+from pupper_sysid.policies.train.run_file import RUN_FILE, Run
+from pupper_sysid.policies.walks.tracking import STRIDE_ERRORS
+
+ERRORS = {
+    "mae_vx_m_s": ("forward", "m/s"),
+    "mae_vy_m_s": ("sideways", "m/s"),
+    "mae_yaw_rad_s": ("in turning", "rad/s"),
+}
+_CURVES = {
+    "reward": "reward per step",
+    "falls_per_1000_steps": "falls / 1,000 steps",
+    "std": "action noise",
+}
+
+
+def walking_sections(
+    policy: Policy, run: Run | None, folder: Path, found: Evaluation
+) -> list[Section]:
+    """The page's sections.
+
+    Parameters
+    ----------
+    policy : Policy
+    run : Run or None
+        How it was trained, if its folder says so.
+    folder : Path
+        Of the run or policy; its curves are shown if they are there.
+    found : Evaluation
+
+    Raises
+    ------
+    InputError
+        If the folder's curves cannot be read.
+    """
+    rows = [_cells(row) for row in found.conditions]
+    sections = [
+        Section("found", "What was found", findings=_findings(found), notes=[_with_what(found)]),
+        Section(
+            "walks",
+            "How it walks",
+            figures=[
+                Picture(
+                    "errors",
+                    "Mean absolute errors of the mean velocity over a stride, with 90 % intervals. "
+                    "Blue: policy, red where some robots fell; grey: open-loop trot; dotted: a "
+                    "robot that stands, under random commands.",
+                    _errors_figure(found),
+                ),
+                Picture(
+                    "falls",
+                    "Share of robots that fell, with 90 % intervals. Blue: policy; grey: open-loop "
+                    "trot; hollow: standing.",
+                    _falls_figure(found),
+                ),
+            ],
+            tables=[
+                Table("walks", "Errors, and what the feet do", _columns(), tuple(rows)),
+                *_table_of_falls(found),
+            ],
+            notes=[
+                "Errors are of the mean velocity over a stride; of every instant they are in the "
+                "result of --json. A robot that fell counts as one that stands still until the "
+                "end. duty: share of time a foot is on the ground; slip: speed of feet on it; "
+                "speed: mean speed along the command over the commanded one."
+            ],
+        ),
+    ]
+    curves = _curves(folder / PROGRESS)
+    if curves is not None:
+        sections.append(
+            Section(
+                "training",
+                "How it was trained",
+                figures=[
+                    Picture(
+                        "training",
+                        "Training, by samples: reward, falls, and the noise of exploration.",
+                        _training_figure(curves),
+                    )
+                ],
+            )
+        )
+    sections.append(_settings(policy, run))
+    return sections
+
+
+def _findings(found: Evaluation) -> list[tuple[str, str]]:
+    first = found.conditions[0]
+    own, trot, still = first.policy, first.trot, first.standing
+    errors = (
+        f"{getattr(own, key):.3f} {unit} {name} (trot {getattr(trot, key):.3f}, standing "
+        f"{getattr(still, key):.3f})"
+        for key, (name, unit) in ERRORS.items()
+    )
+    worst = max(found.conditions, key=lambda r: (r.policy.fall_rate, r.policy.mae_vx_m_s))
+    half = [r for r in found.conditions if r.trot.fall_rate >= 0.1]
+    won = sum(r.policy.fall_rate <= 0.5 * r.trot.fall_rate for r in half)
+    beside = (
+        f"The open-loop trot falls in 10 % of episodes or more under {len(half)} of "
+        f"{len(found.conditions)} conditions; the policy falls at most half as often in {won} of "
+        "them."
+        if half
+        else "The open-loop trot falls in less than 10 % of episodes under all of them."
+    )
+    return [
+        (
+            "Falls",
+            f"{100 * own.fall_rate:.0f} % of {own.episodes} episodes of {found.episode_s:g} s with "
+            f"random commands. {beside}",
+        ),
+        ("Tracking", "; ".join(errors) + ". Mean absolute errors of every instant."),
+        (
+            "Hardest of these walks",
+            f"{worst.name}: {100 * worst.policy.fall_rate:.0f} % fell (trot "
+            f"{100 * worst.trot.fall_rate:.0f} %), {worst.policy.mae_vx_m_s:.3f} m/s forward, "
+            f"{worst.policy.mae_vy_m_s:.3f} m/s sideways.",
+        ),
+    ]
+
+
+def _with_what(found: Evaluation) -> str:
+    return (
+        f"Walked with the servos of {Path(str(found.actuator)).name}, feedback {found.feedback}, "
+        f"seed {found.seed}, in simulation, on robots and terrain of which no training knows. "
+        "Evaluate with the calibration of another robot before the policy walks on it."
+    )
+
+
+def _cells(row: Row) -> dict[str, Any]:
+    """One row of the table."""
+    found: dict[str, Any] = {"walk": row.name}
+    for walker in ("policy", "trot"):
+        own: Figures = getattr(row, walker)
+        keys = ("fall_rate", *STRIDE_ERRORS, "speed_share")
+        found |= {f"{walker}.{key}": getattr(own, key) for key in keys}
+    own = row.policy
+    duty = float(np.mean(own.duty))
+    return found | {"duty": duty, "stride_hz": own.stride_hz, "slip": own.foot_slip_m_s}
+
+
+def _columns() -> tuple[Column, ...]:
+    def share(key: str) -> Callable[[Mapping[str, Any]], str]:
+        return lambda row: f"{100 * row[key]:.0f}" if np.isfinite(row[key]) else "–"
+
+    found = [Column("", lambda row: row["walk"], "key")]
+    for walker in ("policy", "trot"):
+        found.append(Column(f"{walker}: fell, %", share(f"{walker}.fall_rate")))
+        for key, (name, unit) in zip(STRIDE_ERRORS, ERRORS.values(), strict=True):
+            at = f"{walker}.{key}"
+            found.append(Column(f"{name}, {unit}", lambda row, at=at: f"{row[at]:.3f}"))
+        found.append(Column("speed, %", share(f"{walker}.speed_share")))
+    return (
+        *found,
+        Column("duty", lambda row: f"{row['duty']:.2f}"),
+        Column("strides/s", lambda row: f"{row['stride_hz']:.1f}"),
+        Column("slip, m/s", lambda row: f"{row['slip']:.3f}"),
+    )
+
+
+def _table_of_falls(found: Evaluation) -> list[Table]:
+    """What came before the falls."""
+    rows = tuple(plain(own) for own in in_short(found.falls))
+    columns = (
+        Column("", lambda row: row["row"], "key"),
+        Column("walker", lambda row: row["walker"]),
+        Column("falls", lambda row: str(row["falls"])),
+        Column("time, s", lambda row: f"{row['time_s']:.1f}"),
+        Column("tilt 0.2 s before, °", lambda row: f"{row['tilt_before_deg']:.0f}"),
+        Column("toward", lambda row: row["toward"]),
+        Column("tipped over", lambda row: str(row["tipped"])),
+        Column("within 1 s of a push", lambda row: str(row["after_push"])),
+    )
+    title = "Before falls: medians of time and tilt, most frequent direction"
+    return [Table("falls", title, columns, rows)] if rows else []
+
+
+def _curves(path: Path) -> dict[str, np.ndarray] | None:
+    """Columns of `progress.csv`; None if there is none."""
+    if not path.exists():
+        return None
+    remedy = "Move it away for a page without the training."
+    found = read_table(path, read_text(path, LARGEST_BYTES, remedy), strict=False).numbers
+    lacking = [name for name in ("samples", *_CURVES) if name not in found]
+    if lacking:
+        raise InputError(f"{path} has no numbers called {lacking[0]}. {remedy}")
+    return {name: found[name] for name in ("samples", *_CURVES)}
+
+
+@styled
+def _training_figure(curves: Mapping[str, np.ndarray]) -> Figure:
+    figure, axes = axes_column(len(_CURVES), 1.7 * len(_CURVES))
+    for (key, title), one in zip(_CURVES.items(), axes, strict=True):
+        one.plot(curves["samples"] / 1e6, curves[key], color=BLUE, lw=1.2)
+        one.set_ylabel(title)
+        if key == "falls_per_1000_steps":
+            one.set_ylim(bottom=0)
+    axes[-1].set_xlabel("samples [millions]")
+    return figure
+
+
+@styled
+def _errors_figure(found: Evaluation) -> Figure:
+    rows, still = found.conditions, found.conditions[0].standing
+    figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.3 * len(rows)), layout="constrained")
+    axes = figure.subplots(1, len(STRIDE_ERRORS), sharey=True)
+    place = -np.arange(len(rows))
+    for key, (name, unit), one in zip(STRIDE_ERRORS, ERRORS.values(), axes, strict=True):
+        for off, walker in ((0.15, "policy"), (-0.15, "trot")):
+            for at, row in zip(place, rows, strict=True):
+                own: Figures = getattr(row, walker)
+                colour = FAINT if walker == "trot" else RED if own.fall_rate > 0 else BLUE
+                _point(one, getattr(own.intervals, key), at + off, 1.0, colour)
+        one.axvline(getattr(still, key), color=FAINT, ls=":")
+        one.set_title(f"{name}, {unit}", fontsize=9)
+        one.set_xlim(left=0)
+        one.tick_params(axis="x", labelsize=7.5)
+    axes[0].set_yticks(place, [row.name for row in rows], fontsize=7.5)
+    return figure
+
+
+@styled
+def _falls_figure(found: Evaluation) -> Figure:
+    rows = found.conditions
+    figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.3 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    place = -np.arange(len(rows))
+    for off, walker, colour in ((0.2, "policy", BLUE), (0.0, "trot", FAINT)):
+        for at, row in zip(place, rows, strict=True):
+            _point(axes, getattr(row, walker).intervals.fall_rate, at + off, 100.0, colour)
+    still = [100 * row.standing.fall_rate for row in rows]
+    axes.plot(still, place - 0.2, "o", mfc="none", mec=FAINT, ms=4, ls="none")
+    axes.set_xlim(-2, 102)
+    axes.set_xlabel("fell, %")
+    axes.set_yticks(place, [row.name for row in rows], fontsize=7.5)
+    return figure
+
+
+def _point(axes: Any, value: Interval, at: float, scale: float, colour: str) -> None:
+    """A value with its interval, on a line of its own."""
+    axes.plot(scale * value.value, at, "o", color=colour, ms=4)
+    if np.isfinite(value.low):
+        axes.plot([scale * max(value.low, 0.0), scale * value.high], [at, at], color=colour, lw=1.2)
+
+
+def _settings(policy: Policy, run: Run | None) -> Section:
+    contract = policy.contract
+    words = [
+        f"Policy: {contract.kind}, trained with {Path(contract.actuator).name}. "
+        f"Evaluated with {', '.join(f'{n} {v}' for n, v in versions().items())}."
+    ]
+    if run is None:
+        return Section("made", "Where this comes from", words)
+    rows = tuple({"setting": key, "value": value} for key, value in _flat(plain(run)))
+    columns = (
+        Column("setting", lambda row: row["setting"], "key"),
+        Column("value", lambda row: row["value"], "prose"),
+    )
+    return Section(
+        "made", "Where this comes from", words,
+        tables=[Table("settings", f"Settings of the training ({RUN_FILE})", columns, rows)],
+    )  # fmt: skip
+
+
+def _flat(value: Mapping[str, Any], before: str = "") -> list[tuple[str, str]]:
+    """Nested settings as dotted names."""
+    found = []
+    for key, one in value.items():
+        if isinstance(one, Mapping):
+            found += _flat(one, f"{before}{key}.")
+        else:
+            words = ", ".join(map(str, one)) if isinstance(one, list | tuple) else str(one)
+            found.append((f"{before}{key}", words))
+    return found

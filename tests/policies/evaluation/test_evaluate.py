@@ -1,0 +1,191 @@
+"""Evaluation: falls and tracking errors, by command, ground and added dead time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.policies.evaluation.battery import BATTERY, battery_robots
+from pupper_sysid.policies.evaluation.evaluate import (
+    RANDOM as RANDOM_COMMANDS,
+)
+from pupper_sysid.policies.evaluation.evaluate import (
+    WALKERS,
+    Case,
+    evaluate,
+    summary,
+    table,
+    usual_robots,
+    walk,
+)
+from pupper_sysid.policies.evaluation.falls import in_short
+from pupper_sysid.policies.evaluation.figures import figures_of, share_interval
+from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, evaluation_task
+from pupper_sysid.sim.walking.config import Curriculum, Walking
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+
+CALIBRATION = str(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
+
+
+class Scripted:
+    """Robots with even numbers stand; the others fold all legs and fall on their bellies."""
+
+    def reset(self, action):
+        self.rows = np.arange(len(action))
+
+    def act(self, observation):
+        return np.outer(self.rows % 2, [0.0, 4.0, -4.0] * 4)
+
+
+def test_a_robot_that_stands_still_is_wrong_by_what_it_was_asked_and_what_it_moved():
+    """Triangle inequality, |error - asked| ≤ mean speed, for every episode and axis."""
+    task = evaluation_task(Walking(), 1.0)
+    found = walk(None, task, servo_ranges("ideal"), 6, 3, threads=1)
+    assert not found.fell.any() and found.alive.all()
+    moved = np.abs(found.velocity).mean(axis=0)
+    assert (np.abs(found.error - found.commanded) <= moved + 1e-9).all()
+    # ideal servos stand still after a drop of 2 mm: what is left is the command
+    np.testing.assert_allclose(found.error.mean(axis=0), found.commanded.mean(axis=0), rtol=0.05)
+    ends = np.array([RANDOM.forward_m_s[1], RANDOM.sideways_m_s[1], RANDOM.yaw_rad_s[1]])
+    assert (found.commanded <= ends).all() and (found.commanded > 0).all()
+
+
+def test_the_error_is_that_of_the_command_given():
+    task = evaluation_task(Walking(), 0.4)
+    command = (0.15, -0.05, 0.4)
+    found = walk(None, task, servo_ranges(CALIBRATION), 3, 3, command, threads=1)
+    np.testing.assert_allclose(found.commanded, [np.abs(command)] * 3)
+    expected = np.abs(found.velocity - command).mean(axis=0)
+    np.testing.assert_allclose(found.error, expected)
+
+
+def test_the_share_of_falls_counts_each_robot_that_fell_once_and_no_time_out():
+    task = evaluation_task(Walking(), 2.0)
+    found = walk(Scripted(), task, servo_ranges(CALIBRATION), 6, 3, (0.0, 0.0, 0.0), threads=1)
+    assert found.fell.tolist() == [False, True] * 3
+    assert summary(found).fall_rate == 0.5
+    lived = found.alive.sum(axis=0)
+    assert (lived[1::2] < task.episode_steps).all()
+    assert (lived[::2] == task.episode_steps).all()
+
+
+def test_after_a_fall_the_error_is_that_of_standing_to_the_end_of_the_episode():
+    """Also where all robots of a condition have fallen, and nothing is simulated any more."""
+    task, command = evaluation_task(Walking(), 2.0), np.array([0.2, 0.0, -0.4])
+
+    class Folding(Scripted):
+        def act(self, observation):
+            return np.tile([0.0, 4.0, -4.0] * 4, (len(observation), 1))
+
+    for policy in (Scripted(), Folding()):
+        found = walk(policy, task, servo_ranges(CALIBRATION), 4, 3, tuple(command), threads=1)
+        assert found.command.shape == (100, 4, 3) and found.fell[1]
+        for i in np.flatnonzero(found.fell):
+            steps = int(found.alive[:, i].sum())
+            before = np.abs(found.velocity[:steps, i] - command).sum(axis=0)
+            np.testing.assert_allclose(
+                found.error[i], (before + (100 - steps) * np.abs(command)) / 100
+            )
+    assert found.fell.all() and not found.alive[-1].any()
+
+
+def test_policy_trot_and_standing_walk_as_the_same_robots_in_every_row():
+    shares = []
+    found = evaluate(
+        None, Walking(episode_s=0.1), servo_ranges(CALIBRATION), table(("flat", "rough"), (0, 40)),
+        usual_robots(5), 7, 1, progress=shares.append,
+    )  # fmt: skip
+    names = [row.name for row in found.conditions]
+    assert names == ["random commands", *DIRECTIONS, "ground: rough", "dead time +40 ms"]
+    assert [row.command for row in found.conditions] == [None, *DIRECTIONS.values(), None, None]
+    first = found.conditions[0]
+    assert [getattr(first, walker).episodes for walker in WALKERS] == [5, 2, 2]
+    assert {row.policy.episodes for row in found.conditions[1:]} == {1}
+    assert found.episode_s == 0.1 and found.actuator == CALIBRATION and found.seed == 7
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1.0)
+    # a policy that is none stands: the same two robots twice
+    servos, task = servo_ranges(CALIBRATION), evaluation_task(Walking(), 0.1)
+    own, standing = (
+        walk(None, task, servos, 5, 7, None, 1, walker) for walker in ("policy", "standing")
+    )
+    np.testing.assert_array_equal(own.velocity, standing.velocity)
+    own, beside = figures_of(standing.first(2)), first.standing
+    assert (beside.mae_vx_m_s, beside.duty) == (own.mae_vx_m_s, own.duty)
+    assert first.trot.mae_vx_m_s != own.mae_vx_m_s
+
+
+def test_the_open_loop_trot_keeps_its_clock_and_follows_its_commands():
+    """3.25 strides per second, on straight paths the commanded speed within a tenth."""
+    task = evaluation_task(Walking(), 6.0)
+    found = walk(None, task, servo_ranges(CALIBRATION), 4, 0, (0.15, 0.0, 0.0), 1, "trot")
+    own = figures_of(found, (0.15, 0.0, 0.0))
+    assert own.fall_rate == 0 and own.stride_hz == pytest.approx(3.25, rel=0.05)
+    assert own.speed_share == pytest.approx(1.0, abs=0.15)
+    assert own.speed_share == pytest.approx(own.mean_velocity[0] / 0.15)
+    assert 0.5 < np.mean(own.duty) < 0.75
+    # within a stride the trunk sways: averaged over it, the error is a fraction
+    assert own.stride_mae_vx_m_s < 0.75 * own.mae_vx_m_s
+    assert 0 < own.heading_drift_deg < 90
+    turned = np.degrees(np.abs(found.heading[-1] - found.heading[0]))
+    assert own.heading_drift_deg == pytest.approx(turned.mean())
+
+
+def test_the_battery_has_a_row_for_each_condition_and_its_falls_say_what_came_before():
+    names = [case.name for case in BATTERY]
+    assert len(set(names)) == len(names) and max(map(len, names)) <= 18
+    groups = {case.group for case in BATTERY}
+    assert groups == {
+        "push", "slope", "stairs", "payload", "leg", "ticks", "dead time", "jitter", "friction",
+        "robot",
+    }  # fmt: skip
+    hard = [case for case in BATTERY if case.name in ("pushes of 1.2 m/s", "steps of 15 mm")]
+    found = evaluate(
+        Scripted(), Walking(episode_s=3.4), servo_ranges(CALIBRATION), hard, battery_robots(2), 0, 1
+    )
+    assert [row.name for row in found.conditions] == [RANDOM_COMMANDS.name, *(c.name for c in hard)]
+    assert all(getattr(row, w).episodes == 2 for row in found.conditions for w in WALKERS)
+    # the second of the scripted robots folds up and falls on its belly
+    belly = [f for f in found.falls if f.walker == "policy" and f.episode == 1]
+    assert {f.row for f in belly} == {row.name for row in found.conditions}
+    assert all(f.time_s < 1.5 and not f.tipped and f.since_push_s is None for f in belly)
+    pushed = [f for f in found.falls if f.row == hard[0].name and f.since_push_s is not None]
+    assert all(0 <= f.since_push_s <= 0.4 and f.time_s > 3.0 for f in pushed)
+    short = in_short(found.falls)
+    assert sum(own.falls for own in short) == len(found.falls)
+    assert sum(own.after_push for own in short) == len(pushed)
+
+
+def test_a_case_is_walked_on_its_own_ground_whatever_the_tasks():
+    task = evaluation_task(Walking(terrain="rough"))
+    assert Case("direction", "forward").condition(task, 1, "trot").task.terrain == "flat"
+    assert Case("ground", "s", terrain="slopes").condition(task, 1, "trot").task.terrain == "slopes"
+
+
+def test_intervals_are_over_episodes():
+    """Of no falls in 30 episodes, 1 - 0.05^(1/30); of errors 0 and 2, 1 ± 6.314 (t, one degree)."""
+    none = share_interval(0, 30)
+    assert (none.value, none.low) == (0.0, 0.0) and none.high == pytest.approx(1 - 0.05 ** (1 / 30))
+    every = share_interval(30, 30)
+    assert every.high == 1.0 and every.low == pytest.approx(0.05 ** (1 / 30))
+    found = walk(None, evaluation_task(Walking(), 0.1), servo_ranges("ideal"), 2, 0, threads=1)
+    own = summary(found).intervals.mae_yaw_rad_s
+    half = abs(found.error[0, 2] - found.error[1, 2]) / 2
+    assert own.value == pytest.approx(found.error[:, 2].mean())
+    assert own.high - own.value == pytest.approx(6.3138 * half, rel=1e-4)
+
+
+def test_an_evaluation_has_no_pushes_no_curriculum_and_gentle_starts():
+    task = evaluation_task(Walking())
+    assert task.randomisation.push_m_s == 0 and task.randomisation.on_the_move == 0
+    assert task.curriculum == Curriculum() and task.commands == RANDOM
+    assert task.episode_s == Walking().episode_s
+    assert task.physics == "evaluation"
+
+
+def test_an_evaluation_is_the_same_for_the_same_seed_and_another_for_another():
+    task, servos = evaluation_task(Walking(), 0.2), servo_ranges(CALIBRATION)
+    one, same, other = (walk(None, task, servos, 3, seed, threads=1).error for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
