@@ -1,0 +1,1 @@
+"""Evaluation of policies: tables of walks, falls, and a page about them."""

@@ -1,0 +1,280 @@
+"""Walks under many conditions at once.
+
+All conditions of one task (one kind of ground) share an environment, since commands, dead times and
+handicaps are each robot's own; two environments run at a time, so that one computes its physics
+while the other acts and reads. Robot k of every condition is the same robot (servos, friction,
+start, noise, random commands, pushes) until one falls, whatever it walks by, so that conditions
+differ in nothing else.
+
+Robots and terrain are others than those of a training with the same seed.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.walks.conditions import Condition, Moment, Recorder, random_commands
+from pupper_sysid.policies.walks.handicaps import (
+    impose,
+    missed_ticks,
+    push_directions,
+    see_slope,
+)
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.draws import at_rest
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
+from pupper_sysid.sim.walking.shared_draws import Twins
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+_SEED = 2_000_003  # added to a seed: a training with the same one has other robots
+_AT_A_TIME = 2  # environments: one steps while the other acts
+_COMMAND = OBSERVATION_PARTS["command"]
+
+
+def walk_together(
+    policy: Policy | None,
+    servos: ServoRanges,
+    conditions: Sequence[Condition],
+    seconds: float,
+    seed: int,
+    threads: int,
+    recorder: Callable[[PupperEnv, Policy | None, Sequence[Condition]], Recorder[T]],
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[T]:
+    """Walk from a gentle start under every condition.
+
+    Parameters
+    ----------
+    policy : Policy or None
+        Keeps its own state; None stands still.
+    servos : ServoRanges
+    conditions : sequence of Condition
+    seconds : float
+        Duration; a walk ends sooner when no robot of the condition is up any more.
+    seed : int
+        Of servos, friction, start, noise and random commands.
+    threads : int
+        Of the physics; 0 for all cores. Results do not depend on it.
+    recorder : callable
+        Makes the recorder of an environment, with its conditions in the order of its robots and
+        its policy, which acts there alone.
+    progress : callable
+        Called with the share of the work that is done, from any thread.
+
+    Returns
+    -------
+    list
+        What the recorders kept, by condition.
+
+    Raises
+    ------
+    InputError
+        If `seconds` is shorter than a step, or an environment cannot be made.
+    """
+    step_s = max(c.task.control_step_s for c in conditions)
+    if round(seconds / step_s) < 1:
+        raise InputError(f"A rollout of {seconds} s is shorter than one step of {step_s} s.")
+    shared = _Shared(
+        max(c.robots for c in conditions), any(c.handicap.extra_jitter_s for c in conditions)
+    )
+    done, lock, stop = 0.0, threading.Lock(), threading.Event()
+    total = seconds * sum(c.robots for c in conditions)
+    found: dict[int, T] = {}
+
+    def advance(robot_seconds: float) -> bool:
+        """Count what was walked; whether to go on."""
+        nonlocal done
+        with lock:
+            done += robot_seconds
+            progress(min(done / total, 1.0))
+        return not stop.is_set()
+
+    def walk(environments: list[list[int]], threads: int) -> None:
+        for chosen in environments:
+            own = [conditions[i] for i in chosen]
+            group = _Group(policy, servos, own, seconds, seed, threads, shared, recorder)
+            if not group.walk(advance):
+                return
+            found.update(zip(chosen, group.found(), strict=True))
+
+    shares = _shares(conditions)
+    cores = threads or os.cpu_count() or 1
+    workers = min(len(shares), cores)
+    with ThreadPoolExecutor(workers) as pool:
+        each = [cores // workers + (k < cores % workers) for k in range(workers)]
+        running = [pool.submit(walk, s, each[k % workers]) for k, s in enumerate(shares)]
+        try:
+            wait(running, return_when="FIRST_EXCEPTION")
+        finally:  # after Ctrl-C, or an error in one of them, the others end with their step
+            stop.set()
+        for one in running:
+            one.result()
+    return [found[i] for i in range(len(conditions))]
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What environments have in common, so that they draw alike."""
+
+    robots: int
+    """Different ones."""
+    jitter: bool
+    """Whether any condition adds jitter."""
+
+
+def _shares(conditions: Sequence[Condition]) -> list[list[list[int]]]:
+    """Conditions by worker, of like amounts of work, and by environment."""
+    shares: list[list[int]] = [[] for _ in range(_AT_A_TIME)]
+
+    def work(share: list[int]) -> int:
+        return sum(conditions[i].robots for i in share)
+
+    for i in sorted(range(len(conditions)), key=lambda i: -conditions[i].robots):
+        min(shares, key=work).append(i)
+    return [_by_task(conditions, sorted(share)) for share in shares if share]
+
+
+def _by_task(conditions: Sequence[Condition], chosen: Sequence[int]) -> list[list[int]]:
+    groups: list[list[int]] = []
+    for i in chosen:
+        same = (g for g in groups if conditions[g[0]].task == conditions[i].task)
+        group = next(same, None)
+        if group is None:
+            groups.append([i])
+        else:
+            group.append(i)
+    return groups
+
+
+class _Group:
+    """An environment, and the conditions of its robots."""
+
+    def __init__(
+        self, policy: Policy | None, servos: ServoRanges, conditions: Sequence[Condition],
+        seconds: float, seed: int, threads: int, shared: _Shared,
+        recorder: Callable[[PupperEnv, Policy | None, Sequence[Condition]], Recorder],
+    ):  # fmt: skip
+        step_s = conditions[0].task.control_step_s
+        self.conditions, self.step_s, self.steps = conditions, step_s, round(seconds / step_s)
+        ends = np.cumsum([0, *(c.robots for c in conditions)]).tolist()
+        self.robots = [slice(a, b) for a, b in pairwise(ends)]
+        number = np.concatenate([np.arange(c.robots) for c in conditions])
+
+        def each(values: Sequence[float]) -> Array:
+            return np.repeat(np.array(values), [c.robots for c in conditions])
+
+        # a step longer, so that no episode times out within it
+        task = replace(conditions[0].task, episode_s=(self.steps + 1) * step_s)
+        self.env = PupperEnv(
+            task, servos, ends[-1], _SEED + seed, threads, servo_model_of(servos.source, step_s),
+            each([c.extra_dead_time_s for c in conditions]), Twins(number, shared.robots),
+            each([c.handicap.extra_jitter_s for c in conditions]) if shared.jitter else None,
+        )  # fmt: skip
+        for own, robots in zip(conditions, self.robots, strict=True):
+            impose(self.env.robots, _numbers(robots), own.handicap)
+        self.policy = deepcopy(policy)  # hooks of a recorder hear this environment only
+        self.recorder = recorder(self.env, self.policy, conditions)
+        random = random_commands(shared.robots, self.steps, step_s, seed)
+        commands = np.concatenate(
+            [
+                random[:, : c.robots] if c.command is None
+                else np.broadcast_to(c.command, (self.steps, c.robots, 3))
+                for c in conditions
+            ],
+            axis=1,
+        )  # fmt: skip
+        self.commands = at_rest(task.commands, commands.reshape(-1, 3)).reshape(commands.shape)
+        self.pushes = push_directions(shared.robots, self.steps, step_s, seed)
+        chance = each([c.handicap.missed_ticks for c in conditions])
+        self.missed = missed_ticks(shared.robots, self.steps, seed)[:, number] < chance
+        self.led, self.trotting = (
+            np.flatnonzero(np.repeat([c.walker == w for c in conditions], np.diff(ends)))
+            for w in ("policy", "trot")
+        )
+        self.trot = Trot()
+        self.last = np.zeros(len(conditions), int)  # steps until none of a condition was up
+
+    def walk(self, advance: Callable[[float], bool]) -> bool:
+        """Walk to the end; False if `advance` said to stop."""
+        env, n = self.env, self.env.environments
+        observation, _ = env.observe()
+        alive = np.ones(n, bool)
+        if self.policy:
+            self.policy.reset(env.action[self.led])
+        for step, command in enumerate(self.commands):
+            env.set_command(command)
+            observation[:, _COMMAND] = command
+            self._handicap(step, observation)
+            action = self._action(step, observation)
+            for own, robots in zip(self.conditions, self.robots, strict=True):
+                if own.disturb:
+                    own.disturb(step, env, _numbers(robots))
+            result = env.step(action)
+            up = np.array([alive[robots].any() for robots in self.robots])
+            self.last[up] = step + 1
+            fell = alive & result.done & ~result.timed_out
+            alive = alive & ~result.done
+            self.recorder.keep(Moment(observation, action, command, result.facts, alive, fell))
+            observation = result.observation
+            left = self.steps - step - 1 if not alive.any() else 0
+            if not advance((1 + left) * n * self.step_s):
+                return False
+            if left:
+                break
+        return True
+
+    def _handicap(self, step: int, observation: NDArray[np.float32]) -> None:
+        """Push robots, and alter what they see."""
+        direction = self.pushes.get(step)
+        for own, robots in zip(self.conditions, self.robots, strict=True):
+            if own.handicap.push_m_s and direction is not None:
+                self._push(_numbers(robots), own.handicap.push_m_s * direction)
+            see_slope(observation[robots], _numbers(robots), self.env.robots, own.handicap)
+            if own.change:
+                observation[robots] = own.change(step, observation[robots])
+
+    def _push(self, ids: NDArray[np.intp], added: Array) -> None:
+        robots = self.env.robots
+        robots.push(ids, robots.qvel[ids, :2] + added[: len(ids)])
+
+    def _action(self, step: int, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What each robot does by its walker."""
+        env, missed = self.env, self.missed[step]
+        action = np.zeros((env.environments, len(env.default)), np.float32)
+        if self.policy and len(self.led):
+            late = missed[self.led]
+            # a policy without missed ticks need not know of them
+            more = (late,) if late.any() else ()
+            action[self.led] = self.policy.act(observation[self.led], *more)
+        if len(self.trotting):
+            angle = 2 * np.pi * self.trot.frequency_hz * step * self.step_s
+            phase = np.full(len(self.trotting), angle)
+            joints = self.trot.joints(phase, self.commands[step, self.trotting])
+            action[self.trotting] = (joints - env.default) / env.config.action_scale
+        action[missed] = env.action[missed]
+        return action
+
+    def found(self) -> list:
+        """What was kept, by condition."""
+        given = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
+        return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in given]
+
+
+def _numbers(robots: slice) -> NDArray[np.intp]:
+    return np.arange(robots.start, robots.stop)
