@@ -106,6 +106,9 @@ class Hyperparameters:
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
     exploration: Exploration = field(default_factory=Exploration)
+    mirror: bool = False
+    """Whether every sample is also learned from as its mirror image, left for right; for policies
+    without a memory."""
     normalise: bool = True
     """Whether observations are normalised by their running mean and deviation."""
     freeze_normaliser: bool = False

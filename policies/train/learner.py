@@ -421,9 +421,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
-        raise InputError(
-            f"{path} is damaged and cannot be read. {_ANOTHER}"
-        ) from error
+        raise InputError(f"{path} is damaged and cannot be read. {_ANOTHER}") from error
     if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
         raise InputError(f"{path} is not a checkpoint of pupper-train.")
     if content.get("schema_version") == 1:

@@ -113,8 +113,9 @@ def _from_scratch(kind: Kind) -> Run:
     return Run(
         architecture=Architecture(kind, (128, 64), 64, (128, 64)), task=PRESETS["scratch"],
         learner=Hyperparameters(
-            steps_per_environment=20, learning_rate=1e-3, desired_kl=0.02,
-            exploration=Exploration((0.5, 0.04), (2.0, 20.0), 0.08),
+            steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.015,
+            exploration=Exploration((0.5, 0.04), (1.5, 18.0), 0.08),
+            mirror=kind in ("mlp", "mlp-actions"),
         ),
         imitation=Imitation(iterations=0), environments=1024, iterations=2500, minutes=90.0,
     )  # fmt: skip

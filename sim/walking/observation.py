@@ -79,7 +79,15 @@ def observed(
     return whole
 
 
-PRIVILEGED_SIZE = 82
+PRIVILEGED = (
+    ("base_linear_velocity", 3), ("joint_position_relative", 12), ("joint_velocity", 12),
+    ("height", 1), ("air_s", 4), ("contact_s", 4), ("friction", 1), ("dead_time_s", 12),
+    ("added_mass", 1), ("centre_of_mass", 3), ("leg_strength", 4), ("battery", 1),
+    ("joint_zero", 12), ("imu_mounting", 3), ("gyro_bias", 3), ("imu_age", 2), ("readings", 3),
+    ("time_left", 1),
+)  # fmt: skip
+"""Name and size of each part of what the critic sees."""
+PRIVILEGED_SIZE = sum(size for _, size in PRIVILEGED)
 
 
 def privileged_of(
@@ -92,11 +100,11 @@ def privileged_of(
     parts : sequence of ndarray, each of shape (n, k)
         Velocity of the trunk in its own frame [m/s], joint angles from the default pose [rad] and
         velocities [rad/s], height above the ground [m], times of each foot in the air and on the
-        ground [s], friction, dead times [s], added mass [kg],
-        shift of the centre of mass [m], strength of the legs and of the battery relative to the
-        model, errors of the joints' zeros [rad], rotation of the IMU [rad], errors of its rates
-        [rad/s], ages of its newest sample and of its samples [s], factor on the readings' periods
-        and on the commands' jitter, whether efforts are read, share of the episode that is left.
+        ground [s], friction, dead times [s], added mass [kg], shift of the centre of mass [m],
+        strength of the legs and of the battery relative to the model, errors of the joints' zeros
+        [rad], rotation of the IMU [rad], errors of its rates [rad/s], its latency and period [s],
+        factors on the readings' periods and on the commands' jitter with whether efforts are read,
+        share of the episode that is left: the parts of `PRIVILEGED`.
     out : ndarray of float32, shape (n, 82), optional
         Where to write it.
     """

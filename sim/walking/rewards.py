@@ -173,7 +173,11 @@ class Rewards:
     """Norm of the velocities."""
 
 
-DEFAULT = Rewards()
+DEFAULT = Rewards(
+    tracking_shape="gaussian", linear_sigma=0.05, stride_linear_sigma=0.025, angular_sigma=0.25,
+    stride_angular_sigma=0.1,
+)  # fmt: skip
+"""With widths of about an imitated trot's errors, where the slope of a Gaussian is largest."""
 
 RELEASE = Rewards(
     base_linear_velocity=15.0, base_angular_velocity=10.0, tracking_shape="exponential",
