@@ -16,12 +16,15 @@ from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 
 def open_bus(
-    address: BusAddress, joint_map: JointMap | None = None, joints: Sequence[str] | None = None
+    address: BusAddress,
+    joint_map: JointMap | None = None,
+    joints: Sequence[str] | None = None,
+    exclusive: bool = True,
 ) -> ServoBus:
     """The bus itself, unguarded; see `FeetechBus` and `Esp32Bus` for parameters and errors."""
     if address.kind == "esp32":
-        return Esp32Bus(Path(address.where), joint_map)
-    return FeetechBus(address.where, address.baud, joint_map, joints)
+        return Esp32Bus(Path(address.where), joint_map, exclusive)
+    return FeetechBus(address.where, address.baud, joint_map, joints, exclusive)
 
 
 def open_guarded(

@@ -2,7 +2,7 @@
 
 The proxy shares one block of memory among all its clients: the last writer wins, a client that died
 goes unnoticed, and the feedback is 20 to 100 ms old without a time stamp. Hence one owner at a time
-(a lock file beside the socket), a time-out on every exchange, a new connection after anything
+(`hardware.lock`), a time-out on every exchange, a new connection after anything
 unexpected, and every position read twice, because the datagrams have no checksum. Stale readings
 are passed on as they come; `sysid` estimates their feedback age.
 
@@ -11,7 +11,6 @@ Counts are those of the firmware's stored calibration, not raw ones.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import select
 import socket
@@ -30,6 +29,7 @@ from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.imu import ImuSample, from_chip
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.lock import own
 
 TIMEOUT_S = 0.03
 VOLTAGE_BAND_V = (4.2, 8.7)
@@ -56,6 +56,9 @@ class Esp32Bus(HostClock):
         The proxy's socket.
     joint_map : JointMap, optional
         For the proxy's counts; by default the preset mini_pupper_2, in servo coordinates.
+    exclusive : bool
+        Whether to refuse a robot that another program drives. Only what switches the torque off
+        goes without.
 
     Raises
     ------
@@ -67,7 +70,9 @@ class Esp32Bus(HostClock):
 
     name = "esp32"
 
-    def __init__(self, path: Path = SOCKET, joint_map: JointMap | None = None):
+    def __init__(
+        self, path: Path = SOCKET, joint_map: JointMap | None = None, exclusive: bool = True
+    ):
         super().__init__()
         self.path = Path(path)
         self._map = joint_map or load_joint_map("mini_pupper_2").per_servo()
@@ -88,7 +93,9 @@ class Esp32Bus(HostClock):
                 "proxy drives the servos 1 to 12 together, so the map must have them all."
             )
         self._by_id = np.array(self._map.ids) - 1
-        self._owner = _own(self.path)
+        if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
+            raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
+        self._owner = own(self.path) if exclusive else None
         self._socket: socket.socket | None = None
         self._retry_s = 0.0
         self._power: datagrams.Power | None = None
@@ -269,30 +276,3 @@ class Esp32Bus(HostClock):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-
-
-def _own(path: Path) -> int:
-    """Descriptor of the lock file beside the socket, locked until it is closed."""
-    if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
-        raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
-    lock = path.with_name(path.name + ".lock")
-    try:
-        try:
-            # reading is enough to lock it, also a file that root has left
-            descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
-        except FileNotFoundError:
-            descriptor = os.open(lock, os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
-    except OSError as error:
-        advice = ""
-        if lock.exists():
-            advice = f" Run this as its owner, or, while no program drives it, `sudo rm {lock}`."
-        raise BusError(f"{lock} cannot be opened: {error.strerror}.{advice}") from error
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise BusError(
-            f"{path}: another pupper-sysid is driving this robot. Stop it first: servos execute "
-            "whichever command arrived last, so only one program may command them."
-        ) from None
-    return descriptor

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
@@ -41,7 +42,7 @@ AUTO_BAUDS = (1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400)
 LOAD_SCALE = 1e-3
 
 SPEED_LIMIT_RAD_S = 7.5
-"""Nominal speed of the servo [rad/s]."""
+"""Speed of a servo whose data sheet is not known, or states none [rad/s]."""
 
 _FIRST, _SHORTEST, _LENGTHS = 56, 6, 6  # position, speed, load; voltage; temperature; …
 _FASTEST_RAD_S = 20.0  # no servo of this size turns faster
@@ -81,6 +82,8 @@ class FeetechBus(HostClock):
         For raw counts; by default the preset that fits the servos found.
     joints : sequence of str, optional
         Only these, and all of them; by default those of the map that answer.
+    exclusive : bool
+        Whether to refuse a port that another program has open.
 
     Raises
     ------
@@ -98,11 +101,12 @@ class FeetechBus(HostClock):
         baud: int | None = None,
         joint_map: JointMap | None = None,
         joints: Sequence[str] | None = None,
+        exclusive: bool = True,
     ):
         # all presets of this layout share the ids
         wanted = joint_map or load_joint_map("sts3215").per_servo()
         wanted = wanted.select(joints) if joints else wanted
-        self.line, found = open_line(device, baud, wanted.ids)
+        self.line, found = open_line(device, baud, wanted.ids, exclusive)
         try:
             series = _known(found, device)
             names = _answering(wanted, series, joints is not None, self.line)
@@ -290,6 +294,13 @@ class FeetechBus(HostClock):
             servo.doubtful_s = -np.inf
         return good
 
+    def _speeds_rad_s(self) -> list[float]:
+        """Speed of each servo by its data sheet, at its supply voltage."""
+        return [
+            no_load_speed(setup["model"], setup.get("supply_voltage_v")) or SPEED_LIMIT_RAD_S
+            for setup in self._setups.values()
+        ]
+
     def _describe(self, device: str) -> dict[str, Any]:
         supply = [
             (VOLT_SCALE * own["min_voltage"], VOLT_SCALE * own["max_voltage"])
@@ -302,7 +313,7 @@ class FeetechBus(HostClock):
             "device": device,
             "baud": self.line.baud,
             "echo": self.line.echoes,
-            "speed_limit_rad_s": SPEED_LIMIT_RAD_S,
+            "speed_limit_rad_s": min(self._speeds_rad_s(), default=SPEED_LIMIT_RAD_S),
             "poll_rate_hz": 0.0,
             "real_time": True,
         }
@@ -312,7 +323,7 @@ class FeetechBus(HostClock):
 
 
 def open_line(
-    device: str, baud: int | None, ids: Sequence[int]
+    device: str, baud: int | None, ids: Sequence[int], exclusive: bool = True
 ) -> tuple[FeetechLine, dict[int, int | Series]]:
     """Open a line at the first of the baud rates at which a servo answers.
 
@@ -324,7 +335,7 @@ def open_line(
         If the port cannot be opened, or no servo answers.
     """
     for rate in (baud,) if baud else AUTO_BAUDS:
-        line = FeetechLine(device, rate)
+        line = FeetechLine(device, rate, exclusive)
         line.detect_echo()
         found = line.find(ids)
         if found:

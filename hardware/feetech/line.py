@@ -74,6 +74,8 @@ class FeetechLine:
         Serial port.
     baud : int
         Bits per second.
+    exclusive : bool
+        Whether to refuse a port that another program has open.
 
     Raises
     ------
@@ -81,10 +83,10 @@ class FeetechLine:
         If the port cannot be opened, is in use, or the other SDK of the same name is installed.
     """
 
-    def __init__(self, device: str, baud: int):
+    def __init__(self, device: str, baud: int, exclusive: bool = True):
         self.device, self.baud, self.echoes = device, baud, False
         self.patience_s = REPLY_TIMEOUT_S
-        self._port = _sdk_port(device, baud)
+        self._port = _sdk_port(device, baud, exclusive)
         self._packets = _sdk().protocol_packet_handler()
         self._retry_s = self._busy_s = 0.0
         try:
@@ -281,8 +283,8 @@ def _sdk() -> Any:
     return scservo_sdk
 
 
-def _sdk_port(device: str, baud: int) -> Any:
-    """Port of the SDK, exclusive and without busy waiting."""
+def _sdk_port(device: str, baud: int, exclusive: bool) -> Any:
+    """Port of the SDK, without busy waiting."""
 
     class Port(_sdk().PortHandler):
         """Exclusive; sleeps while it waits; discards old bytes before it sends."""
@@ -295,8 +297,9 @@ def _sdk_port(device: str, baud: int) -> Any:
             self.shut()
             # an exclusive lock: two programs on one line would destroy each other's frames
             self.ser = serial.Serial(
-                self.port_name, cflag_baud, timeout=_POLL_S, write_timeout=0.5, exclusive=True
-            )
+                self.port_name, cflag_baud, timeout=_POLL_S, write_timeout=0.5,
+                exclusive=exclusive,
+            )  # fmt: skip
             # some adapters and an emulated line do not have it
             with contextlib.suppress(ValueError, NotImplementedError, *PORT_ERRORS):
                 self.ser.set_low_latency_mode(True)

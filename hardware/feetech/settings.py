@@ -31,14 +31,15 @@ VOLT_SCALE = 0.1
 EEPROM_END = 40
 
 _PIECES = (16, 15, 14, 13, 9)  # of registers 0 to 66; unequal: a late reply fits no later read
-_READ_BACK_TRIES, _STORING_S = 5, 0.01
+_READ_TRIES, _STORING_S = 5, 0.01
 
 
 def memory_of(line: FeetechLine, servo: int) -> bytes | None:
     """Registers 0 to 66 of a servo, read in pieces; None if a read failed."""
     memory = b""
     for size in _PIECES:
-        reply = line.read(servo, len(memory), size) or line.read(servo, len(memory), size)
+        tries = (line.read(servo, len(memory), size) for _ in range(_READ_TRIES))
+        reply = next((found for found in tries if found), None)
         if reply is None:
             return None
         memory += reply.frame.data
@@ -80,7 +81,7 @@ def return_delay_s(setup: dict[str, Any]) -> float:
 def read_register(line: FeetechLine, servo: int, series: Series, name: str) -> int | None:
     """Value of a register; None if it could not be read."""
     register = series.registers[name]
-    for _ in range(_READ_BACK_TRIES):
+    for _ in range(_READ_TRIES):
         reply = line.read(servo, register.address, register.size)
         if reply:
             return series.decode(name, reply.frame.data, register.address)

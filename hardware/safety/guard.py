@@ -17,6 +17,7 @@ to what was found, and the watchdog does if this process dies.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,8 +32,11 @@ from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 _HEARTBEAT_S = 0.1
 _PARK_PERIOD_S = 0.02
-_LONGEST_TICK_S = 0.06  # a pause does not save up for a jump
+_FIRST_TICK_S = 0.02  # until the driver's own rate is known
+_LATE = 1.5  # a pause does not save up for a jump: so many ticks at most
+_SHORTEST_TICK_S, _LONGEST_TICK_S = 0.001, 0.06
 _REST_S = 0.1  # longer than any tick: the command has been at rest
+_RECENT_TICKS = 9
 _TORQUE_OFF_TRIES = 10
 _STALE_S = 0.1  # older than any feedback age
 _LOCATE_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
@@ -87,6 +91,7 @@ class GuardedBus:
         self._sent: Angles | None = None
         self._sent_s = -np.inf
         self._velocity = np.zeros(len(bus.joint_names))
+        self._ticks: deque[float] = deque(maxlen=_RECENT_TICKS)
         self._monitor = Monitor(bus, self.guard)
         self.registers = ChangedRegisters(bus, watchdog)
 
@@ -330,19 +335,24 @@ class GuardedBus:
         """`command`, or a point towards it that the speed and acceleration limits allow."""
         assert self._sent is not None
         wanted, here = self.limits.servo_angles(command), self.limits.servo_angles(self._sent)
-        dt = float(np.clip(since_s, 1e-4, _LONGEST_TICK_S))
-        if since_s > _REST_S:
-            self._velocity[:] = 0.0
+        tick = float(np.median(self._ticks)) if self._ticks else _FIRST_TICK_S
+        dt = max(min(since_s, _LATE * tick), 1e-4)
+        if since_s > _REST_S:  # a new start
+            self._velocity[:], dt = 0.0, min(tick, _FIRST_TICK_S)
+        else:
+            self._ticks.append(min(max(since_s, _SHORTEST_TICK_S), _LONGEST_TICK_S))
         asked = (wanted - here) / dt
         gain = self.guard.acceleration_rad_s2 * dt
         low = np.maximum(np.minimum(self._velocity, 0.0) - gain, -self.guard.speed_rad_s)
         high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self.guard.speed_rad_s)
-        self._velocity = np.clip(asked, low, high)
-        limited = self._velocity != asked
+        velocity = np.clip(asked, low, high)
+        limited = velocity != asked
+        # over all of a late tick the joint was slower than that
+        self._velocity = velocity * min(dt / min(max(since_s, 1e-4), _LONGEST_TICK_S), 1.0)
         if not limited.any():
             return command
         self.report.slowed += 1
-        slower = np.where(limited, here + self._velocity * dt, wanted)
+        slower = np.where(limited, here + velocity * dt, wanted)
         return self.limits.clip(self.limits.from_servo_angles(slower))
 
     def _check_first(self, allowed: Angles) -> None:

@@ -3,8 +3,9 @@
 Neither the robot's proxy nor a servo notices that its host has died: the last command is held for
 ever, with full torque. So a program that drives a robot starts a `Watchdog` and calls `beat` often.
 If the pipe between the two closes without a message, or no beat comes for a second,
-`hardware.safety.watchdog_process` parks the robot. If that process ends, the next beat stops the
-driver.
+`hardware.safety.watchdog_process` parks the robot. That process answers what it receives: if it
+ends, or does not answer for half a second, the next beat stops the driver. Nothing here waits for
+it: a full pipe is the same as no answer.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import select
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,6 +29,7 @@ from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.joint_map import JointMap
 
 _BEAT_S = 0.05
+_SILENT_S = 0.5
 _START_WITHIN_S = 20.0
 
 
@@ -50,9 +53,12 @@ class Watchdog:
         self._process = subprocess.Popen(
             # -P: a file in the user's folder, such as json.py, must not stand in for a module
             [sys.executable, "-P", "-m", "pupper_sysid.hardware.safety.watchdog_process"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )  # fmt: skip
         self._beaten_s = 0.0
+        self._unanswered: deque[float] = deque()
+        assert self._process.stdin is not None and self._process.stdout is not None
         self._send(
             {
                 "kind": address.kind,
@@ -63,7 +69,6 @@ class Watchdog:
                 "driver": os.getpid(),
             }
         )
-        assert self._process.stdout is not None
         ready, _, _ = select.select([self._process.stdout], [], [], _START_WITHIN_S)
         if not ready or self._process.stdout.readline() != b"ready\n":
             self._process.kill()
@@ -71,6 +76,9 @@ class Watchdog:
                 "the watchdog process did not start, and without it the robot would not be parked "
                 "if this process died. Check the machine's load and memory, then try again."
             )
+        for pipe in (self._process.stdin, self._process.stdout):
+            os.set_blocking(pipe.fileno(), False)
+        self._unanswered.clear()
 
     def arm(self, joints: Sequence[str], pose_rad: NDArray[np.float64]) -> None:
         """Expect beats from now on, and park at this pose.
@@ -89,11 +97,18 @@ class Watchdog:
         Raises
         ------
         SafetyStop
-            If the watchdog process has ended.
+            If the watchdog process has ended, or has not answered for half a second.
         """
         now = time.monotonic()
         if now - self._beaten_s > _BEAT_S:
             self._beaten_s = now
+            self._take_answers()
+            if self._unanswered and now - self._unanswered[0] > _SILENT_S:
+                raise SafetyStop(
+                    f"the watchdog process has not answered for {_SILENT_S:g} s, and without it "
+                    "the robot would not be parked if this process died. Find out what stopped "
+                    "it, then start again."
+                )
             if self._process.poll() is not None:
                 raise SafetyStop(
                     "the watchdog process has ended, and without it the robot would not be parked "
@@ -123,11 +138,23 @@ class Watchdog:
             self._process.wait(1.0)
 
     def _send(self, message: dict[str, Any]) -> None:
+        """Write a message; a pipe that is full takes none, which leaves it unanswered."""
         pipe = self._process.stdin
-        if pipe is not None and not pipe.closed:
-            with contextlib.suppress(OSError):
-                pipe.write(json.dumps(message).encode() + b"\n")
-                pipe.flush()
+        if pipe is None or pipe.closed:
+            return
+        self._unanswered.append(time.monotonic())
+        left = json.dumps(message).encode() + b"\n"
+        with contextlib.suppress(OSError):
+            while left:  # the first message is longer than a pipe takes at once
+                left = left[os.write(pipe.fileno(), left) :]
+
+    def _take_answers(self) -> None:
+        """Forget as many messages as have been answered."""
+        assert self._process.stdout is not None
+        with contextlib.suppress(OSError):
+            for _ in os.read(self._process.stdout.fileno(), 65_536):
+                if self._unanswered:
+                    self._unanswered.popleft()
 
     def _close_pipe(self) -> None:
         if self._process.stdin is not None:

@@ -1,6 +1,5 @@
 """The robot's proxy: layouts of its datagrams, its emulator's quirks, and a bus that bears both."""
 
-import os
 import socket
 import tempfile
 import time
@@ -310,28 +309,6 @@ def test_a_second_owner_is_refused_until_the_first_lets_go(path, patient):
             Esp32Bus(path)
         bus.close()
         Esp32Bus(path).close()
-
-
-@pytest.mark.parametrize("readable", [True, False])
-def test_a_lock_that_another_user_left_keeps_nobody_out_if_it_can_be_read(
-    path, monkeypatch, readable
-):
-    lock = path.with_name("s.lock")
-    lock.touch()
-    opened = os.open
-
-    def as_another_user(name, flags, *mode):
-        if not readable or flags & (os.O_RDWR | os.O_CREAT):
-            raise PermissionError(13, "Permission denied")
-        return opened(name, flags, *mode)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "open", as_another_user)
-        if readable:
-            os.close(esp32_bus._own(path))
-        else:
-            with pytest.raises(BusError, match=f"as its owner, or, .* `sudo rm {lock}`"):
-                esp32_bus._own(path)
 
 
 def test_a_missing_socket_gives_a_sentence_and_keeps_no_lock(path, patient):

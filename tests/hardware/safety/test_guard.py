@@ -170,8 +170,19 @@ def test_speed_is_gained_anew_after_a_rest():
     rested = bus.goal[0]
     guard.sleep_until(guard.now() + 0.5)
     guard.write(np.array([1.9, 0.0]))
-    # the longest tick counts, 60 ms: 0.6 rad/s, whatever the speed was before the rest
-    assert bus.goal[0] - rested == pytest.approx(0.6 * 0.06)
+    # one tick of 20 ms counts: 0.2 rad/s, whatever the speed was before the rest
+    assert bus.goal[0] - rested == pytest.approx(0.2 * 0.02)
+
+
+def test_a_pause_of_any_length_saves_up_no_more_than_half_a_tick():
+    for pause_s in (0.03, 0.059, 0.09, 0.5, 5.0):
+        bus = PlainBus()
+        guard = ready(bus, GuardLimits(acceleration_rad_s2=1e4))
+        drive(guard, 0.5, lambda t: np.array([0.01 * t, 0.0]))
+        before = bus.goal[0]
+        guard.sleep_until(guard.now() + pause_s)
+        guard.write(np.array([1.5, 0.0]))
+        assert bus.goal[0] - before <= 8.0 * 1.5 * 0.02 + 1e-9, pause_s
 
 
 def test_a_first_command_before_every_joint_was_read_is_refused():

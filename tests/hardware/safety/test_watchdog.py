@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from pupper_sysid.hardware.address import BusAddress, parse_address
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.lock import LOG
 from pupper_sysid.hardware.safety import watchdog_process
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.watchdog import Watchdog
@@ -167,10 +169,12 @@ def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
     assert len(server.emulator.bench.commands) == commands
 
 
-def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monkeypatch):
+def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monkeypatch, tmp_path):
     # the servos share this process and a busy machine
     monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(watchdog_process, "_GIVE_UP_S", 3.0)
+    monkeypatch.setattr(watchdog_process, "_SOON_S", 2.0)
+    monkeypatch.setattr(watchdog_process, "_GONE_S", 0.5)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     layout = load_joint_map("sts3215")
     there = [i for i in layout.ids if i != 5]  # LF_thigh, on which LF_calf hangs
     servos = still_servos(ids=there)
@@ -179,9 +183,83 @@ def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monke
             "kind": "feetech", "where": server.device, "baud": 1_000_000,
             "map": layout.file.model_dump(mode="json", by_alias=True), "coordinates": "joint",
         }  # fmt: skip
-        watchdog_process.park(orders, dict.fromkeys(layout.joint_names, 0.0))
+        parking = threading.Thread(
+            target=watchdog_process.park, args=(orders, dict.fromkeys(layout.joint_names, 0.0))
+        )
+        parking.start()
+        wait_for(lambda: (tmp_path / "pupper-sysid" / LOG).exists(), 10.0)
     assert dict(bench_of(servos).torques) == dict.fromkeys(there, False)
     assert bench_of(servos).goals == []
+    parking.join(10.0)
+    assert not parking.is_alive(), "a line that is gone is given up"
+    said = (tmp_path / "pupper-sysid" / LOG).read_text()
+    assert "the torque of LF_thigh could not be switched off and may be on" in said
+    assert "has been gone" in said.splitlines()[-1]
+
+
+@pytest.mark.wall_clock
+def test_a_program_that_waits_for_the_lock_does_not_keep_the_robot_on(robot):
+    server, address = robot
+    if not address.startswith("esp32"):
+        pytest.skip("a serial line is not waited for")
+    process = drive(address)
+    waiting = subprocess.Popen(
+        [sys.executable, "-c", WAITS_FOR_LOCK, address.split(":", 1)[1]], cwd=ROOT
+    )
+    time.sleep(1.0)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    try:
+        assert wait_for(lambda: limp(server), 6.0) < 3.0
+        assert waiting.poll() is None, "it holds the lock"
+    finally:
+        waiting.kill()
+        waiting.wait()
+
+
+WAITS_FOR_LOCK = """
+import fcntl, hashlib, os, sys, time
+from pathlib import Path
+from pupper_sysid.hardware.lock import open_here
+robot = os.fsencode(Path(sys.argv[1]).resolve())
+lock = open_here(hashlib.sha256(robot).hexdigest()[:16] + ".lock", os.O_RDWR)
+fcntl.flock(lock, fcntl.LOCK_EX)
+time.sleep(60)
+"""
+
+
+@pytest.mark.wall_clock
+def test_a_watchdog_that_was_stopped_is_noticed_within_a_second(robot):
+    server, address = robot
+    bus = switched_on(address)
+    assert bus._watchdog is not None
+    stopped = bus._watchdog._process.pid
+    os.kill(stopped, signal.SIGSTOP)
+    began = time.monotonic()
+    try:
+        pose = bus.read().position_rad
+        with pytest.raises(SafetyStop, match="has not answered for 0.5 s"):
+            while time.monotonic() - began < 5.0:
+                bus.write(np.where(np.isfinite(pose), pose, bus.sent))
+                bus.sleep_until(bus.now() + 0.02)
+        assert time.monotonic() - began < 1.5
+        bus.close()
+        assert limp(server)
+    finally:
+        os.kill(stopped, signal.SIGCONT)
+
+
+def test_beats_to_a_watchdog_that_reads_nothing_never_wait():
+    lost = Watchdog(BusAddress("esp32", "/tmp/none"), None)
+    os.kill(lost._process.pid, signal.SIGSTOP)
+    try:
+        began = time.monotonic()
+        for _ in range(2000):
+            lost._send({"registers": {"LF_hip": dict.fromkeys(map(str, range(20)), 1)}})
+        assert time.monotonic() - began < 2.0
+    finally:
+        lost._process.kill()
+        lost._process.wait()
 
 
 def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monkeypatch):
@@ -193,7 +271,7 @@ def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monke
             return super().torque(on) and (on or len(asked) > 45)
 
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(watchdog_process, "open_bus", lambda *of: Deaf(draw_robot(rng), rng))
+    monkeypatch.setattr(watchdog_process, "open_bus", lambda *of, **how: Deaf(draw_robot(rng), rng))
     orders = {"kind": "esp32", "where": "", "baud": None, "map": None, "coordinates": "servo"}
     watchdog_process.park(orders, DEFAULT_POSE)
     assert len(asked) > 45 and not asked[-1]

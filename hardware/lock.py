@@ -1,0 +1,87 @@
+"""One program at a time: a lock per robot in a folder of the user's own.
+
+The folder is `$XDG_RUNTIME_DIR/pupper-sysid`, else `/tmp/pupper-sysid-<user id>`; nobody else may
+write there, and files in it are opened without following links and without waiting. A lock is held
+by whoever opened its file, also by a child that inherited it; so nothing that must not wait, such
+as switching the torque off, takes it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+from pupper_sysid.common.errors import BusError
+
+LOG = "watchdog.log"
+"""File of this folder in which the watchdog says what it could not do."""
+
+
+def runtime_folder() -> Path:
+    """The folder, made if missing.
+
+    Raises
+    ------
+    BusError
+        If it is not a folder that only this user can write to.
+    """
+    given = os.environ.get("XDG_RUNTIME_DIR", "")
+    folder = Path(f"/tmp/pupper-sysid-{os.getuid()}")
+    if given and Path(given).is_absolute() and Path(given).is_dir():
+        folder = Path(given) / "pupper-sysid"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise BusError(f"{folder} cannot be made: {error.strerror}. Make it yourself.") from error
+    own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+    if not own or stat.S_IMODE(found.st_mode) & 0o022:
+        raise BusError(
+            f"{folder} is not a folder that only you can write to, so what it says of robots in "
+            "use cannot be trusted. Remove it."
+        )
+    return folder
+
+
+def open_here(name: str, flags: int) -> int:
+    """Descriptor of a regular file in the folder, made if missing.
+
+    Raises
+    ------
+    BusError
+        If it is a link, a FIFO or anything else, or cannot be opened.
+    """
+    path = runtime_folder() / name
+    safe = os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags | safe, 0o600)
+    except OSError as error:
+        raise BusError(f"{path} cannot be opened: {error.strerror}. Remove it.") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise BusError(f"{path} is not a regular file. Remove it.")
+    return descriptor
+
+
+def own(robot: Path) -> int:
+    """Descriptor of the lock of a robot at this path, locked until it is closed.
+
+    Raises
+    ------
+    BusError
+        If another program holds it.
+    """
+    name = hashlib.sha256(os.fsencode(robot.resolve())).hexdigest()[:16] + ".lock"
+    descriptor = open_here(name, os.O_RDWR)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise BusError(
+            f"{robot}: another pupper-sysid is driving this robot. Stop it first: servos execute "
+            "whichever command arrived last, so only one program may command them."
+        ) from None
+    return descriptor

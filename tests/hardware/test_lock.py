@@ -1,0 +1,83 @@
+"""The lock of a robot: in a folder of the user's own, never through a link, never waiting."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.lock import open_here, own, runtime_folder
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path, monkeypatch):
+    folder = tmp_path / "runtime"
+    folder.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    return folder / "pupper-sysid"
+
+
+def test_the_folder_is_the_users_own(runtime):
+    assert runtime_folder() == runtime
+    assert stat.S_IMODE(runtime.stat().st_mode) == 0o700
+    runtime.chmod(0o777)
+    with pytest.raises(BusError, match="only you can write to"):
+        runtime_folder()
+
+
+def test_a_folder_that_is_a_link_is_refused(runtime, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    runtime.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BusError, match="is not a folder that only you"):
+        runtime_folder()
+
+
+def test_without_a_runtime_folder_there_is_one_of_the_users_number(monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "relative")
+    assert runtime_folder().name == f"pupper-sysid-{os.getuid()}"
+
+
+def test_a_fifo_or_a_dangling_link_in_the_locks_place_is_answered_at_once(runtime, tmp_path):
+    runtime_folder()
+    os.mkfifo(runtime / "fifo")
+    (runtime / "link").symlink_to(tmp_path / "made")
+    for name in ("fifo", "link"):
+        with pytest.raises(BusError, match="Remove it"):
+            open_here(name, os.O_RDWR)
+    assert not (tmp_path / "made").exists()
+
+
+def test_one_owner_at_a_time_whatever_the_path_is_called(tmp_path):
+    robot = tmp_path / "robot.sock"
+    robot.touch()
+    (tmp_path / "alias").symlink_to(robot)
+    held = own(robot)
+    with pytest.raises(BusError, match="another pupper-sysid is driving"):
+        own(tmp_path / "alias")
+    os.close(held)
+    os.close(own(tmp_path / "alias"))
+
+
+def test_a_child_that_inherits_the_lock_keeps_it(tmp_path):
+    """As flock does: so nothing that must not wait may need it."""
+    robot = tmp_path / "robot.sock"
+    held = own(robot)
+    os.set_inheritable(held, True)
+    child = subprocess.Popen(
+        [sys.executable, "-c", "import sys; sys.stdin.read()"], close_fds=False,
+        stdin=subprocess.PIPE,
+    )  # fmt: skip
+    os.close(held)
+    try:
+        with pytest.raises(BusError):
+            own(robot)
+    finally:
+        child.communicate()
+    again = own(robot)
+    fcntl.flock(again, fcntl.LOCK_UN)
+    os.close(again)
