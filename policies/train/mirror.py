@@ -80,9 +80,8 @@ class MirrorImages(Symmetry):
 
     @staticmethod
     def _both(env: Any, obs: TensorDict, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor]:
-        image = TensorDict(
-            {name: mirrored(values, name) for name, values in obs.items()}, obs.batch_size
-        )
+        names = [str(name) for name in obs.keys()]
+        image = TensorDict({n: mirrored(obs[n], n) for n in names}, obs.batch_size)
         return torch.cat([obs, image]), torch.cat([actions, mirrored(actions)])  # pyright: ignore
 
     def compute_loss(self, actor, batch, original_batch_size: int) -> torch.Tensor:

@@ -90,7 +90,7 @@ class HeldReadings:
         ----------
         ids : ndarray of int
         position : ndarray, shape (len(ids), servos)
-            [rad]
+            Servo angles at which they rest [rad].
         period : ndarray, shape (len(ids),), or float
             Factor on the periods of their polls.
         """
