@@ -29,7 +29,7 @@ from hostile.options import OPTIONS, every_command
 from hostile.run import Outcome, run, warm
 from hostile.spoil import ALWAYS_REFUSED, CONTENT, PLACES
 
-SLOW_S = 5.0
+SLOW_S = 8.0
 """A refusal that takes longer than this is a fault [s of processor time]."""
 ELSEWHERE = ("executed", "evil.npy", "x.csv", "x.yaml")
 

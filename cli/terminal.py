@@ -100,10 +100,11 @@ def table(title: str, *columns: str) -> Table:
         min_width=min(len(title), out.width),  # a title is broken at the table's width
     )  # fmt: skip
     for k, column in enumerate(columns):
-        # folded where it is too wide: a number cut off at … is another number
+        # folded where it is too wide, headings between words: a number cut off at … is another
         made.add_column(
-            column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold"
-        )
+            column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold",
+            min_width=max(map(len, column.split()), default=0),
+        )  # fmt: skip
     return made
 
 
@@ -174,6 +175,12 @@ def need_positive(name: str, value: float) -> None:
     """Refuse an option that is not a positive number."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}; it must be a positive number.")
+
+
+def need_within(name: str, value: float, low: float, high: float, unit: str) -> None:
+    """Refuse an option that is no number between two others, which are included."""
+    if not low <= value <= high:
+        raise InputError(f"{name} is {value:g} {unit}; it must be from {low:g} to {high:g} {unit}.")
 
 
 @contextmanager

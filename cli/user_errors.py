@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,6 +76,9 @@ def parse(
     seed = getattr(parsed, "seed", 0)
     if seed < 0:
         raise InputError(f"--seed is {seed}; it must be a whole number from 0 on.")
+    for field in fields(parsed):
+        if getattr(parsed, field.name) == "" != field.default:
+            raise InputError(f"`{field.name}` is empty. Write a value, or leave it out.")
     return parsed
 
 
@@ -121,15 +125,18 @@ def _signalled() -> int:
 def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     """Yield the arguments without those of every program; an exception becomes a sentence."""
     debug = "--debug" in arguments
+    _open_closed()
     try:
-        if "--version" in arguments:
-            _print_version(program)
-        if "--install-completion" in arguments:
-            arguments = _completion(program)
-        times, rest = _read_limit([a for a in arguments if a != "--debug"])
-        with reading_up_to(times):
-            yield rest
-        sys.stdout.flush()
+        try:
+            if "--version" in arguments:
+                _print_version(program)
+            if "--install-completion" in arguments:
+                arguments = _completion(program)
+            times, rest = _read_limit([a for a in arguments if a != "--debug"])
+            with reading_up_to(times):
+                yield rest
+        finally:  # also what help printed, which ends the program by itself
+            sys.stdout.flush()
         if code := _signalled():  # it ended as after Ctrl-C, with everything done
             sys.exit(code)
     except PupperError as error:
@@ -141,7 +148,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         err.print("Stopped.")
         sys.exit(_signalled() or 1)
     except BrokenPipeError:  # `| head` closed its end: no error
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         sys.exit(0)
     except Exception as error:
         if debug:
@@ -181,13 +188,31 @@ def _of_the_system(error: OSError) -> str:
     where = error.filename
     if where is None:
         where = "standard output"
-        with suppress(OSError):  # what its buffer holds would fail once more at the exit
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
     return f"{where}: {error.strerror}. Make room, or choose another file or folder."
 
 
+def _open_closed() -> None:
+    """Open streams that were closed by whoever started the program, to nowhere.
+
+    Otherwise the next file that is opened takes the number of standard output.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
+
+
+def _silence(stream: Any) -> None:
+    """Send what a stream's buffer holds nowhere: it would fail once more at the exit."""
+    with suppress(OSError, AttributeError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def _print_error(error: str) -> None:
-    err.print(Text.assemble(("error: ", "red"), error), soft_wrap=True)
+    try:
+        err.print(Text.assemble(("error: ", "red"), error), soft_wrap=True)
+    except OSError:  # nowhere to say it; the exit code does
+        _silence(sys.stderr)
 
 
 def _print_version(program: str) -> None:

@@ -51,6 +51,11 @@ def _recording(name: str, lines: list[str], refused: bool = True, end: str = "")
     BOMBS[f"recording, {name}"] = make, refused
 
 
+def _said(name: str, lines: list[str]) -> None:
+    """A recording of which the doctor says that it is of no use, with exit code 0."""
+    _recording(name, lines, refused=False)
+
+
 def _rows(count: int, row: Callable[[int], str]) -> list[str]:
     return [HEADER, *map(row, range(count))]
 
@@ -82,12 +87,12 @@ _recording("a cell of 200,000 characters", [HEADER, _row(0, position_rad="1" * 2
 _recording("a column of 200,000 characters", ["x" * 200_000 + "," + HEADER, *GOOD[1:]])
 _recording("counts of 1e300", [HEADER + ",position_count", *(f"{r},1e300" for r in GOOD[1:])])
 _recording("times of 1e300", _rows(300, lambda k: _row(k, send_time_s=f"{k}e300")))
-_recording("times a nanosecond apart",
+_said("times a nanosecond apart",
            _rows(300, lambda k: _row(k, send_time_s=k * 1e-9, read_time_s=k * 1e-9)))  # fmt: skip
-_recording("times a year apart",
+_said("times a year apart",
            _rows(300, lambda k: _row(k, send_time_s=3e7 * k, read_time_s=3e7 * k)))  # fmt: skip
-_recording("tones of 1e-300 Hz", _rows(300, lambda k: _row(k, frequency_hz=1e-300)))
-_recording("tones of 1e300 Hz", _rows(300, lambda k: _row(k, frequency_hz=1e300)))
+_said("tones of 1e-300 Hz", _rows(300, lambda k: _row(k, frequency_hz=1e-300)))
+_said("tones of 1e300 Hz", _rows(300, lambda k: _row(k, frequency_hz=1e300)))
 _recording("quotes in each cell", _rows(100_000, lambda k: '"' + _row(k).replace(",", '","') + '"'),
            False)  # fmt: skip
 _recording("a quantum of 1e-7 rad", ['# bus: {"command_quantum_rad": 1e-7}', *GOOD], False)
@@ -189,8 +194,8 @@ def _parquet_texts(folder: Path) -> Argv:
 
     count = 10**6
     joint = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["x" * 10**6])
-    return _parquet(folder, pa.table({"time": np.arange(count), "joint": joint,
-                                      "goal": np.zeros(count), "position": np.zeros(count)}))  # fmt: skip
+    numbers = {"time": np.arange(count), "goal": np.zeros(count), "position": np.zeros(count)}
+    return _parquet(folder, pa.table(numbers | {"joint": joint}))
 
 
 @_bomb("parquet, 5,000 columns")
@@ -204,10 +209,10 @@ def _parquet_columns(folder: Path) -> Argv:
 def _parquet_lists(folder: Path) -> Argv:
     import pyarrow as pa
 
-    lists = pa.ListArray.from_arrays(
-        np.arange(0, 41 * 10**6, 10**6, np.int32), np.zeros(40 * 10**6)
-    )
-    return _parquet(folder, pa.table({"time": np.arange(40), "action": lists, "observation.state": lists}))  # fmt: skip
+    ends = np.arange(0, 41 * 10**6, 10**6, np.int32)
+    lists = pa.ListArray.from_arrays(ends, np.zeros(40 * 10**6))
+    columns = {"time": np.arange(40), "action": lists, "observation.state": lists}
+    return _parquet(folder, pa.table(columns))
 
 
 @_bomb("parquet, nested a hundred levels")
@@ -269,9 +274,8 @@ def _mcap_many_joints(folder: Path) -> Argv:
 @_bomb("MCAP, times at the ends of the scale", refused=False)
 def _mcap_times(folder: Path) -> Argv:
     own = ros_messages()
-    return _mcap(
-        folder, [*own, ("/joint_states", 2**63, own[0][2]), ("/joint_states", 0, own[1][2])]
-    )
+    ends = [("/joint_states", time_ns, own[0][2]) for time_ns in (2**63, 0)]
+    return _mcap(folder, [*own, *ends])
 
 
 def _sqlite(folder: Path, *statements: str) -> Argv:

@@ -121,9 +121,12 @@ def make_kit(folder: Path) -> None:
     pupper_deploy.main(["policy", *_WALK])
     shutil.copy(folder / "walks" / "w" / "walk.csv", folder)
     pupper_train.main(
-        "--actuator calibrated.yaml --environments 4 --iterations 2 --minutes 1 --name r --threads 1"
-        " --imitation.iterations 1 --architecture.hidden 16 --architecture.critic-hidden 16"
-        " --task.episode-s 0.2 --learner.steps-per-environment 6 --learner.minibatches 1".split()
+        [
+            *"--actuator calibrated.yaml --environments 4 --iterations 2 --minutes 1".split(),
+            *"--name r --threads 1 --imitation.iterations 1 --architecture.hidden 16".split(),
+            *"--architecture.critic-hidden 16 --task.episode-s 0.2".split(),
+            *"--learner.steps-per-environment 6 --learner.minibatches 1".split(),
+        ]
     )
     shutil.move(folder / "runs" / "r", folder / "run")
     shutil.rmtree(folder / "runs")

@@ -58,12 +58,12 @@ def _moved(data: bytes, rng: Generator) -> bytes:
 
 
 NUMBERS = {
-    "a NaN": "nan", "YAML's NaN": ".nan", "an infinity": "inf", "1e400": "1e400", "-1e308": "-1e308",
-    "1e-320": "1e-320", "400 digits": "9" * 400, "5000 digits": "9" * 5000, "4_1": "4_1",
-    "Arabic digits": "٤١", "a hexadecimal": "0x7f", "a negative": "-{}", "a million times": "{}e6",
-    "a text": '"x"', "nothing": "", "null": "null", "a list": "[1, 2]", "a mapping": '{"a": 1}',
-    "true": "true", "NaN in JSON": "NaN", "Infinity in JSON": "-Infinity", "2**63": str(2**63),
-    "half a number": "{}.5", "zero": "0",
+    "a NaN": "nan", "YAML's NaN": ".nan", "an infinity": "inf", "1e400": "1e400",
+    "-1e308": "-1e308", "1e-320": "1e-320", "400 digits": "9" * 400, "5000 digits": "9" * 5000,
+    "4_1": "4_1", "Arabic digits": "٤١", "a hexadecimal": "0x7f", "a negative": "-{}",
+    "a million times": "{}e6", "a text": '"x"', "nothing": "", "null": "null", "a list": "[1, 2]",
+    "a mapping": '{"a": 1}', "true": "true", "NaN in JSON": "NaN",
+    "Infinity in JSON": "-Infinity", "2**63": str(2**63), "half a number": "{}.5", "zero": "0",
 }  # fmt: skip
 WORDS = {
     "terminal escapes": "\x1b]0;x\x07\x1b[2J", "reversed text": "\u202egnp", "a path": "../../../x",

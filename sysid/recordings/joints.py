@@ -9,9 +9,9 @@ from zlib import crc32
 
 import numpy as np
 
-from pupper_sysid.common.children import end_with_parent
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
+from pupper_sysid.sysid.recordings.children import end_with_parent
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 Recordings = Recording | Sequence[Recording]

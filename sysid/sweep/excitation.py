@@ -49,6 +49,18 @@ SPEED_MARGIN = 0.9
 LOOP_PERIOD_S = 0.019
 """Default time between commands [s]: the rate of the recordings this project starts from."""
 
+RATES_HZ = (1.0, 1000.0)
+"""Slowest and fastest control loop [Hz]."""
+
+TRIAL_S = (0.1, 86_400.0)
+"""Shortest and longest trial [s]."""
+
+MOST_LOOPS = 1000
+"""Largest number of loops of a file of commands, and of times to play it."""
+
+LOWEST_HZ = 0.01
+"""Slowest tone: five periods take more than eight minutes."""
+
 POLL_RATE_HZ = 1 / 0.02685
 """Feedback polls of a Mini Pupper 2 [Hz], assumed before a recording."""
 
@@ -179,6 +191,8 @@ def plan(
     ):
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"excitation: {name} is {value}; it must be a positive number.")
+    if duration_s is not None and duration_s > TRIAL_S[1]:
+        raise InputError(f"excitation: duration_s is {duration_s:g}; it must be at most a day.")
     highest = min(HIGHEST_HZ, 0.5 / loop_period_s)
     frequencies = [_checked_frequency(f, highest) for f in frequencies_hz]
     if not frequencies and kind not in ("steps", "prbs"):
@@ -301,10 +315,10 @@ def off_harmonics(frequency_hz: float, rates_hz: Sequence[float], duration_s: fl
 
 
 def _checked_frequency(value: float, highest_hz: float) -> float:
-    if not (np.isfinite(value) and 0 < value <= highest_hz):
+    if not LOWEST_HZ <= value <= highest_hz:
         raise InputError(
-            f"frequency {value:g} Hz: it must be above 0 and at most {highest_hz:g} Hz, "
-            "half the rate at which commands are sent."
+            f"frequency {value:g} Hz: it must be at least {LOWEST_HZ:g} Hz and at most "
+            f"{highest_hz:g} Hz, half the rate at which commands are sent."
         )
     return float(value)
 

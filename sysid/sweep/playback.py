@@ -20,11 +20,10 @@ from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import read_table
-from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, TrialPlan
+from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, MOST_LOOPS, Plan, TrialPlan
 
 _LARGEST_RAD = 2 * np.pi
 _LARGEST_BYTES = 100e6
-_MOST_LOOPS = 1000
 
 
 def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
@@ -79,7 +78,7 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     first = numbers[0, 1:]
     trials = []
     starts = np.flatnonzero(np.concatenate([[True], np.diff(loops) != 0]))
-    refuse_more(path, len(starts), _MOST_LOOPS, "loops")
+    refuse_more(path, len(starts), MOST_LOOPS, "loops")
     if len(np.unique(loops)) < len(starts):
         raise InputError(f"{path}, column loop: the rows of a loop must follow one another.")
     for start, stop in pairwise([*starts, len(numbers)]):

@@ -20,11 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, InputError, SafetyStop
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_ROWS
 from pupper_sysid.hardware.bus import BusSample, ServoBus, header_entries
 from pupper_sysid.hardware.loop import FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.sysid.recordings.files import RecordingWriter
+from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan, TrialPlan
 from pupper_sysid.sysid.sweep.resume import Resume
 
@@ -85,7 +88,8 @@ def record(
     Raises
     ------
     InputError
-        If the plan names a joint that is not on the bus, or the file exists.
+        If the plan names a joint that is not on the bus, the recording would be too long to be
+        read, or the file exists.
     BusError
         If the bus gives no position reading; `SafetyStop` if the guard ended the recording, or the
         loop missed too many deadlines: torque is off then.
@@ -121,6 +125,9 @@ class _Session:
                 f"the plan cannot be executed: {wrong}. "
                 f"The bus {bus.name} has {', '.join(bus.joint_names)}."
             )
+        rows = sum(len(t.joints) * t.duration_s for t in plan.trials) / period_s
+        refuse_more("The recording, by its plan,", rows, MOST_ROWS, "rows", "Make it shorter.")
+        refuse_more("The recording, by its plan,", len(plan.trials), MOST_TRIALS, "trials")
         self._bus, self._plan, self._resume = bus, plan, resume
         self._progress: Progress = progress or (lambda done, total, what: None)
         # a joint without a start pose in the plan stays where it is

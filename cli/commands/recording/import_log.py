@@ -72,7 +72,7 @@ class Import:
         refuse_overwrite(out, self.force)
         options = LogOptions(
             self.time, self.command, self.position, self.trial,
-            {name.strip(): name.strip() for name in (self.joints or "").split(",") if name.strip()},
+            {} if self.joints is None else _names(self.joints),
             self.unit, {}, self.read_before_send or None, self.stamp,
         )  # fmt: skip
         if self.mapping:
@@ -106,6 +106,14 @@ class Import:
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}", soft_wrap=True)
+
+
+def _names(text: str) -> dict[str, str]:
+    """Joints to read, which keep their names."""
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise InputError(f"--joints '{text}': write the log's names once each, with commas: a,b.")
+    return {name: name for name in names}
 
 
 def _same(one: Path, other: Path) -> bool:

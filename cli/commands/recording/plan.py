@@ -15,6 +15,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.sysid.sweep.excitation import RATES_HZ
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.plan.proposal import SweepPlan
@@ -60,7 +61,7 @@ class Plan:
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
         if self.rate is not None:
-            terminal.need_positive("--rate", self.rate)
+            terminal.need_within("--rate", self.rate, *RATES_HZ, "Hz")
         made = self._made()
         if self.out is not None:
             save_plan(made, self.out, self.force)

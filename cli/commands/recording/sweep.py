@@ -12,16 +12,17 @@ from typing import Any, Literal
 import numpy as np
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import JOINTS_FILE, connect
+from pupper_sysid.cli.buses import JOINTS_FILE, connect, parse_registers
 from pupper_sysid.cli.commands.recording.bench import (
     BENCH_MAP,
     BENCH_RATE_HZ,
     loads_of,
     open_bench,
+    open_emulated,
     plan_of_bench,
 )
 from pupper_sysid.common.errors import BusError, InputError
-from pupper_sysid.common.files import refuse_overwrite, sha256
+from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
 from pupper_sysid.hardware.bus import ServoBus
@@ -37,7 +38,10 @@ from pupper_sysid.sysid.sweep.bench import (
 )
 from pupper_sysid.sysid.sweep.excitation import (
     LOOP_PERIOD_S,
+    MOST_LOOPS,
     POLL_RATE_HZ,
+    RATES_HZ,
+    TRIAL_S,
     Plan,
     parse_frequencies,
     plan,
@@ -101,6 +105,8 @@ class Sweep:
     """Continue this unfinished recording with its own plan; other options are ignored."""
     truth: bool = False
     """Also write the true parameters and positions of the emulated robot, beside the recording."""
+    registers: str = ""
+    """Registers of the emulated robot's STS3215 that differ from the factory's, e.g. p=16."""
     real_time: bool = False
     """Run the emulated robot in real time."""
     force: bool = False
@@ -193,11 +199,13 @@ class Sweep:
         rate = self.rate
         if rate is None:
             rate = BENCH_RATE_HZ if self.load else round(1 / LOOP_PERIOD_S, 2)
-        terminal.need_positive("--rate", rate)
-        terminal.need_positive("--most-seconds", self.most_seconds)
+        terminal.need_within("--rate", rate, *RATES_HZ, "Hz")
+        terminal.need_within("--most-seconds", self.most_seconds, *TRIAL_S, "s")
+        if self.duration is not None:
+            terminal.need_within("--duration", self.duration, *TRIAL_S, "s")
         bus = bus_name(self.bus)
-        if self.loops < 1:
-            raise InputError(f"--loops is {self.loops}; it must be at least 1.")
+        if not 1 <= self.loops <= MOST_LOOPS:
+            raise InputError(f"--loops is {self.loops}; it must be from 1 to {MOST_LOOPS}.")
         if self.real_time and bus != EMULATED:
             raise InputError("--real-time: a real bus always runs in real time; leave it out.")
         loop_period_s = 1.0 / rate
@@ -232,8 +240,9 @@ class Sweep:
             "loops": self.loops,
             "plan": str(self.plan) if self.plan else None,
             "load": self.load,
-            "gains": parse_gains(self.gains) if self.gains else [],
-            "until": self._series(joints) if self.until else None,
+            "gains": [] if self.gains is None else parse_gains(self.gains),
+            "until": self._series(joints) if self.until is not None else None,
+            "registers": self._registers(bus),
         }
 
     def _frequencies(self) -> list[float]:
@@ -255,6 +264,15 @@ class Sweep:
         other = next((n for n in ("plan", "playback", "until") if getattr(self, n)), None)
         if other:
             raise InputError(f"--load and --{other}: give one of the two.")
+
+    def _registers(self, bus: str) -> dict[str, int]:
+        """Registers of emulated servos."""
+        if self.registers and (self.load is not None or bus != EMULATED):
+            raise InputError(
+                "--registers: sets those of an emulated robot. A real one's are recorded as they "
+                "are; on a bench --gains sets the P gain."
+            )
+        return parse_registers(self.registers)
 
     def _map(self) -> str | None:
         """The joint map that is named; of a bench, the preset unless there is one in the folder."""
@@ -334,20 +352,7 @@ def _open(request: dict[str, Any]) -> ServoBus:
     if request.get("load"):
         return open_bench(request)
     if request["bus"] == EMULATED:
-        from pupper_sysid.sim.emulator.bus import EmulatedBus
-        from pupper_sysid.sim.emulator.robot import directly_read, draw_robot
-
-        rng = np.random.default_rng(request["seed"])
-        real_time = bool(request["real_time"])
-        own = load_joint_map(request["joint_map"]) if request["joint_map"] else None
-        robot = f"an emulated one with the servos of {own.file.name}" if own else "the emulated one"
-        how = ", in real time" if real_time else ""
-        terminal.err.print(f"No robot: using {robot}{how}.", soft_wrap=True)
-        drawn = draw_robot(rng, directly_read(own) if own else None, own)
-        if request.get("plan"):  # the same robot, but not once more the same noise
-            noise = int(sha256(Path(request["plan"]))[:12], 16)
-            rng = np.random.default_rng([request["seed"], noise])
-        return EmulatedBus(drawn, rng, real_time=real_time)
+        return open_emulated(request)
     return connect(request["bus"], request["joint_map"], request["joints"])
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import Calibration
 
 _MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
+_STEPS_S = 1e-5, 0.1
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,7 @@ class Export:
         step = self.physics_step
         if step is None:
             step = _MJCF_STEP_S if self.to == "mjcf" else _TRAINING_STEP_S
+        terminal.need_within("--physics-step", step, *_STEPS_S, "s")
         if self.to == "newton":
             target = self.out or Path(f"{path.stem}_newton")
             export_newton(calibration, step, target, self.force)
