@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pupper_sysid.cli.flags import spell
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.joints import select_joints, share_sentences
 
 if TYPE_CHECKING:
@@ -134,12 +134,36 @@ def print_fleet(
     """Print a fleet's joints, outliers and failed recordings, and the files written.
 
     `what` names the result per robot; `columns` gives title and digits by column of the table.
+
+    Raises
+    ------
+    PupperError
+        At the end, if a recording could not be used: the exit code says so, too.
     """
     from pupper_sysid.sysid.fleet.calibration import TABLE
 
     if as_json:
         print_json(fleet.summary(folder, elapsed_s))
-        return
+    else:
+        _print_fleet_table(fleet, folder, elapsed_s, what, columns)
+    if fleet.failed:
+        raise PupperError(
+            f"{len(fleet.failed)} of {len(fleet.failed) + len(fleet.made) + len(fleet.kept)} "
+            f"recordings could not be used: {', '.join(sorted(fleet.failed)[:5])}"
+            f"{' …' if len(fleet.failed) > 5 else ''}. The others are done; {folder / TABLE} says "
+            "why."
+        )
+
+
+def _print_fleet_table(
+    fleet: Fleet,
+    folder: Path,
+    elapsed_s: float,
+    what: str,
+    columns: Mapping[str, tuple[str, int]],
+) -> None:
+    from pupper_sysid.sysid.fleet.calibration import TABLE
+
     titles = [title for title, _ in columns.values()]
     shown = table("Fleet: median and middle 90 % of the robots", "joint", "robots", *titles)
     known = fleet.table.query("problem == ''")

@@ -25,5 +25,11 @@ class BusError(PupperError):
     """A servo bus failed."""
 
 
+class MissingDevice(BusError):
+    """There is no device of the name that was given."""
+
+    exit_code = 2
+
+
 class SafetyStop(BusError):
     """The robot was stopped to prevent harm."""

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.common.errors import BusError, InputError, MissingDevice
 from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
@@ -114,7 +114,7 @@ class Esp32Bus(HostClock):
         } | self._map.metadata()
         if not self._connected():
             self.close()
-            raise BusError(
+            raise (BusError if self.path.exists() else MissingDevice)(
                 f"{self.path}: no answer. On the robot, check `systemctl status "
                 "esp32-proxy`; without a robot, start one with `pupper-sysid emulate esp32`."
             )

@@ -24,7 +24,7 @@ from typing import Any
 
 import serial
 
-from pupper_sysid.common.errors import BusError
+from pupper_sysid.common.errors import BusError, MissingDevice
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.registers import (
     BROADCAST_ID,
@@ -92,6 +92,8 @@ class FeetechLine:
         try:
             self._port.openPort()
         except PORT_ERRORS as error:
+            if not Path(device).exists():  # a wrong name, not a fault of the line
+                raise MissingDevice(_cannot_open(device, error)) from error
             raise BusError(_cannot_open(device, error)) from error
         # a USB adapter may collect bytes for 16 ms
         self.patience_s += _latency_s(device)

@@ -8,6 +8,7 @@ environment. The feedback comes along, apart from the actuator.
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -239,8 +240,11 @@ def check_actuator(actuator: str) -> None:
         If it is none of them.
     """
     if actuator != IDEAL and not is_shipped(actuator) and not Path(actuator).exists():
+        near = difflib.get_close_matches(actuator, (*PRESETS, IDEAL), n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
         raise InputError(
-            f"`actuator` {actuator}: there is no such file. Give a calibration "
-            f"(`pupper-sysid calibrate` writes one), a servo model's folder, a servo "
+            f"`actuator` {actuator}: there is no such file.{hint} Give a calibration "
+            "(`pupper-sysid calibrate` writes one, `pupper-sysid samples` copies one of an "
+            "emulated robot), a servo model's folder, a servo "
             f"card (`pupper-sysid servo list`), or one of {', '.join((*PRESETS, IDEAL))}."
         )

@@ -118,13 +118,13 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, expecte
     ("bus", "expected"),
     [
         ("feetech:/dev/no-such-port", "There is no such device"),
-        ("esp32:/tmp/no-such-folder-here/socket", "cannot be opened"),
+        ("esp32:/tmp/no-such-folder-here/socket", "no answer. On the robot"),
         ("esp32:nobody.socket", "no answer. On the robot"),
     ],
 )
 def test_a_missing_bus_is_refused_with_what_to_check(capsys, bus, expected):
     code, _, err = run(capsys, "sweep", *SHORT, "--bus", bus)
-    assert code == 1 and expected in err
+    assert code == 2 and expected in err
 
 
 def test_a_map_of_the_other_frame_is_refused(capsys):

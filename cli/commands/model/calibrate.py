@@ -50,7 +50,8 @@ class Calibrate:
     jobs: int = 2
     """Robots of a fleet that are calibrated at the same time."""
     cluster: str | None = None
-    """Dask scheduler to calibrate a fleet on, such as tcp://host:8786."""
+    """Dask scheduler to calibrate a fleet on, such as tls://host:8786. It executes code: who controls
+    it can run programs on this computer; see docs/exports.md."""
     force: bool = False
     """Replace the calibration file if it exists."""
     json: bool = False
@@ -69,7 +70,7 @@ class Calibrate:
         if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
             self._fleet(self.recordings[0], started)
             return
-        if self.cluster:
+        if self.cluster is not None:
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
         out = self.out or Path("calibrated.yaml")
         refuse_overwrite(out, self.force)  # before the work, not after it
@@ -102,12 +103,19 @@ class Calibrate:
 
     def _fleet(self, root: Path, started: float) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet.calibration import Settings, calibrate_fleet, robots_in
+        from pupper_sysid.sysid.fleet.calibration import (
+            Settings,
+            calibrate_fleet,
+            robots_in,
+            trust,
+        )
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
         out = self.out or root.resolve().with_name(f"{root.resolve().name}_calibrated")
         settings = Settings(self.seed, self.stall_torque)
+        if self.cluster is not None:
+            terminal.warn([trust(self.cluster)])
         with terminal.progress("calibrating", len(robots_in(root))) as advance:
             fleet = calibrate_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance

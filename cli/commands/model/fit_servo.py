@@ -31,9 +31,9 @@ _SCORES = (
     ("rmse_raw_rad", "raw"),
     ("rmse_one_step_rad", "one step"),
     ("linear_rmse_rad", "linear"),
-    ("delayed_pd_rmse_rad", "delayed PD"),
-    ("persistence_rmse_rad", "persistence"),
-    ("repeatability_rad", "repeatability"),
+    ("delayed_pd_rmse_rad", "PD"),
+    ("persistence_rmse_rad", "persist."),
+    ("repeatability_rad", "repeats"),
 )
 
 
@@ -74,7 +74,8 @@ class FitServo:
     jobs: int = 2
     """Robots of a fleet that are fitted at the same time."""
     cluster: str | None = None
-    """Dask scheduler to fit a fleet on, such as tcp://host:8786."""
+    """Dask scheduler to fit a fleet on, such as tls://host:8786. It executes code, and whoever
+    controls it can run programs on this computer: see docs/exports.md."""
     force: bool = False
     """Replace the model in --out."""
     json: bool = False
@@ -92,7 +93,7 @@ class FitServo:
         if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
             self._fleet(self.recordings[0], split)
             return
-        if self.cluster:
+        if self.cluster is not None:
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
         folder = self.out or _free_folder()
         refuse_overwrite(folder / CONTRACT, self.force)
@@ -117,13 +118,15 @@ class FitServo:
 
     def _fleet(self, root: Path, split: Split) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet.calibration import robots_in
+        from pupper_sysid.sysid.fleet.calibration import robots_in, trust
         from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
         started = time.perf_counter()
         out = self.out or root.resolve().with_name(f"{root.resolve().name}_servos")
+        if self.cluster is not None:
+            terminal.warn([trust(self.cluster)])
         settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
         with terminal.progress(f"fitting {self.arch}", len(robots_in(root))) as advance:
             fleet = fit_servo_fleet(
@@ -166,8 +169,8 @@ class FitServo:
             shown.add_row("mean", *means, style="bold")
         terminal.out.print(shown)
         terminal.out.print(
-            "\nFree run: commands only, from the start of each run. DelayedPD, the linear filter "
-            "and the model were fitted to the same readings and scored on the same unseen ones.",
+            "\nFree run: commands only, from the start of each run. DelayedPD (PD), the linear "
+            "filter and the model were fitted to the same readings and scored on the same unseen ones.",
             soft_wrap=True,
         )
         terminal.out.print(Text(f"\n{fit.verdict}", "bold"), soft_wrap=True)
