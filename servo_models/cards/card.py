@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.strict_yaml import dump
@@ -38,7 +39,6 @@ from pupper_sysid.servo_models.calibration.quantity import (
     Quantity,
 )
 from pupper_sysid.servo_models.calibration.under_load import UnderLoad
-from pupper_sysid.servo_models.cards.data_sheet import counts_of
 from pupper_sysid.servo_models.cards.numbers import (
     LOADED_KEYS,
     LoadedLoop,

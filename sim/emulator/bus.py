@@ -20,16 +20,18 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.files import refuse_overwrite, write_text
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.sim.emulator.clocks import RealClock, VirtualClock
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
+from pupper_sysid.sim.emulator.servo_bench import SUPPLY_V
 from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
 
 NOMINAL_SPEED_LIMIT_RAD_S = 7.5
-"""Speed limit of the servo's data sheet [rad/s]."""
+"""Speed limit of the Mini Pupper's servos [rad/s], and of others whose data sheet has none."""
 
 TRUTH_COLUMNS = ("read_time_s", "joint", "true_position_rad", "reading_time_s")
 
@@ -95,6 +97,7 @@ class EmulatedBus:
         self._log: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
         self._closed = False
         self.limits = robot.joint_map.per_servo().position_limits()
+        speed = no_load_speed(robot.joint_map.file.servo or "", SUPPLY_V)
         self.metadata: dict[str, Any] = {
             "kind": "emulated",
             "readings": "polled" if spec.poll_period_s > 0 or spec.loss > 0 else "live",
@@ -105,7 +108,7 @@ class EmulatedBus:
             "count_zero_rad": {s.joint: s.zero_rad for s in robot.servos},
             "joint_map": robot.joint_map.file.name,
             "rest_pose_rad": dict(zip(self.joint_names, map(float, pose), strict=True)),
-            "speed_limit_rad_s": NOMINAL_SPEED_LIMIT_RAD_S,
+            "speed_limit_rad_s": speed or NOMINAL_SPEED_LIMIT_RAD_S,
             "real_time": real_time,
         }
 

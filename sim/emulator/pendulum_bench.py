@@ -11,7 +11,7 @@ DelayedPD servo that is equivalent at the factory's gains where nothing saturate
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,6 +130,38 @@ class PendulumBench:
     def set_register(self, index: int, time_s: float, name: str, value: int) -> None:
         """Set a register of a servo from `time_s` on."""
         self._servos[index].set_register(time_s, name, value)
+
+
+def has_registers(joint_map: JointMap) -> bool:
+    """Whether the robot of a joint map is emulated with servos whose registers act."""
+    return joint_map.file.servo == "STS3215"
+
+
+def draw_of_map(
+    rng: np.random.Generator, joint_map: JointMap, registers: Mapping[str, int] | None = None
+) -> tuple[EmulatedRobot, PendulumBench | None]:
+    """Draw the robot of a joint map, in free air, and what moves its servos.
+
+    STS3215 are bare servos of a bench. Others move like the Mini Pupper's, with torque and speed of
+    their data sheet.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    joint_map : JointMap
+    registers : mapping of str to int, optional
+        Of servos that have them (`has_registers`), where they differ from the factory's.
+
+    Returns
+    -------
+    (EmulatedRobot, PendulumBench or None)
+        None for servos in free air as `EmulatedBus` has them.
+    """
+    if not has_registers(joint_map):
+        return draw_robot(rng, directly_read(joint_map), joint_map), None
+    spec = BenchSpec(registers=tuple((registers or {}).items()))
+    robot = draw_bench(rng, spec=spec, joint_map=joint_map)
+    return robot, PendulumBench(robot)
 
 
 def draw_bench(

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
+from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.servo_models.cards.data_sheet import data_sheet
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from pupper_sysid.common.data_sheet import stall_torque
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.card import Gains, Score, ServoCard, Source
-from pupper_sysid.servo_models.cards.data_sheet import stall_torque
 from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop
 from pupper_sysid.sysid.loaded.joint_fit import LoadedFit
 from pupper_sysid.sysid.recordings.recording import Recording

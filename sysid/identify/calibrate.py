@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pupper_sysid.common.children import end_with_parent
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibration_file import (
@@ -32,6 +31,7 @@ from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import SIMULATED
 from pupper_sysid.sysid.loaded.calibrate import fit_joints, loaded_joints, with_loaded
+from pupper_sysid.sysid.recordings.children import end_with_parent
 from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.recordings.recording import Trial
 

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from pupper_sysid.common.data_sheet import recorded_stall_torque
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
@@ -36,7 +37,6 @@ from pupper_sysid.servo_models.calibration.parts import (
     Selection,
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.cards.data_sheet import recorded_stall_torque
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.results import UNTOLD, CandidateFit, JointCalibrationResult

@@ -62,6 +62,8 @@ class Request(BaseModel):
     """Of a bench: a pendulum, or `none`; absent in sweeps of robots."""
     gains: list[int] = []
     """P gains of a bench."""
+    registers: dict[str, int] = {}
+    """Of emulated servos, where they differ from the factory's."""
     until: Series | None = None
     """Absent unless the sweep goes on until an interval is narrow."""
 

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
 import yaml
 
 from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.data import SAMPLES
+from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.pendulum_bench import draw_of_map
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
+from support.servo_servers import on_a_port
 
 
 def test_the_samples_are_copied_whole_and_never_over_other_files(tmp_path, monkeypatch, capsys):
@@ -27,19 +36,78 @@ def test_the_samples_are_copied_whole_and_never_over_other_files(tmp_path, monke
     assert not Path("samples/README.md").exists(), "nothing was written"
 
 
-def test_an_arm_of_sts3215_is_emulated_and_calibrated_with_the_torque_of_its_data_sheet(
-    tmp_path, monkeypatch, capsys
-):
+@pytest.fixture
+def arm(tmp_path, monkeypatch, capsys) -> str:
+    """Joint map of the sample arm, in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    arm = SAMPLES / "so101.xml"
-    run_program(capsys, pupper_sysid, "init-robot", arm, "--out", "arm.yaml")
+    model = SAMPLES / "so101.xml"
+    code, _, err = run_program(capsys, pupper_sysid, "init-robot", model, "--out", "arm.yaml")
+    assert code == 0, err
     assert yaml.safe_load(Path("arm.yaml").read_text())["servo"] == "STS3215"
+    return "arm.yaml"
+
+
+SHORT = ("--joints", "wrist_roll", "--freqs", "1,4", "--duration", "1", "--seed", "1")
+
+
+def test_an_arm_of_sts3215_is_emulated_by_its_servos_data_sheet_and_registers(arm, capsys):
+    found = data_sheet("STS3215")
+    assert found
+    sheet = found.at(7.4)
     code, _, err = run_program(
-        capsys, pupper_sysid, "sweep", "--joint-map", "arm.yaml", "--joints", "wrist_roll",
-        "--freqs", "1,2", "--duration", "1", "--seed", "1", "--truth", "--out", "sweep.csv",
+        capsys, pupper_sysid, "sweep", "--joint-map", arm, *SHORT, "--registers", "p=16",
+        "--truth", "--out", "sweep.csv",
     )  # fmt: skip
     assert code == 0, err
     recording = load("sweep.csv")
-    assert recording.metadata["servos"]["wrist_roll"]["model"] == "STS3215"
+    servo = recording.trials("wrist_roll")[0].servo
+    assert (servo.model, servo.p_gain, servo.d_gain, servo.supply_voltage_v) == (
+        "STS3215", 16, 32, 7.4,
+    )  # fmt: skip
+    assert recording.metadata["bus"]["speed_limit_rad_s"] == sheet.no_load_speed_rad_s
+    assert recording.metadata["bus"]["command_quantum_rad"]["wrist_roll"] == 2 * np.pi / 4096
+    # at 4 Hz 0.3 rad would be 7.5 rad/s, which no STS3215 reaches
+    tone = recording.table[recording.table.frequency_hz == 4].command_rad
+    assert tone.abs().max() * 8 * np.pi < sheet.no_load_speed_rad_s
     truth = yaml.safe_load(Path("sweep.truth.yaml").read_text())["joints"]["wrist_roll"]
-    assert abs(truth["actuator"]["effort_limit"] - 1.912) < 0.01
+    assert truth["actuator"]["effort_limit"] == pytest.approx(sheet.stall_torque_nm, rel=0.3)
+    loaded = truth["loaded_servo"]
+    assert truth["actuator"]["stiffness"] == pytest.approx(
+        16 * loaded["duty_per_rad"] * loaded["torque_nm"]
+    )
+
+
+def test_registers_are_of_emulated_servos_that_have_them(arm, capsys):
+    assert "on a bench --gains" in refused(
+        capsys, pupper_sysid, "sweep", "--load", "none", "--registers", "p=16"
+    )
+    assert "A real one's are recorded" in refused(
+        capsys, pupper_sysid, "sweep", "--bus", "feetech:nowhere", "--registers", "p=16"
+    )
+    assert "have none that act" in refused(capsys, pupper_sysid, "sweep", "--registers", "p=16")
+    assert "'q=16' sets no register" in refused(
+        capsys, pupper_sysid, "sweep", "--joint-map", arm, "--registers", "q=16"
+    )
+    assert "have none that act" in refused(
+        capsys, pupper_sysid, "emulate", "feetech", "--registers", "p=16"
+    )
+
+
+@pytest.mark.wall_clock
+def test_an_arm_on_a_line_of_sts3215_is_swept_at_the_gain_it_has(arm, capsys):
+    rng, layout = np.random.default_rng(1), load_joint_map(arm)
+    robot, plant = draw_of_map(rng, layout, {"p": 16})
+    servos = FeetechEmulator(ServoBench(robot, layout, rng, plant=plant), STS3215, rng)
+    with on_a_port(servos) as port:
+        code, _, err = run_program(
+            capsys, pupper_sysid, "sweep", "--joint-map", arm, *SHORT[:-2], "--bus",
+            f"feetech:{port.device}", "--out", "line.csv",
+        )  # fmt: skip
+    assert code == 0, err
+    recording = load("line.csv")
+    servo = recording.trials("wrist_roll")[0].servo
+    assert (servo.model, servo.p_gain, servo.d_gain) == ("STS3215", 16, 32)
+    assert recording.trials("wrist_roll")[0].readings == "live"
+    assert recording.metadata["bus"]["speed_limit_rad_s"] == pytest.approx(5.445, abs=1e-3)
+    # a loaded machine may miss a reading
+    assert np.nanmax(recording.table.position_rad.abs()) > 0.2

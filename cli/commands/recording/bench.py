@@ -1,13 +1,16 @@
-"""`sweep --load`: the bus and the plan of one servo on a bench."""
+"""`sweep`: the emulated bus; the bus and the plan of one servo on a bench (`--load`)."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import connect
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
 from pupper_sysid.hardware.address import EMULATED
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
@@ -35,6 +38,30 @@ def loads_of(request: dict[str, Any]) -> dict[str, Any]:
     """The entry `loads` of the recording's header; empty without a load."""
     load = load_of(request)
     return {"loads": {j: load.model_dump() for j in request["joints"]}} if load else {}
+
+
+def open_emulated(request: dict[str, Any]) -> ServoBus:
+    """The emulated robot: that of the joint map, or a Mini Pupper 2."""
+    from pupper_sysid.sim.emulator.bus import EmulatedBus
+    from pupper_sysid.sim.emulator.pendulum_bench import draw_of_map, has_registers
+    from pupper_sysid.sim.emulator.robot import draw_robot
+
+    rng = np.random.default_rng(request["seed"])
+    own = load_joint_map(request["joint_map"]) if request["joint_map"] else None
+    robot = f"an emulated one with the servos of {own.file.name}" if own else "the emulated one"
+    how = ", in real time" if request["real_time"] else ""
+    terminal.err.print(f"No robot: using {robot}{how}.", soft_wrap=True)
+    registers = request.get("registers") or {}
+    if registers and not (own and has_registers(own)):
+        raise InputError(
+            "--registers: the servos of this robot have none that act. Give a --joint-map whose "
+            "`servo` is STS3215."
+        )
+    drawn, plant = draw_of_map(rng, own, registers) if own else (draw_robot(rng), None)
+    if request.get("plan"):  # the same robot, but not once more the same noise
+        noise = int(sha256(Path(request["plan"]))[:12], 16)
+        rng = np.random.default_rng([request["seed"], noise])
+    return EmulatedBus(drawn, rng, bool(request["real_time"]), plant)
 
 
 def open_bench(request: dict[str, Any]) -> ServoBus:

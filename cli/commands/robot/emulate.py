@@ -16,6 +16,7 @@ import tyro
 import yaml
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import parse_registers
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.numbers import whole
@@ -34,8 +35,8 @@ from pupper_sysid.sim.emulator.pendulum_bench import (
     Pendulum,
     PendulumBench,
     draw_bench,
+    has_registers,
 )
-from pupper_sysid.sim.emulator.pendulum_servo import REGISTERS
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.sweep.bench import parse_load
@@ -99,9 +100,10 @@ class Feetech(Common):
     backlash: float = 0.0
     """With --load: play of its gears [degrees]."""
     registers: str = ""
-    """With --load: registers that differ from the factory's, e.g. p=16,goal_speed=400."""
+    """With --load or a --joint-map of STS3215: registers that differ from the factory's, e.g.
+    p=16,goal_speed=400."""
     joint_map: str | None = None
-    """Joint map of another robot, such as `init-robot` writes."""
+    """Joint map of another robot, such as `init-robot` writes; its joints are in free air."""
     ids: str = "all"
     """Which of them are there: 1-12, 4,5,6, or all."""
     baud: int | None = None
@@ -124,24 +126,28 @@ class Feetech(Common):
                 raise InputError(
                     "--load is a bench with one STS3215: leave out --model, --walking."
                 )
-        elif self.backlash or self.registers:
-            raise InputError(
-                "--backlash and --registers are of a bench: add --load (or --load none)."
-            )
+        elif self.backlash:
+            raise InputError("--backlash is of a bench: add --load (or --load none).")
         layout = load_joint_map(self.joint_map or preset)
+        loaded_servos = bool(self.load or (self.joint_map and has_registers(layout)))
+        if self.registers and not loaded_servos:
+            raise InputError(
+                "--registers: these servos have none that act. Add --load (or --load none), or a "
+                "--joint-map whose `servo` is STS3215."
+            )
         if self.joint_map and self.walking:
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
         baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
         if baud not in BAUD_RATES:
             raise InputError(f"--baud {baud}: choose {', '.join(map(str, BAUD_RATES))}.")
         load = None
-        if self.load:
-            load = parse_load(self.load)
+        if loaded_servos:
+            load = parse_load(self.load) if self.load else None
             loaded = draw_bench(
                 rng, Pendulum(**(load.model_dump() if load else {})),
                 BenchSpec(
                     backlash_rad=math.radians(self.backlash),
-                    registers=_parse_registers(self.registers),
+                    registers=tuple(parse_registers(self.registers).items()),
                 ),
                 layout,
             )  # fmt: skip
@@ -244,21 +250,6 @@ def _serve_with(server: ProxySocket | FeetechPty, what: str, commands: str) -> N
     terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.", soft_wrap=True)
     with real_time_priority():  # bytes that come late would look like a slow servo
         server.serve()
-
-
-def _parse_registers(text: str) -> tuple[tuple[str, int], ...]:
-    """Registers that `text` sets: p=16,goal_speed=400."""
-    found = []
-    for part in filter(None, text.split(",")):
-        name, _, value = (piece.strip() for piece in part.partition("="))
-        number = whole(value) if value.isascii() and value.isdecimal() else -1
-        if name not in REGISTERS or not 0 <= number <= 65_535:
-            raise InputError(
-                f"--registers: '{part}' sets no register that acts here; write p=16, and of these: "
-                f"{', '.join(REGISTERS)}."
-            )
-        found.append((name, number))
-    return tuple(found)
 
 
 def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:

@@ -2,7 +2,8 @@
 
 A free-air recording leaves the scale of the torques open; the stall torque of the servo's data
 sheet sets it. `stall_torque` gives that of the recorded servo at its supply voltage;
-`STALL_TORQUE_NM` of `common.joints` is the Mini Pupper's.
+`STALL_TORQUE_NM` of `common.joints` is the Mini Pupper's. `no_load_speed` bounds what a sweep asks
+of a servo.
 
 Data sheets state a few voltages. Between them torque and speed are taken as proportional to the
 voltage of the nearest one, as those of a DC motor are.
@@ -180,6 +181,25 @@ def stall_torque(model: str | int, supply_v: float | None = None) -> tuple[float
         )
     rating = sheet.at(supply_v)
     return rating.stall_torque_nm, f"{sheet.name} at {rating.supply_v:g} V: {rating.source}"
+
+
+def no_load_speed(model: str | int, supply_v: float | None = None) -> float | None:
+    """Speed without load [rad/s] of a servo model at a supply voltage; None if it is not known.
+
+    Parameters
+    ----------
+    model : str or int
+        Name or number.
+    supply_v : float, optional
+        [V]; without one the lowest stated rating.
+
+    Examples
+    --------
+    >>> round(no_load_speed("STS3215", 12.0), 2), no_load_speed("SCS0009")
+    (4.71, None)
+    """
+    sheet = data_sheet(model)
+    return sheet.at(supply_v).no_load_speed_rad_s if sheet else None
 
 
 def recorded_stall_torque(servos: Iterable[Mapping[str, Any]]) -> tuple[float, str] | None:
