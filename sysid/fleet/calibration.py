@@ -9,10 +9,15 @@ One recording is one robot. Each gets its own calibration file, written when it 
 interrupted run continues: a file made from the same bytes with the same settings is kept. A
 recording that cannot be used does not stop the others; the reason is in the table. Servos far from
 the same joint's on the other robots are marked as outliers.
+
+A Dask scheduler and its workers execute code, and their answers are unpickled here: whoever
+controls that address can run programs on this computer. It is therefore never searched for, and
+never taken from Dask's configuration, but only from the caller (`trust`).
 """
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +32,8 @@ from joblib import Parallel, delayed, parallel_config
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import sha256, write_text
+from pupper_sysid.common.reading.budget import read_limit, reading_up_to
+from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.identify.calibration_file import GIVEN_TORQUE
@@ -38,6 +45,8 @@ OUTLIER = 5.0
 deviations."""
 FEWEST = 5
 """Robots needed to mark outliers."""
+
+_ADDRESS = re.compile(r"(tls|tcp)://[A-Za-z0-9_.:\[\]-]+:[0-9]{1,5}")
 
 QUANTITIES = {
     "lag_ms": lambda joint: _ms(joint.lag.lag_s),
@@ -151,7 +160,8 @@ def calibrate_fleet(
     jobs : int
         Processes here; joints of one robot then run one after the other.
     cluster : str, optional
-        Address of a Dask scheduler (`tcp://…`) whose workers see the same folders.
+        Address of a Dask scheduler, `tls://HOST:PORT` or `tcp://HOST:PORT`, whose workers see the
+        same folders. See `trust`.
     force : bool
         Make calibrations anew that another recording or other settings made.
     progress : callable, optional
@@ -160,7 +170,7 @@ def calibrate_fleet(
     Raises
     ------
     InputError
-        If there is no recording, or the cluster cannot be reached.
+        If there is no recording, or the cluster is no address or cannot be reached.
     """
     targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
     return run_fleet(
@@ -213,9 +223,11 @@ def run_fleet(
     """
     if jobs < 1:
         raise InputError(f"`jobs` is {jobs}; it must be at least 1.")
+    if cluster is not None:
+        trust(cluster)
     fleet, todo = Fleet(), []
     for path, target in targets.items():
-        if target.exists() and is_of(target, path):
+        if target.exists() and _same(is_of, target, path):
             fleet.kept.append(_called(target))
         elif target.exists() and not force:
             raise InputError(
@@ -225,7 +237,8 @@ def run_fleet(
         else:
             todo.append((path, target))
     with _backend(cluster) as parallel:
-        work = parallel(jobs)(delayed(_one)(make, path, target) for path, target in todo)
+        limit = read_limit()
+        work = parallel(jobs)(delayed(_one)(make, path, target, limit) for path, target in todo)
         for name, problem in cast(Iterable[tuple[str, str]], work):
             (fleet.failed if problem else fleet.made).append(name)
             if problem:
@@ -278,16 +291,58 @@ def _calibrated(path: Path, target: Path, settings: Settings) -> None:
     made.save(target, force=True)
 
 
-def _one(make: Callable[[Path, Path], None], path: Path, target: Path) -> tuple[str, str]:
+def _same(is_of: Callable[[Path, Path], bool], target: Path, path: Path) -> bool:
+    """Whether a target was made from a recording; one that cannot be read is left to `make`."""
+    try:
+        return is_of(target, path)
+    except PupperError:
+        return False
+
+
+def _one(
+    make: Callable[[Path, Path], None], path: Path, target: Path, limit: float
+) -> tuple[str, str]:
     """Make one robot's; its name, and what went wrong or nothing."""
     try:
-        make(path, target)
+        with reading_up_to(limit):
+            make(path, target)
     except PupperError as error:
         return _called(target), str(error)
     except Exception as error:  # a defect that one robot's log brings out must not cost the others
         at = traceback.extract_tb(error.__traceback__)[-1]
         return _called(target), f"{type(error).__name__}: {error} ({Path(at.filename).name})"
     return _called(target), ""
+
+
+def trust(cluster: str) -> str:
+    """What is risked by computing on a cluster, as a sentence.
+
+    Parameters
+    ----------
+    cluster : str
+        Address of a Dask scheduler.
+
+    Raises
+    ------
+    InputError
+        If it is not written out as `tls://HOST:PORT` or `tcp://HOST:PORT`.
+    """
+    found = _ADDRESS.fullmatch(cluster)
+    if found is None:
+        raise InputError(
+            f"`cluster` is '{printable(cluster)[:60]}'; write out the scheduler's address, such as "
+            "tls://host:8786. Schedulers are never searched for, since they execute code."
+        )
+    risk = (
+        f"{cluster} is trusted: it executes code, and its answers are unpickled here, so whoever "
+        "controls it can run programs on this computer."
+    )
+    if found[1] == "tls":
+        return risk
+    return (
+        f"{risk} tcp:// tells neither who answers nor who listens: use it within a network of your "
+        "own, else tls:// with certificates (docs/exports.md)."
+    )
 
 
 @contextmanager

@@ -50,8 +50,8 @@ class Calibrate:
     jobs: int = 2
     """Robots of a fleet that are calibrated at the same time."""
     cluster: str | None = None
-    """Dask scheduler to calibrate a fleet on, such as tls://host:8786. It executes code: who controls
-    it can run programs on this computer; see docs/exports.md."""
+    """Dask scheduler to calibrate a fleet on, such as tls://host:8786. It executes code, and who
+    controls it can run programs on this computer: see docs/exports.md."""
     force: bool = False
     """Replace the calibration file if it exists."""
     json: bool = False

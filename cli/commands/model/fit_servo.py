@@ -74,7 +74,7 @@ class FitServo:
     jobs: int = 2
     """Robots of a fleet that are fitted at the same time."""
     cluster: str | None = None
-    """Dask scheduler to fit a fleet on, such as tls://host:8786. It executes code, and whoever
+    """Dask scheduler to fit a fleet on, such as tls://host:8786. It executes code, and who
     controls it can run programs on this computer: see docs/exports.md."""
     force: bool = False
     """Replace the model in --out."""

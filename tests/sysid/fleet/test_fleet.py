@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,11 +12,14 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import reading_up_to
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.fleet import calibration as fleet
 from pupper_sysid.sysid.fleet.calibration import OUTLIER, QUANTITIES, _outliers
 from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
+from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run
 
 NAMES = tuple(QUANTITIES)
@@ -45,14 +49,14 @@ def two_made_and_one_failed(said: str, out: Path) -> pd.DataFrame:
 def test_a_folder_becomes_a_calibration_per_robot_and_one_table(sweeps, tmp_path, capsys):
     out = tmp_path / "fleet"
     code, said, err = run(capsys, "calibrate", sweeps, "--jobs", "2", "--out", out, "--json")
-    assert code == 0, err
+    assert code == 1 and "1 of 3 recordings could not be used: torn" in err
     table = two_made_and_one_failed(said, out)
     own = load_calibration(out / "r2.yaml").joint("LF_hip").actuator
     assert table["dead_time_ms"].iloc[1] == pytest.approx(1e3 * own.dead_time_s.value)
 
     # nothing is calibrated twice, and what was edited is seen
     code, said, err = run(capsys, "calibrate", sweeps, "--out", out, "--json")
-    assert code == 0, err
+    assert code == 1 and "torn" in err
     assert sorted(json.loads(said)["kept"]) == ["r1", "r2"] and json.loads(said)["made"] == []
     assert "--force" in refused(
         capsys,
@@ -70,21 +74,21 @@ def test_a_folder_becomes_a_servo_model_per_robot_and_one_table(sweeps, tmp_path
     out = tmp_path / "models"
     arguments = ("fit-servo", sweeps, "--arch", "fir", "--out", out)
     code, said, err = run(capsys, *arguments, "--json")
-    assert code == 0, err
+    assert code == 1 and "torn" in err
     table = two_made_and_one_failed(said, out)
     known = load_servo_model(out / "r2").contract.joints["LF_hip"].scores["rmse_free_run_rad"]
     assert table["free_run_mrad"].iloc[1] == pytest.approx(1e3 * known)
     assert 0 < known < 1e-3 * table["persistence_mrad"].iloc[1]
 
     code, said, err = run(capsys, *arguments)
-    assert code == 0 and "2 kept" in err and "torn was left out" in err
+    assert code == 1 and "2 kept" in err and "torn was left out" in err
     assert "--force" in refused(capsys, pupper_sysid, *arguments, "--seed", "3")
     # another split or other readings are another model, too; what auto took stays
     loops = ("--train-before", "1", "--test-after", "1")
     assert "--force" in refused(capsys, pupper_sysid, *arguments, *loops)
     counted = load_servo_model(out / "r1").contract.readings_counted["LF_hip"]
     code, _, err = run(capsys, *arguments, "--readings", counted)
-    assert code == 0 and "2 kept" in err
+    assert code == 1 and "2 kept" in err
     other = "all" if counted == "fresh" else "fresh"
     assert "--force" in refused(capsys, pupper_sysid, *arguments, "--readings", other)
 
@@ -131,6 +135,66 @@ def test_a_dask_cluster_gives_what_one_process_gives(sweeps, tmp_path):
         )
     here = fleet.calibrate_fleet(sweeps, tmp_path / "here", fleet.Settings())
     pd.testing.assert_frame_equal(there.table, here.table)
+
+
+@pytest.mark.parametrize(
+    "address", ["", "scheduler", "inproc://x", "tcp://", "tls://a", "http://a:1", "tcp://a:1/x",
+                "tcp://a:1 b", "file:scheduler.json", "tcp://a\x1b[31m:1"]
+)  # fmt: skip
+def test_a_cluster_is_an_address_that_is_written_out(sweeps, tmp_path, address, monkeypatch):
+    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:9")
+    with pytest.raises(InputError, match="write out the scheduler's address") as refusal:
+        fleet.calibrate_fleet(sweeps, tmp_path, fleet.Settings(), cluster=address)
+    assert str(refusal.value).isprintable()
+
+
+def test_what_a_cluster_is_trusted_with_is_said():
+    for address in ("tls://host:8786", "tcp://[::1]:8786"):
+        said = fleet.trust(address)
+        assert "can run programs on this computer" in said
+        assert ("within a network of your own" in said) == address.startswith("tcp")
+
+
+def test_of_200_recordings_10_are_broken_and_190_are_done(sweeps, tmp_path, capsys):
+    """With a product that is made at once: what counts is who is done, and who is named."""
+    root, out = tmp_path / "robots", tmp_path / "out"
+    root.mkdir(), out.mkdir()
+    good = (sweeps / "r1.csv").read_bytes()
+    broken = {
+        "empty": b"", "cut": good[:900], "binary": bytes(range(256)) * 9, "text": b"hello\n" * 50,
+        "degrees": good.replace(b",0.", b",90."), "long": b"x" * 300_000,
+        "resumed": good + b'# resumed: {"trial": Infinity}\n', "digits": good.replace(b"1", b"1_1"),
+    }  # fmt: skip
+    for k in range(190):
+        (root / f"r{k:03}.csv").write_bytes(good + b"# robot: %d\n" % k)
+    for name, data in broken.items():
+        (root / f"{name}.csv").write_bytes(data)
+    os.mkfifo(root / "pipe.csv")
+    (root / "device.csv").symlink_to("/dev/zero")
+    targets = {path: out / f"{name}.yaml" for path, name in fleet.robots_in(root).items()}
+
+    def make(path: Path, target: Path) -> None:
+        target.write_text(load(path).name)
+
+    made = fleet.run_fleet(
+        targets, lambda target, path: False, make,
+        lambda target: {"LF_hip": {}}, (), out, 1, None, True, None,
+    )  # fmt: skip
+    assert len(made.made) == 190
+    assert sorted(made.failed) == sorted([*broken, "pipe", "device"])
+    assert all(problem.endswith(".") for problem in made.problems.values())
+
+
+def test_the_limit_of_reading_holds_for_every_worker(sweeps, tmp_path):
+    root = tmp_path / "robots"
+    root.mkdir()
+    shutil.copy(sweeps / "r1.csv", root / "r1.csv")
+    with (root / "r1.csv").open("a") as file:
+        file.write("# note: " + '"' + "x" * 1_500_000 + '"\n')
+    first = fleet.calibrate_fleet(root, tmp_path / "a", fleet.Settings(), jobs=2)
+    assert "read_limit=2" in first.problems["r1"]
+    with reading_up_to(2):
+        assert fleet.calibrate_fleet(root, tmp_path / "b", fleet.Settings(), jobs=2).made == ["r1"]
 
 
 def test_an_outlier_is_named_and_equal_servos_are_not():
