@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -32,6 +32,9 @@ from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, StackName, suited
+
+if TYPE_CHECKING:
+    from pupper_sysid.policies.deploy.servo_match import ServoMatch
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -151,8 +154,12 @@ def _run(options: Deploy) -> None:
             )
         else:
             _show_match(parts.match)
+        match = parts.servo_match if options.actuator else None
+        if options.actuator:
+            _show_servos(match, policy.contract.servo is not None)
         header = parts.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
+            "servo_match": match and match.to_dict(),
         }  # fmt: skip
         _walk(options, bus, imu, parts.controller, header, folder, truth)
 
@@ -232,6 +239,20 @@ def _show_match(match: Any) -> None:
     err.print(table)
 
 
+def _show_servos(match: ServoMatch | None, carried: bool) -> None:
+    """The robot's servos beside those of the training."""
+    if match is None:
+        err.print(
+            "The robot's servos were not compared with those of the training: "
+            + ("a learned model has no numbers." if carried else "the policy's file has none."),
+            soft_wrap=True,
+        )
+    elif match.outside:
+        warn([f"{match.here} is not what the policy was trained for:", *match.sentences()])
+    else:
+        err.print(*match.sentences(), soft_wrap=True)
+
+
 def _walk(
     options: Deploy, bus: GuardedBus, imu: Imu, controller: Any, header: dict[str, Any],
     folder: Path, truth: Any,
@@ -285,12 +306,14 @@ def _walk(
         "stop_reason": outcome.stop_reason,
         "guard": outcome.guard,
         "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},
+        "servo_match": header["servo_match"],
         "log": str(log),
     }  # fmt: skip
     if options.json:
         print_json(found)
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
+    del found["servo_match"]  # it was shown before the walk
     for key, value in found.items():
         shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)

@@ -14,11 +14,19 @@ from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.policies.deploy.controller import Controller
 from pupper_sysid.policies.deploy.observer_match import Match, compare
 from pupper_sysid.policies.deploy.observers import make_observer
+from pupper_sysid.policies.deploy.servo_match import ServoMatch, servo_match
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.network.trained_servo import trained_servo
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.servo_file import WEIGHTS
-from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import (
+    ServoRanges,
+    is_servo_model,
+    servo_model_of,
+    servo_ranges,
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +36,8 @@ class Assembly:
     controller: Controller
     match: Match
     """The observer on this robot compared with the actuator the policy was trained with."""
+    servo_match: ServoMatch | None
+    """The robot's servos compared with those of the training; None if either is not known."""
     header: dict[str, Any]
     """Everything that `reassemble` needs."""
 
@@ -87,7 +97,7 @@ def assemble(
         "servo": str(servo) if model else None,
         "servo_sha256": _hash(servo / WEIGHTS) if servo and model else None,
     }  # fmt: skip
-    return Assembly(controller, match, header)
+    return Assembly(controller, match, _servo_match(policy, servos, trained), header)
 
 
 def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:
@@ -114,6 +124,17 @@ def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:
         file = header[changed[0].removesuffix("_sha256")]
         raise InputError(f"{log} was made with another file at {file}. Restore that file.")
     return found.controller
+
+
+def _servo_match(policy: Policy, here: ServoRanges, trained: str | None) -> ServoMatch | None:
+    """Compare with the servos in the policy's file, or with the calibration of an older one."""
+    if is_servo_model(here.source):
+        return None
+    own, feedback = policy.contract.servo, policy.contract.feedback
+    if own is None and trained is not None:
+        known = feedback if feedback in ("held", "ideal") else "held"
+        own = trained_servo(trained, known, Walking(), servo_ranges(trained, known))
+    return None if own is None else servo_match(own, here)
 
 
 def _stall_torque(servos: ServoRanges) -> float:

@@ -2,7 +2,8 @@
 
 Exported files map observation and state to action and next state, under rsl_rl's names (`obs`,
 `h_in`, `c_in` → `actions`, `h_out`, `c_out`); a Transformer's state is its context. The contract is
-in the metadata.
+in the metadata, under one key, as JSON: the same as in the policy's folder, with the servos of the
+training (`servo`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pupper_sysid.policies.network.policy_file import (
     save_policy,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
+from pupper_sysid.policies.network.trained_servo import trained_servo
 from pupper_sysid.policies.train.run_file import Run as TrainingRun
 from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE, VELOCITY_STEPS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
@@ -56,6 +58,7 @@ def write_policy(
     size = OBSERVATION_SIZE + 12 * action_history
     network = PolicyNetwork(shape.kind, size, shape.hidden, shape.memory, run.learner.normalise)
     network.take(weights)
+    servo = trained_servo(run.actuator, run.feedback, task, servos)
     source = Path(run.actuator)
     delays = np.concatenate([servos.low["dead_time_s"], servos.high["dead_time_s"]])
     about = {
@@ -74,10 +77,11 @@ def write_policy(
         "control_step_s": task.control_step_s,
         "physics_step_s": task.physics_step_s,
         "knee": task.knee,
-        "actuator": source.name if source.exists() else run.actuator,
+        "actuator": servo.actuator,
         "actuator_sha256": sha256(source) if source.is_file() else None,
-        "feedback": run.feedback,
+        "feedback": servo.feedback,
         "dead_time_s": [float(delays.min()), float(delays.max())],
+        "servo": servo.model_dump(mode="json", by_alias=True),
         "training": training,
     }
     save_policy(folder, network, about, force)

@@ -1,7 +1,8 @@
 """Policy files: a folder with weights (safetensors) and a contract (JSON); nothing is unpickled.
 
 The contract defines a policy's inputs and outputs: names and order of the observation, scales,
-default pose, joint order, rates, and the actuator and feedback of its training. `load_policy`
+default pose, joint order, rates, and the servos and feedback of its training
+(`policies.network.trained_servo`). `load_policy`
 refuses other files. Every policy passes the gate `refuse_bad` before it is written: no NaN, right
 shapes, and actions that depend on the observation.
 """
@@ -14,11 +15,11 @@ import warnings
 from collections.abc import Callable
 from copy import copy
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
@@ -35,9 +36,10 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.reading.tensors import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
+from pupper_sysid.policies.network.trained_servo import SERVO_VERSION, TrainedServo
 from pupper_sysid.sim.walking.observation import OBSERVATION, VELOCITY_STEPS
 
-SCHEMA, VERSION = "pupper-policy", 2
+SCHEMA, VERSION = "pupper-policy", 3
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 _LARGEST_BYTES = 200_000_000
 _AGAIN = "Copy the whole folder again."
@@ -64,7 +66,7 @@ class Contract(_Part):
     """Inputs, outputs and training of a policy."""
 
     schema_name: Annotated[Literal["pupper-policy"], Field(alias="schema")]
-    schema_version: Literal[1, 2]
+    schema_version: Literal[1, 2, 3]
     kind: Kind
     hidden: Annotated[list[Annotated[int, Field(gt=0, le=8192)]], Field(max_length=16)]
     memory: Annotated[int, Field(gt=0, le=8192)]
@@ -90,9 +92,24 @@ class Contract(_Part):
         Field(min_length=2, max_length=2, validation_alias=AliasChoices("dead_time_s", "delay_s")),
     ]
     """Shortest and longest dead time it was trained with; `delay_s` in version 1."""
+    servo: TrainedServo | None = None
+    """The servos it was trained with, whole; null is no evidence of any. From version 3 on."""
     training: dict[str, Any]
     versions: dict[str, str]
     weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+    @model_validator(mode="after")
+    def _one_servo(self) -> Self:
+        own = self.servo
+        if own is None:
+            return self
+        if own.dead_times_s is not None and own.dead_times_s != tuple(self.dead_time_s):
+            raise ValueError("dead_time_s is not that of the servo")
+        if own.actuator != self.actuator or own.feedback != self.feedback:
+            raise ValueError("actuator and feedback are not those of the servo")
+        if self.actuator_sha256 is not None and own.actuator_sha256 != self.actuator_sha256:
+            raise ValueError("actuator_sha256 is not that of the servo")
+        return self
 
     @property
     def observation_size(self) -> int:
@@ -206,6 +223,8 @@ def load_policy(folder: Path) -> Policy:
     found = read_json(path, remedy=_AGAIN)
     if isinstance(found, dict):
         refuse_other_version(path, found.get("schema_version"), VERSION)
+        if isinstance(servo := found.get("servo"), dict):
+            refuse_other_version(f"{path}, servo", servo.get("schema_version"), SERVO_VERSION)
     contract = validated(Contract, found, path, remedy="copy the whole folder again")
     contract = contract.model_copy(update={"schema_version": VERSION})
     if list(contract.default_pose_rad) != list(JOINT_NAMES):

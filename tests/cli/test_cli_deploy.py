@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -107,6 +108,27 @@ def test_a_robot_unlike_the_one_of_the_training_is_told_before_the_start(capsys,
         "--name", "late",
     )  # fmt: skip
     assert code == 0 and "60 ms later than the trained actuator" in err
+    said = " ".join(err.split())
+    assert "late.yaml is not what the policy was trained for" in said
+    assert re.search(
+        r"Dead time \(\w+\): [\d.]+ ms, [5-6]\d(\.\d)? ms more than in the training", said
+    )
+
+
+def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here, late):
+    arguments = (POLICY, "--seconds", 0.1, "--name", "walk", "--force", "--json")
+    code, out, err = run_program(capsys, pupper_deploy, *arguments, "--actuator", CALIBRATION)
+    found = json.loads(out)
+    assert code == 0 and found["servo_match"]["outside"] == []
+    assert "within the ranges that the policy was trained for" in err
+    code, out, _ = run_program(capsys, pupper_deploy, *arguments, "--actuator", late)
+    found = json.loads(out)
+    worst = found["servo_match"]["outside"]
+    assert {one["quantity"] for one in worst} == {"dead time"} and len(worst) == 12
+    assert all(50 < one["beyond"] <= 61 and one["unit"] == "ms" for one in worst)
+    assert read_walk(Path(found["log"])).header["servo_match"] == found["servo_match"]
+    code, out, err = run_program(capsys, pupper_deploy, *arguments)
+    assert code == 0 and json.loads(out)["servo_match"] is None  # no robot was named
 
 
 def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys, late):
@@ -186,10 +208,10 @@ def test_orbits_close(capsys, here):
     assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
 
 
-@pytest.mark.parametrize("what", ["terrain", "compliance"])
-def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what):
+@pytest.mark.parametrize(("what", "count"), [("terrain", 7), ("compliance", 6)])
+def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, count):
     rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
-    assert len(rows) == 6 and all(0 <= r["survival"] <= 1 for r in rows)
+    assert len(rows) == count and all(0 <= r["survival"] <= 1 for r in rows)
 
 
 def test_a_quick_look_is_smaller_and_says_so(capsys, here, monkeypatch):

@@ -21,6 +21,7 @@ from pupper_sysid.policies.train.run_file import load_run, preset
 from support.browser import looks_right
 from support.command_line import refused
 from support.command_line import run_program as run
+from support.json_keys import DOCUMENTED, key_line
 from support.tiny_training import CALIBRATION
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -116,12 +117,12 @@ def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here, arguments, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--environments", "0"), "at least 1 is needed"),
+        (("--environments", "0"), "environments is 0; it must be from 1 to"),
         (("--learner.minibatches", "0"), "minibatches is 0"),
         (("--architecture.hidden", "0"), "at least 1"),
         (("--task.control-step-s", "0.003"), "whole multiple"),
         (("--policy", "lstm", "--environments", "1"), "1 environments cannot be split"),
-        (("--threads", "-1"), "threads is -1; it must be 0 or more"),
+        (("--threads", "-1"), "threads is -1; it must be from 0 to"),
         (("--seed", "-1"), "seed is -1; it must be 0 or more"),
         (("--imitation.minibatches", "0"), "imitation.minibatches is 0"),
         (("--architecture.hidden", "--seed", "1"), "architecture.hidden is empty"),
@@ -206,6 +207,9 @@ def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
     first = found["conditions"][0]
     assert [first[w]["episodes"] for w in ("policy", "trot", "standing")] == [5, 2, 2]
     assert {f["walker"] for f in found["falls"]} <= {"policy", "trot", "standing"}
+    # all but those of a fall, of which there need be none
+    keys = DOCUMENTED["pupper-eval"]
+    assert key_line(found | {"falls": []}) == keys[: keys.index(".{row")]
 
 
 def test_a_quick_look_is_smaller_and_says_so(capsys, trained, monkeypatch):
@@ -251,6 +255,8 @@ def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_b
     found = json.loads(out)
     assert code == 0 and found["battery"] and found["quick"]
     assert [row["name"] for row in found["conditions"][1:]] == [case.name for case in BATTERY]
+    keys = key_line(found).replace(", command, policy", ", command[], policy")  # none here
+    assert keys == DOCUMENTED["pupper-eval"]
     assert found["falls"], "two robots fall at least once in 3.4 s of pushes of 1.2 m/s and slopes"
     for fall in found["falls"]:
         assert 0 < fall["time_s"] <= 3.4 and 0 <= fall["tilt_before_deg"] < 90

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
 
 import pytest
 
 from support.command_line import run
-from support.json_keys import key_line
+from support.json_keys import DOCUMENTED, key_line
 from support.package import ROOT
 
-ROWS = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", (ROOT / "docs/formats.md").read_text(), re.M)
-DOCUMENTED = {command: keys for commands, keys in ROWS for command in commands.split(", ")}
 SAMPLE = ROOT / "data/samples/sweep.csv"
 COMMANDS = {
     "sweep": ("--freqs", "4", "--joints", "LF_hip"),

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from pupper_sysid.common.joints import JOINT_NAMES
+from support.package import ROOT
+
+_ROWS = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", (ROOT / "docs/formats.md").read_text(), re.M)
+DOCUMENTED = {command: keys for commands, keys in _ROWS for command in commands.split(", ")}
+"""Keys by command."""
 
 # objects whose keys are names of the data
 _BY_NAME = frozenset(
@@ -13,7 +19,10 @@ _BY_NAME = frozenset(
     | {"coefficients", "leave_one_out_ranges", "candidate_models", "presets", "undecided"}
 )
 # objects that another line, or a file, describes
-_ELSEWHERE = {"calibration": ": as in the YAML file", "lag": ": as in delay"}
+_ELSEWHERE = {
+    "calibration": ": as in the YAML file", "lag": ": as in delay", "trot": ": as policy",
+    "standing": ": as policy",
+}  # fmt: skip
 _INTERVAL = {"value", "low", "high"}
 _QUANTITY = _INTERVAL | {"identified", "why"}
 

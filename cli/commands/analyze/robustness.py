@@ -88,7 +88,7 @@ class Autonomy(Commanded):
 
 @dataclass(frozen=True)
 class Terrain(Commanded):
-    """Survival and errors on rough ground, slopes, troughs and steps.
+    """Survival and errors on rough ground, slopes, troughs, steps and stairs.
 
     Example: pupper-analyze terrain runs/<name>
     """

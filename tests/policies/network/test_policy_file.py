@@ -128,7 +128,7 @@ def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(tmp_path):
     ("change", "words"),
     [
         ({"schema": "pupper-servo"}, "schema"),
-        ({"schema_version": 3}, "Upgrade pupper-sysid"),
+        ({"schema_version": 4}, "Upgrade pupper-sysid"),
         ({"schema_version": 0}, "schema_version"),
         ({"kind": "perceptron"}, "kind"),
         ({"hidden": []}, "does not fit"),

@@ -1,0 +1,196 @@
+"""The servos of a training in the policy's file: whole, exact, and refused where they are wrong."""
+
+from __future__ import annotations
+
+import json
+import time
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.policies.network.policy_export import export_policy, write_policy
+from pupper_sysid.policies.network.policy_file import CONTRACT, load_policy
+from pupper_sysid.policies.network.trained_servo import TrainedServo, trained_servo
+from pupper_sysid.sim.walking.config import Randomisation, Walking
+from pupper_sysid.sim.walking.differences import Differences
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.tiny_training import CALIBRATION, networks, tiny_run
+
+SERVOS = servo_ranges(CALIBRATION)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    weights = networks("mlp")[0].state_dict()
+    run = tiny_run("mlp")
+    run = replace(run, architecture=replace(run.architecture, hidden=(32, 16)))
+    write_policy(tmp_path, dict(weights), run, SERVOS, 0, {"seed": 0})
+    return tmp_path
+
+
+def rewrite(folder: Path, change) -> None:
+    """Change the servo of a contract, given as plain data."""
+    path = folder / CONTRACT
+    whole = json.loads(path.read_text())
+    change(whole["servo"])
+    path.write_text(json.dumps(whole))
+
+
+def test_every_number_of_the_servos_is_read_back_to_the_last_bit(folder):
+    contract = load_policy(folder).contract
+    own = contract.servo
+    assert own is not None and own.joints is not None and own.kind == "calibration"
+    assert own.actuator == contract.actuator == "calibrated.yaml"
+    assert own.actuator_sha256 == sha256(Path(CALIBRATION))
+    assert list(own.joints) == list(JOINT_NAMES)
+    for i, name in enumerate(JOINT_NAMES):
+        joint = own.joints[name]
+        for field in SERVOS.value:
+            for end in ("low", "value", "high"):
+                assert getattr(getattr(joint, field), end) == getattr(SERVOS, end)[field][i]
+        for field in ("poll_period_s", "loss", "quantum_rad", "offset_rad"):
+            assert getattr(joint.feedback, field) == getattr(SERVOS.feedback[i], field)
+    assert own.command_jitter_s.value == SERVOS.command_jitter_s
+    assert list(own.dead_times_s) == contract.dead_time_s
+
+
+def test_what_a_training_draws_widens_the_ranges():
+    task = Walking(
+        randomisation=Randomisation(torque_scale=(0.5, 1.5)),
+        differences=Differences(battery=(0.86, 1.1), poll_period=(0.9, 1.2), command_jitter=(0, 2)),
+    )
+    own = trained_servo(CALIBRATION, "held", task, replace(SERVOS, command_jitter_s=0.004))
+
+    def ends(range_):
+        return range_.low, range_.value, range_.high
+
+    assert ends(own.torque_scale) == (0.5, 1.0, 1.5) and ends(own.voltage_scale) == (0.86, 1.0, 1.1)
+    assert ends(own.poll_scale) == (0.9, 1.0, 1.2) and ends(own.command_jitter_s) == (
+        0,
+        0.004,
+        0.008,
+    )
+
+
+@pytest.mark.parametrize("name", ["ideal", "paper"])
+def test_servos_without_a_file_have_a_name_and_no_hash(name):
+    own = trained_servo(name, "ideal", Walking(), servo_ranges(name, "ideal"))
+    assert (own.actuator, own.actuator_sha256) == (name, None)
+    assert own.kind == ("ideal" if name == "ideal" else "calibration")
+    assert own.joints is not None and own.joints["LF_hip"].feedback.poll_period_s == 0
+
+
+def test_a_learned_model_is_known_by_its_weights_and_has_no_numbers(tmp_path):
+    (tmp_path / "weights.safetensors").write_bytes(b"weights")
+    own = trained_servo(str(tmp_path), "held", Walking(), servo_ranges("ideal"))
+    assert own.kind == "learned" and own.joints is None and own.dead_times_s is None
+    assert own.actuator == tmp_path.name
+    assert own.actuator_sha256 == sha256(tmp_path / "weights.safetensors")
+
+
+def test_an_absent_servo_is_no_evidence_and_older_files_are_read(folder):
+    path = folder / CONTRACT
+    for version, servo in ((3, None), (2, ...), (1, ...)):
+        whole = json.loads(path.read_text())
+        whole["schema_version"] = version
+        if servo is ...:
+            whole.pop("servo", None)
+        else:
+            whole["servo"] = servo
+        if version == 1:
+            whole["delay_s"] = whole.pop("dead_time_s")
+        path.write_text(json.dumps(whole))
+        contract = load_policy(folder).contract
+        assert contract.servo is None and contract.schema_version == 3
+
+
+def first(servo):
+    return servo["joints"]["LF_hip"]
+
+
+def with_order_reversed(servo):
+    servo["joints"] = dict(reversed(servo["joints"].items()))
+
+
+def with_another_joint(servo):
+    servo["joints"]["tail"] = deepcopy(first(servo))
+
+
+WRONG = {
+    "another schema": lambda s: s.update(schema="pupper-servo"),
+    "no schema": lambda s: s.pop("schema"),
+    "version of words": lambda s: s.update(schema_version="1"),
+    "version 1.0": lambda s: s.update(schema_version=1.0),
+    "a missing joint": lambda s: s["joints"].pop("RB_calf"),
+    "another joint": with_another_joint,
+    "joints in another order": with_order_reversed,
+    "joints in a list": lambda s: s.update(joints=list(s["joints"].values())),
+    "no joints": lambda s: s.update(joints=None),
+    "joints of a learned model": lambda s: s.update(kind="learned"),
+    "an unknown key": lambda s: first(s).update(colour="red"),
+    "a missing number": lambda s: first(s).pop("damping"),
+    "a number as text": lambda s: first(s)["stiffness"].update(value="1.0"),
+    "a number as truth": lambda s: first(s)["stiffness"].update(low=True),
+    "a list for a number": lambda s: first(s)["stiffness"].update(low=[0.0] * 100_000),
+    "NaN": lambda s: first(s)["stiffness"].update(value=float("nan")),
+    "infinity": lambda s: first(s)["effort_limit"].update(high=float("inf")),
+    "a huge number": lambda s: first(s)["effort_limit"].update(high=1e300),
+    "a huge integer": lambda s: first(s)["effort_limit"].update(high=10**400),
+    "a negative number": lambda s: first(s)["friction_loss"].update(low=-1.0),
+    "a range upside down": lambda s: first(s)["armature"].update(low=1.0),
+    "a dead time of a minute": lambda s: first(s)["dead_time_s"].update(high=60.0),
+    "a dead time other than the contract's": lambda s: [
+        j["dead_time_s"].update(high=1.0) for j in s["joints"].values()
+    ],
+    "a loss of one": lambda s: first(s)["feedback"].update(loss=1.0),
+    "a poll period that is no number": lambda s: first(s)["feedback"].update(poll_period_s=None),
+    "an offset of many turns": lambda s: first(s)["feedback"].update(offset_rad=1e6),
+    "another actuator": lambda s: s.update(actuator="another.yaml"),
+    "a name of a million letters": lambda s: s.update(actuator="x" * 10**6),
+    "another hash": lambda s: s.update(actuator_sha256="0" * 64),
+    "a hash that is none": lambda s: s.update(actuator_sha256="0" * 63),
+    "no hash": lambda s: s.update(actuator_sha256=None),
+    "another feedback": lambda s: s.update(feedback="ideal"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_servo_that_is_present_and_wrong_is_refused_with_one_sentence(folder, what):
+    rewrite(folder, WRONG[what])
+    began = time.process_time()
+    with pytest.raises(InputError) as refused:
+        load_policy(folder)
+    said = str(refused.value)
+    assert str(folder) in said and "\n" not in said and said.endswith(".") and len(said) < 1000
+    assert time.process_time() - began < 2.0
+
+
+@pytest.mark.parametrize("value", [5, "servo", [], True, {}, [[[[]]]]])
+def test_a_servo_that_is_no_object_of_its_kind_is_refused(folder, value):
+    path = folder / CONTRACT
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"servo": value}))
+    with pytest.raises(InputError, match="servo"):
+        load_policy(folder)
+
+
+def test_a_servo_of_a_newer_version_asks_for_an_upgrade(folder):
+    rewrite(folder, lambda s: s.update(schema_version=2))
+    with pytest.raises(InputError, match=r"servo.*Upgrade pupper-sysid"):
+        load_policy(folder)
+
+
+def test_an_exported_policy_carries_the_servo_to_the_last_bit(folder, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    policy = load_policy(folder)
+    export_policy(policy, "onnx", tmp_path / "policy.onnx")
+    metadata = {e.key: e.value for e in onnx.load(tmp_path / "policy.onnx").metadata_props}
+    found = TrainedServo.model_validate(json.loads(metadata["contract"])["servo"])
+    assert found == policy.contract.servo
+    values = [j.stiffness.value for j in (found.joints or {}).values()]
+    np.testing.assert_array_equal(values, SERVOS.value["stiffness"])
