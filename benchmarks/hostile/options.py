@@ -92,12 +92,14 @@ _values("pupper_eval policy --actuator calibrated.yaml --quick", "--episodes", "
 _values("pupper_eval policy --actuator calibrated.yaml --quick", "--seconds", "0", "-1", "nan",
         "inf", "1e12")  # fmt: skip
 _values(_EVAL, "--extra-delay-ms", "nan", "-1", "inf", "1e12")
-_TRAIN = "pupper_train --actuator calibrated.yaml --name t --minutes 0.01 --iterations 1"
+_TINY = "pupper_train --actuator calibrated.yaml --name t --imitation.iterations 1"
+_TRAIN = f"{_TINY} --minutes 0.01 --iterations 1"
 _values(_TRAIN, "--environments", "0", "-1", "x", "9" * 30)
-_values("pupper_train --actuator calibrated.yaml --name t --iterations 1", "--minutes", "nan", "-1",
+_values(f"{_TINY} --environments 4 --iterations 1", "--minutes", "nan", "-1",
         "0", "x")  # fmt: skip
-_values("pupper_train --actuator calibrated.yaml --name t --minutes 0.01", "--iterations", "0",
+_values(f"{_TINY} --environments 4 --minutes 0.01", "--iterations", "0",
         "-1", "1e3")  # fmt: skip
+_TRAIN += " --environments 4"
 _values(_TRAIN, "--threads", "-1", "9" * 30)
 _values(_TRAIN, "--architecture.memory", "0", "-1", "9" * 30)
 _values(_TRAIN, "--architecture.hidden", "0", "-1", "9" * 30)

@@ -25,6 +25,7 @@ from pupper_sysid.policies.network.hyperparameters import (
     Imitation,
     Kind,
 )
+from pupper_sysid.policies.train.ranges import refuse_impossible
 from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
 
 Start = Literal["imitation", "scratch"]
@@ -67,9 +68,7 @@ class Run:
     """Of everything that is drawn."""
 
     def __post_init__(self):
-        for name in ("threads", "seed"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
+        refuse_impossible(self)
 
 
 def preset(
