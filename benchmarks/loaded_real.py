@@ -24,7 +24,7 @@ import numpy as np
 from pupper_sysid.servo_models.loaded_servo import COLUMNS
 from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, fit_loaded_joint
 from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
-from pupper_sysid.sysid.loaded.runs import at_steps, prepare, simulate
+from pupper_sysid.sysid.loaded.runs import Run, at_steps, prepare, simulate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -37,14 +37,18 @@ FITTED_S = 40.0
 
 def errors(found: LoadedFit, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     """Model minus reading of every row [rad], and its time [s]."""
+    run = prepare(trial, found.lattice, found.reference_voltage_v)
+    assert run is not None
+    return at_steps(track(found, run), run.row_step) - run.row_rad, run.row_step * run.step_s
+
+
+def track(found: LoadedFit, run: Run) -> np.ndarray:
+    """Positions that a fitted servo predicts at the edges of the steps of a run [rad]."""
     servo, row = found.servo.arrays(), np.zeros((1, WIDTH))
     row[0, : len(COLUMNS)] = [float(servo[name]) for name in COLUMNS]
     for column, name in ((-2, "gravity_nm"), (-1, "hanging_rad"), (0, "offset_rad")):
         row[0, OFFSET + column] = found.numbers[name].value if name in found.numbers else 0.0
-    run = prepare(trial, found.lattice, found.reference_voltage_v)
-    assert run is not None
-    track = simulate(row, np.array([float(servo["dead_time_s"])]), run)[:, 0]
-    return at_steps(track, run.row_step) - run.row_rad, run.row_step * run.step_s
+    return simulate(row, np.array([float(servo["dead_time_s"])]), run)[:, 0]
 
 
 def dead_time(found: LoadedFit) -> str:

@@ -372,6 +372,7 @@ class LoadedLoop(Part):
             "load-dependent friction": self.load_friction_load or self.load_friction_motor,
             "dead zone": self.dead_zone_rad,
             "start duty": self.start_duty,
+            "limit on the set-point's acceleration": self.acceleration_limit_rad_s2,
         }
         left = [name for name, number in names.items() if number is not None]
         return f"Left out of the PD: {', '.join(left)}." if left else ""

@@ -229,13 +229,13 @@ class _Servo:
         held = run.held
         if np.isfinite(self.velocity_limit):
             held = held.copy()
-            held[0] = _slewed(held[0], self.velocity_limit * run.step_s, run.start_rad - offset_rad)
+            held[0] = slewed(held[0], self.velocity_limit * run.step_s, run.start_rad - offset_rad)
         changed = replace(run, p_gain=gain, held=held)
         dead_time = np.array([float(own["dead_time_s"])])
         return simulate(row, dead_time, changed)[:, 0]
 
 
-def _slewed(command: NDArray[np.float64], step: float, start: float) -> NDArray[np.float64]:
+def slewed(command: NDArray[np.float64], step: float, start: float) -> NDArray[np.float64]:
     """The set-point that follows a command at a limited rate."""
     out, now = np.empty_like(command), start
     for k, wanted in enumerate(command):

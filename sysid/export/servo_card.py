@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pupper_sysid.common.data_sheet import stall_torque
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.card import Gains, Score, ServoCard, Source
-from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop
+from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop, TorquePD
 from pupper_sysid.sysid.loaded.joint_fit import LoadedFit
 from pupper_sysid.sysid.recordings.recording import Recording
 
@@ -63,9 +64,7 @@ def to_card(
     InputError
         If there is no fit, no supply voltage, or no data sheet where the load is unknown.
     """
-    if not fits:
-        raise InputError("A servo card needs a fit. Name a joint that was fitted.")
-    first = next(iter(fits.values()))
+    first = _first(fits)
     volts = first.reference_voltage_v if supply_v is None else supply_v
     if not volts > 0:
         raise InputError(f"{name}: the recordings hold no supply voltage. Give `supply_v`.")
@@ -81,12 +80,93 @@ def to_card(
             told.append(sentence)
             told.append("The armature holds the inertia of what the joint moved.")
     middle = sorted(fits, key=lambda s: _stiffness(specimens[s], fits[s].p_gain))[len(fits) // 2]
+    return _card(
+        name, servo, fits, recordings, source, specimens, load=load, supply_v=float(volts),
+        gains=(gains or Gains()).model_copy(update={"p": float(first.p_gain)}),
+        notes=tuple(told), default=default or middle,
+    )  # fmt: skip
+
+
+def to_drive_card(
+    name: str,
+    servo: str,
+    fits: Mapping[str, LoadedFit],
+    drives: Mapping[str, tuple[float, float]],
+    recordings: Sequence[Recording],
+    source: Source,
+    load: str,
+    notes: Sequence[str] = (),
+) -> ServoCard:
+    """A card of drives whose gains are in N·m/rad, which sets the scale of all torques.
+
+    Such a drive commands torque, so its numbers are those of a PD servo. Motions that never reach
+    its torque limit cannot tell its D gain from drag: `damping_nm_s_per_rad` is their sum.
+
+    Parameters
+    ----------
+    name, servo, fits, recordings, source, load, notes
+        As for `to_card`.
+    drives : dict of str to (float, float)
+        By specimen: P gain [N·m/rad] and torque limit [N·m] that were set in the drive.
+
+    Raises
+    ------
+    InputError
+        If there is no fit.
+    """
+    _first(fits)
+    set_there = "set in the drive and stated by the recording; the scale of all torques"
+    specimens = {}
+    for specimen, fit in fits.items():
+        stiffness, limit = drives[specimen]
+        per = fit.numbers["stiffness_nm_per_rad"]
+
+        def scaled(
+            of: str, fit: LoadedFit = fit, factor: float = stiffness / per.value
+        ) -> Quantity:
+            own = fit.numbers[of]
+            ends = own.value * factor, own.low * factor, own.high * factor
+            return _quantity(ends, fit.undecided.get(of))
+
+        dead_time = fit.numbers["dead_time_s"]
+        ends = stiffness / per.value, stiffness / per.high, stiffness / per.low
+        specimens[specimen] = TorquePD(
+            model="delayed_pd",
+            stiffness_nm_per_rad=Quantity(value=stiffness, identified="no", why=set_there),
+            damping_nm_s_per_rad=scaled("back_emf"),
+            friction_loss_nm=scaled("friction_loss"),
+            armature_kg_m2=_quantity(ends, "it holds the inertia of what the joint moved"),
+            effort_limit_nm=Quantity(
+                value=limit, identified="no", why="set in the drive; never reached here"
+            ),
+            dead_time_s=_quantity(
+                (dead_time.value, dead_time.low, dead_time.high), fit.undecided.get("dead_time_s")
+            ),
+        )
+    return _card(
+        name, servo, fits, recordings, source, specimens, load=load, notes=tuple(notes),
+        default=next(iter(fits)),
+    )  # fmt: skip
+
+
+def _first(fits: Mapping[str, LoadedFit]) -> LoadedFit:
+    if not fits:
+        raise InputError("A servo card needs a fit. Name a joint that was fitted.")
+    return next(iter(fits.values()))
+
+
+def _card(
+    name: str,
+    servo: str,
+    fits: Mapping[str, LoadedFit],
+    recordings: Sequence[Recording],
+    source: Source,
+    specimens: Mapping[str, LoadedLoop | TorquePD],
+    **stated: Any,
+) -> ServoCard:
     return ServoCard(
         name=name,
         servo=servo,
-        supply_v=float(volts),
-        gains=(gains or Gains()).model_copy(update={"p": float(first.p_gain)}),
-        load=load,
         published=False,
         source=source,
         data=tuple(
@@ -94,10 +174,15 @@ def to_card(
         ),
         scores=tuple(score for s, fit in fits.items() for score in _scores(s, fit)),
         date=utc_now()[:10],
-        notes=tuple(told),
-        default=default or middle,
-        specimens=specimens,
+        specimens=dict(specimens),
+        **stated,
     )
+
+
+def _quantity(ends: tuple[float, float, float], doubt: str | None) -> Quantity:
+    """A quantity from its value and the ends of its interval."""
+    value, low, high = ends
+    return Quantity(value=value, low=low, high=high, identified="no" if doubt else "yes", why=doubt)
 
 
 def _loop(fit: LoadedFit, scale: float, why: str) -> LoadedLoop:

@@ -58,12 +58,15 @@ def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
     gains = sorted(r.p_gain for r in runs)
     middle = gains[len(gains) // 2]
     off = any((r.held[1] < 1).any() for r in runs)
+    ramps = [t.servo.set_point_acceleration_rad_s2 for t in trials]
+    limits = [ramp for ramp in ramps if ramp is not None and np.isfinite(ramp)]
+    ramp = float(np.median(limits)) if limits else float("nan")
     if not known:
-        return Scales(100.0, 1.0, middle, False, off, True)
+        return Scales(100.0, 1.0, middle, False, off, True, ramp, bool(limits))
     inertia = max(float(r.load[0]) for r in runs)
     # without gravity the scale is a torque that would reach 10 rad/s within 0.1 s
     torque = max(max(float(r.load[1]) for r in runs), 100.0 * inertia)
-    return Scales(torque, inertia, middle, True, off, False)
+    return Scales(torque, inertia, middle, True, off, False, ramp, bool(limits))
 
 
 def shortened(runs: tuple[Run, ...]) -> tuple[Run, ...]:

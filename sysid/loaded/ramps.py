@@ -84,8 +84,10 @@ def settled(
     Returns
     -------
     scales, runs, noise_rad
-        As given where the runs do not show a limit.
+        As given where the runs state it, or do not show a limit.
     """
+    if all(r.ramp_known for r in runs):
+        return structure.scales, runs, noise_rad
     plain = search.search(Problem(structure, runs, noise_rad), rng, start.point[None])[0]
     limited = Structure((*structure.features, "acceleration"), structure.scales)
     place = limited.names.index("acceleration_limit")
@@ -96,13 +98,17 @@ def settled(
     gain = plain.cost - fit.cost
     found = either.settle(fit)
     nats = gain / correlation(limited, fit, found, noise_rad)
-    if nats < _TELLING_NATS or gain < _TELLING_SHARE * plain.cost:
+    if not structure.scales.acceleration_stated and (
+        nats < _TELLING_NATS or gain < _TELLING_SHARE * plain.cost
+    ):
         return structure.scales, runs, noise_rad
     for _ in range(_ROUNDS):
         noise_rad = noise_of(limited, fit, found, least_rad)
         either = EitherWay(limited, runs, noise_rad)
         fit = either.scanned(fit)
         found = either.settle(fit)
+    if structure.scales.acceleration_stated:
+        return structure.scales, found, noise_rad
     limit = float(limited.decode(fit.point)[place])
     return replace(structure.scales, acceleration_rad_s2=limit), found, noise_rad
 

@@ -118,14 +118,15 @@ def prepare(
         load = [own.inertia_kg_m2, own.gravity_nm, own.hanging_rad]
     gain = trial.p_gain if np.isfinite(trial.p_gain) else 1.0
     first = trial.position_rad[np.isfinite(trial.position_rad)][0]
-    register = trial.servo.registers.get("acceleration")
+    ramp = trial.servo.set_point_acceleration_rad_s2
     return Run(
         _label(trial), gain, np.array(load), held, rest, float(first),
         to_step(reading.time_s[inside]), reading.position_rad[inside],
         to_step(trial.read_time_s),
         to_step(np.where(reading.held_time_s >= start, reading.held_time_s, np.nan)),
         trial.position_rad,
-        ramp_share=float("inf") if register == 0 else 1.0, ramp_known=register is not None,
+        ramp_share=1.0 if ramp is None or np.isfinite(ramp) else float("inf"),
+        ramp_known=ramp is not None,
     )  # fmt: skip
 
 

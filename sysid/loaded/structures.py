@@ -54,7 +54,9 @@ class Scales:
     gravity : bool
         Whether an unknown gravity is fitted.
     acceleration_rad_s2 : float
-        Limit on the set-point's acceleration that the runs show; NaN if none.
+        Limit on the set-point's acceleration that the runs state or show; NaN if none.
+    acceleration_stated : bool
+        Whether a register states it.
     """
 
     torque: float
@@ -64,6 +66,7 @@ class Scales:
     torque_off: bool = False
     gravity: bool = False
     acceleration_rad_s2: float = float("nan")
+    acceleration_stated: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,9 @@ class Structure:
                 "stribeck_friction", 0.05 * torque, 1e-5 * torque, 10 * torque, 2.0
             ),
             "stribeck_speed_rad_s": Parameter("stribeck_speed_rad_s", 0.1, 0.005, 3.0, 1.5),
-            "acceleration_limit": Parameter("acceleration_limit", ramp, 1.0, 3000.0, 1.2),
+            "acceleration_limit": Parameter(
+                "acceleration_limit", ramp, 1.0, 3000.0, 0.03 if s.acceleration_stated else 1.2
+            ),
             "damping": Parameter("damping", 0.05 * torque, 1e-5 * torque, 200 * torque, 2.0),
             "dead_zone_rad": Parameter("dead_zone_rad", 0.003, 1e-4, 0.05, 1.0),
             "start_duty": Parameter("start_duty", 0.01, 1e-4, 0.2, 1.5),

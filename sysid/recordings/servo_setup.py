@@ -8,9 +8,12 @@ Both are optional. With a known load the servo's torques can be identified in N�
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from pupper_sysid.common.data_sheet import counts_of
 
 _Positive = Annotated[float, Field(gt=0, le=1e6)]
 _NotNegative = Annotated[float, Field(ge=0, le=1e6)]
@@ -37,6 +40,18 @@ class ServoSetup(BaseModel):
     """Nominal supply voltage [V]; the column `voltage_v` overrides it."""
     registers: dict[str, int] = {}
     """Other registers by name (`hardware.feetech.registers`)."""
+
+    @property
+    def set_point_acceleration_rad_s2(self) -> float | None:
+        """Largest acceleration of the set-point by the register `acceleration` [rad/s²].
+
+        None where it is not stated; infinite at 0. A unit is 100 counts/s².
+        """
+        units = self.registers.get("acceleration")
+        if units is None:
+            return None
+        counts = counts_of(self.model or "STS3215") or 4096.0
+        return 100 * units * math.tau / counts if units else math.inf
 
 
 class PendulumLoad(BaseModel):
