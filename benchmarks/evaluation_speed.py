@@ -3,12 +3,11 @@
     .venv/bin/python benchmarks/evaluation_speed.py data/samples/policies/lstm
 
 The conditions of `pupper-eval` (100 episodes of random commands, seven directions, three kinds of
-ground, two added dead times) walk one after the other, as they did before, and all together, in
-turns, for --seconds of simulated time each; the median of the ratios of processor and wall time is
-printed with their middle half, beside the load of the machine. Before, flat ground and no added
-dead time were walked again, too. Then the shares of one environment, on one core, by the number of
-its robots, with one and with two threads of torch. `time pupper-eval POLICY` and `time pupper-eval
---quick POLICY` on a quiet machine give the whole.
+ground, two added dead times; policy, trot and standing) walk one after the other and all together,
+in turns, for --seconds of simulated time each; the median of the ratios of processor and wall time
+is printed with their middle half, beside the load of the machine. Then the shares of one
+environment, on one core, by the number of its robots, with one and with two threads of torch.
+`time pupper-eval POLICY` and `time pupper-eval --quick POLICY` on a quiet machine give the whole.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +26,11 @@ import torch
 import tyro
 
 from pupper_sysid.cli.policy_choice import policy_at, simulator
+from pupper_sysid.policies.evaluation.evaluate import RANDOM, WALKERS, table, usual_robots
 from pupper_sysid.policies.evaluation.figures import Recorder
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import (
-    DIRECTIONS,
-    Condition,
-    evaluation_task,
-    walk_together,
-)
+from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
+from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
@@ -53,14 +49,9 @@ class Options:
 
 
 def conditions(task: Walking) -> list[Condition]:
-    """Those of `pupper-eval`, and the two that were walked twice at the end."""
-    half = EPISODES // 2
-    found = [Condition(task, EPISODES)]
-    found += [Condition(task, EPISODES // 5, command) for command in DIRECTIONS.values()]
-    for ground in ("rough", "slopes", "troughs"):
-        found.append(Condition(replace(task, terrain=ground), half))
-    found += [Condition(task, half, None, extra) for extra in (0.04, 0.08)]
-    return [*found, Condition(task, half), Condition(task, half)]
+    """Those of `pupper-eval`: policy, trot and standing under each."""
+    robots = usual_robots(EPISODES)
+    return [c.condition(task, robots(c, w), w) for c in (RANDOM, *table()) for w in WALKERS]
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, float]:
@@ -83,10 +74,10 @@ def in_turns(policy: Policy, task: Walking, servos: ServoRanges, seconds: float)
 
     walk(each[:1])  # imports, caches
     load = os.getloadavg()[0]
-    found = np.array([[timed(one_by_one), timed(lambda: walk(each[:-2]))] for _ in range(ROUNDS)])
+    found = np.array([[timed(one_by_one), timed(lambda: walk(each))] for _ in range(ROUNDS)])
     steps = round(seconds / task.control_step_s)
     for name, times, some in (
-        ("one after the other, as before", found[:, 0], each), ("together", found[:, 1], each[:-2])
+        ("one after the other", found[:, 0], each), ("together", found[:, 1], each)
     ):  # fmt: skip
         count = sum(c.robots for c in some)
         processor, wall = np.median(times, axis=0)
@@ -98,7 +89,9 @@ def in_turns(policy: Policy, task: Walking, servos: ServoRanges, seconds: float)
     ratio = found[:, 1] / found[:, 0]
     for kind, values in zip(("processor", "wall"), ratio.T, strict=True):
         low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-        print(f"together over before, {kind} time: {middle:.2f} ({low:.2f} to {high:.2f})")
+        print(
+            f"together over one after the other, {kind} time: {middle:.2f} ({low:.2f} to {high:.2f})"
+        )
     print(f"Load of the machine at the start {load:.1f}, at the end {os.getloadavg()[0]:.1f}.\n")
 
 
