@@ -89,9 +89,8 @@ def in_turns(policy: Policy, task: Walking, servos: ServoRanges, seconds: float)
     ratio = found[:, 1] / found[:, 0]
     for kind, values in zip(("processor", "wall"), ratio.T, strict=True):
         low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-        print(
-            f"together over one after the other, {kind} time: {middle:.2f} ({low:.2f} to {high:.2f})"
-        )
+        ends = f"({low:.2f} to {high:.2f})"
+        print(f"together over one after the other, {kind} time: {middle:.2f} {ends}")
     print(f"Load of the machine at the start {load:.1f}, at the end {os.getloadavg()[0]:.1f}.\n")
 
 
