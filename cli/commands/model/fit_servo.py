@@ -170,7 +170,8 @@ class FitServo:
         terminal.out.print(shown)
         terminal.out.print(
             "\nFree run: commands only, from the start of each run. DelayedPD (PD), the linear "
-            "filter and the model were fitted to the same readings and scored on the same unseen ones.",
+            "filter and the model were fitted to the same readings and scored on the same unseen "
+            "ones.",
             soft_wrap=True,
         )
         terminal.out.print(Text(f"\n{fit.verdict}", "bold"), soft_wrap=True)

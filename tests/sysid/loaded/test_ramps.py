@@ -57,7 +57,8 @@ def recording(
     )  # fmt: skip
     setup = {"p_gain": 16.0, "registers": registers or {}}
     header = {
-        "readings": "live", "joints": ["j"], "start_pose_rad": {"j": float(command[0])}, "servos": {"j": setup},
+        "readings": "live", "joints": ["j"], "start_pose_rad": {"j": float(command[0])},
+        "servos": {"j": setup},
     }  # fmt: skip
     return Recording.from_frame(table, metadata=header, name=motion)
 
