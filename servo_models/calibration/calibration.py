@@ -34,7 +34,7 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, Delayed
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 
 SCHEMA = "pupper-calibration"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 PRESETS = ("paper", "release")
 
 _RENAMED = {
@@ -104,7 +104,7 @@ class Calibration(Part):
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
     """Kind of the file."""
-    schema_version: Literal[3] = SCHEMA_VERSION
+    schema_version: Literal[4] = SCHEMA_VERSION
     """Version of the file's format."""
     robot: str
     """The robot that was measured."""
@@ -319,7 +319,9 @@ def _load(path: Path) -> Calibration:
     refuse_other_version(path, version, SCHEMA_VERSION)
     if version == SCHEMA_VERSION:
         return validated(Calibration, data, path, lines)
-    if version == 2:  # the same without `under_load`
+    if version in (2, 3):  # 2 is the same without `under_load`
+        if version == 3:
+            data = data | {"joints": _with_unseen_runs(data.get("joints"))}
         return validated(Calibration, data | {"schema_version": SCHEMA_VERSION}, path, lines)
     data = _renamed(data) | {"schema_version": SCHEMA_VERSION}
     lines = {tuple(map(_new_name, place)): n for place, n in lines.items()}
@@ -330,6 +332,35 @@ def _load(path: Path) -> Calibration:
         for old, new in _RENAMED.items():
             message = message.replace(new, old)  # the words of the file that is being read
         raise InputError(message) from error
+
+
+def _with_unseen_runs(joints: Any) -> Any:
+    """Joints of a version 3 file, whose fits under load had errors under another's name."""
+    if not isinstance(joints, dict):
+        return joints
+    return {
+        name: _of_unseen_runs(joint)
+        if isinstance(joint, dict) and joint.get("under_load") is not None
+        else joint
+        for name, joint in joints.items()
+    }
+
+
+def _of_unseen_runs(joint: dict) -> dict:
+    """A joint's scores, RMS, and its candidates', mean absolute errors, by their present names."""
+    old, found = "rmse_leave_one_frequency_out_rad", dict(joint)
+    if isinstance(scores := joint.get("scores"), dict):
+        found["scores"] = {"rmse_unseen_runs_rad" if k == old else k: v for k, v in scores.items()}
+    selection = joint.get("selection")
+    if isinstance(selection, dict) and isinstance(selection.get("candidate_models"), list):
+        models = [
+            {"mae_unseen_runs_rad" if k == old else k: v for k, v in model.items()}
+            if isinstance(model, dict)
+            else model
+            for model in selection["candidate_models"]
+        ]
+        found["selection"] = selection | {"candidate_models": models}
+    return found
 
 
 def _new_name(name: str | int) -> str | int:

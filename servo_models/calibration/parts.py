@@ -188,6 +188,8 @@ class Scores(Part):
     """Free-run error on all rows, the model sampled at the poll instants (held) [rad]."""
     rmse_leave_one_frequency_out_rad: NotNegative | None = None
     """Free-run error on fresh rows of frequencies that were left out of the fit [rad]."""
+    rmse_unseen_runs_rad: NotNegative | None = None
+    """Under load: free-run error on fresh rows of runs that were left out of the fit [rad]."""
     fit_percent: Number | None = None
     """100 · (1 − RMSE / standard deviation of the reading) on fresh rows [%]."""
 
@@ -207,6 +209,9 @@ class CandidateModel(Part):
     """Free-run error on all rows as logged (raw) [rad]."""
     rmse_leave_one_frequency_out_rad: NotNegative | None = None
     """Free-run error on frequencies that were left out of the fit [rad]."""
+    mae_unseen_runs_rad: NotNegative | None = None
+    """Under load: mean absolute free-run error on fresh rows of runs that were left out of the fit,
+    mean over runs [rad]."""
     fit_percent: Number | None = None
     """100 · (1 − RMSE / standard deviation of the reading) on fresh rows [%]."""
     parameters: dict[str, Number] = Field(default_factory=dict)

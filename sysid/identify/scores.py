@@ -34,6 +34,9 @@ class Scores(Result):
         The same by frequency [Hz] (by trial number where there are no tones).
     fit_percent : float
         100 (1 - RMS / standard deviation of the fresh readings).
+    rmse_unseen_runs_rad : float
+        Of a servo under load: free run on fresh rows of runs (of other gains, loads or motions)
+        the fit has not seen; else NaN.
     """
 
     rmse_fresh_rad: float
@@ -43,6 +46,13 @@ class Scores(Result):
     rmse_leave_one_frequency_out_rad: float
     rmse_by_left_out_frequency_rad: dict[str, float]
     fit_percent: float
+    rmse_unseen_runs_rad: float = float("nan")
+
+    @property
+    def rmse_unseen_rad(self) -> float:
+        """Error on unseen motion: on runs under load, on frequencies else."""
+        runs = self.rmse_unseen_runs_rad
+        return runs if np.isfinite(runs) else self.rmse_leave_one_frequency_out_rad
 
 
 def score(

@@ -161,9 +161,10 @@ def fit_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> JointCalibrat
         rmse_held_rad=errors["held"],
         rmse_raw_rad=errors["raw"],
         rmse_one_step_rad=float("nan"),
-        rmse_leave_one_frequency_out_rad=errors["unseen"],
+        rmse_leave_one_frequency_out_rad=float("nan"),
         rmse_by_left_out_frequency_rad={},
         fit_percent=100 * (1 - errors["fresh"] / max(spread, 1e-9)),
+        rmse_unseen_runs_rad=errors["unseen"],
     )
     undecided = {
         name: found.undecided[source]
@@ -294,7 +295,7 @@ def _joint(
                     model=s.name,
                     parameter_count=len(s.parameters),
                     rmse_fresh_rad=s.rmse_rad,
-                    rmse_leave_one_frequency_out_rad=(
+                    mae_unseen_runs_rad=(
                         s.mae_unseen_rad if np.isfinite(s.mae_unseen_rad) else None
                     ),
                     parameters=s.parameters,
@@ -306,7 +307,7 @@ def _joint(
             rmse_free_run_raw_rad=finite["raw"],
             rmse_free_run_fresh_rad=finite["fresh"],
             rmse_free_run_held_rad=finite["held"],
-            rmse_leave_one_frequency_out_rad=finite["unseen"],
+            rmse_unseen_runs_rad=finite["unseen"],
         ),
         warnings=result.warnings,
     )

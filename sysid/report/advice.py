@@ -113,6 +113,6 @@ def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
             "readings are held, but the bus's poll period could not be found. Record a longer "
             f"sweep ({_LONG_S:g} s or more) at full amplitude."
         )
-    if not np.isfinite(pd.scores.rmse_leave_one_frequency_out_rad) and tones:
+    if not np.isfinite(pd.scores.rmse_unseen_rad) and tones:
         found.append("no frequency could be left out, so the model was not tested on new motion.")
     return found

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
 from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
@@ -153,7 +154,7 @@ def test_every_quantity_of_a_calibration_has_a_unit_and_a_description():
 
 def version_1(path: Path) -> Path:
     """The file at `path` with the keys that it had in version 1."""
-    text = path.read_text().replace("schema_version: 3", "schema_version: 1")
+    text = path.read_text().replace("schema_version: 4", "schema_version: 1")
     for new, old in (
         ("dead_time_s:", "delay_s:"), ("candidate_models:", "ladder:"),
         ("raw_lag_s", "naive_lag_s"), ("rmse_raw_rad", "rmse_naive_rad"),
@@ -164,9 +165,9 @@ def version_1(path: Path) -> Path:
     return path
 
 
-def test_a_file_of_version_1_is_read_and_saved_in_version_3(file, tmp_path):
+def test_a_file_of_version_1_is_read_and_saved_in_the_present_version(file, tmp_path):
     loaded = load_calibration(version_1(file))
-    assert loaded.joints == calibration().joints and loaded.schema_version == 3
+    assert loaded.joints == calibration().joints and loaded.schema_version == 4
     loaded.save(tmp_path / "again.yaml")
     assert " delay_s:" not in (tmp_path / "again.yaml").read_text()
     assert load_calibration("data/samples/calibrated.yaml").joint_names[0] == "LF_hip"
@@ -178,3 +179,40 @@ def test_faults_of_a_version_1_file_are_named_in_its_own_words_and_lines(file):
     line = next(n for n, t in enumerate(text.splitlines(), 1) if "value: 25.0" in t)
     with pytest.raises(InputError, match=rf"line {line}: joints\.LF_hip\.actuator\.delay_s is not"):
         load_calibration(file)
+
+
+def test_errors_on_unseen_runs_of_a_version_3_file_have_their_own_names(file, tmp_path):
+    """Version 3 had a mean absolute error over left-out runs among the RMS over frequencies."""
+    card = load_calibration("sts3215-bam-m6")
+    block = next(iter(card.joints.values())).under_load
+    assert block is not None
+    calibration(LF_hip=joint_calibration(), LF_thigh=joint_calibration()).save(file, force=True)
+    data = yaml.safe_load(file.read_text()) | {"schema_version": 3}
+    loaded, free = data["joints"].values()
+    for joint, under_load in ((loaded, block.model_dump(mode="json")), (free, None)):
+        joint["under_load"] = under_load
+        for own in (joint["scores"], *joint["selection"]["candidate_models"]):
+            own.pop("rmse_unseen_runs_rad", own.pop("mae_unseen_runs_rad", None))
+            own["rmse_leave_one_frequency_out_rad"] = 0.012
+    old = tmp_path / "old.yaml"
+    old.write_text(dump(data))
+    first, second = load_calibration(old).joints.values()
+    for joint, seen in ((first, (None, 0.012, None, 0.012)), (second, (0.012, None, 0.012, None))):
+        scores, model = joint.scores, joint.selection.candidate_models[0]
+        assert seen == (
+            scores.rmse_leave_one_frequency_out_rad, scores.rmse_unseen_runs_rad,
+            model.rmse_leave_one_frequency_out_rad, model.mae_unseen_runs_rad,
+        )  # fmt: skip
+    load_calibration(old).save(tmp_path / "new.yaml")
+    assert load_calibration(tmp_path / "new.yaml").joints == load_calibration(old).joints
+
+
+def test_a_damaged_version_3_file_is_refused_like_any_other(file, tmp_path):
+    text = file.read_text().replace("schema_version: 4", "schema_version: 3")
+    for damage in (
+        "joints: 3", "joints: {LF_hip: 3}", "joints: {LF_hip: {under_load: 1, scores: 2}}",
+        "joints: {LF_hip: {under_load: 1, selection: {candidate_models: [3]}}}",
+    ):  # fmt: skip
+        file.write_text(text[: text.index("\njoints:") + 1] + damage + "\n")
+        with pytest.raises(InputError, match="joints"):
+            load_calibration(file)

@@ -85,9 +85,9 @@ def test_a_missing_file_is_refused_and_a_misspelt_preset_is_recognised(tmp_path)
         (b"schema: pupper-calibration\nschema_version: true\n", "schema_version is True"),
         (
             b"schema: pupper-calibration\nschema_version: 0\n",
-            "schema_version is 0; this version reads 3",
+            "schema_version is 0; this version reads 4",
         ),
-        (b"schema: pupper-calibration\nschema_version: 4\nnew: 1\n", "newer version.*Upgrade"),
+        (b"schema: pupper-calibration\nschema_version: 5\nnew: 1\n", "newer version.*Upgrade"),
     ],
 )
 def test_what_is_no_calibration_is_refused_with_what_is_wrong(tmp_path, content, says):

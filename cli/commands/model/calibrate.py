@@ -144,7 +144,7 @@ class Calibrate:
                 _number(a.friction_loss_nm, 3),
                 f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
                 "EMF" if brakes else "slew",
-                terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_leave_one_frequency_out_rad),
+                terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_unseen_rad),
                 *([terminal.ms(paper.rmse_fresh_rad if paper else None)] if published else []),
             )  # fmt: skip
         terminal.out.print(shown)

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam
-from pupper_sysid.servo_models.cards.card import ServoCard
-from pupper_sysid.servo_models.cards.data_sheet import (
+from pupper_sysid.common.data_sheet import (
     data_sheet,
     recorded_stall_torque,
     stall_torque,
 )
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam
+from pupper_sysid.servo_models.cards.card import ServoCard
 from pupper_sysid.servo_models.cards.files import card_names, load_card
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, stated
 from pupper_sysid.servo_models.delayed_pd import DelayedPD

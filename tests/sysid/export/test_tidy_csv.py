@@ -89,7 +89,7 @@ def test_the_table_of_a_calibration_says_where_it_comes_from():
     lines = [line[2:] for line in to_csv(paper).splitlines() if line.startswith("# ")]
     assert lines[0] == "pupper-sysid calibration table"
     said = {key: json.loads(value) for key, _, value in (s.partition(": ") for s in lines[1:])}
-    assert said["schema"] == "pupper-calibration" and said["schema_version"] == 3
+    assert said["schema"] == "pupper-calibration" and said["schema_version"] == 4
     assert said["created"] == paper.created and said["units"] == paper.units
     assert said["notes"] == list(paper.notes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from pupper_sysid.servo_models.calibration.under_load import RecordedLoad, Under
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
+from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.loaded import search
 from pupper_sysid.sysid.loaded.calibrate import loaded_joints
 from pupper_sysid.sysid.loaded.runs import prepare
@@ -110,6 +112,27 @@ def test_numbers_in_newton_metres_follow_from_a_known_load():
 def test_a_known_load_several_gains_or_torque_off_make_a_loaded_joint():
     knee = {"knee": recording(8.0).trials("knee")}
     assert loaded_joints(knee) == ["knee"]
+
+
+def test_errors_on_runs_left_out_of_a_fit_under_load_have_names_of_their_own():
+    def short(whole: Recording) -> Recording:
+        return replace(whole, table=whole.table[whole.table.send_time_s < 1.5])
+
+    found = calibrate([short(recording(8.0)), short(recording(32.0, 3))])
+    result, joint = found["knee"], found.calibration.joint("knee")
+    assert joint.under_load is not None and joint.scores.rmse_leave_one_frequency_out_rad is None
+    scores = result.delayed_pd.scores
+    assert np.isnan(scores.rmse_leave_one_frequency_out_rad)
+    unseen = joint.scores.rmse_unseen_runs_rad
+    assert unseen == scores.rmse_unseen_runs_rad == scores.rmse_unseen_rad
+    models = {m.model: m for m in joint.selection.candidate_models}
+    assert all(m.rmse_leave_one_frequency_out_rad is None for m in models.values())
+    # the chosen structure's mean absolute error is below its RMS error on the same rows
+    mean = models[joint.selection.model].mae_unseen_runs_rad
+    assert mean is not None and unseen is not None and mean < unseen
+    dead_time = joint.actuator.dead_time_s
+    assert dead_time.low is not None and dead_time.high is not None
+    assert dead_time.low <= TRUE.dead_time_s <= dead_time.high
 
 
 def test_a_calibration_predicts_a_gain_it_has_not_seen(tmp_path: Path):
