@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pupper_sysid.hardware.address import BusAddress
-from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.joint_map import JointMap
@@ -20,7 +20,7 @@ def open_bus(
     joint_map: JointMap | None = None,
     joints: Sequence[str] | None = None,
     exclusive: bool = True,
-) -> ServoBus:
+) -> Esp32Bus | FeetechBus:
     """The bus itself, unguarded; see `FeetechBus` and `Esp32Bus` for parameters and errors."""
     if address.kind == "esp32":
         return Esp32Bus(Path(address.where), joint_map, exclusive)
@@ -36,7 +36,8 @@ def open_guarded(
     """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
     bus = open_bus(address, joint_map, joints)
     try:
-        watchdog = Watchdog(address, joint_map)
+        # rate and map as found: nothing is to be detected when it is urgent
+        watchdog = Watchdog(replace(address, baud=bus.metadata.get("baud")), bus.joint_map)
     except BaseException:
         bus.close()
         raise

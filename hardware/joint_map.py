@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
+from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order, strange_joint
@@ -54,8 +55,9 @@ _FILE = ConfigDict(
 )
 
 
-_SCALE_FACTOR = 2.0
-"""By how much a scale may differ from one turn per whole range; 1,024 counts may be 300°."""
+_SCALE_FACTOR, _KNOWN_FACTOR = 2.5, 1.3
+"""By how much a scale may differ from one turn per whole range (1,024 counts may be 300°, and
+reports of the Mini Pupper's servos go up to twice that), and from a known servo's data sheet."""
 
 
 class JointEntry(BaseModel):
@@ -116,13 +118,16 @@ class JointMapFile(BaseModel):
     @model_validator(mode="after")
     def _scales(self) -> JointMapFile:
         # every limit of the guard is in radians: a wrong scale would stretch them all
-        whole = self.counts / (2 * math.pi)
+        known = counts_of(self.servo) if self.servo else None
+        whole = (known or self.counts) / (2 * math.pi)
+        factor = _KNOWN_FACTOR if known else _SCALE_FACTOR
+        what = f"the {self.servo}" if known else f"a servo of {self.counts} counts a turn"
         for joint, entry in self.joints.items():
-            if not 1 / _SCALE_FACTOR <= entry.counts_per_rad / whole <= _SCALE_FACTOR:
+            if not 1 / factor <= entry.counts_per_rad / whole <= factor:
                 raise ValueError(
-                    f"{joint}: counts_per_rad is {entry.counts_per_rad:.4g}, but a servo of "
-                    f"{self.counts} counts a turn has {whole:.4g}, and all limits scale with it. "
-                    "Measure it with `pupper-sysid calibrate-joints`"
+                    f"{joint}: counts_per_rad is {entry.counts_per_rad:.4g}, but {what} has "
+                    f"{whole:.4g}, and all limits scale with it. Measure it with "
+                    "`pupper-sysid calibrate-joints`"
                 )
         return self
 

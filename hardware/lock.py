@@ -66,6 +66,11 @@ def open_here(name: str, flags: int) -> int:
     return descriptor
 
 
+def lock_name(robot: Path) -> str:
+    """Name of the lock's file of a robot at this path, whatever link leads to it."""
+    return hashlib.sha256(os.fsencode(robot.resolve())).hexdigest()[:16] + ".lock"
+
+
 def own(robot: Path) -> int:
     """Descriptor of the lock of a robot at this path, locked until it is closed.
 
@@ -74,8 +79,7 @@ def own(robot: Path) -> int:
     BusError
         If another program holds it.
     """
-    name = hashlib.sha256(os.fsencode(robot.resolve())).hexdigest()[:16] + ".lock"
-    descriptor = open_here(name, os.O_RDWR)
+    descriptor = open_here(lock_name(robot), os.O_RDWR)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

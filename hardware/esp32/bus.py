@@ -75,24 +75,25 @@ class Esp32Bus(HostClock):
     ):
         super().__init__()
         self.path = Path(path)
-        self._map = joint_map or load_joint_map("mini_pupper_2").per_servo()
-        if self._map.frame != "proxy":
+        self.joint_map = joint_map or load_joint_map("mini_pupper_2").per_servo()
+        name = self.joint_map.file.name
+        if self.joint_map.frame != "proxy":
             raise InputError(
-                f"the joint map {self._map.file.name} holds raw counts, and the proxy uses "
+                f"the joint map {name} holds raw counts, and the proxy uses "
                 "calibrated ones. Make a map with `pupper-sysid calibrate-joints --bus esp32`."
             )
-        if self._map.file.counts != datagrams.HIGHEST_COUNT + 1:
+        if self.joint_map.file.counts != datagrams.HIGHEST_COUNT + 1:
             raise InputError(
-                f"the joint map {self._map.file.name} is for servos of {self._map.file.counts} "
+                f"the joint map {name} is for servos of {self.joint_map.file.counts} "
                 f"counts; the proxy's have {datagrams.HIGHEST_COUNT + 1}. Choose another map, such "
                 "as mini_pupper_2."
             )
-        if sorted(self._map.ids) != list(range(1, datagrams.SERVOS + 1)):
+        if sorted(self.joint_map.ids) != list(range(1, datagrams.SERVOS + 1)):
             raise InputError(
-                f"the joint map {self._map.file.name} has the ids {sorted(self._map.ids)}; the "
+                f"the joint map {name} has the ids {sorted(self.joint_map.ids)}; the "
                 "proxy drives the servos 1 to 12 together, so the map must have them all."
             )
-        self._by_id = np.array(self._map.ids) - 1
+        self._by_id = np.array(self.joint_map.ids) - 1
         if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
             raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
         self._owner = own(self.path) if exclusive else None
@@ -102,8 +103,8 @@ class Esp32Bus(HostClock):
         self._power_s = -np.inf
         self._on = np.ones(datagrams.SERVOS, bool)
         self._command = np.full(datagrams.SERVOS, datagrams.NO_COUNT)  # which cannot be sent
-        self.joint_names = self._map.joint_names
-        self.limits = self._map.position_limits()
+        self.joint_names = self.joint_map.joint_names
+        self.limits = self.joint_map.position_limits()
         self.metadata: dict[str, Any] = {
             "kind": "esp32 proxy",
             "readings": "polled",
@@ -111,7 +112,7 @@ class Esp32Bus(HostClock):
             "speed_limit_rad_s": SPEED_LIMIT_RAD_S,
             "voltage_band_v": list(VOLTAGE_BAND_V),
             "real_time": True,
-        } | self._map.metadata()
+        } | self.joint_map.metadata()
         if not self._connected():
             self.close()
             raise (BusError if self.path.exists() else MissingDevice)(
@@ -122,7 +123,7 @@ class Esp32Bus(HostClock):
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
         """Send commands; the proxy's acknowledgement does not mean that a servo has them."""
         command = finite_angles(position_rad, datagrams.SERVOS, str(self.path))
-        self._command[self._by_id] = self._map.clip_counts(self._map.to_counts(command))
+        self._command[self._by_id] = self.joint_map.clip_counts(self.joint_map.to_counts(command))
         sent_s = self.now()
         return Sent(sent_s if self._send_command() else float("nan"), command)
 
@@ -140,7 +141,7 @@ class Esp32Bus(HostClock):
         missing = np.full(joints, np.nan)
         return BusSample(
             np.full(joints, at),
-            self._map.to_angles(np.where(count < 0, np.nan, count)),
+            self.joint_map.to_angles(np.where(count < 0, np.nan, count)),
             count,
             voltage_v=missing if self._power is None else np.full(joints, self._power.voltage_v),
             load=missing if load is None else load[self._by_id],

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.data_sheet import no_load_speed
+from pupper_sysid.common.data_sheet import data_sheet, no_load_speed
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
@@ -110,13 +110,13 @@ class FeetechBus(HostClock):
         try:
             series = _known(found, device)
             names = _answering(wanted, series, joints is not None, self.line)
-            self._map = _fitting(joint_map, series, device).select(names)
-            self._servos = [_Servo(i, series[i]) for i in self._map.ids]
+            self.joint_map = _fitting(joint_map, series, device).select(names)
+            self._servos = [_Servo(i, series[i]) for i in self.joint_map.ids]
             super().__init__()
             self._turn = 0
             self._doubts_s: list[float] = []
-            self.joint_names = self._map.joint_names
-            self.limits = self._map.position_limits()
+            self.joint_names = self.joint_map.joint_names
+            self.limits = self.joint_map.position_limits()
             self._setups = {
                 joint: setup_of(s.id, s.series, memory_of(self.line, s.id))
                 for joint, s in zip(self.joint_names, self._servos, strict=True)
@@ -129,7 +129,7 @@ class FeetechBus(HostClock):
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
         """Send commands to all servos in one frame."""
         command = finite_angles(position_rad, len(self._servos), self.line.device)
-        counts = self._map.clip_counts(self._map.to_counts(command))
+        counts = self.joint_map.clip_counts(self.joint_map.to_counts(command))
         values = {
             servo.id: servo.series.encode("goal_position", int(count))
             for servo, count in zip(self._servos, counts, strict=True)
@@ -168,12 +168,14 @@ class FeetechBus(HostClock):
             if len(memory) > 7:
                 servo.temperature_c = float(decode("present_temperature", memory, _FIRST))
             volts[k], temperature[k] = servo.voltage_v, servo.temperature_c
-        position = self._map.to_angles(np.where(count < 0, np.nan, count))
+        position = self.joint_map.to_angles(np.where(count < 0, np.nan, count))
         return BusSample(time_s, position, count, volts, temperature, load, status)
 
     def torque(self, on: bool) -> bool:
         """Hold the present pose, or switch the torque off; whether every servo confirms it."""
         tries = _TORQUE_ON_TRIES if on else _TORQUE_OFF_TRIES  # torque-off must not wait
+        if not on:  # all at once, also those that hear but do not answer
+            self.line.torque_off([s.id for s in self._servos])
         return all([any(self._torque(s, on) for _ in range(tries)) for s in self._servos])
 
     def goals(self) -> NDArray[np.float64]:
@@ -187,7 +189,7 @@ class FeetechBus(HostClock):
                     data = reply.frame.data
                     counts[k] = servo.series.decode("goal_position", data, goal.address)
                     break
-        return self._map.to_angles(counts)
+        return self.joint_map.to_angles(counts)
 
     def servo_setups(self) -> dict[str, dict[str, Any]]:
         """Model, firmware, gains and registers of each servo, as found when the bus was opened."""
@@ -276,7 +278,7 @@ class FeetechBus(HostClock):
         """Whether the servo can be there: 1 garbled frame in 256 has a correct checksum."""
         if not 0 <= count < servo.series.counts:
             return False
-        per_rad = float(self._map.counts_per_rad()[index])
+        per_rad = float(self.joint_map.counts_per_rad()[index])
 
         def reachable(since_s: float, from_count: int) -> bool:
             farthest = _SLACK_RAD + _FASTEST_RAD_S * (at - since_s)
@@ -319,7 +321,7 @@ class FeetechBus(HostClock):
         }
         if supply:
             known["voltage_band_v"] = [max(v[0] for v in supply), min(v[1] for v in supply)]
-        return known | self._map.metadata()
+        return known | self.joint_map.metadata()
 
 
 def open_line(
@@ -402,6 +404,12 @@ def _fitting(joint_map: JointMap | None, series: dict[int, Series], device: str)
         raise InputError(
             f"the joint map {joint_map.file.name} is for servos of {joint_map.file.counts} "
             f"counts; these {one.name} have {one.counts}. Choose another map."
+        )
+    named = data_sheet(joint_map.file.servo) if joint_map.file.servo else None
+    if named and named.model_number != one.model:
+        raise InputError(
+            f"the joint map {joint_map.file.name} is for {named.name} servos; these are "
+            f"{one.name}. Choose another map."
         )
     return joint_map
 

@@ -31,6 +31,7 @@ from pupper_sysid.hardware.feetech.registers import (
     MODEL_ADDRESS,
     PING,
     SERIES,
+    TORQUE_ADDRESS,
     Series,
     series_of_model_bytes,
 )
@@ -149,6 +150,10 @@ class FeetechLine:
         if ok and self.echoes:  # or the echo would come between the next request and its reply
             self._arrived(len(self._port.sent))
         return before if ok else float("nan")
+
+    def torque_off(self, servos: Sequence[int]) -> None:
+        """Switch the torque of all these off at once; it needs no reply, and confirms nothing."""
+        self.sync_write(TORQUE_ADDRESS, {servo: b"\0" for servo in servos})
 
     def model(self, servo: int) -> int | Series | None:
         """Series of `servo`; its model number (little endian) if unknown; None if no reply."""

@@ -20,7 +20,7 @@ BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_
 """By the value of the servo's baud register."""
 RETURN_DELAY_UNIT_S = 2e-6
 
-MODEL_ADDRESS = 3
+MODEL_ADDRESS, TORQUE_ADDRESS = 3, 40
 _SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
 
 
@@ -55,7 +55,7 @@ _COMMON = {
     "min_start_force": Register(24, 2),
     "dead_zone_cw": Register(26),
     "dead_zone_ccw": Register(27),
-    "torque_enable": Register(40),
+    "torque_enable": Register(TORQUE_ADDRESS),
     "acceleration": Register(41),
     "goal_time": Register(44, 2),
     "goal_speed": Register(46, 2),

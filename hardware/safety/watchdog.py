@@ -39,8 +39,8 @@ class Watchdog:
     Parameters
     ----------
     address : BusAddress
-    joint_map : JointMap or None
-        As given to `open_bus`.
+    joint_map : JointMap
+        That of the bus.
 
     Raises
     ------
@@ -48,7 +48,7 @@ class Watchdog:
         If the process does not start.
     """
 
-    def __init__(self, address: BusAddress, joint_map: JointMap | None):
+    def __init__(self, address: BusAddress, joint_map: JointMap):
         # a session of its own: Ctrl-C at the terminal is for the driver
         self._process = subprocess.Popen(
             # -P: a file in the user's folder, such as json.py, must not stand in for a module
@@ -64,8 +64,8 @@ class Watchdog:
                 "kind": address.kind,
                 "where": address.where,
                 "baud": address.baud,
-                "map": joint_map.file.model_dump(mode="json", by_alias=True) if joint_map else None,
-                "coordinates": joint_map.coordinates if joint_map else None,
+                "map": joint_map.file.model_dump(mode="json", by_alias=True),
+                "coordinates": joint_map.coordinates,
                 "driver": os.getpid(),
             }
         )

@@ -6,9 +6,10 @@ them back to the pose in which the robot was found, switches the torque off, and
 that the driver had changed.
 
 Switching the torque off takes no lock: a program that waits for the driver's end, or a child that
-inherited its descriptor, holds it. It is tried until every servo has confirmed, or until the line
-has been gone for a minute; what did not succeed is said in the system's log and in `watchdog.log`
-of the runtime folder (`hardware.lock`).
+inherited its descriptor, holds it. It is tried until every servo has confirmed, also if the line is
+gone for a day. Only a line that cannot come back ends it: a pseudo-terminal, or a socket whose
+folder was removed. What has not succeeded is said in the system's log and in `watchdog.log` of the
+runtime folder (`hardware.lock`).
 
     python -P -m pupper_sysid.hardware.safety.watchdog_process    (started by `watchdog.Watchdog`)
 """
@@ -23,15 +24,17 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 # everything that parking needs is loaded at the start, not when it is urgent
-from pupper_sysid.common.errors import BusError, PupperError
+from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.address import BusAddress
-from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.connect import open_bus
+from pupper_sysid.hardware.feetech.bus import AUTO_BAUDS
+from pupper_sysid.hardware.feetech.line import FeetechLine
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
 from pupper_sysid.hardware.lock import LOG, open_here
 from pupper_sysid.hardware.safety.guard import GuardedBus
@@ -47,119 +50,157 @@ PARK_WITHIN_S = 0.5
 
 _OPEN_WITHIN_S = 0.4
 _SOON_S = 10.0  # until then it is tried all the time, then once a second
-_GONE_S = 60.0
-_SAY_EVERY_S = 60.0
+_GONE_S = 10.0
+_SAY_EVERY_S, _LONGEST_SILENCE_S = 60.0, 3600.0
 _RESTORE_WITHIN_S = 10.0
+
+
+@dataclass
+class _Orders:
+    """What the driver wants done if it is gone."""
+
+    address: BusAddress
+    joint_map: JointMap
+    driver: int
+    pose_rad: dict[str, float] = field(default_factory=dict)
+    """Joints whose torque is on, and where they were found."""
+    only_limp: bool = False
+    """Leave the way back out."""
+    registers: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Values to be set back, by joint and name."""
+    patience_s: float = HANG_S
+    done: bool = False
+    """The driver needs no watchdog any more."""
+
+    def take(self, line: bytes) -> None:
+        """Take a message of the driver."""
+        try:
+            message: dict[str, Any] = json.loads(line)
+        except ValueError:  # half of one: the pipe was full
+            message = {"limp": True}
+        self.done |= "bye" in message
+        self.patience_s = SWITCH_ON_S if "arm" in message else HANG_S
+        if "arm" in message:
+            self.pose_rad, self.only_limp = message["arm"], False
+        if "disarm" in message:
+            self.pose_rad = {}
+        self.only_limp |= "limp" in message
+        self.registers = message.get("registers", self.registers)
 
 
 def main() -> None:
     """Wait for messages of the driver; park the robot if it is gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    orders = json.loads(sys.stdin.buffer.readline())
+    orders = first_orders(json.loads(sys.stdin.buffer.readline()))
     sys.stdout.write("ready\n")
     sys.stdout.flush()
-    pipe, received, pose, only_limp = sys.stdin.fileno(), b"", None, False
-    answers = sys.stdout.fileno()
+    with contextlib.suppress(Exception):  # of whatever kind: servos may be on
+        _follow(orders, sys.stdin.fileno(), sys.stdout.fileno())
+    if orders.done:
+        return
+    if orders.pose_rad:
+        park(orders)
+    if orders.registers:
+        restore(orders)
+
+
+def first_orders(message: dict[str, Any]) -> _Orders:
+    """Orders of the first message of `Watchdog`: address, joint map, and the driver's id."""
+    joint_map = joint_map_from(message["map"], "the joint map")
+    if message["coordinates"] == "servo":
+        joint_map = joint_map.per_servo()
+    address = BusAddress(message["kind"], message["where"], message["baud"])
+    return _Orders(address, joint_map, message["driver"])
+
+
+def _follow(orders: _Orders, pipe: int, answers: int) -> None:
+    """Take messages until the driver is gone, hangs, or needs no watchdog any more."""
     os.set_blocking(answers, False)
-    registers: dict[str, dict[str, int]] = {}
-    last, patience_s = time.monotonic(), HANG_S
-    while True:
+    received, last = b"", time.monotonic()
+    while not orders.done:
         ready, _, _ = select.select([pipe], [], [], 0.1)
-        if ready:
-            data = os.read(pipe, 65_536)
-            last = time.monotonic()
-            *lines, received = (received + data).split(b"\n")
-            for line in lines:
-                message = json.loads(line)
-                if "bye" in message:
-                    return
-                patience_s = SWITCH_ON_S if "arm" in message else HANG_S
-                if "arm" in message:
-                    pose, only_limp = message["arm"], False
-                if "disarm" in message:
-                    pose = None
-                only_limp |= "limp" in message
-                registers = message.get("registers", registers)
-            with contextlib.suppress(OSError):  # nobody reads, or the driver is gone
-                os.write(answers, b"." * len(lines))
-            if not data:
-                break
-        elif pose is not None and time.monotonic() - last > patience_s:
-            with contextlib.suppress(OSError):
-                os.kill(orders["driver"], signal.SIGKILL)
-            break
-    if pose is not None:
-        park(orders, pose, only_limp)
-    if registers:
-        restore(orders, registers)
+        if not ready:
+            if orders.pose_rad and time.monotonic() - last > orders.patience_s:
+                with contextlib.suppress(OSError):
+                    os.kill(orders.driver, signal.SIGKILL)
+                return
+            continue
+        data = os.read(pipe, 65_536)
+        last = time.monotonic()
+        *lines, received = (received + data).split(b"\n")
+        for line in lines:
+            orders.take(line)
+        with contextlib.suppress(OSError):  # nobody reads, or the driver is gone
+            os.write(answers, b"." * len(lines))
+        if not data:
+            return
 
 
-def park(orders: dict[str, Any], pose_rad: dict[str, float], only_limp: bool = False) -> None:
+def park(orders: _Orders) -> None:
     """Open the bus that the driver has left; park the robot, or only switch its torque off.
 
-    All joints go back together if they answer soon; those that do not are tried again by
-    themselves. Where a joint's angle takes two servos (joint coordinates), a servo that does not
-    answer prevents the way back of the others: only the torque of all is switched off then.
-
-    Parameters
-    ----------
-    orders : dict
-        First message of `Watchdog`: address and joint map.
-    pose_rad : dict of str to float
-        Joints whose torque is on, and where they were found.
-    only_limp : bool
-        Leave the way back out.
+    All joints go back together if the bus can be opened soon, and all of them answer; after that
+    they are only switched off, those that do not answer too.
     """
-    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
-    joint_map = joint_map_from(orders["map"], "the joint map") if orders["map"] else None
-    servo_map = joint_map.per_servo() if joint_map else None
-    if orders["coordinates"] == "servo":
-        joint_map = servo_map
-    left, start = list(pose_rad), time.monotonic()
-    said_s, present_s = start + _SOON_S, start
+    left, start = list(orders.pose_rad), time.monotonic()
+    say_s, silence_s, present_s = start + _SOON_S, _SAY_EVERY_S, start
     while left:
         now = time.monotonic()
-        if _is_there(address):
+        if _is_there(orders.address):
             present_s = now
-        elif now - present_s > _GONE_S:
-            _say(f"{address.where} has been gone for {_GONE_S:g} s; {_may_be_on(left)}")
+        elif now - present_s > _GONE_S and not _can_come_back(orders.address):
+            _say(f"{orders.address.where} is gone for good; {_may_be_on(left)}")
             return
-        if now > said_s:
-            _say(f"{address.where}: {_may_be_on(left)} It is tried on.")
-            said_s = now + _SAY_EVERY_S
+        if now > say_s:
+            _say(f"{orders.address.where}: {_may_be_on(left)} It is tried on.")
+            say_s, silence_s = now + silence_s, min(2 * silence_s, _LONGEST_SILENCE_S)
         try:
-            answering, late = left, now - start > _OPEN_WITHIN_S
-            if late:
-                answering = _answering(address, servo_map, left)
-                only_limp |= joint_map is not servo_map and len(answering) < len(left)
-            bus, owned = _open(address, servo_map if only_limp else joint_map, answering, late)
-        except PupperError:
+            if orders.only_limp or now - start > _OPEN_WITHIN_S:
+                left = _limp(orders, left)
+            else:
+                left = _go_home(orders)
+        except Exception:  # of whatever kind, a lack of memory too: the torque may be on
             # the driver's lock goes with its last thread, which can take a moment
             time.sleep(0.02 if now - start < _SOON_S else 1.0)
             continue
-        guard = GuardedBus(bus, GuardLimits(park_within_s=PARK_WITHIN_S))
-        try:
-            if not only_limp and owned:
-                _go_home(guard, pose_rad)
-            if guard.torque(False):  # else the servos that did not confirm are tried again
-                left = [name for name in left if name not in guard.joint_names]
-        finally:
-            guard.close()
         if left and now - start > _SOON_S:
             time.sleep(1.0)
 
 
-def _open(
-    address: BusAddress, joint_map: JointMap | None, joints: list[str] | None, late: bool
-) -> tuple[ServoBus, bool]:
-    """The bus, and whether it is this process's alone; if `late`, it need not be."""
+def _go_home(orders: _Orders) -> list[str]:
+    """Park all joints where they were found; those that did not confirm that they are limp."""
+    joints = list(orders.pose_rad)
+    guard = GuardedBus(
+        open_bus(orders.address, orders.joint_map, joints),
+        GuardLimits(park_within_s=PARK_WITHIN_S),
+    )
     try:
-        return open_bus(address, joint_map, joints), True
+        guard.take_over()
+        guard.park(np.array([orders.pose_rad[name] for name in guard.joint_names]))
     except PupperError:
-        if not late:
-            raise
-        return open_bus(address, joint_map, joints, exclusive=False), False
+        guard.limp()
+    finally:
+        limp = guard.torque(False)
+        guard.close()
+    return [] if limp else joints
+
+
+def _limp(orders: _Orders, joints: list[str]) -> list[str]:
+    """Switch the torque off, whoever holds the lock; those of `joints` that did not confirm it."""
+    address, joint_map = orders.address, orders.joint_map.per_servo()
+    if address.kind == "feetech":
+        joint_map = joint_map.select(joints)
+        # first without waiting for anything: it reaches servos that hear but do not answer, too
+        line = FeetechLine(address.where, address.baud or AUTO_BAUDS[0], exclusive=False)
+        line.torque_off(joint_map.ids)
+        line.close()
+    bus = open_bus(address, joint_map, exclusive=False)
+    try:
+        limp = bus.torque(False)
+    finally:
+        bus.close()
+    return [name for name in joints if not limp or name not in bus.joint_names]
 
 
 def _is_there(address: BusAddress) -> bool:
@@ -175,6 +216,12 @@ def _is_there(address: BusAddress) -> bool:
         except OSError:
             return True
     return True
+
+
+def _can_come_back(address: BusAddress) -> bool:
+    """Whether a line that is gone may be plugged in or served again, with the same servos."""
+    terminal = os.path.realpath(address.where).startswith("/dev/pts/")
+    return os.path.isdir(os.path.dirname(address.where) or ".") and not terminal
 
 
 def _may_be_on(joints: list[str]) -> str:
@@ -197,24 +244,13 @@ def _say(text: str) -> None:
         os.close(descriptor)
 
 
-def restore(orders: dict[str, Any], registers: dict[str, dict[str, int]]) -> None:
-    """Set registers back; tries for some seconds. The torque is off.
-
-    Parameters
-    ----------
-    orders : dict
-        First message of `Watchdog`.
-    registers : dict
-        Values by joint and name.
-    """
-    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
-    servo_map = (
-        joint_map_from(orders["map"], "the joint map").per_servo() if orders["map"] else None
-    )
-    start = time.monotonic()
+def restore(orders: _Orders) -> None:
+    """Set the registers back; tries for some seconds. The torque is off."""
+    start, registers = time.monotonic(), orders.registers
+    joint_map = orders.joint_map.per_servo()
     while registers and time.monotonic() - start < _RESTORE_WITHIN_S:
         try:
-            bus, _ = _open(address, servo_map, list(registers), late=True)
+            bus = open_bus(orders.address, joint_map, list(registers), exclusive=False)
         except PupperError:
             time.sleep(0.02)
             continue
@@ -222,25 +258,6 @@ def restore(orders: dict[str, Any], registers: dict[str, dict[str, int]]) -> Non
         changed.restore()
         registers = changed.found
         bus.close()
-
-
-def _go_home(guard: GuardedBus, pose_rad: dict[str, float]) -> None:
-    """Park the joints of this bus where they were found; torque off where that is impossible."""
-    try:
-        guard.take_over()
-        guard.park(np.array([pose_rad[name] for name in guard.joint_names]))
-    except PupperError:
-        guard.limp()
-
-
-def _answering(address: BusAddress, servo_map: JointMap | None, joints: list[str]) -> list[str]:
-    """Those of `joints` whose servos answer."""
-    bus, _ = _open(address, servo_map, None, late=True)
-    bus.close()
-    found = [name for name in joints if name in bus.joint_names]
-    if not found:
-        raise BusError("None of the joints answers.")
-    return found
 
 
 if __name__ == "__main__":

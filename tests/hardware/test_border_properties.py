@@ -36,7 +36,7 @@ def joint_maps(draw) -> JointMap:
         data["joints"][joint] = entry | {
             "sign": draw(st.sampled_from([1, -1])),
             "neutral_rad": neutral,
-            "counts_per_rad": draw(st.floats(50, 800)),
+            "counts_per_rad": draw(st.floats(70, 400)),
             "offset_counts": draw(st.integers(-100, 100)),
             "limits_counts": (low, draw(st.integers(650, 1023))),
             # around the neutral, where the counts always have room

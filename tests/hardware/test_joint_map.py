@@ -336,6 +336,26 @@ def test_a_bad_line_in_a_file_is_named_with_its_number(tmp_path, pupper):
         load_joint_map(path)
 
 
+def test_a_named_servo_s_scale_is_held_to_its_data_sheet():
+    """652 counts per radian are 4,096 a turn; 900 is within the bounds of an unknown servo only."""
+    data = load_joint_map("sts3215").file.model_dump(by_alias=True)
+
+    def scaled(counts_per_rad: float, servo: str | None):
+        hip = data["joints"]["LF_hip"] | {"counts_per_rad": counts_per_rad}
+        return data | {"servo": servo, "joints": data["joints"] | {"LF_hip": hip}}
+
+    for servo in ("STS3215", None):
+        with pytest.raises(InputError, match="LF_hip: counts_per_rad is 6519"):
+            joint_map_from(scaled(6519.0, servo), "mine")
+    with pytest.raises(InputError, match="is 900, but the STS3215 has 651.9"):
+        joint_map_from(scaled(900.0, "STS3215"), "mine")
+    joint_map_from(scaled(900.0, None), "mine")
+
+
+def test_the_largest_scale_reported_of_the_mini_pupper_is_accepted():
+    joint_map_from(edited(put("LF_hip", counts_per_rad=350.0, limits_counts=(300, 700))), "mine")
+
+
 def test_a_missing_file_gives_a_sentence_with_the_presets(tmp_path):
     with pytest.raises(InputError, match="does not exist. Presets of joint maps: mini_pupper_2,"):
         load_joint_map(tmp_path / "joints.yaml")

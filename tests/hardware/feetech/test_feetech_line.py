@@ -469,6 +469,15 @@ def test_a_joint_map_of_the_wrong_frame_or_counts_is_refused(preset, sentence):
         FeetechBus(server.device, 1_000_000).close()
 
 
+def test_a_joint_map_of_another_model_is_refused():
+    data = load_joint_map("sts3215").file.model_dump(by_alias=True) | {"servo": "STS3250"}
+    with (
+        on_a_port(still_servos()) as server,
+        pytest.raises(InputError, match="is for STS3250 servos; these are STS3215"),
+    ):
+        FeetechBus(server.device, 1_000_000, joint_map_from(data, "mine"))
+
+
 def test_a_map_may_give_a_servo_any_id():
     servos = still_servos()
     data = load_joint_map("sts3215").file.model_dump(by_alias=True)
