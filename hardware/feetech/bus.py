@@ -20,12 +20,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.data_sheet import data_sheet, no_load_speed
+from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
-from pupper_sysid.hardware.feetech.line import FRAME_BYTES, FeetechLine, Reply, known_models
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
+from pupper_sysid.hardware.feetech.line import FRAME_BYTES, Reply
+from pupper_sysid.hardware.feetech.opening import (
+    answering_joints,
+    fitting_map,
+    known_series,
+    open_line,
+)
+from pupper_sysid.hardware.feetech.protection import PROTECTIONS, protections_to_set
+from pupper_sysid.hardware.feetech.registers import STS3215, Series
 from pupper_sysid.hardware.feetech.settings import (
     VOLT_SCALE,
     memory_of,
@@ -35,9 +42,6 @@ from pupper_sysid.hardware.feetech.settings import (
     write_register,
 )
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-
-AUTO_BAUDS = (1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400)
-"""Baud rates tried, in this order, where none is given."""
 
 LOAD_SCALE = 1e-3
 
@@ -108,19 +112,20 @@ class FeetechBus(HostClock):
         wanted = wanted.select(joints) if joints else wanted
         self.line, found = open_line(device, baud, wanted.ids, exclusive)
         try:
-            series = _known(found, device)
-            names = _answering(wanted, series, joints is not None, self.line)
-            self.joint_map = _fitting(joint_map, series, device).select(names)
+            series = known_series(found, device)
+            names = answering_joints(wanted, series, joints is not None, self.line)
+            self.joint_map = fitting_map(joint_map, series, device).select(names)
             self._servos = [_Servo(i, series[i]) for i in self.joint_map.ids]
             super().__init__()
             self._turn = 0
             self._doubts_s: list[float] = []
             self.joint_names = self.joint_map.joint_names
             self.limits = self.joint_map.position_limits()
-            self._setups = {
-                joint: setup_of(s.id, s.series, memory_of(self.line, s.id))
-                for joint, s in zip(self.joint_names, self._servos, strict=True)
-            }
+            self._setups, self._unprotected = {}, {}
+            for joint, servo in zip(self.joint_names, self._servos, strict=True):
+                memory = memory_of(self.line, servo.id)
+                self._setups[joint] = setup_of(servo.id, servo.series, memory)
+                self._unprotected[joint] = _protections(servo.series, memory)
             self.metadata: dict[str, Any] = self._describe(device)
         except BaseException:
             self.line.close()
@@ -194,6 +199,10 @@ class FeetechBus(HostClock):
     def servo_setups(self) -> dict[str, dict[str, Any]]:
         """Model, firmware, gains and registers of each servo, as found when the bus was opened."""
         return {joint: dict(setup) for joint, setup in self._setups.items()}
+
+    def protections_to_set(self) -> dict[str, dict[str, int]]:
+        """By joint, registers whose protection was weaker than the factory's when opened."""
+        return {joint: own for joint, own in self._unprotected.items() if own}
 
     def register(self, joint: str, name: str) -> int:
         """Present value of a register; see `hardware.bus.RegisterBus`."""
@@ -324,98 +333,9 @@ class FeetechBus(HostClock):
         return known | self.joint_map.metadata()
 
 
-def open_line(
-    device: str, baud: int | None, ids: Sequence[int], exclusive: bool = True
-) -> tuple[FeetechLine, dict[int, int | Series]]:
-    """Open a line at the first of the baud rates at which a servo answers.
-
-    Returns it with those of `ids` that answer, and their series or unknown model number.
-
-    Raises
-    ------
-    BusError
-        If the port cannot be opened, or no servo answers.
-    """
-    for rate in (baud,) if baud else AUTO_BAUDS:
-        line = FeetechLine(device, rate, exclusive)
-        line.detect_echo()
-        found = line.find(ids)
-        if found:
-            return line, found
-        line.close()
-    raise BusError(
-        f"{device}: no servo answers at {rates_in_words(baud)} baud (tried ids {_span(ids)}). "
-        "Check that the servos have power, the data line is connected, and their ids, with "
-        f"`pupper-sysid scan --bus feetech:{device}`."
-    )
-
-
-def rates_in_words(baud: int | None) -> str:
-    """Baud rates that are tried, for a message."""
-    return str(baud) if baud else ", ".join(map(str, AUTO_BAUDS))
-
-
-def _known(found: dict[int, int | Series], device: str) -> dict[int, Series]:
-    """Series of the servos found; an unknown model is refused."""
-    for servo, model in found.items():
-        if not isinstance(model, Series):
-            raise BusError(
-                f"{device}: servo {servo} has the model number {model}, which is not known; known "
-                f"are {known_models()}. Registers differ between series, so nothing is sent to it."
-            )
-    return {i: s for i, s in found.items() if isinstance(s, Series)}
-
-
-def _answering(
-    wanted: JointMap, series: dict[int, Series], all_of_them: bool, line: FeetechLine
-) -> list[str]:
-    """Joints of `wanted` whose servos answer; refused if none does, or not `all_of_them`."""
-    servos = dict(zip(wanted.joint_names, wanted.ids, strict=True))
-    answering = [j for j, i in servos.items() if i in series]
-    silent = [f"{j} (id {i})" for j, i in servos.items() if i not in series]
-    if (silent and all_of_them) or not answering:
-        raise BusError(
-            f"{line.device}: {', '.join(silent)} does not answer at {line.baud} baud. Check power "
-            "and wiring, choose the joints that are there, and list the servos with "
-            f"`pupper-sysid scan --bus feetech:{line.device}`."
-        )
-    return answering
-
-
-def _fitting(joint_map: JointMap | None, series: dict[int, Series], device: str) -> JointMap:
-    """The given map, or the preset for the servos found; refused if it does not fit them."""
-    names = {s.name for s in series.values()}
-    if len(names) != 1:
-        raise BusError(
-            f"{device}: servos of different series ({', '.join(sorted(names))}) share the line, "
-            "and their counts differ. Use one series per line."
-        )
-    one = next(iter(series.values()))
-    if joint_map is None:
-        preset = {SCS0009.name: "mini_pupper_2_direct", STS3215.name: "sts3215"}[one.name]
-        return load_joint_map(preset).per_servo()
-    if joint_map.frame != "raw":
-        raise InputError(
-            f"the joint map {joint_map.file.name} holds counts of the robot's proxy, and a direct "
-            "bus uses raw ones. Make a map with "
-            f"`pupper-sysid calibrate-joints --bus feetech:{device}`."
-        )
-    if joint_map.file.counts != one.counts:
-        raise InputError(
-            f"the joint map {joint_map.file.name} is for servos of {joint_map.file.counts} "
-            f"counts; these {one.name} have {one.counts}. Choose another map."
-        )
-    named = data_sheet(joint_map.file.servo) if joint_map.file.servo else None
-    if named and named.model_number != one.model:
-        raise InputError(
-            f"the joint map {joint_map.file.name} is for {named.name} servos; these are "
-            f"{one.name}. Choose another map."
-        )
-    return joint_map
-
-
-def _span(ids: Sequence[int]) -> str:
-    ids = sorted(ids)
-    if ids == list(range(ids[0], ids[-1] + 1)) and len(ids) > 2:
-        return f"{ids[0]} to {ids[-1]}"
-    return ", ".join(map(str, ids))
+def _protections(series: Series, memory: bytes | None) -> dict[str, int]:
+    """Protections to set of a servo with this memory; none if it could not be read."""
+    if memory is None:
+        return {}
+    known = [name for name in PROTECTIONS if name in series.registers]
+    return protections_to_set(series, {name: series.decode(name, memory) for name in known})

@@ -49,6 +49,7 @@ _COMMON = {
     "max_voltage": Register(14),
     "min_voltage": Register(15),
     "max_torque": Register(16, 2),
+    "unload_condition": Register(19),
     "p": Register(21),
     "d": Register(22),
     "i": Register(23),
@@ -137,6 +138,9 @@ STS3215 = Series(
     | {
         "homing_offset": Register(31, 2, _OFFSET_SIGN),
         "mode": Register(33),
+        "protective_torque": Register(34),
+        "protection_time": Register(35),
+        "overload_torque": Register(36),
         "goal_position": Register(42, 2, 15),
         "torque_limit": Register(48, 2),
         "present_position": Register(56, 2, 15),

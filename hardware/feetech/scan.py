@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.feetech.bus import AUTO_BAUDS, rates_in_words
 from pupper_sysid.hardware.feetech.line import FeetechLine
+from pupper_sysid.hardware.feetech.opening import AUTO_BAUDS, rates_in_words
 from pupper_sysid.hardware.feetech.registers import HIGHEST_ID, Series, error_words
 from pupper_sysid.hardware.feetech.settings import VOLT_SCALE, memory_of
 

@@ -17,7 +17,6 @@ to what was found, and the watchdog does if this process dies.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,16 +26,12 @@ from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.moves import raised_cosine
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
+from pupper_sysid.hardware.safety.rates import RateLimit
 from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 _HEARTBEAT_S = 0.1
 _PARK_PERIOD_S = 0.02
-_FIRST_TICK_S = 0.02  # until the driver's own rate is known
-_LATE = 1.5  # a pause does not save up for a jump: so many ticks at most
-_SHORTEST_TICK_S, _LONGEST_TICK_S = 0.001, 0.06
-_REST_S = 0.1  # longer than any tick: the command has been at rest
-_RECENT_TICKS = 9
 _TORQUE_OFF_TRIES = 10
 _STALE_S = 0.1  # older than any feedback age
 _LOCATE_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
@@ -90,8 +85,7 @@ class GuardedBus:
         self._present_s = np.full(len(bus.joint_names), -np.inf)
         self._sent: Angles | None = None
         self._sent_s = -np.inf
-        self._velocity = np.zeros(len(bus.joint_names))
-        self._ticks: deque[float] = deque(maxlen=_RECENT_TICKS)
+        self._rates = RateLimit(self.limits, self.guard.speed_rad_s, self.guard.acceleration_rad_s2)
         self._monitor = Monitor(bus, self.guard)
         self.registers = ChangedRegisters(bus, watchdog)
 
@@ -146,9 +140,11 @@ class GuardedBus:
         now = self.bus.now()
         if self._sent is None:
             self._check_first(allowed)
-            self._velocity[:] = 0.0
+            self._rates.rest()
         else:
-            allowed = self._limit_rates(allowed, now - self._sent_s)
+            slower = self._rates.limited(allowed, self._sent, now - self._sent_s)
+            self.report.slowed += slower is not allowed
+            allowed = slower
         sent = self.bus.write(allowed)
         self._beat()
         if np.isfinite(sent.time_s):
@@ -164,8 +160,8 @@ class GuardedBus:
         Raises
         ------
         BusError
-            If a position is missing, or a servo did not confirm that its torque is on; the torque
-            of all is switched off then.
+            If a position is missing, a servo does not take a protection that it lacks, or a servo
+            did not confirm that its torque is on; the torque of all is switched off then.
         """
         if not on:
             self._torque_off()
@@ -175,6 +171,7 @@ class GuardedBus:
             self._present[self.bus.now() - self._present_s > _STALE_S] = np.nan
             self._home = None
         home = self._locate()
+        self._protect()
         if self._watchdog:
             # before the first servo is on: a driver killed from here on leaves some that are
             self._watchdog.arm(self.joint_names, home)
@@ -291,6 +288,14 @@ class GuardedBus:
         if interrupted:
             raise interrupted
 
+    def _protect(self) -> None:
+        """Switch servos' own protections on that somebody has switched off, until `close`."""
+        weak = getattr(self.bus, "protections_to_set", dict)()
+        for joint, own in weak.items():
+            for name, value in own.items():
+                if name not in self.registers.found.get(joint, {}):
+                    self.set_register(joint, name, value)
+
     def _beat(self) -> None:
         if self._watchdog:
             try:
@@ -330,30 +335,6 @@ class GuardedBus:
             share = min((self.bus.now() - start) / duration, 1.0)
             self.write(origin + raised_cosine(share) * way)
             self.read()
-
-    def _limit_rates(self, command: Angles, since_s: float) -> Angles:
-        """`command`, or a point towards it that the speed and acceleration limits allow."""
-        assert self._sent is not None
-        wanted, here = self.limits.servo_angles(command), self.limits.servo_angles(self._sent)
-        tick = float(np.median(self._ticks)) if self._ticks else _FIRST_TICK_S
-        dt = max(min(since_s, _LATE * tick), 1e-4)
-        if since_s > _REST_S:  # a new start
-            self._velocity[:], dt = 0.0, min(tick, _FIRST_TICK_S)
-        else:
-            self._ticks.append(min(max(since_s, _SHORTEST_TICK_S), _LONGEST_TICK_S))
-        asked = (wanted - here) / dt
-        gain = self.guard.acceleration_rad_s2 * dt
-        low = np.maximum(np.minimum(self._velocity, 0.0) - gain, -self.guard.speed_rad_s)
-        high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self.guard.speed_rad_s)
-        velocity = np.clip(asked, low, high)
-        limited = velocity != asked
-        # over all of a late tick the joint was slower than that
-        self._velocity = velocity * min(dt / min(max(since_s, 1e-4), _LONGEST_TICK_S), 1.0)
-        if not limited.any():
-            return command
-        self.report.slowed += 1
-        slower = np.where(limited, here + velocity * dt, wanted)
-        return self.limits.clip(self.limits.from_servo_angles(slower))
 
     def _check_first(self, allowed: Angles) -> None:
         """Refuse a first command, within the limits, that would make a joint jump."""

@@ -33,8 +33,8 @@ import numpy as np
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.connect import open_bus
-from pupper_sysid.hardware.feetech.bus import AUTO_BAUDS
 from pupper_sysid.hardware.feetech.line import FeetechLine
+from pupper_sysid.hardware.feetech.opening import AUTO_BAUDS
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
 from pupper_sysid.hardware.lock import LOG, open_here
 from pupper_sysid.hardware.safety.guard import GuardedBus

@@ -30,19 +30,22 @@ from pupper_sysid.sim.emulator.faults import BusFaults, with_wrong_length
 from pupper_sysid.sim.emulator.servo_bench import AMBIENT_C, ServoBench
 
 MEMORY_BYTES = 80
+_OVERLOAD = 32  # of `hardware.feetech.registers.ERROR_BITS`
 
 _SETTINGS = {
     "SCS0009": {
         "firmware_major": 0, "firmware_minor": 16, "return_delay": 0, "response_level": 1,
         "min_angle": 20, "max_angle": 1003, "max_temperature": 80, "max_voltage": 84,
         "min_voltage": 40, "max_torque": 1000, "p": 15, "d": 15, "i": 0, "min_start_force": 24,
-        "dead_zone_cw": 1, "dead_zone_ccw": 1,
+        "dead_zone_cw": 1, "dead_zone_ccw": 1, "unload_condition": 37,
     },
     "STS3215": {
         "firmware_major": 3, "firmware_minor": 9, "return_delay": 250, "response_level": 1,
         "min_angle": 0, "max_angle": 4095, "max_temperature": 70, "max_voltage": 80,
         "min_voltage": 40, "max_torque": 1000, "p": 32, "d": 32, "i": 0, "min_start_force": 16,
         "dead_zone_cw": 1, "dead_zone_ccw": 1, "torque_limit": 1000, "mode": 0,
+        "unload_condition": 44, "protective_torque": 20, "protection_time": 200,
+        "overload_torque": 80,
     },
 }  # fmt: skip
 
@@ -56,6 +59,9 @@ class _Servo:
     faulty_until: float = -np.inf
     frozen_count: int = 0
     error: int = 0
+    loaded_since: float = np.inf
+    overloaded: bool = False
+    """Its protection has acted; until its power is switched off."""
 
 
 class FeetechEmulator:
@@ -199,6 +205,7 @@ class FeetechEmulator:
             return []
         self._refresh(servo_id, begin)
         error = servo.error if begin < servo.faulty_until else 0
+        error |= _OVERLOAD * servo.overloaded
         frame = Frame(servo_id, error, bytes(servo.memory[address : address + size]))
         answer = frame.encode()
         # the answer of another servo to another request
@@ -260,6 +267,24 @@ class FeetechEmulator:
         self._set(servo_id, "present_load", self.bench.load(k))
         self._set(servo_id, "present_voltage", round(10 * self.bench.supply_v))
         self._set(servo_id, "present_temperature", round(AMBIENT_C))
+        self._protect(servo_id, at)
+
+    def _protect(self, servo_id: int, at: float) -> None:
+        """The servo's own overload protection, as its registers have it."""
+        if "overload_torque" not in self.series.registers:
+            return
+        servo, k = self.servos[servo_id], self.bench.index_of_id[servo_id]
+        loaded = abs(self._get(servo_id, "present_load")) > 10 * self._get(
+            servo_id, "overload_torque"
+        )
+        servo.loaded_since = min(servo.loaded_since, at) if loaded else np.inf
+        lasted_s = at - servo.loaded_since
+        enabled = self._get(servo_id, "unload_condition") & _OVERLOAD
+        if enabled and lasted_s >= 0.01 * self._get(servo_id, "protection_time"):
+            servo.overloaded = True
+            if "torque_limit" in self._acting:
+                limit = 10 * self._get(servo_id, "protective_torque")
+                self.bench.set_register(k, at, "torque_limit", limit)
 
     def _set(self, servo_id: int, name: str, value: int) -> None:
         register = self.series.registers[name]

@@ -12,9 +12,10 @@ from scservo_sdk import scservo_def
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech import scan
-from pupper_sysid.hardware.feetech.bus import FeetechBus, open_line
+from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.feetech.frames import Frame
 from pupper_sysid.hardware.feetech.line import FeetechLine
+from pupper_sysid.hardware.feetech.opening import open_line
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
 from pupper_sysid.hardware.feetech.settings import memory_of
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map

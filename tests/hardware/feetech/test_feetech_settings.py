@@ -17,10 +17,13 @@ from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.bus import FeetechBus
+from pupper_sysid.hardware.feetech.line import FeetechLine
+from pupper_sysid.hardware.feetech.protection import PROTECTIONS
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.feetech.settings import EEPROM_END
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
-from support.servo_servers import on_a_port, still_servos
+from support.servo_servers import bench_of, on_a_port, still_servos, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -126,3 +129,88 @@ def test_registers_of_servos_that_were_unplugged_are_set_back_once_they_return(s
     while p_of(sts) != 32:
         assert time.monotonic() < until, "the gain was not set back"
         time.sleep(0.02)
+
+
+def set_protection(server, **values: int) -> None:
+    for name, value in values.items():
+        server.emulator._set(1, name, value)
+
+
+def protection(server) -> dict[str, int]:
+    return {name: server.emulator._get(1, name) for name in PROTECTIONS}
+
+
+FACTORY = {
+    "unload_condition": 44, "protective_torque": 20, "protection_time": 200, "overload_torque": 80,
+}  # fmt: skip
+OFF = {
+    "unload_condition": 8, "protective_torque": 100, "protection_time": 0, "overload_torque": 100,
+}  # fmt: skip
+
+
+def test_protections_that_are_off_are_on_while_the_torque_is_and_off_again_at_the_end(sts):
+    set_protection(sts, **OFF)
+    guard = GuardedBus(FeetechBus(sts.device))
+    assert protection(sts) == OFF, "nothing is written before the torque is switched on"
+    guard.torque(True)
+    assert protection(sts) == FACTORY
+    assert sts.emulator.servos[1].memory[STS3215.lock_address] == 1
+    guard.torque(False)
+    guard.torque(True)
+    guard.close()
+    assert protection(sts) == OFF
+
+
+def test_protections_of_the_factory_or_stronger_are_left_alone(sts):
+    own = FACTORY | {"overload_torque": 25, "protective_torque": 10}
+    set_protection(sts, **own)
+    written, store = [], sts.emulator._store
+    sts.emulator._store = lambda servo, at, *rest: (written.append(at), store(servo, at, *rest))
+    guard = GuardedBus(FeetechBus(sts.device))
+    guard.torque(True)
+    guard.close()
+    assert protection(sts) == own and min(written) >= EEPROM_END
+
+
+def test_the_torque_stays_off_if_a_servo_does_not_take_its_protection(sts):
+    set_protection(sts, **OFF)
+    servo, store = sts.emulator.servos[1], sts.emulator._store
+
+    def stubborn(servo_id: int, address: int, data: bytes, at: float) -> None:
+        store(servo_id, address, data, at)
+        servo.memory[19] = OFF["unload_condition"]
+
+    sts.emulator._store = stubborn
+    bench_of(sts.emulator).torques.clear()
+    guard = GuardedBus(FeetechBus(sts.device))
+    with pytest.raises(BusError, match="unload_condition did not take the value 44"):
+        guard.torque(True)
+    guard.close()
+    assert (1, True) not in bench_of(sts.emulator).torques
+
+
+PROTECTED = CHANGED.replace('bus.set_register("RF_hip", "p", 8)', "bus.torque(True)")
+
+
+@pytest.mark.wall_clock
+def test_the_watchdog_sets_protections_back_if_the_driver_is_killed(sts):
+    set_protection(sts, **OFF)
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROTECTED, f"feetech:{sts.device}"], stdout=subprocess.PIPE, cwd=ROOT
+    )
+    assert process.stdout is not None and process.stdout.readline() == b"changed\n"
+    assert protection(sts) == FACTORY
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert wait_until(lambda: protection(sts) == OFF, 12.0)
+
+
+def test_an_emulated_servo_that_is_blocked_reports_overload_after_its_protection_time(sts):
+    line = FeetechLine(sts.device, 1_000_000)
+    bench_of(sts.emulator).loads[1] = 900
+    set_protection(sts, protection_time=20)
+    began = time.monotonic()
+    while not (reply := line.read(1, 56, 6)) or not reply.frame.code & 32:
+        assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began > 0.19
+    line.close()
