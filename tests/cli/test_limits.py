@@ -1,0 +1,122 @@
+"""Limits and numbers of the command line, closed streams and full disks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pupper_sysid.cli.programs import pupper_deploy, pupper_sysid, pupper_train
+from support.command_line import refused, run
+
+SWEEP = Path(__file__).parents[2] / "data/samples/sweep.csv"
+COMMANDS = Path(__file__).parents[2] / "data/samples/walk_commands.csv"
+
+
+def wide(folder: Path, columns: int) -> Path:
+    path = folder / "wide.csv"
+    path.write_text(
+        ",".join(f"c{k}" for k in range(columns)) + "\n" + ",".join(["1"] * columns) + "\n"
+    )
+    return path
+
+
+def test_a_file_beyond_a_limit_names_the_option_that_reads_it(capsys, tmp_path):
+    path = wide(tmp_path, 3000)
+    said = refused(capsys, pupper_sysid, "import", path)
+    assert "has 3,000 columns; at most 2,000 columns are read" in said
+    assert said.endswith("raise the limits of reading with --read-limit 2.")
+    for words in (("--read-limit", "2"), ("--read-limit=2",)):
+        assert "columns are read" not in refused(capsys, pupper_sysid, "import", path, *words)
+
+
+@pytest.mark.parametrize("value", ["0", "0.5", "1001", "nan", "inf", "x", "4_1", "٣", ""])
+def test_the_limit_of_reading_is_a_number_from_1_to_1000(capsys, value):
+    assert "--read-limit" in refused(capsys, pupper_sysid, "doctor", SWEEP, "--read-limit", value)
+
+
+def test_the_limit_of_reading_needs_a_value(capsys):
+    assert "--read-limit needs a number" in refused(
+        capsys, pupper_sysid, "doctor", SWEEP, "--read-limit"
+    )
+
+
+@pytest.mark.parametrize("number", ["4_1", "٤١", "１０", "0x10", "1e", "4,1"])
+@pytest.mark.parametrize("option", ["--rate", "--duration", "--seed", "--loops"])
+def test_numbers_of_options_are_numerals_in_ascii(capsys, option, number):
+    code, out, err = run(capsys, "sweep", option, number)
+    assert code == 2 and out == "" and "is not a" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--duration", "1e12"), "--duration is 1e+12 s; it must be from 0.1 to 86400 s"),
+        (("--duration", "nan"), "--duration is nan"),
+        (("--rate", "1e12"), "--rate is 1e+12 Hz; it must be from 1 to 1000 Hz"),
+        (("--rate", "1e-12"), "--rate is 1e-12 Hz"),
+        (("--freqs", "0.001"), "at least 0.01 Hz"),
+        (("--playback", str(COMMANDS), "--loops", "1000000000000"), "from 1 to 1000"),
+        (("--duration", "86400", "--rate", "1000"), "rows; at most 5,000,000"),
+        (("--until", ""), "--until is empty"),
+        (("--joints", ""), "--joints is empty"),
+        (("--playback", "/dev/zero"), "/dev/zero is not a file"),
+    ],
+)
+def test_a_sweep_that_cannot_be_meant_is_refused_before_it_begins(
+    capsys, monkeypatch, tmp_path, words, says
+):
+    monkeypatch.chdir(tmp_path)
+    assert says in refused(capsys, pupper_sysid, "sweep", *words)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("ids", ["1-999999999999", "5-1", "٣", "", "1,", "0"])
+def test_ids_of_an_emulated_line_are_those_of_its_servos(capsys, ids):
+    assert "--ids" in refused(capsys, pupper_sysid, "emulate", "feetech", "--ids", ids)
+
+
+@pytest.mark.parametrize("words", [("--environments", "9" * 30), ("--minutes", "nan")])
+def test_a_training_that_cannot_be_meant_is_refused(capsys, words):
+    said = refused(capsys, pupper_train, "--actuator", "paper", *words)
+    assert f"{words[0].removeprefix('--')} is" in said
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize(
+    "words", [["sweep", "--help"], ["--help"], ["servo", "list"], ["servo", "list", "--json"]]
+)
+def test_help_that_cannot_be_printed_is_an_error_too(words):
+    with open("/dev/full", "w") as full:
+        ended = command(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.returncode == 2
+    assert "error: standard output: No space left on device." in ended.stderr
+    assert "Traceback" not in ended.stderr and "Exception" not in ended.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="streams are closed by a shell")
+@pytest.mark.parametrize("words", [["sweep", "--help"], ["servo", "list"], ["doctor", "none.csv"]])
+def test_a_program_whose_streams_are_closed_ends_as_ever(tmp_path, words):
+    expected = 2 if "none.csv" in words else 0
+    for closed in ((0, 1, 2), (1,), (2,)):
+
+        def close(streams=closed) -> None:
+            for stream in streams:
+                os.close(stream)
+
+        ended = command(words, cwd=tmp_path, preexec_fn=close)
+        assert ended.returncode == expected, closed
+
+
+def command(words, **how):
+    program = "from pupper_sysid.cli.programs.pupper_sysid import main; main()"
+    return subprocess.run([sys.executable, "-c", program, *words], check=False, **how)
+
+
+def test_a_script_or_log_that_never_ends_is_refused_at_once(capsys):
+    for option in ("--playback", "--replay"):
+        words = ["data/samples/policies/mlp"] if option == "--replay" else []
+        assert "is not a file" in refused(capsys, pupper_deploy, *words, option, "/dev/zero")
