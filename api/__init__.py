@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.servo_file import load_servo_model
     from pupper_sysid.servo_models.sparse_equation import SparseEquation
     from pupper_sysid.sim.walking.env import PupperEnv
+    from pupper_sysid.sysid.backlash.measure import backlash
     from pupper_sysid.sysid.compare.compare import compare
     from pupper_sysid.sysid.doctor.examination import examine
     from pupper_sysid.sysid.identify.calibrate import calibrate
@@ -45,6 +46,7 @@ _MODULES = {
     "examine": "sysid.doctor.examination",
     "lag": "sysid.identify.dead_time",
     "frequency_response": "sysid.lag.frequency_response",
+    "backlash": "sysid.backlash.measure",
     "calibrate": "sysid.identify.calibrate",
     "sparse_equations": "sysid.sparse.equations",
     "fit_servo": "sysid.servo_fit.fit",
@@ -79,6 +81,7 @@ __all__ = [
     "PupperError",
     "Recording",
     "SparseEquation",
+    "backlash",
     "calibrate",
     "compare",
     "examine",

@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.sysid.backlash import backlash
+from pupper_sysid.sysid.backlash.measure import backlash
 from support.strokes import stroked
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import pupper_sysid as ps
 from support.command_line import run
+from support.strokes import stroked
 
 SWEEP = Path("data/samples/sweep.csv")
 
@@ -92,6 +93,22 @@ def test_a_result_is_the_json_of_its_command(capsys, recording, command, functio
     assert found.to_dict() == json.loads(out)
     assert list(found.to_frame()["joint"].unique()) == ["LF_hip"]
     assert found.plot().axes
+
+
+def test_backlash_is_the_json_of_its_command_with_a_row_per_gain(capsys, tmp_path):
+    strokes, _ = stroked(3, 2.0, 0)
+    strokes.save(tmp_path / "strokes.csv")
+    code, out, err = run(capsys, "backlash", tmp_path / "strokes.csv", "--json")
+    assert code == 0, err
+    found = ps.backlash(ps.load(tmp_path / "strokes.csv"))
+    assert found.to_dict() == json.loads(out)
+    table, own = found.to_frame(), found["bench"]
+    assert list(table["joint"]) == ["bench", "bench"] and list(table["p_gain"]) == [8, 32]
+    assert list(table["hysteresis_rad_low"]) == [g.hysteresis_rad.low for g in own.gains]
+    assert own.backlash_rad and set(table["backlash_rad"]) == {own.backlash_rad.value}
+    (axes,) = found.plot().axes
+    assert axes.get_xlabel() == "P gain" and "bench: backlash 1.9" in axes.get_title(loc="left")
+    assert str(found).startswith("bench: hysteresis ") and "at P 32" in str(found)
 
 
 def test_a_joint_that_was_not_recorded_is_refused():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.backlash import backlash
+from pupper_sysid.sysid.backlash.measure import backlash
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.package import ROOT

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,8 @@ from scipy.stats import t as student
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.common.results import JointResults, Result
+from pupper_sysid.common.results import JointResults
+from pupper_sysid.sysid.backlash.results import GainHysteresis, JointBacklash
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -41,6 +43,9 @@ from pupper_sysid.sysid.recordings.joints import (
     joint_trials,
 )
 from pupper_sysid.sysid.recordings.recording import Trial
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FASTEST_RAD_S = 0.5
 """Faster strokes are no test of hysteresis: inertia counts."""
@@ -58,52 +63,18 @@ _DRAWS = 600
 _Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True)
-class GainHysteresis(Result):
-    """Hysteresis at one P gain.
-
-    Attributes
-    ----------
-    p_gain : float
-        NaN if the recording does not say it.
-    hysteresis_rad : Interval
-        Command difference between strokes up and down at the same reading and no speed.
-    lag_s : Interval
-        Lag behind a slow ramp: back-EMF over stiffness, and the dead time.
-    strokes : int
-    """
-
-    p_gain: float
-    hysteresis_rad: Interval
-    lag_s: Interval
-    strokes: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointBacklash(Result):
-    """Hysteresis, dead zone and backlash of one joint.
-
-    Attributes
-    ----------
-    gains : tuple of GainHysteresis
-    dead_zone_rad : Interval or None
-        Half of the hysteresis that does not shrink with the gain. Its lower end is 0 where friction
-        explains all; None with a single gain.
-    backlash_rad : Interval or None
-        Play between motor and output; None without a load that reveals it.
-    notes : tuple of str
-        What could not be told apart, and what would.
-    """
-
-    gains: tuple[GainHysteresis, ...]
-    dead_zone_rad: Interval | None
-    backlash_rad: Interval | None
-    notes: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Backlash(JointResults[JointBacklash]):
     """Hysteresis, dead zone and backlash by joint."""
+
+    def plot(self) -> Figure:
+        """Hysteresis over the P gain, a panel per joint: friction falls as 1/P, a dead zone stays.
+
+        The dashed line falls as 1/P from the lowest gain; the shaded band is twice the dead zone.
+        """
+        from pupper_sysid.sysid.backlash.figure import hysteresis_figure
+
+        return hysteresis_figure(self)
 
 
 @dataclass(frozen=True)
@@ -131,10 +102,22 @@ def backlash(recordings: Recordings, joints: Joints = None, seed: int = 0) -> Ba
     seed : int
         Of the bootstrap over strokes.
 
+    Returns
+    -------
+    Backlash
+        Hysteresis per P gain, dead zone and play, by joint.
+
     Raises
     ------
     InputError
         If a joint has too few slow strokes.
+
+    Examples
+    --------
+    >>> from pupper_sysid.sysid.recordings.files import load
+    >>> found = backlash(load("recordings/reversal.csv"))  # doctest: +SKIP
+    >>> print(found)  # doctest: +SKIP
+    bench: hysteresis 1.50° [1.48, 1.51] at P 8, …, backlash 1.92° [1.83, 2.00]
     """
     given = as_sequence(recordings)
     found = {

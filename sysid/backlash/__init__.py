@@ -1,0 +1,1 @@
+"""Hysteresis, dead zone and backlash of a servo from slow strokes."""
