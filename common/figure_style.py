@@ -132,17 +132,17 @@ def inline_svg(drawing: bytes, words: str) -> str:
 
 
 _VARIABLES = {
-    "#000000": "--ink", INK: "--ink", FAINT: "--drawing-faint", "#ffffff": "--drawing-paper",
-    _STYLE["grid.color"]: "--line", BLUE: "--drawing-blue", SKY: "--drawing-sky",
-    GREEN: "--drawing-green", ORANGE: "--drawing-orange", RED: "--drawing-red",
-    PINK: "--drawing-pink",
+    "#000000": "ink", INK: "ink", FAINT: "drawing-faint", "#ffffff": "drawing-paper",
+    _STYLE["grid.color"]: "line", BLUE: "drawing-blue", SKY: "drawing-sky",
+    GREEN: "drawing-green", ORANGE: "drawing-orange", RED: "drawing-red",
+    PINK: "drawing-pink",
 }  # fmt: skip
 _BY_HEX = {colour.lower(): name for colour, name in _VARIABLES.items()}
 
 
 def _variable(colour: str) -> str:
     name = _BY_HEX.get(colour.lower())
-    return f"var({name}, {colour})" if name else colour
+    return f"var(--{name}, {colour})" if name else colour
 
 
 def refuse_picture(path: Path, force: bool = False) -> None:

@@ -83,7 +83,7 @@ def walking_sections(
             ],
             notes=[
                 "Errors are of the mean velocity over a stride; of every instant they are in the "
-                "result of --json. A robot that fell counts as one that stands still until the "
+                "JSON result. A robot that fell counts as one that stands still until the "
                 "end. duty: share of time a foot is on the ground; slip: speed of feet on it; "
                 "speed: mean speed along the command over the commanded one."
             ],

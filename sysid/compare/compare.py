@@ -194,7 +194,7 @@ def _opened(
             name = f"{name} ({called if called != name else len(opened) + 1})"
         opened[name] = found
         notes += [
-            f"{called} was fitted to {inputs[h]}: its errors here are too small. Its contract "
+            f"{called} was fitted to {inputs[h]}: its errors here are too small. Its file "
             "holds those on unseen data."
             for h in found.fitted_to
             if h in inputs

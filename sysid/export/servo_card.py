@@ -104,10 +104,22 @@ def to_drive_card(
 
     Parameters
     ----------
-    name, servo, fits, recordings, source, load, notes
-        As for `to_card`.
+    name : str
+        Of the card.
+    servo : str
+        Manufacturer and model.
+    fits : dict of str to LoadedFit
+        By specimen, such as a joint.
     drives : dict of str to (float, float)
         By specimen: P gain [N·m/rad] and torque limit [N·m] that were set in the drive.
+    recordings : sequence of Recording
+        The data; names and hashes go into the card.
+    source : Source
+        Of the recordings.
+    load : str
+        What the drive moved, in words.
+    notes : sequence of str
+        Sentences for the reader.
 
     Raises
     ------

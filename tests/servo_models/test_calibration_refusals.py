@@ -80,7 +80,7 @@ def test_a_missing_file_is_refused_and_a_misspelt_preset_is_recognised(tmp_path)
         (b"? [1, 2]\n: 3\n", "not a plain word"),
         (b"&x a: 3\n", "not a plain word"),
         (b"a:\n  b: 1\n  b: 2\n", "line 3, a.b stands in the file twice"),
-        (b"[" * 1_000_000, "nested deeper"),
+        (b"[" * 1_000_000, "more than 20 levels of nesting"),
         (b"schema: pupper-calibration\n", "schema_version is null"),
         (b"schema: pupper-calibration\nschema_version: true\n", "schema_version is True"),
         (
@@ -109,7 +109,7 @@ def test_ten_megabytes_of_aliases_are_refused_at_once(tmp_path):
     path.write_text("a: &a [x, x]\nb: [" + "*a, " * 2_500_000 + "*a]\n")
     assert path.stat().st_size > 10_000_000
     start = time.perf_counter()
-    with pytest.raises(InputError, match="larger than 2 MB"):
+    with pytest.raises(InputError, match=r"at most 2\.0 MB are read"):
         load_calibration(path)
     assert time.perf_counter() - start < 1.0
 

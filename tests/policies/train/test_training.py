@@ -239,7 +239,7 @@ def test_a_termination_signal_ends_a_long_update_within_a_second(tmp_path):
 
 
 def test_time_that_is_up_ends_a_run_with_everything_saved(tmp_path):
-    train(tmp_path, tiny_run(minutes=1e-9))
+    train(tmp_path, tiny_run(minutes=0.001))
     found = read_checkpoint(tmp_path / LAST)
     assert found["iteration"] == 0 and found["more"]["imitated"] == 2
 
