@@ -347,9 +347,7 @@ class _Recorder:
             )
         )  # fmt: skip
 
-    def of(
-        self, condition: Condition, robots: slice, steps: int, commands: Array
-    ) -> _Kept:
+    def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> _Kept:
         force, speed, acceleration, along, alive = (
             np.stack([step[i][robots] for step in self._steps[:steps]]) for i in range(5)
         )

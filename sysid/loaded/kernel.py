@@ -181,3 +181,41 @@ def residuals(
                 low = track[row, i]
                 position = low + part * (track[row + 1, i] - low)
                 out[first + i, n] = position + values[first + i, OFFSET] - reading[n]
+
+
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
+def costs(
+    values, dead_time, run, p_gain, load, ramp_share, start, step, reading, noise, pad, h, stop, out
+):
+    """Soft-L1 cost of each candidate on one run: Σ sqrt(1 + r²) − 1, r a residual over the noise.
+
+    Parameters as for `residuals`, and
+
+    Parameters
+    ----------
+    noise : float
+        [rad].
+    out : ndarray, shape (candidates,)
+        Overwritten.
+    """
+    count, samples = len(out), len(step)
+    steps = min(int(np.ceil(np.max(step))) + 1, run.shape[1] - pad) if samples else 0
+    who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
+    offset, total = np.zeros(LANES), np.zeros(LANES)
+    for first in range(0, count, LANES):
+        used = fill_lanes(first, count, who)
+        _simulate(
+            values, dead_time, who, run, p_gain, load, ramp_share, start, steps, pad, h, stop, track
+        )
+        for i in range(LANES):
+            offset[i], total[i] = values[who[i], OFFSET], 0.0
+        for n in range(samples):
+            row = min(int(step[n]), steps - 1)
+            part, read = step[n] - row, reading[n]
+            for i in range(LANES):
+                low = track[row, i]
+                position = low + part * (track[row + 1, i] - low)
+                r = (position + offset[i] - read) / noise
+                total[i] += np.sqrt(1.0 + r * r) - 1.0
+        for i in range(used):
+            out[first + i] = total[i]

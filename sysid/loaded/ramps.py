@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.sysid.loaded import search
 from pupper_sysid.sysid.loaded.errors import correlation, noise_of
-from pupper_sysid.sysid.loaded.runs import Run, residuals
+from pupper_sysid.sysid.loaded.runs import Run, costs, residuals
 from pupper_sysid.sysid.loaded.search import Fit, Problem
 from pupper_sysid.sysid.loaded.structures import Scales, Structure
 
@@ -41,6 +41,14 @@ class EitherWay(Problem):
             better = _cost(on) <= _cost(off)
             chosen.append(np.where(better[:, None], on, off))
         return np.concatenate(chosen, axis=1)
+
+    def run_costs(
+        self, columns: NDArray[np.float64], dead_time_s: NDArray[np.float64], index: int
+    ) -> NDArray[np.float64]:
+        """As of `Problem`, of the better way."""
+        ways = _ways((self.runs[index],))
+        each = [costs(columns, dead_time_s, way[0], self.noise_rad[index]) for way in ways]
+        return np.minimum(*each)
 
     def scanned(self, fit: Fit) -> Fit:
         """The best local fit from the best limit at this point: the cost has many minima there."""

@@ -195,6 +195,19 @@ def residuals(
     return found
 
 
+def costs(
+    columns: NDArray[np.float64], dead_time_s: NDArray[np.float64], run: Run, noise_rad: float
+) -> NDArray[np.float64]:
+    """Soft-L1 cost of candidates on one run, shape (candidates,), without arrays of residuals."""
+    out = np.empty(len(columns))
+    kernel.costs(
+        columns, dead_time_s / run.step_s, run.held, run.p_gain, run.load, run.ramp_share,
+        run.start_rad, run.sample_step, run.sample_rad, noise_rad, run.rest, run.step_s,
+        -FRICTION_IMPEDANCE, out,
+    )  # fmt: skip
+    return out
+
+
 def free_run(
     structure: Structure, values: NDArray[np.float64], runs: Sequence[Run]
 ) -> list[NDArray[np.float64]]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sysid.loaded.runs import Run, residuals
+from pupper_sysid.sysid.loaded.runs import Run, costs, residuals
 from pupper_sysid.sysid.loaded.structures import Structure
 
 _CANDIDATES, _KEEP, _FINAL = 1024, 12, 4
@@ -22,6 +22,7 @@ _LINEAR = 0.02  # scale of coordinates that are no logarithms
 _POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 80, 30
 _CHAINS, _SETTLING, _DRAWING = 32, 120, 120
 _LARGEST_BATCH = 4_000_000  # residuals at once
+_TOGETHER = 64  # starts
 
 
 @dataclass(frozen=True)
@@ -50,15 +51,31 @@ class Problem:
         centre, sd = self.structure.prior
         return 0.5 * np.sum(((points - centre) / sd) ** 2, axis=-1)
 
-    def costs(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Cost of each of `points` (candidates, parameters)."""
-        samples = sum(len(r.sample_step) for r in self.runs)
-        batch = max(16, _LARGEST_BATCH // max(samples, 1) // 16 * 16)
-        found = []
-        for k in range(0, len(points), batch):
-            r = self.scaled(points[k : k + batch])
-            found.append(np.sum(np.sqrt(1.0 + r**2) - 1.0, axis=1))
-        return np.concatenate(found) + self.prior(points)
+    def run_costs(
+        self, columns: NDArray[np.float64], dead_time_s: NDArray[np.float64], index: int
+    ) -> NDArray[np.float64]:
+        """Cost of candidates on the run `index`."""
+        return costs(columns, dead_time_s, self.runs[index], self.noise_rad[index])
+
+    def costs(
+        self, points: NDArray[np.float64], ceiling: NDArray[np.float64] | float = np.inf
+    ) -> NDArray[np.float64]:
+        """Cost of each of `points` (candidates, parameters).
+
+        Parameters
+        ----------
+        points : ndarray, shape (candidates, parameters)
+        ceiling : ndarray, shape (candidates,), or float
+            A candidate that costs as much after some runs is not simulated on the others; its cost
+            is what it had by then.
+        """
+        found = self.prior(points)
+        values = self.structure.decode(points)
+        columns = self.structure.columns(values)
+        for index in range(len(self.runs)):
+            (left,) = np.nonzero(found < ceiling)
+            found[left] += self.run_costs(columns[left], values[left, 0], index)
+        return found
 
 
 @dataclass(frozen=True)
@@ -82,7 +99,7 @@ def search(
         Further starts, in fitted coordinates.
     """
     starts = _sobol(problem.structure, rng, _CANDIDATES)
-    best = starts[np.argsort(problem.costs(starts))[:_KEEP]]
+    best = _cheapest(problem, starts, _KEEP)
     if more is not None:
         best = np.concatenate([best, more])
     rough = _local(problem, best, _SHORT, _WIDE_STEP)
@@ -115,7 +132,7 @@ def evolve(
         trial = z + factor * (toward - z) + factor * (z[one] - z[two])
         keep = rng.random(z.shape) > 0.9
         trial = np.clip(np.where(keep, z, trial), low, high)
-        new = problem.costs(trial)
+        new = problem.costs(trial, cost)
         better = new < cost
         z[better], cost[better] = trial[better], new[better]
     return min(refine(problem, z[np.argsort(cost)[:2]]), *fits, key=lambda f: f.cost)
@@ -145,9 +162,10 @@ def sample(
     """
     low, high = problem.structure.box
 
-    def tempered(points: NDArray) -> NDArray[np.float64]:
+    def tempered(points: NDArray, ceiling: NDArray | float = np.inf) -> NDArray[np.float64]:
         prior = problem.prior(points)
-        return (problem.costs(points) - prior) / temperature + prior
+        whole = problem.costs(points, (ceiling - prior) * temperature + prior)
+        return (whole - prior) / temperature + prior
 
     k = len(low)
     spread = np.where(problem.structure.logarithmic, 0.1, 0.1 * _LINEAR)
@@ -163,8 +181,8 @@ def sample(
         scale = gamma * rng.uniform(0.6, 1.1, (_CHAINS, 1))
         proposal = z + scale * (z[one] - z[two]) + 1e-3 * rng.standard_normal(z.shape)
         inside = ((proposal >= low) & (proposal <= high)).all(axis=1)
-        new = tempered(np.clip(proposal, low, high))
-        accepted = inside & (np.log(rng.random(_CHAINS)) < cost - new)
+        most = cost - np.log(rng.random(_CHAINS))
+        accepted = inside & ((new := tempered(np.clip(proposal, low, high), most)) < most)
         z = np.where(accepted[:, None], proposal, z)
         cost = np.where(accepted, new, cost)
         if generation >= _SETTLING:
@@ -185,6 +203,17 @@ def _sobol(structure: Structure, rng: np.random.Generator, count: int) -> NDArra
     points = low + unit * (high - low)
     points[0] = centre
     return points
+
+
+def _cheapest(
+    problem: Problem, points: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """The `count` points of the lowest cost, the cheapest first; most others are given up early."""
+    found = np.full(len(points), np.inf)
+    for first in range(0, len(points), _TOGETHER):
+        part = slice(first, first + _TOGETHER)
+        found[part] = problem.costs(points[part], np.partition(found, count - 1)[count - 1])
+    return points[np.argsort(found)[:count]]
 
 
 def _local(

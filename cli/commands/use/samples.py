@@ -48,4 +48,3 @@ class Samples:
             f"Wrote {len(files)} files. Next: pupper-sysid delay {self.out / 'sweep.csv'}",
             soft_wrap=True,
         )
-
