@@ -111,6 +111,13 @@ class LoadedServoParameters:
         """The numbers as arrays, by name."""
         return {f.name: np.asarray(getattr(self, f.name), float) for f in fields(self)}
 
+    def beyond_delayed_pd(self) -> tuple[str, ...]:
+        """Terms of this servo that `DelayedPD`, and with it simulators' actuators, do not have."""
+        own = self.arrays()
+        there = [words for name, words in _BEYOND.items() if np.max(own[name]) > 0]
+        limited = [words for name, words in _LIMITS_BEYOND.items() if np.min(own[name]) < np.inf]
+        return (*there, *limited)
+
     def delayed_pd(
         self, p_gain: ArrayLike, load_inertia_kg_m2: ArrayLike = 0.0, torque_nm: ArrayLike = 0.0
     ) -> DelayedPDParameters:
@@ -142,6 +149,19 @@ class LoadedServoParameters:
             back_emf=own["back_emf"],
         )
 
+
+_BEYOND = {
+    "load_friction_motor": "friction that grows with the motor's torque",
+    "load_friction_load": "friction that grows with the load",
+    "load_friction_quadratic": "friction that grows with the squared torque",
+    "stribeck_friction": "friction that is larger at standstill",
+    "start_duty": "the minimum start force",
+    "dead_zone_rad": "the dead zone",
+}
+_LIMITS_BEYOND = {
+    "acceleration_limit": "the limit on the set-point's acceleration",
+    "torque_limit": "a torque limit below the stall torque at speed",
+}
 
 COLUMNS = tuple(f.name for f in fields(LoadedServoParameters) if f.name != "dead_time_s")
 """Order of the numbers in `sysid.loaded.kernel`, without the dead time."""

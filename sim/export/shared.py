@@ -84,7 +84,7 @@ def step_note(
 
 
 def origin(calibration: Calibration) -> Iterator[str]:
-    """Where the numbers come from, in sentences."""
+    """Where the numbers come from, and what of servos under load they leave out, in sentences."""
     made = ", ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in calibration.inputs)
     yield (
         f"Servos of {calibration.robot}, calibrated {calibration.created}"
@@ -95,6 +95,23 @@ def origin(calibration: Calibration) -> Iterator[str]:
     scales = {j.actuator.scale.source: j.actuator.scale for j in calibration.joints.values()}
     for source, scale in scales.items():
         yield f"Torques are scaled by {scale.anchor} {scale.value_nm:g} N·m: {source}."
+    yield from _beyond(calibration)
+
+
+def _beyond(calibration: Calibration) -> Iterator[str]:
+    """What of servos that were fitted under load no target carries."""
+    joints: dict[tuple[str, ...], list[str]] = {}
+    for name, joint in calibration.joints.items():
+        if joint.under_load is not None:
+            servo = joint.under_load.servo(joint.actuator.dead_time_s.value)
+            if lost := servo.beyond_delayed_pd():
+                joints.setdefault(lost, []).append(name)
+    for lost, names in joints.items():
+        yield (
+            f"Fitted under load, but not carried over: {', '.join(lost)} ({', '.join(names)}). "
+            "The friction here is that of one motor torque; `under_load` of the calibration has "
+            "the whole servo."
+        )
 
 
 # --------------------------------------------------------------------------- Python modules

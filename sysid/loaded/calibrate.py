@@ -406,30 +406,14 @@ def _warnings(joint: str, found: LoadedFit) -> list[str]:
     made = []
     for name, why in found.undecided.items():
         made.append(f"{joint}: {name} is not identified: {why}.")
-    servo = found.servo.arrays()
-    lost = [
-        words
-        for name, words in (
-            ("load_friction_motor", "friction that grows with the load"),
-            ("load_friction_quadratic", "friction that grows with the squared torque"),
-            ("stribeck_friction", "friction that is larger at standstill"),
-            ("start_duty", "the minimum start force"),
-            ("dead_zone_rad", "the dead zone"),
-        )
-        if float(servo[name]) > 0
-    ]
-    if np.isfinite(float(servo["acceleration_limit"])):
-        lost.append("the limit on the set-point's acceleration")
-    if np.isfinite(float(servo["torque_limit"])):
-        lost.append("a torque limit below the stall torque at speed")
-    if lost:
+    if lost := found.servo.beyond_delayed_pd():
         made.append(
             f"{joint}: simulators' actuators do not carry {', '.join(lost)}; DelayedPD has the "
             f"friction of a motor torque of {_torque(found):.2g}"
             f"{' N·m' if found.known_load else ' rad/s²'}. `under_load` has the whole servo."
         )
     free = [n + 1 for n, r in enumerate(found.runs) if np.isinf(r.ramp_share)]
-    if free and np.isfinite(float(servo["acceleration_limit"])):
+    if free and np.isfinite(float(found.servo.arrays()["acceleration_limit"])):
         made.append(
             f"{joint}: the set-point's acceleration is limited, but not in run "
             f"{', '.join(map(str, free))} of {len(found.runs)}. A register decides that "

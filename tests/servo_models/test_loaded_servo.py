@@ -46,6 +46,15 @@ def test_without_load_and_its_friction_it_is_delayed_pd():
     assert np.abs(difference).max() < 1e-9
 
 
+def test_what_delayed_pd_lacks_is_named():
+    assert SERVO.beyond_delayed_pd() == ()
+    assert set(EXTENDED.beyond_delayed_pd()) == {
+        "friction that grows with the motor's torque", "friction that grows with the load",
+        "friction that grows with the squared torque", "friction that is larger at standstill",
+        "the minimum start force", "the dead zone", "a torque limit below the stall torque at speed",
+    }  # fmt: skip
+
+
 def test_mujoco_swings_the_same_pendulum():
     servo, gain = SERVO, 16.0
     mass, length = 0.49, 0.1

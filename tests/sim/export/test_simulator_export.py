@@ -332,3 +332,15 @@ def test_steps_in_which_a_servo_only_rattles_are_refused(capsys, tmp_path, to):
         "--out", tmp_path / "x",
     )  # fmt: skip
     assert "not stable in physics steps of 50 ms; take shorter ones" in said
+
+
+@pytest.mark.parametrize("target", ["mjcf", "isaaclab", "mjlab", "newton"])
+def test_what_a_target_cannot_carry_of_a_servo_under_load_is_said_in_it(
+    capsys, tmp_path, monkeypatch, target
+):
+    monkeypatch.chdir(tmp_path)
+    run_program(capsys, pupper_sysid, "export", "xl330-m288", "--to", target, "--out", "made")
+    made = tmp_path / "made"
+    files = [p for p in made.rglob("*") if p.is_file()] if made.is_dir() else [made]
+    said = " ".join(" ".join(p.read_text().split()) for p in files)
+    assert "not carried over: friction that grows with the motor's torque" in said
