@@ -51,7 +51,8 @@ def test_what_delayed_pd_lacks_is_named():
     assert set(EXTENDED.beyond_delayed_pd()) == {
         "friction that grows with the motor's torque", "friction that grows with the load",
         "friction that grows with the squared torque", "friction that is larger at standstill",
-        "the minimum start force", "the dead zone", "a torque limit below the stall torque at speed",
+        "the minimum start force", "the dead zone",
+        "a torque limit below the stall torque at speed",
     }  # fmt: skip
 
 
