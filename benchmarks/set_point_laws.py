@@ -6,7 +6,8 @@ The last 20 s of `chirp_sweep` move as if the set-point's acceleration was limit
 `prbs_excitation` do not. Each law moves the set-point of one servo model (position loop in duty, DC
 motor, dry friction that grows with the motor's torque, gravity, dead time), fitted to chirp, PRBS
 and steps of each joint together; `frequency_sweep` is left out. Printed is the RMS error [mrad],
-mean over joints. Recordings are found through PUPPER_REAL_DATA, else in ../shared/real.
+mean over joints. With `--alone`, each recording is fitted alone, and its dead time is printed.
+Recordings are found through PUPPER_REAL_DATA, else in ../shared/real.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -70,6 +72,9 @@ LAWS = {
     "limited, but not from rest": Law(FROM_REST),
     "limited, but not beyond a distance": Law(FAR, ("limit", "distance")),
     "limited in all recordings but PRBS": Law(LIMITED, free=("prbs_excitation",)),
+    "the same, and a later start in PRBS": Law(
+        LIMITED, ("limit", "later in PRBS"), free=("prbs_excitation",)
+    ),
     "a limit for each recording": Law(LIMITED, ("limit", "limit of PRBS", "limit of steps")),
 }
 BASE = {
@@ -80,6 +85,7 @@ BASE = {
 MORE = {
     "limit": (40, 15, 4000), "limit of PRBS": (1000, 15, 4000), "limit of steps": (100, 15, 4000),
     "damping": (5, 1e-2, 500), "forward": (0.7, 0.05, 3), "distance": (0.1, 0.005, 0.3),
+    "later in PRBS": (0.015, 1e-3, 0.05),
 }  # fmt: skip
 LINEAR = {"offset": (0.0, -0.1, 0.1), "sine": (0.0, -100, 100), "cosine": (0.0, -100, 100)}
 
@@ -150,10 +156,12 @@ def _vector(law: Law, x: np.ndarray, motion: str) -> np.ndarray:
             "prbs_excitation": own["limit of PRBS"],
             "step_response": own["limit of steps"],
         }.get(motion, limit)
+    late = own.get("later in PRBS", 0.0) if motion == "prbs_excitation" else 0.0
     return np.array([
-        own["dead time"] / STEP_S, own["stiffness"], own["stall"], own["speed"], own["friction"],
-        own["load friction"], limit, own.get("damping", 0.0), own.get("forward", 0.0),
-        own.get("distance", np.inf), own["offset"], own["sine"], own["cosine"],
+        (own["dead time"] + late) / STEP_S, own["stiffness"], own["stall"], own["speed"],
+        own["friction"], own["load friction"], limit, own.get("damping", 0.0),
+        own.get("forward", 0.0), own.get("distance", np.inf), own["offset"], own["sine"],
+        own["cosine"],
     ])  # fmt: skip
 
 
@@ -164,18 +172,24 @@ def errors(law: Law, x: np.ndarray, motion: str, run: Run, changed: np.ndarray) 
     return np.interp(run.sample_step, np.arange(len(out)), out) - run.sample_rad
 
 
-def fit(law: Law, runs: dict[str, Run], starts: int, rng: np.random.Generator) -> np.ndarray:
-    """Least squares over `FITTED`, each part with the same weight, from a few starts."""
+def fit(
+    law: Law,
+    runs: dict[str, Run],
+    starts: int,
+    rng: np.random.Generator,
+    parts: Sequence[tuple[str, float, float]] = FITTED,
+) -> np.ndarray:
+    """Least squares over `parts`, each with the same weight, from a few starts."""
     goals = {m: _goals(r, law.on_write) for m, r in runs.items()}
 
     def left(x: np.ndarray) -> np.ndarray:
         found = []
         for motion, run in runs.items():
-            if motion == MOTIONS[3]:
+            if not any(own == motion for own, _, _ in parts):
                 continue
             error = errors(law, x, motion, run, goals[motion])
             time = run.sample_step * run.step_s
-            for own, begin, end in FITTED:
+            for own, begin, end in parts:
                 if own == motion:
                     part = error[(time >= begin) & (time < end)]
                     found.append(30 * part / NOISE_RAD / np.sqrt(len(part)))
@@ -209,37 +223,58 @@ def _goals(run: Run, every_write: bool) -> np.ndarray:
     return written
 
 
+def part_error(law: Law, x: np.ndarray, run: Run, part: tuple[str, float, float]) -> float:
+    """RMS error of a part of a recording [mrad]."""
+    motion, begin, end = part
+    error = errors(law, x, motion, run, _goals(run, law.on_write))
+    now = run.sample_step * run.step_s
+    return 1e3 * float(np.sqrt(np.mean(error[(now >= begin) & (now < end)] ** 2)))
+
+
+def alone(joint: str, runs: dict[str, Run], starts: int, seed: int) -> None:
+    """Dead time of each part of the recordings, fitted alone."""
+    for name, part in PARTS.items():
+        said = []
+        for law in ("the command at once", "limited acceleration (sqrt braking), one limit"):
+            x = fit(LAWS[law], runs, starts, np.random.default_rng(seed), (part,))
+            error = part_error(LAWS[law], x, runs[part[0]], part)
+            said.append(f"{law}: {1e3 * np.exp(x[0]):.1f} ms (error {error:.1f} mrad)")
+        print(f"  {joint}, {name}: {'; '.join(said)}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--joints", nargs="+", choices=JOINTS, default=JOINTS)
+    parser.add_argument("--alone", action="store_true", help="each recording alone")
     parser.add_argument("--starts", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    rows, limits = {name: [] for name in LAWS}, {name: [] for name in LAWS}
+    rows: dict[str, list[list[float]]] = {name: [] for name in LAWS}
+    extras: dict[str, list[list[float]]] = {name: [] for name in LAWS}
     begun = time.process_time()
     for joint in asked.joints:
         trials = {m: load(REAL / "sage_so101" / m).trials(joint)[0] for m in MOTIONS}
         lattice = find_poll_lattice(tuple(trials.values()), np.random.default_rng(0))
         runs = {m: r for m, t in trials.items() if (r := prepare(t, lattice)) is not None}
+        if asked.alone:
+            alone(joint, runs, asked.starts, asked.seed)
+            continue
         for name, law in LAWS.items():
             x = fit(law, runs, asked.starts, np.random.default_rng(asked.seed))
-            row = []
-            for motion, begin, end in PARTS.values():
-                run = runs[motion]
-                error = errors(law, x, motion, run, _goals(run, law.on_write))
-                now = run.sample_step * run.step_s
-                part = error[(now >= begin) & (now < end)]
-                row.append(1e3 * float(np.sqrt(np.mean(part**2))))
+            row = [part_error(law, x, runs[part[0]], part) for part in PARTS.values()]
             rows[name].append(row)
-            if "limit" in law.fitted:
-                limits[name].append(float(np.exp(x[names(law).index("limit")])))
+            extras[name].append([float(np.exp(x[names(law).index(n)])) for n in law.fitted])
             print(f"  {joint}, {name}: {' '.join(f'{v:.1f}' for v in row)}", flush=True)
-    print(f"| law | {' | '.join(PARTS)} | limit, rad/s² |")
-    print(f"|---{'|---' * (len(PARTS) + 1)}|")
-    for name, each in rows.items():
-        mean = " | ".join(f"{v:.1f}" for v in np.mean(each, axis=0))
-        own = limits[name]
-        print(f"| {name} | {mean} | {f'{min(own):.0f}–{max(own):.0f}' if own else 'none'} |")
+    if not asked.alone:
+        print(f"| law | {' | '.join(PARTS)} | fitted, range over joints |")
+        print(f"|---{'|---' * (len(PARTS) + 1)}|")
+        for name, each in rows.items():
+            mean = " | ".join(f"{v:.1f}" for v in np.mean(each, axis=0))
+            low, high = np.min(extras[name], axis=0), np.max(extras[name], axis=0)
+            own = ", ".join(
+                f"{n} {a:.3g}–{b:.3g}" for n, a, b in zip(LAWS[name].fitted, low, high, strict=True)
+            )
+            print(f"| {name} | {mean} | {own or 'none'} |")
     print(f"{time.process_time() - begun:.0f} s of processor time")
 
 
