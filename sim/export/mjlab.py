@@ -44,6 +44,7 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
                 ("effort_limit", a.effort_limit_nm, "effort_limit_nm"),
                 ("armature", a.armature_kg_m2, "armature_kg_m2"),
                 ("frictionloss", a.friction_loss_nm, "friction_loss_nm"),
+                ("viscous_damping", a.back_emf_nm_s_per_rad, "back_emf_nm_s_per_rad"),
                 ("delay_min_lag", steps),
                 ("delay_max_lag", steps),
                 ("delay_hold_prob", 0.0),

@@ -2,9 +2,9 @@
 
 Newton's `DriveNeuralMLP` reads an ONNX file that maps position error and velocity to an effort,
 with its contract as metadata. A calibrated PD is exactly such a network with a single layer. Delay
-and effort limit are components of their own there (`delay_steps`, `ClampingMaxEffort`), armature
-and dry friction belong to the joint. Learned servo models cannot be exported: they predict a
-servo's position, and Newton needs its effort.
+and effort limit are components of their own there (`delay_steps`, `ClampingMaxEffort`), armature,
+dry friction and back-EMF, as damping, belong to the joint. Learned servo models cannot be exported:
+they predict a servo's position, and Newton needs its effort.
 
 Names are those of Newton 1.8.0; `benchmarks/peers/check_exports.py` holds them against the release.
 """
@@ -52,6 +52,7 @@ def add_actuators(builder):
         dof = builder.joint_qd_start[joint]
         builder.joint_armature[dof] = servo["armature"]
         builder.joint_friction[dof] = servo["friction_loss"]
+        builder.joint_damping[dof] = servo["back_emf"]
         builder.joint_target_ke[dof] = builder.joint_target_kd[dof] = 0.0
         builder.add_actuator(
             DriveNeuralMLP,
@@ -135,6 +136,7 @@ def _module(calibration: Calibration, delays: dict[str, Interval], physics_step_
             "effort_limit": actuator.effort_limit_nm.value,
             "armature": actuator.armature_kg_m2.value,
             "friction_loss": actuator.friction_loss_nm.value,
+            "back_emf": actuator.back_emf_nm_s_per_rad.value,
         }
         servos.append(f'"{name}": {json.dumps(row)},')
     notes = (
@@ -151,7 +153,7 @@ def _module(calibration: Calibration, delays: dict[str, Interval], physics_step_
         "from pathlib import Path\n\n"
         "from newton.actuators import ClampingMaxEffort, DriveNeuralMLP\n\n"
         + block("SERVOS", servos)
-        + '"""Units: N·m, kg·m², physics steps."""\n\n'
+        + '"""Units: N·m, N·m·s/rad, kg·m², physics steps."""\n\n'
         + feedback_block(calibration)
         + '"""What makes each joint\'s readings stale, quantised and biased."""\n\n'
         + _CODE

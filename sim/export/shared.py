@@ -26,7 +26,7 @@ from pupper_sysid.servo_models.step_size import MUJOCO, Engine, delay_at_step
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
 TORQUE_KEYS = (
     "stiffness_nm_per_rad", "damping_nm_s_per_rad", "friction_loss_nm", "armature_kg_m2",
-    "effort_limit_nm",
+    "effort_limit_nm", "back_emf_nm_s_per_rad",
 )  # fmt: skip
 EXPLICIT_PD = Engine(slews=False, implicit=False)
 """Isaac Lab and Newton: torque computed before each step, set-points of unlimited speed."""
@@ -129,14 +129,18 @@ def block(name: str, rows: Sequence[str], brackets: str = "{}") -> str:
     return f"{name} = {brackets[0]}\n" + indent("\n".join(rows), "    ") + f"\n{brackets[1]}\n"
 
 
-def call(function: str, *arguments: tuple[str, Any] | tuple[str, Quantity, str]) -> str:
+def call(function: str, *arguments: tuple[str, Any] | tuple[str, Quantity, str] | str) -> str:
     """A call with a keyword argument per line.
 
     An argument is its name and value; a quantity also has its key in the calibration, and is
-    followed by a comment: unit, how well it is known, interval.
+    followed by a comment: unit, how well it is known, interval. A text stands as it is.
     """
     lines = []
-    for name, value, *key in arguments:
+    for argument in arguments:
+        if isinstance(argument, str):
+            lines.append(argument + "\n")
+            continue
+        name, value, *key = argument
         comment = ""
         if key:
             comment = f"  # {unit_of(key[0])}, {KNOWN[value.identified]}"

@@ -12,6 +12,11 @@ ISAACLAB = {
     "velocity_limit_sim", "stiffness", "damping", "armature", "friction", "dynamic_friction",
     "viscous_friction", "min_delay", "max_delay",
 }  # fmt: skip
+ISAACLAB_3 = (ISAACLAB - {"effort_limit", "velocity_limit"}) | {
+    "actuator_effort_limit", "actuator_velocity_limit", "joint_effort_limit",
+    "joint_velocity_limit",
+}  # fmt: skip
+"""Of 3.0.0, without the names that are deprecated there."""
 MJLAB = {
     "target_names_expr", "transmission_type", "armature", "frictionloss", "viscous_damping",
     "delay_min_lag", "delay_max_lag", "delay_hold_prob", "delay_update_period",

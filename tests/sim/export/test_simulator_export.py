@@ -32,7 +32,7 @@ from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, rest_at
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
-from support.exported_servos import ISAACLAB, MJLAB, in_free_air
+from support.exported_servos import ISAACLAB, ISAACLAB_3, MJLAB, in_free_air
 
 ROOT = Path(__file__).resolve().parents[3]
 CALIBRATED = ROOT / "data/samples/calibrated.yaml"
@@ -139,7 +139,8 @@ class _Recorder:
     """Stands in for a configuration class: takes its released field names and no others."""
 
     def __init__(self, fields: set[str]):
-        self.fields, self.made = fields, []
+        self.fields = self.__dataclass_fields__ = fields
+        self.made = []
 
     def __call__(self, **given: Any) -> dict[str, Any]:
         assert set(given) <= self.fields, set(given) - self.fields
@@ -155,6 +156,45 @@ def executed(text: str, package: str, name: str, recorder: _Recorder, monkeypatc
     space: dict[str, Any] = {}
     exec(compile(text, "exported.py", "exec"), space)
     return space
+
+
+@pytest.fixture(scope="module")
+def braking(calibration):
+    """The calibration with servos whose speed back-EMF limits."""
+    joints = {}
+    for name, joint in calibration.joints.items():
+        emf = joint.actuator.back_emf_nm_s_per_rad.model_copy(update={"value": 0.0321})
+        actuator = joint.actuator.model_copy(update={"back_emf_nm_s_per_rad": emf})
+        joints[name] = joint.model_copy(update={"actuator": actuator})
+    return calibration.model_copy(update={"joints": joints})
+
+
+def test_back_emf_brakes_in_every_simulator(braking, monkeypatch, tmp_path):
+    text = to_isaaclab(braking, 0.005)
+    recorder = _Recorder(ISAACLAB)
+    space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
+    assert all(made["viscous_friction"] == 0.0321 for made in space["ACTUATORS"].values())
+    text, recorder = to_mjlab(braking, 0.005), _Recorder(MJLAB)
+    executed(text, "mjlab.actuator", "BuiltinPositionActuatorCfg", recorder, monkeypatch)
+    assert [made["viscous_damping"] for made in recorder.made] == [0.0321] * 3
+    export_newton(braking, 0.005, tmp_path)
+    module = (tmp_path / "newton_actuators.py").read_text()
+    assert (
+        module.count('"back_emf": 0.0321') == 3
+        and 'joint_damping[dof] = servo["back_emf"]' in module
+    )
+    assert to_mjcf(braking, 0.002).count('damping="0.0321"') == 3
+    joints = json.loads(to_json(braking, 0.005))["joints"]
+    assert all(j["actuator"]["back_emf_nm_s_per_rad"]["value"] == 0.0321 for j in joints.values())
+
+
+def test_the_isaac_lab_export_takes_the_names_of_limits_that_are_there(calibration, monkeypatch):
+    text = to_isaaclab(calibration, 0.005)
+    for fields, name in ((ISAACLAB, "effort_limit"), (ISAACLAB_3, "actuator_effort_limit")):
+        recorder = _Recorder(fields)
+        executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
+        limits = [j.actuator.effort_limit_nm.value for j in calibration.joints.values()]
+        assert [made[name] for made in recorder.made] == limits
 
 
 def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
@@ -284,8 +324,8 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(
     added: list[dict[str, Any]] = []
     builder = types.SimpleNamespace(
         joint_label=labels, joint_qd_start=[0, 6, 7, 8], joint_q_start=[0, 7, 8, 9],
-        joint_armature=[0.0] * 9, joint_friction=[0.0] * 9, joint_target_ke=[1.0] * 9,
-        joint_target_kd=[1.0] * 9, add_actuator=lambda drive, **given: added.append(given),
+        joint_armature=[0.0] * 9, joint_friction=[0.0] * 9, joint_damping=[0.0] * 9,
+        joint_target_ke=[1.0] * 9, joint_target_kd=[1.0] * 9, add_actuator=lambda drive, **given: added.append(given),
     )  # fmt: skip
     space["add_actuators"](builder)  # type: ignore[operator]
     assert [(a["index"], a["pos_index"]) for a in added] == [(6, 7), (7, 8), (8, 9)]
