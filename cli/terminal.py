@@ -24,6 +24,7 @@ from rich.text import Text
 from pupper_sysid.cli.flags import spell
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.joints import select_joints, share_sentences
+from pupper_sysid.common.reading.numbers import whole
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet
@@ -193,6 +194,14 @@ def cell(value: Any, digits: int) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(cell(v, digits) for v in value)
     return number(value, digits) if isinstance(value, float) else str(value)
+
+
+def whole_numbers(option: str, text: str) -> list[int]:
+    """Loop numbers that an option names, such as 0,1."""
+    try:
+        return [whole(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} is '{text}'; write loop numbers with commas: 0,1.") from None
 
 
 def need_positive(name: str, value: float) -> None:

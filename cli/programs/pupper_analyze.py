@@ -33,6 +33,9 @@ COMMANDS = {
         "walk", "Path, drift and arc in six directions.", "analyze.robustness:Compliance"
     ),
     "servo": Command("servos", "Four servo models on unseen readings.", "analyze.servo:Servo"),
+    "twin": Command(
+        "servos", "A recording's commands on the whole simulated robot.", "analyze.twin:Twin"
+    ),
     "servo-demand": Command(
         "servos", "What a gait needs, against what a servo has.", "analyze.servo_demand:ServoDemand"
     ),

@@ -69,9 +69,10 @@ THIGH_RADIUS_M = 0.0045
 # needs 50 steps of line search (MuJoCo's default), since dry friction is a sharp corner of its
 # cost, and a tolerance that light links do not fall below while they still move. PGS's eight
 # iterations leave 1 mrad/s of a walking robot's joint speeds (in the median; 14 in 1 % of steps).
+EVALUATION_SOLVER = {"solver": "Newton", "iterations": 20, "ls_iterations": 50, "tolerance": 1e-15}
 _SOLVERS = {
     "training": 'solver="PGS" iterations="8"',
-    "evaluation": 'solver="Newton" iterations="20" ls_iterations="50" tolerance="1e-15"',
+    "evaluation": attributes({name: str(value) for name, value in EVALUATION_SOLVER.items()}),
 }
 
 FLAT_GROUND = (

@@ -9,6 +9,7 @@ environment. The feedback comes along, apart from the actuator.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -166,7 +167,7 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     parts: list[JointCalibration] = []
     fallbacks = {}
     for name in JOINT_NAMES:
-        nearest = _nearest(name, calibration)
+        nearest = nearest_joint(name, calibration.joint_names)
         if nearest != name:
             fallbacks[name] = nearest
         parts.append(calibration.joint(nearest))
@@ -187,12 +188,17 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     return ServoRanges(source, low, value, high, feedback, fallbacks, jitter)
 
 
-def _nearest(name: str, calibration: Calibration) -> str:
-    """The calibrated joint nearest to `name`: itself, its kind on another leg, any."""
-    leg, kind = name.split("_")
+def nearest_joint(name: str, known: Sequence[str]) -> str:
+    """The one of the `known` joints nearest to `name`: itself, its kind on another leg, any.
+
+    Examples
+    --------
+    >>> nearest_joint("RF_thigh", ["LF_hip", "LF_thigh"]), nearest_joint("gripper", ["wrist_roll"])
+    ('LF_thigh', 'wrist_roll')
+    """
+    leg, _, kind = name.partition("_")
     return min(
-        calibration.joint_names,
-        key=lambda j: (j != name, j.partition("_")[2] != kind, j.partition("_")[0] != leg),
+        known, key=lambda j: (j != name, j.partition("_")[2] != kind, j.partition("_")[0] != leg)
     )
 
 

@@ -258,17 +258,15 @@ def calibrated_run(
     the positions are looked up several times per tick.
     """
     model = calibration.delayed_pd(data.joints, TIME_STEP_S)
-    tail = math.ceil(data.period_s / TIME_STEP_S) + 1
     shape = stacked(data)[1].shape
-    received = {
-        (e, n): np.pad(trial.command + trial.rest_rad, (0, tail), mode="edge")
+    arrived = {
+        (e, n): received(run, data.period_s)
         for n, joint in enumerate(data.joints)
         for e, run in enumerate(data.runs[joint])
-        for trial in [run.trial_data(np.ones(len(run.tick), bool))]
     }
-    steps = max(map(len, received.values()))
+    steps = max(map(len, arrived.values()))
     commands = np.zeros((steps, *shape))
-    for (e, n), own in received.items():
+    for (e, n), own in arrived.items():
         commands[: len(own), e, n], commands[len(own) :, e, n] = own, own[-1]
 
     def run(start: NDArray[np.float64]) -> Tracks:
@@ -283,6 +281,20 @@ def calibrated_run(
         }
 
     return run
+
+
+def received(run: Run, period_s: float) -> NDArray[np.float64]:
+    """Commands of a run as the bus sent them, averaged over physics steps, to beyond its last tick.
+
+    Parameters
+    ----------
+    run : Run
+    period_s : float
+        Between ticks.
+    """
+    trial = run.trial_data(np.ones(len(run.tick), bool))
+    tail = math.ceil(period_s / TIME_STEP_S) + 1
+    return np.pad(trial.command + trial.rest_rad, (0, tail), mode="edge")
 
 
 def on_ticks(positions: NDArray[np.float64], run: Run, period_s: float) -> NDArray[np.float64]:

@@ -34,13 +34,9 @@ _FULL, _QUICK = (16, 10.0), (5, 8.0)  # robots, seconds each
 
 
 @dataclass(frozen=True)
-class Analysis(ABC):
-    """Options of every analysis."""
+class Drawn(ABC):
+    """Options of every analysis, each of which draws a picture."""
 
-    policies: tyro.conf.Positional[tuple[Path, ...]]
-    """Runs (`runs/<name>`) or policy folders."""
-    actuator: str | None = None
-    """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
     out: Path = Path("analysis")
     """Folder for the picture."""
     seed: int = 0
@@ -52,15 +48,9 @@ class Analysis(ABC):
 
     def run(self) -> None:
         """Analyse, draw and print."""
-        import torch
-
         from pupper_sysid.common.figure_style import save
 
-        name = re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()  # the command's word
-        if not self.policies:
-            raise InputError(f"No policy was named: pupper-analyze {name} runs/<name>.")
-        torch.set_num_threads(1)
-        picture = self.out / f"{name}.png"
+        picture = self.out / f"{self.word}.png"
         refuse_overwrite(picture, self.force)
         found, figure, table = self.analyse()
         save(figure, picture, self.force)
@@ -70,6 +60,11 @@ class Analysis(ABC):
         out.print(table)
         err.print(f"Picture: {picture}", soft_wrap=True)
 
+    @property
+    def word(self) -> str:
+        """The command's word."""
+        return re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()
+
     @abstractmethod
     def analyse(self) -> Found:
         """Results, figure and table."""
@@ -77,6 +72,25 @@ class Analysis(ABC):
     def about(self) -> dict[str, Any]:
         """What else stands in the JSON object."""
         return {}
+
+
+@dataclass(frozen=True)
+class Analysis(Drawn):
+    """Options of the analyses of policies."""
+
+    policies: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Runs (`runs/<name>`) or policy folders."""
+    actuator: str | None = None
+    """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
+
+    def run(self) -> None:
+        """Analyse, draw and print."""
+        import torch
+
+        if not self.policies:
+            raise InputError(f"No policy was named: pupper-analyze {self.word} runs/<name>.")
+        torch.set_num_threads(1)
+        super().run()
 
 
 @dataclass(frozen=True)

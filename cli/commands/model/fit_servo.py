@@ -13,7 +13,6 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
-from pupper_sysid.common.reading.numbers import whole
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
@@ -150,7 +149,8 @@ class FitServo:
             if not all(loops):
                 raise InputError("--train-loops and --test-loops go together, such as 0,1 and 2.")
             return Split.by_trials(
-                _numbers("--train-loops", loops[0]), _numbers("--test-loops", loops[1])
+                terminal.whole_numbers("--train-loops", loops[0]),
+                terminal.whole_numbers("--test-loops", loops[1]),
             )
         if times == (None, None):
             return EACH_GROUP_IN_TURN
@@ -185,10 +185,3 @@ def _free_folder() -> Path:
     while (Path(f"servo-{n}" if n > 1 else "servo") / CONTRACT).exists():
         n += 1
     return Path(f"servo-{n}" if n > 1 else "servo")
-
-
-def _numbers(option: str, text: str) -> list[int]:
-    try:
-        return [whole(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"{option} is '{text}'; write loop numbers with commas: 0,1.") from None

@@ -1,0 +1,347 @@
+"""The twin test: how much does the simulated robot move like the real one?
+
+`twin` gives the commands of a recording to the whole simulated robot, with the servos of one or of
+several actuators, in the air (its trunk fixed) and on the ground. Each predicts the readings that
+the recording's bus would have shown of it: their age, and an offset per joint
+(`sysid.compare.readings`, as in `compare`). Errors per joint stand beside the robot's repeatability
+and persistence, and readings say whether the robot was on the ground (`policies.twin.evidence`).
+
+On the ground several copies move, which differ in friction and payload; the prediction is the mean
+of those that stay up. A robot on its back predicts what one in the air does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.joints import share_sentences
+from pupper_sysid.common.results import Result, internal
+from pupper_sysid.policies.twin.actuators import Actuator, stronger
+from pupper_sysid.policies.twin.evidence import STRONGER, Case, Evidence, Verdict, evidence
+from pupper_sysid.policies.twin.gyro import STEP_S, Gyro, spectrum
+from pupper_sysid.policies.twin.playing import Played, play, sequences
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
+from pupper_sysid.sysid.compare.readings import (
+    ReadingRule,
+    in_words,
+    offsets,
+    reading_rules,
+    with_ages,
+)
+from pupper_sysid.sysid.recordings.joints import chosen_joints
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.servo_fit import scores
+from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.scores import Errors, Tracks
+from pupper_sysid.sysid.servo_fit.windows import Part, everything
+
+if TYPE_CHECKING:
+    from pupper_sysid.sim.robot.servo_robot import ServoRobot
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinErrors(Result):
+    """Errors of the simulated robot on one joint, or their means over joints [rad].
+
+    Attributes
+    ----------
+    mae_rad, rmse_rad : float
+        Mean absolute and root mean square error of the readings that count: rows as logged against
+        predicted readings, or fresh ones where the recording dates them.
+    rmse_raw_rad : float
+        Of rows as logged.
+    offset_rad : float
+        Reading minus prediction, taken out of all.
+    """
+
+    mae_rad: float
+    rmse_rad: float
+    rmse_raw_rad: float
+    offset_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition(Result):
+    """The simulated robot in the air or on the ground.
+
+    Attributes
+    ----------
+    joints : dict of str to TwinErrors
+    mean : TwinErrors
+        Over joints; of the offset, the mean of its size.
+    rmse_rad : Interval
+        Of the mean.
+    copies, upright : int
+        Simulated robots, and how many of them stayed up.
+    first_fall_s : float or None
+        When the first fell [s].
+    gyro : Gyro or None
+        Of those that stayed up; None in the air, or of less than seven seconds.
+    """
+
+    joints: dict[str, TwinErrors]
+    mean: TwinErrors
+    rmse_rad: Interval
+    copies: int
+    upright: int
+    first_fall_s: float | None
+    gyro: Gyro | None
+    errors: dict[str, Errors] = internal()
+    tracks: Tracks = internal()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorTwin(Result):
+    """The simulated robot with one actuator.
+
+    Attributes
+    ----------
+    air : Condition
+    ground : Condition or None
+    evidence : Evidence or None
+        None of a robot that is fixed to the world.
+    """
+
+    air: Condition
+    ground: Condition | None
+    evidence: Evidence | None
+
+    @property
+    def best_rad(self) -> float:
+        """Smaller one of its errors [rad]."""
+        return min(c.rmse_rad.value for c in (self.air, self.ground) if c)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Twin(Result):
+    """Twin test of a recording.
+
+    Attributes
+    ----------
+    robot : str
+    models : dict of str to ActuatorTwin
+        By actuator.
+    best : str
+        The actuator with the smallest error.
+    verdict : {"ground", "air", "cannot tell"}
+        Where the robot was.
+    judge : str or None
+        The actuator by which: the best of those that were not fitted to this recording, whose
+        numbers already hold what the ground did to it. None where all were.
+    scored : str
+        Which rows count.
+    readings : dict of str to ReadingRule
+        By joint, when its readings were measured.
+    persistence_rmse_rad, repeatability_rad : dict of str to float
+        By joint, on the same rows.
+    time_step_s : float
+        Time between commands.
+    notes : tuple of str
+    data : ServoData
+    """
+
+    robot: str
+    models: dict[str, ActuatorTwin]
+    best: str
+    verdict: Verdict
+    judge: str | None
+    scored: str
+    readings: dict[str, ReadingRule]
+    persistence_rmse_rad: dict[str, float]
+    repeatability_rad: dict[str, float]
+    time_step_s: float
+    notes: tuple[str, ...]
+    data: ServoData = internal()
+
+    @property
+    def verdict_in_words(self) -> str:
+        """Where the robot was, and why."""
+        evidence = self.models[self.judge].evidence if self.judge else None
+        if evidence is None:
+            return "Nothing here says whether the robot was on the ground."
+        return f"{evidence.why} (With {self.judge}.)"
+
+
+def twin(
+    recording: Recording,
+    actuators: Mapping[str, Actuator],
+    robot: ServoRobot,
+    feedback: Mapping[str, Calibration] | None = None,
+    test_loops: Sequence[int] = (),
+    copies: int = 16,
+    seed: int = 0,
+    threads: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Twin:
+    """Give a recording's commands to the whole simulated robot and compare the readings.
+
+    Parameters
+    ----------
+    recording : Recording
+    actuators : mapping of str to Actuator
+        By name; see `actuator_of`.
+    robot : ServoRobot
+        `robot_for` the recording.
+    feedback : mapping of str to Calibration, optional
+        Calibrations of the same bus, by name, whose poll is used where the recording does not show
+        its own and no actuator has one.
+    test_loops : sequence of int
+        Score on these loops alone, with the offsets of the others; by default on all.
+    copies : int
+        Robots on the ground per actuator.
+    seed, threads : int
+    progress : callable
+        Called with the share that is done.
+
+    Raises
+    ------
+    InputError
+        If the robot lacks a joint, or cannot be simulated.
+    """
+    if copies < 1:
+        raise InputError(f"{copies} robots; at least 1 is needed.")
+    joints = chosen_joints(recording)
+    data = servo_data([recording], joints, "auto", seed)
+    known = {n: a.calibration for n, a in actuators.items() if a.calibration} | dict(feedback or {})
+    rules = reading_rules(data, recording.name, known)
+    data = with_ages(data, rules)
+    test, rest, scored = _parts(recording, test_loops)
+    given = sequences(data, robot)
+    numbers = [a.values for a in actuators.values()]
+    if robot.free:
+        numbers += [stronger(own, STRONGER) for own in numbers]
+    conditions: list[list[Condition]] = []
+    done, shares = 0.0, [1.0, float(copies)] if robot.free else [1.0]
+    for place, share in enumerate(shares):
+        part = share / sum(shares)
+        played = play(
+            robot, place == 0, numbers, given, data, copies, seed, threads,
+            lambda share, done=done, part=part: progress(done + part * share),
+        )  # fmt: skip
+        conditions.append([_condition(one, data, test, rest, seed) for one in played])
+        done += part
+    models = {
+        name: _twin_of([own[k :: len(actuators)] for own in conditions], data, test, seed)
+        for k, name in enumerate(actuators)
+    }
+    judges = [n for n, a in actuators.items() if not _fitted_to(a, recording)]
+    judge = min(judges, key=lambda name: models[name].best_rad, default=None)
+    found = models[judge].evidence if judge else None
+    return Twin(
+        robot=robot.name, models=models, best=min(models, key=lambda name: models[name].best_rad),
+        verdict=found.verdict if found else "cannot tell", judge=judge, scored=scored,
+        readings=rules, persistence_rmse_rad=scores.persistence(data, test),
+        repeatability_rad=scores.repeatability(data, test), time_step_s=data.period_s,
+        notes=tuple(_notes(actuators, robot, models, rules)), data=data,
+    )  # fmt: skip
+
+
+def _fitted_to(actuator: Actuator, recording: Recording) -> bool:
+    inputs = actuator.calibration.inputs if actuator.calibration else []
+    return any(one.sha256 == recording.sha256 for one in inputs)
+
+
+def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part, str]:
+    """Rows to score, rows of the offsets, and the former in words."""
+    if not test_loops:
+        return everything, everything, "all rows"
+    own = sorted({int(n) for n in recording.table["trial"].unique()})
+    if strange := [n for n in test_loops if n not in own]:
+        raise InputError(
+            f"{recording.name} has no loop {strange[0]}: its loops are {_listed(own)}. Name some "
+            "of them in `test_loops`."
+        )
+    if set(test_loops) == set(own):
+        raise InputError(
+            f"`test_loops` names all loops of {recording.name}: one must be left to estimate the "
+            "offsets from. Leave one out, or give no loops."
+        )
+    chosen = list(test_loops)
+    return (
+        lambda number, elapsed, group: np.isin(number, chosen),
+        lambda number, elapsed, group: ~np.isin(number, chosen),
+        f"loop {_listed(chosen)}, with the offsets of the others",
+    )
+
+
+def _condition(own: Played, data: ServoData, test: Part, rest: Part, seed: int) -> Condition:
+    """Scores of one simulated robot."""
+    zero = {joint: found[0] for joint, found in offsets(own.tracks, data, rest).items()}
+    tracks = {joint: [t + zero[joint] for t in own.tracks[joint]] for joint in data.joints}
+    errors = scores.errors(None, tracks, data, test)
+    joints = {
+        joint: TwinErrors(
+            mae_rad=float(np.mean(np.abs(e.free_run))), rmse_rad=scores.rms(e.free_run),
+            rmse_raw_rad=scores.rms(e.raw), offset_rad=zero[joint],
+        )
+        for joint, e in errors.items()
+    }  # fmt: skip
+    mean = TwinErrors(
+        mae_rad=scores.mean_known([j.mae_rad for j in joints.values()]),
+        rmse_rad=scores.mean_known([j.rmse_rad for j in joints.values()]),
+        rmse_raw_rad=scores.mean_known([j.rmse_raw_rad for j in joints.values()]),
+        offset_rad=float(np.mean(np.abs([j.offset_rad for j in joints.values()]))),
+    )
+    times = STEP_S * np.arange(len(own.gyro[0]) if own.gyro else 0, dtype=float)
+    return Condition(
+        joints=joints, mean=mean, rmse_rad=scores.interval(errors, seed), copies=own.copies,
+        upright=own.upright, gyro=spectrum(times, own.gyro), errors=errors, tracks=tracks,
+        first_fall_s=own.first_fall_s if np.isfinite(own.first_fall_s) else None,
+    )  # fmt: skip
+
+
+def _twin_of(
+    found: Sequence[Sequence[Condition]], data: ServoData, test: Part, seed: int
+) -> ActuatorTwin:
+    """Conditions of one actuator, its torques as they are and stronger, and what they say."""
+    if len(found) == 1:
+        return ActuatorTwin(air=found[0][0], ground=None, evidence=None)
+    cases = [
+        Case(
+            air=air.tracks, ground=ground.tracks, errors=air.errors, ground_errors=ground.errors,
+            offsets={
+                j: (own.offset_rad, ground.joints[j].offset_rad) for j, own in air.joints.items()
+            },
+        )
+        for air, ground in zip(*found, strict=True)
+    ]  # fmt: skip
+    return ActuatorTwin(
+        air=found[0][0], ground=found[1][0], evidence=evidence(cases, data, test, seed)
+    )
+
+
+def _notes(
+    actuators: Mapping[str, Actuator],
+    robot: ServoRobot,
+    models: Mapping[str, ActuatorTwin],
+    rules: Mapping[str, ReadingRule],
+) -> list[str]:
+    notes = [*in_words(rules)]
+    if not robot.free:
+        notes.append(f"{robot.name} is fixed to the world in its model: there is no other ground.")
+    for name, own in actuators.items():
+        borrowed = {joint: [f"{other}'s numbers"] for joint, other in own.fallbacks.items()}
+        notes += [f"{name}: {j} have {said}." for j, said in share_sentences(borrowed)]
+        ground = models[name].ground
+        if ground and not ground.upright:
+            notes.append(
+                f"{name}: no simulated robot stays up (the first falls after "
+                f"{ground.first_fall_s:.1f} s). On its back it moves as in the air, so there is "
+                "nothing to tell the ground from."
+            )
+    if presets := [name for name in actuators if name in PRESETS]:
+        notes.append(
+            f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
+            "age of readings, too, that age counts twice here."
+        )
+    return notes
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))

@@ -1,0 +1,58 @@
+"""`pupper-analyze twin` as a user meets it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pupper_sysid.cli.programs import pupper_analyze
+from support.command_line import refused, run_program
+from support.json_keys import DOCUMENTED, key_line
+from support.package import ROOT
+
+SAMPLES = ROOT / "data/samples"
+WALK, CALIBRATION = SAMPLES / "playback.csv", SAMPLES / "calibrated.yaml"
+
+
+@pytest.fixture
+def imu(tmp_path) -> Path:
+    path = tmp_path / "imu.csv"
+    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(400))
+    path.write_text("timestamp,gx,gy,gz\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def test_the_twin_of_a_sample_walk_is_printed_drawn_and_has_the_documented_keys(
+    capsys, tmp_path, monkeypatch, imu
+):
+    monkeypatch.chdir(tmp_path)
+    given = ("twin", WALK, "--actuator", CALIBRATION, "--robots", 1, "--threads", 1, "--imu", imu)
+    code, out, err = run_program(capsys, pupper_analyze, *given, "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert key_line(found) == DOCUMENTED["pupper-analyze twin"]
+    model = found["models"]["calibrated.yaml"]
+    # an emulated robot in free air, whose servos were calibrated
+    assert (
+        model["air"]["rmse_rad"]["value"] < 0.5 * sum(found["persistence_rmse_rad"].values()) / 12
+    )
+    assert found["verdict"] != "ground"
+    assert Path(found["picture"]).stat().st_size > 20_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((WALK,), "No actuator was named"),
+        ((WALK, "--actuator", "papr"), "papr"),
+        ((WALK, "--actuator", "paper", "--test-loops", "a"), "write loop numbers with commas"),
+        ((WALK, "--actuator", "paper", "--robots", 0), "0 robots"),
+        ((WALK, WALK, "--actuator", "paper"), "One recording at a time"),
+        ((WALK, "--actuator", "paper", "--imu", CALIBRATION), "calibrated.yaml"),
+    ],
+)
+def test_input_that_cannot_be_used_is_refused(capsys, tmp_path, monkeypatch, arguments, says):
+    monkeypatch.chdir(tmp_path)
+    assert says in refused(capsys, pupper_analyze, "twin", *arguments)
