@@ -29,8 +29,8 @@ from hostile.options import OPTIONS, every_command
 from hostile.run import Outcome, run, warm
 from hostile.spoil import ALWAYS_REFUSED, CONTENT, PLACES
 
-SLOW_S = 8.0
-"""A refusal that takes longer than this is a fault [s of processor time]."""
+SLOW_S = 10.0
+"""A refusal that takes longer is a fault [s of processor time]; MuJoCo has as much for a model."""
 ELSEWHERE = ("executed", "evil.npy", "x.csv", "x.yaml")
 
 

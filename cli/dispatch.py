@@ -19,6 +19,9 @@ import tyro
 from pupper_sysid.cli.user_errors import CONFIG, end_politely, parse, user_errors
 from pupper_sysid.common.errors import InputError
 
+_SCREEN = 80
+"""Characters of a line of a terminal."""
+
 
 class Command(NamedTuple):
     """One word of a program."""
@@ -81,8 +84,10 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
     """A program's help: its commands, by group, one line each."""
     group_width = 2 + max(len(c.group) for c in commands.values())
     width = 2 + max(map(len, commands))
-    usage = f"usage: {program} COMMAND [OPTIONS]   (COMMAND --help lists options)"
-    lines, last = [usage, description.strip()], None
+    usage = f"usage: {program} COMMAND [OPTIONS | --help]"
+    told = description.strip()
+    first = f"{usage}   {told}"
+    lines, last = ([first] if len(first) <= _SCREEN else [usage, told]), None
     for word, (group, summary, *_) in commands.items():
         shown = "" if group == last else group
         lines.append(f"{shown:{group_width}}{word:{width}}{summary}")

@@ -188,7 +188,7 @@ def _parquet_rows(folder: Path) -> Argv:
     return _parquet(folder, pa.table({"time": column}))
 
 
-@_bomb("parquet, a million joints of a megabyte each")
+@_bomb("parquet, a million joints of a megabyte each", refused=False)
 def _parquet_texts(folder: Path) -> Argv:
     import pyarrow as pa
 

@@ -11,17 +11,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from pupper_sysid.cli.dispatch import Command, run_command
 
-DESCRIPTION = "Measure a cheap servo. Without a robot: `sweep`, `calibrate`, `report`."
+DESCRIPTION = "Measure a cheap servo."
 _SUMMARIES = {
     "robot": {
         "init-robot": "Begin a joint map for another robot.",
         "scan": "List the servos on a bus.",
         "monitor": "Watch the joints live; nothing moves.",
+        "park": "Switch the torque of robots off.",
         "calibrate-joints": "Measure zero, range and direction of each joint.",
         "emulate": "Emulate a robot behind the real protocols.",
     },
     "recording": {
-        "sweep": "Move joints in tones or steps and record them.",
+        "sweep": "Record joints that move, also without a robot.",
         "import": "Turn another project's log into a recording.",
         "doctor": "Check whether a recording is usable.",
         "delay": "Split the lag into bus, sensor and servo.",
@@ -43,7 +44,7 @@ _SUMMARIES = {
         "samples": "Copy sample recordings, policies and models here.",
     },
 }
-_HOLD_BUS = {"scan", "monitor", "calibrate-joints", "emulate", "sweep"}
+_HOLD_BUS = {"scan", "monitor", "park", "calibrate-joints", "emulate", "sweep"}
 _MODULES = {"import": "import_log"}  # a module cannot be called `import`
 # `fit-servo` of the group `model` is the class FitServo in commands/model/fit_servo.py
 COMMANDS = {

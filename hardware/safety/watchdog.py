@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import subprocess
@@ -26,7 +27,14 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.address import BusAddress
+from pupper_sysid.hardware.clock import lasting_s
 from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.hardware.safety.notes import remove_note, write_note
+
+HANG_S = 1.0
+"""Without a beat for so long, the driver counts as hung."""
+SWITCH_ON_S = 5.0
+"""Longest time to switch the torque on, servo by servo on a line with faults."""
 
 _BEAT_S = 0.05
 _SILENT_S = 0.5
@@ -49,6 +57,23 @@ class Watchdog:
     """
 
     def __init__(self, address: BusAddress, joint_map: JointMap):
+        self._beaten_s, self._due_s = 0.0, math.inf
+        self._unanswered: deque[float] = deque()
+        self._pose: dict[str, float] = {}
+        self._registers: Mapping[str, Mapping[str, int]] = {}
+        self._orders = {
+            "kind": address.kind,
+            # from any folder
+            "where": os.path.abspath(address.where),
+            "baud": address.baud,
+            "map": joint_map.file.model_dump(mode="json", by_alias=True),
+            "coordinates": joint_map.coordinates,
+            "driver": os.getpid(),
+        }
+        self._start()
+
+    def _start(self) -> None:
+        """Start the process, and wait until it is ready."""
         # a session of its own: Ctrl-C at the terminal is for the driver
         self._process = subprocess.Popen(
             # -P: a file in the user's folder, such as json.py, must not stand in for a module
@@ -56,19 +81,8 @@ class Watchdog:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,
         )  # fmt: skip
-        self._beaten_s = 0.0
-        self._unanswered: deque[float] = deque()
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._send(
-            {
-                "kind": address.kind,
-                "where": address.where,
-                "baud": address.baud,
-                "map": joint_map.file.model_dump(mode="json", by_alias=True),
-                "coordinates": joint_map.coordinates,
-                "driver": os.getpid(),
-            }
-        )
+        self._send(self._orders)
         ready, _, _ = select.select([self._process.stdout], [], [], _START_WITHIN_S)
         if not ready or self._process.stdout.readline() != b"ready\n":
             self._process.kill()
@@ -85,11 +99,19 @@ class Watchdog:
 
         To be called before the first servo is on: a driver may be killed while it switches them.
         """
-        self._send({"arm": dict(zip(joints, map(float, pose_rad), strict=True))})
+        self._pose = dict(zip(joints, map(float, pose_rad), strict=True))
+        self._arm()
+        self._due_s = lasting_s() + SWITCH_ON_S
+
+    def _arm(self) -> None:
+        write_note(self._orders, list(self._pose), self._process.pid)
+        self._send({"arm": self._pose})
 
     def disarm(self) -> None:
         """Expect no beats: the torque is off."""
+        self._due_s, self._pose = math.inf, {}
         self._send({"disarm": True})
+        remove_note(self._orders["where"])
 
     def beat(self) -> None:
         """Report that the driver is in control; cheap enough for every tick.
@@ -97,13 +119,22 @@ class Watchdog:
         Raises
         ------
         SafetyStop
-            If the watchdog process has ended, or has not answered for half a second.
+            If the watchdog process has ended, or has not answered for half a second; or if this
+            process, or the machine, stood still for so long that the torque may be off by now.
         """
-        now = time.monotonic()
+        now, lasting = time.monotonic(), lasting_s()
+        late_s = lasting - self._due_s
+        if self._due_s < math.inf:
+            self._due_s = lasting + HANG_S
+        if late_s > 0:
+            raise SafetyStop(
+                f"this process stood still for {HANG_S + late_s:.1f} s while the torque was on. "
+                "Find out what stopped it (a suspended machine, a debugger), then start again."
+            )
         if now - self._beaten_s > _BEAT_S:
             self._beaten_s = now
             self._take_answers()
-            if self._unanswered and now - self._unanswered[0] > _SILENT_S:
+            if self._silent(now):
                 raise SafetyStop(
                     f"the watchdog process has not answered for {_SILENT_S:g} s, and without it "
                     "the robot would not be parked if this process died. Find out what stopped "
@@ -123,10 +154,27 @@ class Watchdog:
 
     def restore(self, registers: Mapping[str, Mapping[str, int]]) -> None:
         """Set these registers back, by joint, if the driver ends without having done so."""
+        self._registers = registers
         self._send({"registers": registers})
 
     def take_over(self) -> None:
-        """Torque-off or a register was not confirmed and the bus is released: keep trying."""
+        """Torque-off or a register was not confirmed and the bus is released: keep trying.
+
+        A watchdog process that has ended or does not answer, which may be why, is replaced.
+
+        Raises
+        ------
+        BusError
+            If a new one does not start.
+        """
+        self._take_answers()
+        if self._process.poll() is not None or self._silent(time.monotonic()):
+            self._process.kill()
+            self._close_pipe()
+            self._start()
+            if self._pose:
+                self._arm()
+            self.restore(self._registers)
         self.only_limp()
         self._close_pipe()
 
@@ -147,6 +195,10 @@ class Watchdog:
         with contextlib.suppress(OSError):
             while left:  # the first message is longer than a pipe takes at once
                 left = left[os.write(pipe.fileno(), left) :]
+
+    def _silent(self, now: float) -> bool:
+        """Whether a message has not been answered in time."""
+        return bool(self._unanswered) and now - self._unanswered[0] > _SILENT_S
 
     def _take_answers(self) -> None:
         """Forget as many messages as have been answered."""

@@ -21,7 +21,6 @@ import json
 import os
 import select
 import signal
-import socket
 import sys
 import time
 from dataclasses import dataclass, field
@@ -32,19 +31,16 @@ import numpy as np
 # everything that parking needs is loaded at the start, not when it is urgent
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.address import BusAddress
+from pupper_sysid.hardware.clock import lasting_s
 from pupper_sysid.hardware.connect import open_bus
-from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.opening import AUTO_BAUDS
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
-from pupper_sysid.hardware.lock import LOG, open_here
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, say, switch_off
 from pupper_sysid.hardware.safety.monitor import GuardLimits
+from pupper_sysid.hardware.safety.notes import remove_note
 from pupper_sysid.hardware.safety.registers import ChangedRegisters
+from pupper_sysid.hardware.safety.watchdog import HANG_S, SWITCH_ON_S
 
-HANG_S = 1.0
-"""Without a beat for so long, the driver counts as hung."""
-SWITCH_ON_S = 5.0
-"""Longest time to switch the torque on, servo by servo on a line with faults."""
 PARK_WITHIN_S = 0.5
 """Longest way back, so that all is over within a second."""
 
@@ -101,6 +97,7 @@ def main() -> None:
         return
     if orders.pose_rad:
         park(orders)
+        remove_note(orders.address.where)
     if orders.registers:
         restore(orders)
 
@@ -117,17 +114,17 @@ def first_orders(message: dict[str, Any]) -> _Orders:
 def _follow(orders: _Orders, pipe: int, answers: int) -> None:
     """Take messages until the driver is gone, hangs, or needs no watchdog any more."""
     os.set_blocking(answers, False)
-    received, last = b"", time.monotonic()
+    received, last = b"", lasting_s()
     while not orders.done:
         ready, _, _ = select.select([pipe], [], [], 0.1)
         if not ready:
-            if orders.pose_rad and time.monotonic() - last > orders.patience_s:
+            if orders.pose_rad and lasting_s() - last > orders.patience_s:
                 with contextlib.suppress(OSError):
                     os.kill(orders.driver, signal.SIGKILL)
                 return
             continue
         data = os.read(pipe, 65_536)
-        last = time.monotonic()
+        last = lasting_s()
         *lines, received = (received + data).split(b"\n")
         for line in lines:
             orders.take(line)
@@ -147,17 +144,17 @@ def park(orders: _Orders) -> None:
     say_s, silence_s, present_s = start + _SOON_S, _SAY_EVERY_S, start
     while left:
         now = time.monotonic()
-        if _is_there(orders.address):
+        if is_there(orders.address):
             present_s = now
-        elif now - present_s > _GONE_S and not _can_come_back(orders.address):
-            _say(f"{orders.address.where} is gone for good; {_may_be_on(left)}")
+        elif now - present_s > _GONE_S and not can_come_back(orders.address):
+            say(f"{orders.address.where} is gone for good; {may_be_on(left)}")
             return
         if now > say_s:
-            _say(f"{orders.address.where}: {_may_be_on(left)} It is tried on.")
+            say(f"{orders.address.where}: {may_be_on(left)} It is tried on.")
             say_s, silence_s = now + silence_s, min(2 * silence_s, _LONGEST_SILENCE_S)
         try:
             if orders.only_limp or now - start > _OPEN_WITHIN_S:
-                left = _limp(orders, left)
+                left = switch_off(orders.address, orders.joint_map, left)
             else:
                 left = _go_home(orders)
         except Exception:  # of whatever kind, a lack of memory too: the torque may be on
@@ -184,64 +181,6 @@ def _go_home(orders: _Orders) -> list[str]:
         limp = guard.torque(False)
         guard.close()
     return [] if limp else joints
-
-
-def _limp(orders: _Orders, joints: list[str]) -> list[str]:
-    """Switch the torque off, whoever holds the lock; those of `joints` that did not confirm it."""
-    address, joint_map = orders.address, orders.joint_map.per_servo()
-    if address.kind == "feetech":
-        joint_map = joint_map.select(joints)
-        # first without waiting for anything: it reaches servos that hear but do not answer, too
-        line = FeetechLine(address.where, address.baud or AUTO_BAUDS[0], exclusive=False)
-        line.torque_off(joint_map.ids)
-        line.close()
-    bus = open_bus(address, joint_map, exclusive=False)
-    try:
-        limp = bus.torque(False)
-    finally:
-        bus.close()
-    return [name for name in joints if not limp or name not in bus.joint_names]
-
-
-def _is_there(address: BusAddress) -> bool:
-    """Whether the line exists; a proxy's socket must have somebody behind it."""
-    if address.kind != "esp32":
-        return os.path.exists(address.where)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as line:
-        line.settimeout(_OPEN_WITHIN_S)
-        try:
-            line.connect(address.where)
-        except (FileNotFoundError, ConnectionRefusedError):
-            return False
-        except OSError:
-            return True
-    return True
-
-
-def _can_come_back(address: BusAddress) -> bool:
-    """Whether a line that is gone may be plugged in or served again, with the same servos."""
-    terminal = os.path.realpath(address.where).startswith("/dev/pts/")
-    return os.path.isdir(os.path.dirname(address.where) or ".") and not terminal
-
-
-def _may_be_on(joints: list[str]) -> str:
-    return (
-        f"the torque of {', '.join(joints)} could not be switched off and may be on: switch the "
-        "robot's power off."
-    )
-
-
-def _say(text: str) -> None:
-    """Into the system's log and `watchdog.log`: the driver's terminal may be gone."""
-    with contextlib.suppress(Exception):
-        import syslog
-
-        syslog.openlog("pupper-sysid")
-        syslog.syslog(syslog.LOG_ALERT, text)
-    with contextlib.suppress(Exception):
-        descriptor = open_here(LOG, os.O_WRONLY | os.O_APPEND)
-        os.write(descriptor, f"{time.strftime('%Y-%m-%dT%H:%M:%S%z')} {text}\n".encode())
-        os.close(descriptor)
 
 
 def restore(orders: _Orders) -> None:

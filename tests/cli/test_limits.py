@@ -120,3 +120,15 @@ def test_a_script_or_log_that_never_ends_is_refused_at_once(capsys):
     for option in ("--playback", "--replay"):
         words = ["data/samples/policies/mlp"] if option == "--replay" else []
         assert "is not a file" in refused(capsys, pupper_deploy, *words, option, "/dev/zero")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--baud", "0"), "--baud 0: choose"),
+        (("--load", "none", "--backlash", "1e9"), "--backlash is 1e+09 degrees; it must be from 0"),
+        (("--load", "none", "--backlash", "-1"), "--backlash is -1 degrees"),
+    ],
+)
+def test_an_emulated_line_that_cannot_be_is_refused(capsys, words, says):
+    assert says in refused(capsys, pupper_sysid, "emulate", "feetech", *words)

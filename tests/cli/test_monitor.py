@@ -165,6 +165,7 @@ def test_ctrl_c_ends_it_as_it_should(capsys, monkeypatch):
     [
         (("--bus", "emulated", "--joint-map", "sts3215"), "has its own"),
         (("--bus", "emulated", "--rate", "0"), "--rate is 0"),
+        (("--bus", "emulated", "--rate", "1e9"), "it must be from 0.1 to 1000 Hz"),
         (("--bus", "emulated", "--seconds", "-1"), "--seconds is -1"),
         (("--bus", "usb"), "write emulated, esp32"),
     ],

@@ -176,3 +176,10 @@ def wait_until(true: Callable[[], bool], seconds: float = 3.0) -> bool:
             return False
         time.sleep(0.005)
     return True
+
+
+def let_go(server: FeetechPty | ProxySocket) -> None:
+    """Switch all servos off, as after power-on: a driver that misses one does not drive it."""
+    bench = server.emulator.bench
+    for k in bench.index_of_id.values():
+        bench.torque(k, server.now(), False)

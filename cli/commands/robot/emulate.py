@@ -41,6 +41,8 @@ from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.sweep.bench import parse_load
 
+_MOST_BACKLASH_DEG = 20.0
+
 
 @dataclass(frozen=True)
 class Common:
@@ -137,7 +139,10 @@ class Feetech(Common):
             )
         if self.joint_map and self.walking:
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
-        baud = self.baud or (1_000_000 if series is STS3215 else 500_000)
+        baud = self.baud
+        if baud is None:
+            baud = 1_000_000 if series is STS3215 else 500_000
+        terminal.need_within("--backlash", self.backlash, 0, _MOST_BACKLASH_DEG, "degrees")
         if baud not in BAUD_RATES:
             raise InputError(f"--baud {baud}: choose {', '.join(map(str, BAUD_RATES))}.")
         load = None

@@ -22,6 +22,7 @@ from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 
+_RATES_HZ = (0.1, 1000.0)
 _ONCE_S = 0.3  # voltage and temperature are not in every reply
 _GOALS_EVERY_S = 1.0  # one request per servo, and only another program could change them
 _DRAW_EVERY_S = 0.1
@@ -53,7 +54,7 @@ class Monitor:
 
     def run(self) -> None:
         """Read and show until the end."""
-        terminal.need_positive("--rate", self.rate)
+        terminal.need_within("--rate", self.rate, *_RATES_HZ, "Hz")
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
         bus = _open(self.bus, self.joint_map)

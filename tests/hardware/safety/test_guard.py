@@ -77,6 +77,12 @@ class RecordingWatchdog(Watchdog):
     def _send(self, message):
         self.log += [f"watchdog {word}" for word in message]
 
+    def arm(self, joints, pose_rad):
+        self._send({"arm": True})
+
+    def disarm(self):
+        self._send({"disarm": True})
+
     def beat(self):
         pass
 

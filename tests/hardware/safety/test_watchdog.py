@@ -9,6 +9,7 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import LOG
+from pupper_sysid.hardware.safety import limp as limp_module
 from pupper_sysid.hardware.safety import watchdog_process
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.watchdog import Watchdog
@@ -30,7 +32,14 @@ from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.recordings.files import load
-from support.servo_servers import bench_of, moving_servos, on_a_port, on_a_socket, still_servos
+from support.servo_servers import (
+    bench_of,
+    let_go,
+    moving_servos,
+    on_a_port,
+    on_a_socket,
+    still_servos,
+)
 
 pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second
 
@@ -76,6 +85,7 @@ def robot(request):
     """A served emulated robot: server and address."""
     if request.param == "feetech":
         with on_a_port(moving_servos()) as server:
+            let_go(server)
             yield server, f"feetech:{server.device}"
         return
     rng = np.random.default_rng(3)
@@ -83,6 +93,7 @@ def robot(request):
     with tempfile.TemporaryDirectory(prefix="w") as name:
         path = Path(name) / "s"
         with on_a_socket(ProxyEmulator(bench, rng), path) as server:
+            let_go(server)
             yield server, f"esp32:{path}"
 
 
@@ -273,6 +284,28 @@ def test_a_watchdog_that_was_stopped_is_noticed_within_a_second(robot):
         os.kill(stopped, signal.SIGCONT)
 
 
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_robot_that_does_not_confirm_is_left_to_a_new_watchdog_if_the_old_one_is_gone(
+    robot, number
+):
+    server, address = robot
+    bus = switched_on(address)
+    assert bus._watchdog is not None
+    gone = bus._watchdog._process.pid
+    os.kill(gone, number)
+    bus.bus.torque = lambda on: False  # type: ignore[method-assign]  # nothing is confirmed
+    with suppress(SafetyStop):
+        while True:
+            bus.sleep_until(bus.now() + 0.2)
+    bus.close()
+    try:
+        assert bus._watchdog._process.pid != gone
+        wait_for(lambda: limp(server), 8.0)
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(gone, signal.SIGCONT)
+
+
 def test_beats_to_a_watchdog_that_reads_nothing_never_wait():
     lost = Watchdog(BusAddress("esp32", "/tmp/none"), load_joint_map("mini_pupper_2"))
     os.kill(lost._process.pid, signal.SIGSTOP)
@@ -295,7 +328,8 @@ def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monke
             return super().torque(on) and (on or len(asked) > 45)
 
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(watchdog_process, "open_bus", lambda *of, **how: Deaf(draw_robot(rng), rng))
+    for module in (limp_module, watchdog_process):
+        monkeypatch.setattr(module, "open_bus", lambda *of, **how: Deaf(draw_robot(rng), rng))
     orders = orders_for()
     watchdog_process.park(orders)
     assert len(asked) > 45 and not asked[-1]
@@ -311,7 +345,8 @@ def test_a_lack_of_memory_does_not_end_the_tries(monkeypatch):
             raise MemoryError
         return last
 
-    monkeypatch.setattr(watchdog_process, "open_bus", open_bus)
+    for module in (limp_module, watchdog_process):
+        monkeypatch.setattr(module, "open_bus", open_bus)
     orders = orders_for()
     watchdog_process.park(orders)
     assert len(tries) == 4
@@ -328,7 +363,7 @@ def test_half_a_message_is_no_reason_to_leave_a_robot():
     "where, comes", [("/dev/ttyUSB0", True), ("/dev/pts/7", False), ("/nowhere/at/all", False)]
 )
 def test_only_a_line_that_cannot_come_back_is_given_up(where, comes):
-    assert watchdog_process._can_come_back(BusAddress("feetech", where)) is comes
+    assert limp_module.can_come_back(BusAddress("feetech", where)) is comes
 
 
 def test_a_driver_without_its_watchdog_does_not_go_on():

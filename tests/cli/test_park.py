@@ -1,0 +1,231 @@
+"""`park` switches a robot off whoever holds its lock, and one that nobody drives any more."""
+
+from __future__ import annotations
+
+import ast
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.cli.commands.robot.park import Park
+from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
+from pupper_sysid.common.errors import SafetyStop
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware import clock
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.lock import runtime_folder
+from pupper_sysid.hardware.safety import watchdog
+from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from support.servo_servers import let_go, moving_servos, on_a_port, on_a_socket, wait_until
+
+ROOT = Path(__file__).resolve().parents[2]
+PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
+
+DRIVER = """
+import os, sys
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
+bus = open_guarded(parse_address(sys.argv[1]))
+for _ in range(20):  # servos that share a busy machine with their driver answer too late
+    try:
+        bus.torque(True)
+        break
+    except BusError:
+        pass
+print(bus._watchdog._process.pid, flush=True)
+while True:
+    bus.write(bus.sent)
+    bus.sleep_until(bus.now() + 0.02)
+"""
+
+
+@pytest.fixture(params=["feetech", "esp32"])
+def robot(request, tmp_path, monkeypatch):
+    """A served emulated robot and its address."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    if request.param == "feetech":
+        with on_a_port(moving_servos()) as server:
+            let_go(server)
+            yield server, f"feetech:{server.device}"
+        return
+    rng = np.random.default_rng(3)
+    bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
+    with on_a_socket(ProxyEmulator(bench, rng), tmp_path / "s") as server:
+        let_go(server)
+        yield server, f"esp32:{tmp_path / 's'}"
+
+
+def limp(server) -> bool:
+    return not any(server.emulator.bench.is_on(k) for k in range(len(JOINT_NAMES)))
+
+
+def driven(address: str) -> tuple[int, int]:
+    """Process ids of a driver and its watchdog."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, address], stdout=subprocess.PIPE, cwd=ROOT
+    )
+    assert process.stdout is not None
+    return process.pid, int(process.stdout.readline())
+
+
+def end(processes: tuple[int, int]) -> None:
+    """Kill those that are left, before one notices that the other is gone."""
+    for signalled in (signal.SIGSTOP, signal.SIGKILL):
+        for number in processes[::-1]:
+            with suppress(ProcessLookupError):
+                os.kill(number, signalled)
+
+
+@pytest.mark.wall_clock
+def test_park_switches_off_and_names_the_program_that_drives_the_robot(robot):
+    server, address = robot
+    processes = driven(address)
+    try:
+        done = subprocess.run(
+            [*PARK, "--bus", address], cwd=ROOT, capture_output=True, text=True, timeout=60
+        )
+        assert f"process {processes[0]} drives this robot" in done.stderr
+        assert done.returncode == 1
+        end(processes)
+        again = subprocess.run(
+            [*PARK, "--bus", address], cwd=ROOT, capture_output=True, text=True, timeout=60
+        )
+        assert again.returncode == 0, again.stderr
+        assert limp(server) and notes() == []
+    finally:
+        end(processes)
+
+
+@pytest.mark.wall_clock
+def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot):
+    server, address = robot
+    processes = driven(address)
+    try:
+        for left_on in (False, True):
+            if left_on:
+                end(processes)
+            done = subprocess.run(PARK, cwd=ROOT, capture_output=True, text=True, timeout=60)
+            assert done.returncode == 0, done.stderr
+            assert ("No driver that is gone" in done.stderr) is not left_on
+            assert limp(server) is left_on
+        assert notes() == []
+    finally:
+        end(processes)
+
+
+@pytest.mark.wall_clock
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, number):
+    server, address = robot
+    supervisor = subprocess.Popen([*PARK, "--supervise"], cwd=ROOT, stderr=subprocess.PIPE)
+    processes = driven(address)
+    try:
+        assert not limp(server) and len(notes()) == 1
+        time.sleep(0.5)
+        assert not limp(server), "it leaves a robot that is driven alone"
+        for each in (signal.SIGSTOP, number):  # neither has time to notice that the other is gone
+            for one in processes[::-1]:
+                os.kill(one, each)
+        assert wait_until(lambda: limp(server), 15.0)
+        assert wait_until(lambda: notes() == [], 15.0)
+    finally:
+        end(processes)
+        supervisor.send_signal(signal.SIGTERM)
+        said = supervisor.communicate(timeout=20)[1].decode()
+    assert "nobody drove it any more" in said and supervisor.returncode == 143
+
+
+@pytest.mark.wall_clock
+def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
+    _, address = robot
+    bus = open_guarded(parse_address(address))
+    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()), 10.0)
+    bus.torque(True)
+    assert bus._watchdog is not None
+    watchdog = bus._watchdog._process.pid
+    os.kill(watchdog, signal.SIGSTOP)
+    time.sleep(1.2)  # as if this process had been stopped, too
+    with pytest.raises(SafetyStop, match="this process stood still for"):
+        bus.write(bus.sent)
+    os.kill(watchdog, signal.SIGCONT)
+    bus.close()
+
+
+@pytest.mark.wall_clock
+def test_a_machine_that_was_suspended_during_a_walk_does_not_go_on(robot, monkeypatch):
+    _, address = robot
+    bus = open_guarded(parse_address(address))
+    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()), 10.0)
+    bus.torque(True)
+    # an hour passes at once, and monotonic clocks stood still
+    monkeypatch.setattr(watchdog, "lasting_s", lambda: clock.lasting_s() + 3600)
+    with pytest.raises(SafetyStop, match="this process stood still for 3[56]"):
+        bus.write(bus.sent)
+    bus.close()
+
+
+def test_the_clock_of_the_watchdog_counts_while_the_machine_is_suspended(monkeypatch):
+    asked = []
+    monkeypatch.setattr(clock.time, "clock_gettime", lambda which: asked.append(which) or 1.0)
+    assert clock.lasting_s() == 1.0 and asked == [clock.time.CLOCK_BOOTTIME]
+
+
+def test_a_robot_that_is_gone_for_good_is_settled(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    write_note(orders("/dev/pts/99999", 0), ["LF_hip"], 0)
+    Park(seconds=0.1).run()
+    assert notes() == [] and "gone for good; the torque of LF_hip" in capsys.readouterr().err
+
+
+def test_a_note_is_removed_after_its_device_was_unplugged(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    link, device = tmp_path / "by-id", tmp_path / "ttyUSB0"
+    link.symlink_to(device)
+    write_note(orders(str(link), os.getpid()), ["LF_hip"], os.getpid())
+    (note,) = notes()
+    assert note.in_control() and note.robot == str(device)
+    link.unlink()
+    remove_note(str(link))
+    assert notes() == []
+
+
+def orders(where: str, driver: int) -> dict:
+    """First message of a driver to its watchdog."""
+    return {
+        "kind": "feetech", "where": where, "baud": 1_000_000, "coordinates": "joint",
+        "map": load_joint_map("sts3215").file.model_dump(mode="json", by_alias=True),
+        "driver": driver,
+    }  # fmt: skip
+
+
+def test_a_note_that_cannot_be_read_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    for k, text in enumerate(("", "{", "[]", '{"map": 3}', '{"map": {}, "joints": 1}')):
+        (runtime_folder() / f"{k}.on").write_text(text)
+    os.mkfifo(runtime_folder() / "fifo.on")
+    assert notes() == []
+
+
+def test_every_command_that_opens_a_bus_is_stopped_as_by_ctrl_c():
+    """`end_politely` installs the handlers; a script's `&` has SIGINT ignored."""
+    openers = {"open_bus", "open_guarded", "connect", "Esp32Bus", "scan_line", "switch_off"}
+    servers = {"FeetechPty", "ProxySocket"}
+    for word, command in COMMANDS.items():
+        module = command.where.split(":")[0].replace(".", "/")
+        tree = ast.parse((ROOT / f"cli/commands/{module}.py").read_text())
+        named = {n.name for i in ast.walk(tree) if isinstance(i, ast.ImportFrom) for n in i.names}
+        assert command.holds_bus == bool(named & (openers | servers)), word
+    assert "end_politely()" in (ROOT / "cli/programs/pupper_deploy.py").read_text()
