@@ -1,0 +1,421 @@
+"""What happens to a robot when its driver, its watchdog or both are killed, stopped or starved?
+
+    .venv/bin/python benchmarks/process_campaign.py --repeats 3 --seed 0
+
+An emulated robot runs in this process behind each real protocol. A driver in a process of its own,
+with its watchdog, swings all joints; at a random moment something happens to one of the two or to
+both. Measured is the time until no servo has torque, from then (from the start of `park` where it
+is called by hand), and whether any gets it again. Scenarios in which neither of the two can do
+anything are those for which `pupper-sysid park` exists; a pause of less than the two tolerate must
+not end a drive. Exits with 1 if one did not end as it should.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from emulators import KINDS, served
+
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.lock import lock_name, runtime_folder
+
+PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
+PATIENCE_S, AFTER_S, SWINGS_S = 12.0, 0.7, (0.3, 1.0)
+HEADROOM = 2 << 20
+"""Memory that a starved process may still take [bytes]."""
+
+DRIVER = """
+import fcntl, os, signal, sys, termios, time
+import numpy as np
+from pupper_sysid.cli.user_errors import end_politely
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.hardware.safety import watchdog
+
+address, says, tty = sys.argv[1:4]
+if tty:
+    fcntl.ioctl(os.open(tty, os.O_RDWR), termios.TIOCSCTTY, 0)
+bus = open_guarded(parse_address(address))
+
+held = []
+
+def hoard(*_):
+    while True:  # what it holds is never given back
+        held.append(bytearray(50_000))
+
+def fill(*_):
+    for _ in range(3000):
+        bus._watchdog.restore({})
+
+def sleep_an_hour(*_):
+    awake = watchdog.lasting_s
+    watchdog.lasting_s = lambda: awake() + 3600
+
+def talk(*_):
+    global talks
+    talks = True
+
+talks = False
+for number, handler in ((signal.SIGUSR1, hoard), (signal.SIGUSR2, fill),
+                        (signal.SIGRTMIN, sleep_an_hour), (signal.SIGRTMIN + 1, talk)):
+    signal.signal(number, handler)
+end_politely()
+try:
+    pose = bus.read().position_rad
+    while not np.isfinite(pose).all():
+        pose = bus.read().position_rad
+    for _ in range(20):  # servos that share a busy machine with their driver answer too late
+        try:
+            bus.torque(True)
+            break
+        except BusError:
+            pass
+    with real_time_priority():
+        start = bus.now()
+        os.write(int(says), b"%d\\n" % bus._watchdog._process.pid)
+        while True:
+            bus.write(pose + 0.2 * np.sin(2 * np.pi * 0.5 * (bus.now() - start)))
+            bus.read()
+            if talks:
+                print("x" * 4000, flush=True)
+            bus.sleep_until(bus.now() + 0.02)
+finally:
+    bus.close()
+"""
+
+
+@dataclass
+class Drive:
+    """A driven robot."""
+
+    where: str
+    driver: subprocess.Popen
+    watchdog: int
+    master: int
+    """The terminal's other end, for a driver that has one."""
+    held: ExitStack
+    """What is to be ended afterwards."""
+    struck_s: float = 0.0
+
+    @property
+    def both(self) -> tuple[int, int]:
+        """Process ids, the watchdog first: the driver notices its end later than the reverse."""
+        return self.watchdog, self.driver.pid
+
+
+Strike = Callable[[Drive], None]
+LIMP, GOES_ON = "limp", "goes on"
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Something that happens to processes."""
+
+    whom: str
+    what: str
+    strike: Strike
+    expected: str = LIMP
+    supervised: bool = False
+    terminal: bool = False
+
+
+def send(drive: Drive, number: int, *whom: int) -> None:
+    """Send a signal; both get it before either can notice."""
+    drive.struck_s = time.monotonic()
+    for one in whom:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(one, number)
+
+
+def to_driver(number: int) -> Strike:
+    """A signal to the driver."""
+    return lambda drive: send(drive, number, drive.driver.pid)
+
+
+def to_watchdog(number: int) -> Strike:
+    """A signal to the watchdog."""
+    return lambda drive: send(drive, number, drive.watchdog)
+
+
+def to_both(number: int) -> Strike:
+    """A signal to both, stopped before so that neither notices the other's end."""
+
+    def strike(drive: Drive) -> None:
+        send(drive, signal.SIGSTOP, *drive.both)
+        send(drive, number, *drive.both)
+
+    return strike
+
+
+def paused(stop: Strike, go_on: Strike, seconds: float) -> Strike:
+    """Stopped, and continued after some time."""
+
+    def strike(drive: Drive) -> None:
+        stop(drive)
+        struck = drive.struck_s
+        time.sleep(seconds)
+        go_on(drive)
+        drive.struck_s = struck
+
+    return strike
+
+
+def lock_wanted(then: Strike) -> Strike:
+    """Another process waits for the robot's lock, and gets it when the driver ends."""
+
+    def strike(drive: Drive) -> None:
+        kind, _, where = drive.where.partition(":")
+        lock = where if kind == "feetech" else str(runtime_folder() / lock_name(Path(where)))
+        waiting = subprocess.Popen(["flock", "-x", lock, "sleep", "30"], start_new_session=True)
+        drive.held.callback(lambda: os.killpg(waiting.pid, signal.SIGKILL))
+        time.sleep(0.2)
+        then(drive)
+
+    return strike
+
+
+def starved(then: Strike, driver: bool, watchdog: bool) -> Strike:
+    """Without memory beyond what they have (`ulimit -v`)."""
+
+    def strike(drive: Drive) -> None:
+        for wanted, process in ((driver, drive.driver.pid), (watchdog, drive.watchdog)):
+            if wanted:
+                pages = int(Path(f"/proc/{process}/statm").read_text().split()[0])
+                most = pages * resource.getpagesize() + HEADROOM
+                resource.prlimit(process, resource.RLIMIT_AS, (most, most))
+        then(drive)
+
+    return strike
+
+
+def pipe_full(drive: Drive) -> None:
+    """A stopped watchdog, and more messages than its pipe takes."""
+    send(drive, signal.SIGSTOP, drive.watchdog)
+    struck = drive.struck_s
+    send(drive, signal.SIGUSR2, drive.driver.pid)
+    drive.struck_s = struck
+
+
+def hang_up(drive: Drive) -> None:
+    """The terminal is closed."""
+    drive.struck_s = time.monotonic()
+    os.close(drive.master)
+    drive.master = -1
+
+
+def parked_by_hand(drive: Drive) -> None:
+    """Both are killed, and `park` is called."""
+    to_both(signal.SIGKILL)(drive)
+    time.sleep(1.0)
+    drive.struck_s = time.monotonic()
+    drive.held.enter_context(subprocess.Popen(PARK, stderr=subprocess.DEVNULL))
+
+
+def killed_then_stopped(drive: Drive) -> None:
+    """The watchdog is stopped for two seconds while it parks."""
+    send(drive, signal.SIGKILL, drive.driver.pid)
+    struck = drive.struck_s
+    time.sleep(0.05)
+    paused(to_watchdog(signal.SIGSTOP), to_watchdog(signal.SIGCONT), 2.0)(drive)
+    drive.struck_s = struck
+
+
+KILL, STOP, GO_ON = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT
+HOARD, HOUR, TALK = signal.SIGUSR1, signal.SIGRTMIN, signal.SIGRTMIN + 1
+
+
+def short(to: Callable[[int], Strike], seconds: float) -> Strike:
+    """Stopped for some time."""
+    return paused(to(STOP), to(GO_ON), seconds)
+
+
+SCENARIOS = (
+    Scenario("driver", "SIGKILL", to_driver(KILL)),
+    Scenario("driver", "SIGSTOP", to_driver(STOP)),
+    Scenario("driver", "SIGSTOP, SIGCONT after 0.2 s", short(to_driver, 0.2), GOES_ON),
+    Scenario("driver", "SIGSTOP, SIGCONT after 2 s", short(to_driver, 2.0)),
+    Scenario("driver", "SIGKILL, lock taken", lock_wanted(to_driver(KILL))),
+    Scenario("driver", "SIGSTOP, lock taken", lock_wanted(to_driver(STOP))),
+    Scenario("driver", "standard output full", to_driver(TALK)),
+    Scenario("driver", "out of memory", starved(to_driver(HOARD), True, False)),
+    Scenario("driver", "terminal closed", hang_up, terminal=True),
+    Scenario("driver", "its machine was suspended: clock + 1 h", to_driver(HOUR)),
+    Scenario("watchdog", "SIGKILL", to_watchdog(KILL)),
+    Scenario("watchdog", "SIGSTOP", to_watchdog(STOP)),
+    Scenario("watchdog", "SIGSTOP, SIGCONT after 0.2 s", short(to_watchdog, 0.2), GOES_ON),
+    Scenario("watchdog", "SIGSTOP, SIGCONT after 2 s", short(to_watchdog, 2.0)),
+    Scenario("watchdog", "SIGKILL, lock taken", lock_wanted(to_watchdog(KILL))),
+    Scenario("watchdog", "SIGSTOP, pipe full", pipe_full),
+    Scenario("watchdog", "out of memory, driver SIGKILL", starved(to_driver(KILL), False, True)),
+    Scenario("watchdog", "SIGSTOP for 2 s, driver SIGKILL", killed_then_stopped),
+    Scenario("both", "SIGSTOP for 3 s (machine suspended)", short(to_both, 3.0)),
+    Scenario("both", "out of memory", starved(to_driver(HOARD), True, True)),
+    Scenario("both", "SIGKILL, supervised", to_both(KILL), supervised=True),
+    Scenario("both", "SIGSTOP, supervised", to_both(STOP), supervised=True),
+    Scenario(
+        "both", "SIGKILL, lock taken, supervised", lock_wanted(to_both(KILL)), supervised=True
+    ),
+    Scenario("both", "SIGKILL, then `park`", parked_by_hand),
+)
+
+
+@dataclass
+class Tally:
+    """What came of one scenario."""
+
+    limp_s: list[float] = field(default_factory=list)
+    on_again: int = 0
+    as_expected: int = 0
+    undriven: int = 0
+    """Drives that the busy machine ended before anything happened, and that were repeated."""
+
+
+@contextmanager
+def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
+    """A driver and its watchdog, in the midst of a swing; None if it did not begin."""
+    reads, writes = os.pipe()
+    master, tty = os.openpty() if scenario.terminal else (-1, -1)
+    with ExitStack() as held:
+        if scenario.supervised:
+            supervisor = subprocess.Popen([*PARK, "--supervise"], stderr=subprocess.PIPE)
+            assert supervisor.stderr is not None
+            supervisor.stderr.readline()  # it watches
+            held.callback(supervisor.wait)
+            held.callback(supervisor.kill)
+        driver = subprocess.Popen(
+            [sys.executable, "-c", DRIVER, where, str(writes), os.ttyname(tty) if tty >= 0 else ""],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, pass_fds=[writes],
+            start_new_session=True,
+        )  # fmt: skip
+        os.close(writes)
+        if tty >= 0:
+            os.close(tty)
+        with os.fdopen(reads, "rb") as said:
+            line = said.readline()
+        drive = Drive(where, driver, int(line or 0), master, held)
+        try:
+            yield drive if line else None
+        finally:
+            for one in drive.both[line == b"" :]:
+                for number in (STOP, KILL):
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(one, number)
+            if drive.master >= 0:
+                os.close(drive.master)
+            driver.communicate()
+
+
+def let_go(server) -> None:
+    """Switch all servos off."""
+    for k in range(len(JOINT_NAMES)):
+        server.emulator.bench.torque(k, server.now(), False)
+
+
+def limp(server) -> bool:
+    """Whether no servo has torque."""
+    return not any(server.emulator.bench.is_on(k) for k in range(len(JOINT_NAMES)))
+
+
+def once(server, where: str, scenario: Scenario, rng: np.random.Generator, tally: Tally) -> bool:
+    """One repeat; False if it has to be repeated."""
+    let_go(server)
+    with driven(where, scenario) as drive:
+        if drive is None:
+            return False
+        time.sleep(float(rng.uniform(*SWINGS_S)))
+        if limp(server) or drive.driver.poll() is not None:
+            return False
+        at = threading.Event()
+        limp_s = [np.inf]
+
+        def watch() -> None:
+            while not at.is_set() and not limp(server):
+                time.sleep(0.002)
+            limp_s[0] = time.monotonic() if limp(server) else np.inf
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()  # a pause ends after the robot may be limp
+        scenario.strike(drive)
+        watcher.join(2.0 if scenario.expected == GOES_ON else PATIENCE_S)
+        at.set()
+        watcher.join()
+        time.sleep(AFTER_S)
+        again = np.isfinite(limp_s[0]) and not limp(server)
+        tally.on_again += again
+        if np.isfinite(limp_s[0]):
+            tally.limp_s.append(limp_s[0] - drive.struck_s)
+        found = LIMP if np.isfinite(limp_s[0]) else GOES_ON
+        running = drive.driver.poll() is None
+        tally.as_expected += found == scenario.expected and not again and (found == LIMP or running)
+    return True
+
+
+def main() -> None:
+    """Run it, and print a table."""
+    parser = argparse.ArgumentParser(description="Processes killed, stopped and starved.")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="scenarios whose name contains this")
+    options = parser.parse_args()
+    print("| bus | process | what happens | repeats | limp after s: median | worst | on again "
+          "| as it should | drives ended before by the load |")  # fmt: skip
+    print("|" + "---|" * 9)
+    rows = failed = 0
+    with tempfile.TemporaryDirectory(prefix="runtime") as runtime:
+        os.environ["XDG_RUNTIME_DIR"] = runtime
+        for kind in KINDS:
+            with served(kind, options.seed) as (server, where, _):
+                for thread in threading.enumerate():  # servos are no program on a busy machine
+                    if thread is not threading.main_thread() and thread.native_id:
+                        with contextlib.suppress(OSError):
+                            how = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+                            os.sched_setscheduler(thread.native_id, how, os.sched_param(10))
+                for number, scenario in enumerate(SCENARIOS):
+                    if options.only not in f"{scenario.whom} {scenario.what}":
+                        continue
+                    rng = np.random.default_rng([options.seed, number])
+                    tally, done = Tally(), 0
+                    while done < options.repeats:
+                        if once(server, where, scenario, rng, tally):
+                            done += 1
+                        else:
+                            tally.undriven += 1
+                            if tally.undriven > 20:
+                                raise SystemExit(f"{kind}: no drive begins on this machine.")
+                    times = np.array(tally.limp_s)
+                    shown = f"{np.median(times):.2f} | {times.max():.2f}" if len(times) else "– | –"
+                    if scenario.expected == GOES_ON:
+                        shown = "goes on | –" if not len(times) else shown
+                    rows += 1
+                    failed += options.repeats - tally.as_expected
+                    print(
+                        f"| {kind} | {scenario.whom} | {scenario.what} | {done} | {shown} "
+                        f"| {tally.on_again} | {tally.as_expected} of {done} | {tally.undriven} |",
+                        flush=True,
+                    )
+    load = " ".join(f"{x:.1f}" for x in os.getloadavg())
+    print(
+        f"\n{rows} scenarios, {rows * options.repeats} runs, {failed} did not end as they should. "
+        f"Load of the machine: {load}."
+    )
+    sys.exit(failed > 0)
+
+
+if __name__ == "__main__":
+    main()
