@@ -171,7 +171,7 @@ def conclude(
         candidate_models=fitted,
         lag=pd.lag,
         presets={
-            name: _score_preset(by_joint[joint], data)
+            name: score_preset(by_joint[joint], data)
             for name, by_joint in (presets or {}).items()
             if joint in by_joint
         },
@@ -237,8 +237,17 @@ def _compared(structures: Mapping[str, StructureFit], ready: PreparedJoint) -> _
     return _Compared(nats, carried, lag)
 
 
-def _score_preset(parameters: DelayedPDParameters, data: tuple[TrialData, ...]) -> Scores:
-    """Scores with the offset of these readings: their median about it, as in `sysid.compare`."""
+def score_preset(parameters: DelayedPDParameters, data: tuple[TrialData, ...]) -> Scores:
+    """Scores of published settings on one joint.
+
+    The offset is that of these readings: their median about it, as in `sysid.compare`.
+
+    Parameters
+    ----------
+    parameters : DelayedPDParameters
+        Of the joint.
+    data : tuple of TrialData
+    """
     one = parameters.per_inertia()
     parts = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
              one.velocity_limit, 0.0)  # fmt: skip

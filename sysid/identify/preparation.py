@@ -7,7 +7,7 @@ commands that never arrived are left out, and each tone gets the noise that its 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -91,8 +91,23 @@ class PreparedJoint:
             )
 
 
-def prepare_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> PreparedJoint:
+def prepare_joint(
+    joint: str,
+    trials: tuple[Trial, ...],
+    seed: int,
+    known: Mapping[str, NDArray[np.float64]] | None = None,
+) -> PreparedJoint:
     """Measure the lag of a joint, date its readings, and put its trials on the physics clock.
+
+    Parameters
+    ----------
+    joint : str
+    trials : tuple of Trial
+        All of this joint.
+    seed : int
+    known : dict of str to ndarray, optional
+        Values of candidate models by name, from an earlier fit to these trials; nothing is fitted
+        then.
 
     Raises
     ------
@@ -107,7 +122,10 @@ def prepare_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> PreparedJ
     least = max(quantum(trials) / 3, _LEAST_NOISE_RAD)
     scale = max(lag.noise_rad, least) if np.isfinite(lag.noise_rad) else _NOISE_RAD
     noise = (scale,) * len(data)
-    first = _first_fits(data, noise, deepcopy(rng))
+    if known is None:
+        first = _first_fits(data, noise, deepcopy(rng))
+    else:
+        first = {name: Fit(v, 0.0, np.zeros((len(v), len(v)))) for name, v in known.items()}
     upsets: tuple[Upset, ...] = ()
     for _ in range(_ROUNDS):
         best = min(first, key=lambda name: first[name].cost)
@@ -122,7 +140,8 @@ def prepare_joint(joint: str, trials: tuple[Trial, ...], seed: int) -> PreparedJ
         if upsets:
             recorded, data = _dated(trials, lattice, upsets)
             noise = noise_by_trial(fresh_residuals(model, values, data), data, least)
-        first = {name: refit(name, data, noise, f) for name, f in first.items()}
+        if known is None:
+            first = {name: refit(name, data, noise, f) for name, f in first.items()}
     if lattice is not lag.feedback:
         lag = lag_budget(joint, trials, rng, lattice)
     return PreparedJoint(rng, lag, recorded, data, noise, first, upsets)

@@ -16,6 +16,7 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.page import WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -25,6 +26,7 @@ from pupper_sysid.sysid.recordings.joints import (
     joint_trials,
 )
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.report.recall import can_recall, recall
 from pupper_sysid.sysid.report.sections import Findings, sections
 
 if TYPE_CHECKING:  # they bring libraries that a page does not need
@@ -56,7 +58,8 @@ def write_report(
     joints : str or sequence of str, optional
         By default all that were recorded.
     calibration : Calibration, optional
-        Made from these recordings: its numbers are shown and its seed is used. By default the
+        Made from these recordings: its numbers are shown and its seed is used, and nothing is
+        fitted again but joints under load, whose fits the file does not hold. By default the
         recordings are calibrated.
     models : sequence of str, Path, Calibration or ServoFit
         Servo models to compare on the recordings, as in `sysid.compare.compare`.
@@ -96,7 +99,16 @@ def write_report(
         if progress:
             progress(what, done / steps)
 
-    results = calibrate(recordings, names, seed, workers=workers, progress=advance)
+    results: dict[str, JointCalibrationResult] = {}
+    if calibration is not None:
+        known = [name for name in names if can_recall(calibration.joint(name))]
+        results = recall(calibration, recordings, known, advance)
+    if left := [name for name in names if name not in results]:
+        fitted = calibrate(recordings, left, seed, workers=workers, progress=advance)
+        calibration = calibration or fitted.calibration
+        results |= fitted.joints
+    assert calibration is not None
+    results = {name: results[name] for name in names}
     examinations, responses = [], {}
     lags = {joint: result.lag for joint, result in results.items()}
     examined = examine(recordings, names, seed=seed, lags=lags)
@@ -114,7 +126,7 @@ def write_report(
         comparison = compare(recordings, models, names, seed=seed, lattices=lattices)
     found = Findings(
         recordings=recordings, results=results, examinations=examinations, responses=responses,
-        calibration=calibration or results.calibration, comparison=comparison,
+        calibration=calibration, comparison=comparison,
     )  # fmt: skip
     return write_findings(found, Path(folder), force)
 

@@ -43,11 +43,15 @@ def folder(swept, made, tmp_path_factory) -> Path:
     """A report that compares the calibration and a preset, too; calibrated once."""
     out = tmp_path_factory.mktemp("report")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "calibrate", lambda *given, **more: made)
+        patch.setattr(report, "calibrate", never)
         report.write_report(
             swept, out, calibration=made.calibration, models=[made.calibration, "paper"]
         )
     return out
+
+
+def never(*given, **more):
+    raise AssertionError("a report with a calibration fits nothing")
 
 
 def table(folder: Path, name: str) -> list[dict[str, str]]:
