@@ -187,14 +187,8 @@ def main() -> None:
         key = ("ground" if truth["ground"] else "air", truth["kind"], truth["zero"])
         counts.setdefault(key, Counter())[evidence.verdict] += 1
         if given.each:
-            shares = [
-                f"{s.value:.2f} [{s.low:.2f}, {s.high:.2f}]" if s else "–"
-                for s in (evidence.motion_share, evidence.load_share)
-            ]
-            gap = evidence.difference_rad
-            print(seed, key, evidence.verdict, "motion", shares[0], "load", shares[1],
-                  f"difference {1e3 * gap.value:.2f} [{1e3 * gap.low:.2f}, {1e3 * gap.high:.2f}]",
-                  flush=True)  # fmt: skip
+            share = evidence.motion[0].correlation if evidence.motion[0] else None
+            print(seed, *key, evidence.verdict, share, evidence.load_share[0], flush=True)
     print("| truth | commands | zeros mrad | ground | air | cannot tell |")
     print("|---|---|---|---|---|---|")
     for (truth, kind, zero), own in sorted(counts.items()):

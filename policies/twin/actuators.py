@@ -57,7 +57,6 @@ def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
         A calibration file, a servo card, a preset, or `ideal`.
     robot : ServoRobot
     recording : Recording
-        A calibration that knows other P gains is taken at the one that the recording names.
 
     Raises
     ------
@@ -76,7 +75,20 @@ def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
         return Actuator(
             {f: np.full(count, x[0]) for f, x in servo_ranges(IDEAL).value.items()}, None, {}
         )
-    calibration, fallbacks = spread_over(load_calibration(name), robot.joints)
+    return of_calibration(load_calibration(name), robot, recording)
+
+
+def of_calibration(calibration: Calibration, robot: ServoRobot, recording: Recording) -> Actuator:
+    """The servos of a calibration, on the joints of a robot.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        One that knows other P gains is taken at the one that the recording names.
+    robot : ServoRobot
+    recording : Recording
+    """
+    calibration, fallbacks = spread_over(calibration, robot.joints)
     gains = {t.p_gain for joint in recording.joints for t in recording.trials(joint)}
     if len(gains) == 1 and np.isfinite(gain := gains.pop()):
         joints = {

@@ -29,7 +29,7 @@ def twin_figure(found: Twin) -> Figure:
     for k, joint in enumerate(joints):
         axes = figure.add_subplot(grid[1 + k // columns, k % columns], sharex=first)
         first = first or axes
-        draw_joint(axes, found, joint)
+        draw_joint(axes, found, joint, found.best)
         if k % columns == 0:
             axes.set_ylabel("rad")
         if k + columns >= len(joints):
@@ -59,17 +59,17 @@ def draw_bars(axes: Axes, found: Twin) -> None:
             )  # fmt: skip
     floor = 1e3 * mean_known(list(found.repeatability_rad.values()))
     if np.isfinite(floor):
-        axes.axvline(floor, color=GREEN, ls="--", label="repeatability")
+        axes.axvline(floor, color=GREEN, ls="--", label=f"repeatability {floor:.1f}")
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     axes.set(xlabel="RMS error of predicted readings, mean of the joints [mrad]", xlim=(0, None))
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, columnspacing=1.2)
 
 
-def draw_joint(axes: Axes, found: Twin, joint: str) -> None:
-    """Readings of a joint where its command moves most, and what the best actuator predicts."""
-    runs, best = found.data.runs[joint], found.models[found.best]
+def draw_joint(axes: Axes, found: Twin, joint: str, actuator: str) -> None:
+    """Readings of a joint where its command moves most, and what an actuator predicts."""
+    runs, model = found.data.runs[joint], found.models[actuator]
     place = max(range(len(runs)), key=lambda n: np.std(runs[n].command_rad))
     run = runs[place]
     time = run.trial.send_time_s - run.trial.send_time_s[0]
@@ -78,7 +78,7 @@ def draw_joint(axes: Axes, found: Twin, joint: str) -> None:
     axes.step(time, run.command_rad[shown], where="post", color=FAINT, lw=0.9, label="command")
     axes.plot(time, run.trial.position_rad[shown], "o", ms=2.2, color=INK, label="readings")
     for key, colour, words in PLACES:
-        own: Condition | None = getattr(best, key)
+        own: Condition | None = getattr(model, key)
         if own is not None:
             line = predicted(own.tracks[joint][place], run, run.reading_tick)[shown]
             axes.plot(time, line, color=colour, lw=1.1, label=words)

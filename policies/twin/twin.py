@@ -1,4 +1,4 @@
-"""The twin test: how much does the simulated robot move like the real one?
+"""Twin test: how much the simulated robot moves like the real one.
 
 `twin` gives the commands of a recording to the whole simulated robot, with the servos of one or of
 several actuators, in the air (its trunk fixed) and on the ground. Each predicts the readings that

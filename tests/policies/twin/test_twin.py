@@ -20,7 +20,7 @@ from support.package import ROOT
 
 CALIBRATION = str(ROOT / "data/samples/calibrated.yaml")
 LOOP_STEPS = 20  # a command every 40 ms
-ROWS = 100
+ROWS = 75
 FOUR_LEGS = """
 <mujoco><worldbody>
   <body name="trunk" pos="0 0 0.2">{root}
@@ -88,7 +88,7 @@ def test_a_robot_in_the_air_is_predicted_exactly_there_and_found_there(played):
 
 
 def test_a_robot_on_the_ground_is_predicted_best_there_and_found_there(played):
-    found = compared(played["ground"], CALIBRATION)
+    found = compared(played["ground"], CALIBRATION, "release")
     model = found.models[CALIBRATION]
     assert model.ground is not None and model.evidence is not None
     # its friction and payload are not those of the copies
@@ -98,12 +98,9 @@ def test_a_robot_on_the_ground_is_predicted_best_there_and_found_there(played):
     assert motion is not None and motion.share.low > 0.5
     assert model.ground.joints["LF_hip"].mae_rad <= model.ground.joints["LF_hip"].rmse_rad
     assert len(twin_figure(found).axes) == 13
-
-
-def test_the_servos_that_moved_the_robot_predict_it_better_than_published_ones(played):
-    found = compared(played["ground"], CALIBRATION, "release")
+    # published servos are not those that moved it
     assert found.best == CALIBRATION
-    assert found.models["release"].best_rad > 2 * found.models[CALIBRATION].best_rad
+    assert found.models["release"].best_rad > 2 * model.best_rad
     assert any("ideal feedback" in note for note in found.notes)
 
 

@@ -1,0 +1,183 @@
+"""Twin test of the real walk: does the simulated robot move like the real one?
+
+The commands of `playback_lstm_25hz.csv` on the whole simulated robot, in the air and on the ground,
+with four sets of servos: the published ones (`paper`, `release`), those calibrated from the sweeps
+of one hip and one thigh, which have not seen the walk, and those refitted on its loops 0 and 1.
+Scored on loop 2, with the offsets of the others. Readings are predicted with the poll of the
+sweeps; the published settings, whose delay was found with ideal feedback, also without it. A linear
+filter and an MLP fitted to loops 0 and 1 stand beside them (`servo_model_accuracy.py`).
+
+    .venv/bin/python benchmarks/twin_playback.py --picture docs/pictures/twin.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from matplotlib.figure import Figure
+from servo_model_accuracy import REAL, SPLIT
+from sweep_to_walk import SWEEPS, WALK
+
+from pupper_sysid.common.figure_style import ORANGE, PINK, save, styled
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.policies.twin.actuators import Actuator, of_calibration, robot_for
+from pupper_sysid.policies.twin.figures import draw_bars, draw_joint
+from pupper_sysid.policies.twin.gyro import read_imu, spectrum
+from pupper_sysid.policies.twin.twin import ActuatorTwin, Condition, Twin, twin
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.servo_fit.fit import fit_servo
+
+CALIBRATED, REFITTED = "calibrated (sweeps)", "refitted (loops 0, 1)"
+SHOWN = ("LF_hip", "LF_thigh", "LF_calf")
+
+
+def mrad(error: Interval) -> str:
+    """An error with its interval."""
+    return f"{1e3 * error.value:.1f} ({1e3 * error.low:.1f}–{1e3 * error.high:.1f})"
+
+
+def cells(own: Condition | None) -> str:
+    """RMS and mean absolute error of a place."""
+    return "– | –" if own is None else f"{mrad(own.rmse_rad)} | {1e3 * own.mean.mae_rad:.1f}"
+
+
+def line_of(name: str, model: ActuatorTwin) -> str:
+    """Row of the first table."""
+    assert model.ground is not None and model.evidence is not None
+    return (
+        f"| {name} | {cells(model.air)} | {cells(model.ground)} "
+        f"| {model.ground.upright} of {model.ground.copies} | {model.evidence.verdict} |"
+    )
+
+
+def evidence_of(found: Twin) -> str:
+    """Table of what each actuator says of where the robot was."""
+    lines = ["| actuator | torques | correlation | share of the motion | share of the load |",
+             "|---|---|---|---|---|"]  # fmt: skip
+    for name, model in found.models.items():
+        assert model.evidence is not None
+        every = zip(model.evidence.motion, model.evidence.load_share, strict=True)
+        for scale, (motion, sag) in zip(("as they are", "× 4"), every, strict=True):
+            shares = (motion and motion.correlation, motion and motion.share, sag)
+            row = " | ".join(
+                "–" if x is None else f"{x.value:.2f} ({x.low:.2f}–{x.high:.2f})" for x in shares
+            )
+            lines.append(f"| {name} | {scale} | {row} |")
+    return "\n".join(lines)
+
+
+def joints_of(found: Twin) -> str:
+    """Table of RMS errors by joint."""
+    names = (CALIBRATED, REFITTED)
+    head = [f"{name}, {place}" for name in names for place in ("air", "ground")]
+    lines = [f"| mrad | {' | '.join(head)} | repeatability |", "|---" * (len(head) + 2) + "|"]
+    for joint, floor in found.repeatability_rad.items():
+        errors = [
+            own.joints[joint].rmse_rad
+            for name in names
+            for own in (found.models[name].air, found.models[name].ground)
+            if own is not None
+        ]
+        row = " | ".join(f"{1e3 * x:.1f}" for x in [*errors, floor])
+        lines.append(f"| {joint} | {row} |")
+    return "\n".join(lines)
+
+
+def gyro_of(found: Twin) -> str:
+    """Table of the spectra of the robot's IMU logs, and of the simulated gyro in the playback."""
+    logs = {}
+    for path in sorted((REAL / "mini_pupper_imu").glob("hw_[lm]*.csv")):
+        time, rate = read_imu(path)
+        logs[path.stem] = spectrum(time, [rate])
+    for name, model in found.models.items():
+        if model.ground is not None:
+            logs[f"simulated playback, {name}"] = model.ground.gyro
+    lines = ["| deviation rad/s, peak Hz, its share of the variance | x | y | z |",
+             "|---|---|---|---|"]  # fmt: skip
+    for name, gyro in logs.items():
+        if gyro is not None:
+            axes = zip(gyro.deviation_rad_s, gyro.peak_hz, gyro.peak_share, strict=True)
+            row = " | ".join(f"{d:.2f}, {peak:.2f}, {share:.2f}" for d, peak, share in axes)
+            lines.append(f"| {name} | {row} |")
+    return "\n".join(lines)
+
+
+@styled
+def picture(found: Twin, beside: dict[str, float]) -> Figure:
+    """Errors by actuator with the fitted models as lines, and one leg of the calibrated robot."""
+    figure = Figure(figsize=(7.6, 6.0), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=[1.5, 1])
+    bars = figure.add_subplot(grid[0, :])
+    for (name, error), colour in zip(beside.items(), (ORANGE, PINK), strict=True):
+        bars.axvline(1e3 * error, color=colour, ls=":", lw=1.8, label=f"{name} {1e3 * error:.1f}")
+    draw_bars(bars, found)
+    for column, joint in enumerate(SHOWN):
+        axes = figure.add_subplot(grid[1, column])
+        draw_joint(axes, found, joint, CALIBRATED)
+        axes.set_xlabel("time [s]")
+        if not column:
+            axes.set_ylabel("rad")
+    lines, labels = figure.axes[1].get_legend_handles_labels()
+    figure.legend(
+        lines, labels, loc="outside lower center", ncols=len(lines), title=f"{CALIBRATED}: one leg"
+    )
+    return figure
+
+
+def main() -> None:
+    """Print the tables, draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    walk = load(REAL / WALK)
+    robot = robot_for(walk)
+    first = Recording.from_frame(walk.table[walk.table["trial"] < 2], metadata=walk.metadata)
+    made = {name: load_calibration(name) for name in PRESETS} | {
+        CALIBRATED: calibrate([load(REAL / name) for name in SWEEPS]).calibration,
+        REFITTED: calibrate(first).calibration,
+    }
+    actuators: dict[str, Actuator] = {
+        name: of_calibration(own, robot, walk) for name, own in made.items()
+    }
+    published = {name: actuators[name] for name in PRESETS}
+    loops = {"test_loops": [2], "seed": given.seed}
+    found = twin(walk, actuators, robot, **loops)
+    ideal = twin(walk, published, robot, **loops).models
+    models = {f"{name}, ideal feedback": own for name, own in ideal.items()} | found.models
+    fitted = fit_servo(walk, None, "mlp", split=SPLIT, seed=given.seed).scored
+    print("| servos | in the air: RMS mrad (90 %) | mean abs. | on the ground: RMS mrad (90 %) | "
+          "mean abs. | upright | the robot was |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|")
+    for name, model in models.items():
+        print(line_of(name, model))
+    for name in ("linear", "mlp"):
+        print(f"| {name}, fitted to loops 0 and 1, no robot "
+              f"| {mrad(fitted[name].rmse_free_run_rad)} | – | – | – | – | – |")  # fmt: skip
+    print(f"| repeatability | {1e3 * np.mean(list(found.repeatability_rad.values())):.1f} "
+          "| – | – | – | – | – |\n")  # fmt: skip
+    print(f"{joints_of(found)}\n\n{evidence_of(found)}\n\n{gyro_of(found)}\n")
+    evidence = found.models[CALIBRATED].evidence
+    assert evidence is not None
+    print(f"{CALIBRATED}: {evidence.why}")
+    if given.picture:
+        errors = {
+            words: fitted[name].rmse_free_run_rad.value
+            for name, words in (("linear", "linear filter"), ("mlp", "MLP"))
+        }
+        drawn = picture(replace(found, models=models), errors)
+        save(drawn, given.picture, force=True)
+
+
+if __name__ == "__main__":
+    main()
