@@ -55,9 +55,10 @@ def xl330(seed: int) -> ServoCard:
     )  # fmt: skip
 
 
-REGISTERS = {"chirp_sweep": 254, "prbs_excitation": 0, "step_response": 254}
+REGISTERS = {"chirp_sweep": 254, "prbs_excitation": None, "step_response": 254}
 """Register `acceleration` of the SO-101's recordings, which they do not state: 254 is what LeRobot
-writes, and whole recordings say where it was in force (docs/which_sts3215.md)."""
+writes, and whole recordings say where it was in force (docs/which_sts3215.md). None: the fit finds
+how much larger the limit was."""
 
 
 def so101(seed: int) -> ServoCard:
@@ -68,7 +69,8 @@ def so101(seed: int) -> ServoCard:
         trials = []
         for recording, units in zip(recordings, REGISTERS.values(), strict=True):
             (trial,) = recording.trials(joint)
-            setup = trial.servo.model_copy(update={"registers": {"acceleration": units}})
+            registers = {} if units is None else {"acceleration": units}
+            setup = trial.servo.model_copy(update={"registers": registers})
             trials.append(replace(first(trial), servo=setup))
         fits[joint] = fit_loaded_joint(joint, trials, seed)
     return to_card(
@@ -84,7 +86,7 @@ def so101(seed: int) -> ServoCard:
             f"all of {MOTIONS[3]}, is left out, for scores.",
             "The limit on the set-point's acceleration is that of the register `acceleration` at "
             "254, which LeRobot writes. The recordings do not state it. Whole recordings move as "
-            "if it was 0 in prbs_excitation.",
+            "if it was larger in prbs_excitation.",
         ),
     )  # fmt: skip
 

@@ -28,7 +28,15 @@ from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.loaded_servo import COLUMNS, LoadedServoParameters
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
-from pupper_sysid.sysid.loaded.runs import Run, at_steps, prepare, simulate, with_voltage
+from pupper_sysid.sysid.loaded.runs import (
+    RAMP_SHARES,
+    Run,
+    at_steps,
+    prepare,
+    simulate,
+    with_ramp,
+    with_voltage,
+)
 from pupper_sysid.sysid.recordings.joints import joint_rng
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
@@ -155,30 +163,27 @@ def predict(
 
 
 def with_ramps(calibration: Calibration, joint: str, runs: Sequence[BenchRun]) -> list[BenchRun]:
-    """The runs, with the set-point's acceleration free where readings fit that better.
+    """The runs, with the limit on the set-point's acceleration that suits their readings best.
 
     For a calibration that limits it; a recording that states its register keeps it.
     """
     servo = _Servo.of(calibration, joint)
     if not np.isfinite(servo.parameters.acceleration_limit):
         return list(runs)
-    free = [
-        b if b.run.ramp_known else replace(b, run=replace(b.run, ramp_share=np.inf)) for b in runs
-    ]
     found = list(runs)
     for place in {b.recording for b in runs}:
         own = [n for n, b in enumerate(runs) if b.recording == place]
         spread = []
-        for tried in (runs, free):
-            left = [
-                b.run.sample_rad - at_steps(servo.track(b, 0.0), b.run.sample_step)
-                for b in (tried[n] for n in own)
-            ]
+        for share in RAMP_SHARES:
+            left = []
+            for n in own:
+                found[n] = b = replace(runs[n], run=with_ramp(runs[n].run, share))
+                left.append(b.run.sample_rad - at_steps(servo.track(b, 0.0), b.run.sample_step))
             every = np.concatenate(left)
             spread.append(float(np.mean(np.abs(every - np.median(every)))))
-        if spread[1] < spread[0]:
-            for n in own:
-                found[n] = free[n]
+        best = RAMP_SHARES[int(np.argmin(spread))]
+        for n in own:
+            found[n] = replace(runs[n], run=with_ramp(runs[n].run, best))
     return found
 
 
@@ -310,14 +315,14 @@ def notes(
             joint
             for joint, own in runs.items()
             if any(
-                np.isinf(b.run.ramp_share) and not b.run.ramp_known
+                b.run.ramp_share > 1 and not b.run.ramp_known
                 for b in with_ramps(calibration, joint, own)
             )
         ]
         if freed:
             made.append(
-                f"{name}: its limit on the set-point's acceleration is taken out of runs of "
-                f"{', '.join(freed)}, which move as if a register had switched it off."
+                f"{name}: its limit on the set-point's acceleration is raised or taken out in runs "
+                f"of {', '.join(freed)}, which move as if a register had done so."
             )
     return list(dict.fromkeys(made))
 

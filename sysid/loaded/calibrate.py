@@ -412,11 +412,15 @@ def _warnings(joint: str, found: LoadedFit) -> list[str]:
             f"friction of a motor torque of {_torque(found):.2g}"
             f"{' N·m' if found.known_load else ' rad/s²'}. `under_load` has the whole servo."
         )
-    free = [n + 1 for n, r in enumerate(found.runs) if np.isinf(r.ramp_share)]
-    if free and np.isfinite(float(found.servo.arrays()["acceleration_limit"])):
+    others = [
+        f"run {n} ({'none' if np.isinf(r.ramp_share) else f'{r.ramp_share:g} times as large'})"
+        for n, r in enumerate(found.runs, 1)
+        if r.ramp_share > 1
+    ]
+    if others and np.isfinite(float(found.servo.arrays()["acceleration_limit"])):
         made.append(
-            f"{joint}: the set-point's acceleration is limited, but not in run "
-            f"{', '.join(map(str, free))} of {len(found.runs)}. A register decides that "
+            f"{joint}: the set-point's acceleration is limited, but otherwise in "
+            f"{', '.join(others)} of {len(found.runs)}. A register decides that "
             "(`acceleration`), so it belongs to the recording, not to the servo."
         )
     if not found.folds:

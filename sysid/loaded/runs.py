@@ -24,6 +24,10 @@ _VOLTAGE_WINDOW_S = 0.1
 """Length of the mean of logged voltages: single ones catch the ripple of the pulse width."""
 
 
+RAMP_SHARES = (1.0, 2.0, 4.0, 8.0, 16.0, float("inf"))
+"""Limits on the set-point's acceleration, over a servo's own, that recordings are tried with."""
+
+
 @dataclass(frozen=True)
 class Run:
     """One trial, ready for simulation.
@@ -52,7 +56,8 @@ class Run:
     step_s : float
         Length of a physics step [s].
     ramp_share : float
-        Largest acceleration of the set-point over the servo's: 1, or inf where it was not limited.
+        Largest acceleration of the set-point over the servo's, one of `RAMP_SHARES`: 1, more where
+        it was limited less, inf where it was not limited.
     ramp_known : bool
         Whether the recording states that (the register `acceleration`).
     """
@@ -128,6 +133,11 @@ def prepare(
         ramp_share=1.0 if ramp is None or np.isfinite(ramp) else float("inf"),
         ramp_known=ramp is not None,
     )  # fmt: skip
+
+
+def with_ramp(run: Run, share: float) -> Run:
+    """The run with another share of the servo's acceleration limit, unless it states its own."""
+    return run if run.ramp_known else replace(run, ramp_share=share)
 
 
 def with_voltage(run: Run, trial: Trial, reference_voltage_v: float) -> NDArray[np.float64]:

@@ -205,9 +205,7 @@ def _sobol(structure: Structure, rng: np.random.Generator, count: int) -> NDArra
     return points
 
 
-def _cheapest(
-    problem: Problem, points: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
+def _cheapest(problem: Problem, points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """The `count` points of the lowest cost, the cheapest first; most others are given up early."""
     found = np.full(len(points), np.inf)
     for first in range(0, len(points), _TOGETHER):

@@ -80,8 +80,16 @@ def test_a_limit_is_found_in_the_chirp_that_has_it_and_not_in_jumps_without(seed
     limit, (chirp, jumps) = found(
         recording(CHIRP, LIMIT_RAD_S2, seed), recording(JUMPS, np.inf, seed)
     )
-    assert limit == pytest.approx(LIMIT_RAD_S2, rel=0.15)
+    assert limit == pytest.approx(LIMIT_RAD_S2, rel=0.05)
     assert chirp.ramp_share == 1.0 and np.isinf(jumps.ramp_share)
+
+
+def test_a_recording_with_a_larger_limit_gets_a_share_of_its_own():
+    limit, (chirp, jumps) = found(
+        recording(CHIRP, LIMIT_RAD_S2, 6), recording(JUMPS, 8 * LIMIT_RAD_S2, 6)
+    )
+    assert limit == pytest.approx(LIMIT_RAD_S2, rel=0.05)
+    assert chirp.ramp_share == 1.0 and jumps.ramp_share == 8.0
 
 
 def test_no_limit_is_found_where_there_is_none():
@@ -122,7 +130,7 @@ def test_a_model_with_a_limit_moves_without_it_where_the_readings_say_so(tmp_pat
     both = compare([limited, free], [tmp_path / "servo.yaml"], "j")
     (model,) = (m for name, m in both.models.items() if "servo.yaml" in name)
     assert model.mean.rmse_raw_rad < 1.5e-3  # a count
-    assert any("acceleration is taken out of runs of j" in note for note in both.notes)
+    assert any("acceleration is raised or taken out in runs of j" in note for note in both.notes)
     stated_limit = recording(JUMPS, np.inf, 6, {"acceleration": 254})
     kept = compare(stated_limit, [tmp_path / "servo.yaml"], "j")
     (model,) = (m for name, m in kept.models.items() if "servo.yaml" in name)
