@@ -64,7 +64,7 @@ def draw_bars(axes: Axes, found: Twin) -> None:
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     axes.set(xlabel="RMS error of predicted readings, mean of the joints [mrad]", xlim=(0, None))
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, columnspacing=1.2)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
 
 
 def draw_joint(axes: Axes, found: Twin, joint: str, actuator: str) -> None:

@@ -59,6 +59,11 @@ def sequences(data: ServoData, robot: ServoRobot) -> Sequences:
     data : ServoData
     robot : ServoRobot
         Has all joints of `data`.
+
+    Raises
+    ------
+    InputError
+        If they do not fit the memory.
     """
     found: dict[tuple, dict[str, int]] = {}
     for joint in data.joints:
@@ -74,6 +79,8 @@ def sequences(data: ServoData, robot: ServoRobot) -> Sequences:
         for own in found.values()
     ]
     steps = max(len(command) for own in arrived for command in own.values())
+    if 8.0 * len(found) * steps * len(idle) > _MOST_BYTES:
+        raise _too_much(len(found), steps)
     commands = np.tile(idle, (len(found), steps + 1, 1))
     reach = [idle[None]]
     for sequence, (own, places) in enumerate(zip(arrived, found.values(), strict=True)):
@@ -153,10 +160,7 @@ def play(
     _, steps, joints = given.commands.shape
     together = int(_MOST_BYTES / (4.0 * total * steps * joints))
     if not together:
-        raise InputError(
-            f"{total} robots over {steps * TIME_STEP_S:.0f} s do not fit the memory. "
-            "Take fewer --robots, or a part of the recording."
-        )
+        raise _too_much(total, steps)
     which = np.repeat(np.arange(len(given.runs)), count)
     found: list[Played] = []
     for at in range(0, len(servos), together):
@@ -194,6 +198,13 @@ def _played(
     return Played(
         tracks, len(upright), int(upright.sum()), float(moved.fell_s.min()), gyro
     )  # fmt: skip
+
+
+def _too_much(robots: int, steps: int) -> InputError:
+    return InputError(
+        f"{robots} robots over {steps * TIME_STEP_S:.0f} s do not fit the memory. Take fewer "
+        "--robots, or a part of the recording."
+    )
 
 
 def _start(run: Run) -> float:

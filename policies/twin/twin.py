@@ -250,7 +250,7 @@ def _fitted_to(actuator: Actuator, recording: Recording) -> bool:
 def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part, str]:
     """Rows to score, rows of the offsets, and the former in words."""
     if not test_loops:
-        return everything, everything, "all rows"
+        return everything, everything, "the whole recording"
     own = sorted({int(n) for n in recording.table["trial"].unique()})
     if strange := [n for n in test_loops if n not in own]:
         raise InputError(

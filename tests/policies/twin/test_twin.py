@@ -126,6 +126,12 @@ def test_loops_that_cannot_be_scored_are_refused(played, options, says):
         compared(played["air"], "ideal", **options)
 
 
+def test_a_recording_that_does_not_fit_the_memory_is_refused(played, monkeypatch):
+    monkeypatch.setattr("pupper_sysid.policies.twin.playing._MOST_BYTES", 1000)
+    with pytest.raises(InputError, match="1 robots over 3 s do not fit the memory"):
+        compared(played["air"], "ideal")
+
+
 def test_stronger_servos_move_alike_in_free_air():
     values = actuator_of("paper", mini_pupper_robot(), recording(trot(9), trot(9))).values
     strong = stronger(values, 4.0)
