@@ -2,8 +2,9 @@
 
     nice -n 5 .venv/bin/python benchmarks/long_runs.py --minutes 60
 
-Four processes in real time, at once: an emulated Mini Pupper 2 on the ground behind the proxy's
-socket, `pupper-deploy` that walks it, a line of emulated servos, and `monitor` on that line. Each
+Processes in real time, at once: an emulated Mini Pupper 2 on the ground behind the proxy's socket,
+`pupper-deploy` that walks it, a line of emulated servos, `monitor` on that line, and `monitor` of
+the emulated robot within it. Each
 is sampled every ten seconds; a walk that ends is begun again and said so. "First" is after two
 minutes, in which libraries and buffers fill; growth is the slope of a straight line from then on,
 with twice its standard error.
@@ -96,7 +97,7 @@ class Run:
 
 
 def main() -> None:
-    """Run all four, and print the table."""
+    """Run all of them, and print the table."""
     parser = argparse.ArgumentParser(description="Do long runs grow?")
     parser.add_argument("--minutes", type=float, default=60.0)
     options = parser.parse_args()
@@ -116,6 +117,8 @@ def main() -> None:
             Run("emulate feetech",
                 [sysid, "emulate", "feetech", "--link", str(line)], folder / "2.log", line),
             Run("monitor", [sysid, "monitor", "--bus", f"feetech:{line}"], folder / "3.log"),
+            Run("monitor --bus emulated", [sysid, "monitor", "--bus", "emulated"],
+                folder / "4.log"),
         ]  # fmt: skip
         begun = []
         try:

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from emulators import KINDS, served
+from emulators import KINDS, hurry, served
 
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.lock import lock_name, runtime_folder
@@ -377,15 +377,12 @@ def main() -> None:
           "| as it should | drives ended before by the load |")  # fmt: skip
     print("|" + "---|" * 9)
     rows = failed = 0
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under `nohup` drivers would ignore it, too
     with tempfile.TemporaryDirectory(prefix="runtime") as runtime:
         os.environ["XDG_RUNTIME_DIR"] = runtime
         for kind in KINDS:
             with served(kind, options.seed) as (server, where, _):
-                for thread in threading.enumerate():  # servos are no program on a busy machine
-                    if thread is not threading.main_thread() and thread.native_id:
-                        with contextlib.suppress(OSError):
-                            how = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-                            os.sched_setscheduler(thread.native_id, how, os.sched_param(10))
+                hurry()
                 for number, scenario in enumerate(SCENARIOS):
                     if options.only not in f"{scenario.whom} {scenario.what}":
                         continue

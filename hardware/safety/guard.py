@@ -128,13 +128,15 @@ class GuardedBus:
         Raises
         ------
         BusError
-            If a command is NaN.
+            If a command is NaN, or they are not one per joint.
         SafetyStop
             If the first command is far from the robot's pose, or the pose is outside the limits.
         """
         command = np.asarray(position_rad, float)
-        if np.isnan(command).any():  # it would stay in the velocity
-            raise BusError(f"{self.name}: commands must be numbers, got {command}.")
+        # one that is no number would stay in the velocity
+        if command.shape != self._present.shape or np.isnan(command).any():
+            wanted = f"{len(self.joint_names)} numbers"
+            raise BusError(f"{self.name}: a command must be {wanted}, got {command}.")
         allowed = self.limits.clip(command)
         self.report.clipped += int(np.any(allowed != command))
         now = self.bus.now()

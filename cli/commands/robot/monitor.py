@@ -221,7 +221,7 @@ def _open(bus: str, joint_map: str | None) -> ServoBus:
         if joint_map:
             raise InputError("--joint-map: the emulated robot has its own; leave it out.")
         rng = np.random.default_rng(0)
-        return EmulatedBus(draw_robot(rng), rng, real_time=True)
+        return EmulatedBus(draw_robot(rng), rng, real_time=True, keep_log=False)
     address = parse_address(bus)
     chosen = chosen_map(joint_map)
     return open_bus(address, chosen.per_servo() if chosen else None)

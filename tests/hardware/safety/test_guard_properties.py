@@ -112,11 +112,19 @@ def test_a_command_that_is_no_number_is_refused_and_leaves_the_guard_as_it_was(
     bad, before = np.array(goal), len(bus.received)
     bad[list(nan)] = np.nan
     bus.time += 0.02
-    with pytest.raises(BusError, match="commands must be numbers"):
+    with pytest.raises(BusError, match="must be 12 numbers"):
         guard.write(bad)
     assert len(bus.received) == before
     guard.write(bus.position)
     assert np.isfinite(bus.received[-1][1]).all()
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (11,), (13,), (12, 1), (1, 12), (0, 12)])
+def test_a_command_that_is_not_one_number_per_joint_is_refused(shape):
+    guard, bus = switched_on("servo")
+    with pytest.raises(BusError, match="must be 12 numbers"):
+        guard.write(np.zeros(shape))
+    guard.write(bus.position)
 
 
 @pytest.mark.parametrize("coordinates", MAPS)
