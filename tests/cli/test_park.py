@@ -17,7 +17,6 @@ import pytest
 from pupper_sysid.cli.commands.robot.park import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware import clock
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
@@ -25,10 +24,7 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
-from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
-from support.servo_servers import let_go, moving_servos, on_a_port, on_a_socket, wait_until
+from support.servo_servers import limp, robot_behind, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
@@ -56,20 +52,8 @@ while True:
 def robot(request, tmp_path, monkeypatch):
     """A served emulated robot and its address."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    if request.param == "feetech":
-        with on_a_port(moving_servos()) as server:
-            let_go(server)
-            yield server, f"feetech:{server.device}"
-        return
-    rng = np.random.default_rng(3)
-    bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
-    with on_a_socket(ProxyEmulator(bench, rng), tmp_path / "s") as server:
-        let_go(server)
-        yield server, f"esp32:{tmp_path / 's'}"
-
-
-def limp(server) -> bool:
-    return not any(server.emulator.bench.is_on(k) for k in range(len(JOINT_NAMES)))
+    with robot_behind(request.param, tmp_path) as served:
+        yield served
 
 
 def driven(address: str) -> tuple[int, int]:

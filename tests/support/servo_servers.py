@@ -178,6 +178,27 @@ def wait_until(true: Callable[[], bool], seconds: float = 3.0) -> bool:
     return True
 
 
+@contextmanager
+def robot_behind(kind: str, folder: Path) -> Iterator[tuple[FeetechPty | ProxySocket, str]]:
+    """A served robot whose servos are limp, behind `feetech` or `esp32`, and its address."""
+    if kind == "feetech":
+        with on_a_port(moving_servos()) as server:
+            let_go(server)
+            yield server, f"feetech:{server.device}"
+        return
+    rng = np.random.default_rng(3)
+    bench = ServoBench(draw_robot(rng), load_joint_map(LAYOUTS["proxy"]), rng.spawn(1)[0])
+    with on_a_socket(ProxyEmulator(bench, rng), folder / "s") as server:
+        let_go(server)
+        yield server, f"esp32:{folder / 's'}"
+
+
+def limp(server: FeetechPty | ProxySocket) -> bool:
+    """Whether no servo has torque."""
+    bench = server.emulator.bench
+    return not any(bench.is_on(k) for k in bench.index_of_id.values())
+
+
 def let_go(server: FeetechPty | ProxySocket) -> None:
     """Switch all servos off, as after power-on: a driver that misses one does not drive it."""
     bench = server.emulator.bench

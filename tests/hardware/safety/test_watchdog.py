@@ -27,17 +27,15 @@ from pupper_sysid.hardware.safety import watchdog_process
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.recordings.files import load
 from support.servo_servers import (
     bench_of,
-    let_go,
+    limp,
     moving_servos,
     on_a_port,
-    on_a_socket,
+    robot_behind,
     still_servos,
 )
 
@@ -83,18 +81,9 @@ def runtime(monkeypatch, tmp_path):
 @pytest.fixture(params=["feetech", "esp32"])
 def robot(request):
     """A served emulated robot: server and address."""
-    if request.param == "feetech":
-        with on_a_port(moving_servos()) as server:
-            let_go(server)
-            yield server, f"feetech:{server.device}"
-        return
-    rng = np.random.default_rng(3)
-    bench = ServoBench(draw_robot(rng), load_joint_map("mini_pupper_2"), rng.spawn(1)[0])
     with tempfile.TemporaryDirectory(prefix="w") as name:
-        path = Path(name) / "s"
-        with on_a_socket(ProxyEmulator(bench, rng), path) as server:
-            let_go(server)
-            yield server, f"esp32:{path}"
+        with robot_behind(request.param, Path(name)) as served:
+            yield served
 
 
 def orders_for(kind: str = "esp32", where: str = "", preset: str = "mini_pupper_2"):
@@ -107,11 +96,6 @@ def orders_for(kind: str = "esp32", where: str = "", preset: str = "mini_pupper_
     orders = watchdog_process.first_orders(message)
     orders.pose_rad = dict(DEFAULT_POSE)
     return orders
-
-
-def limp(server) -> bool:
-    bench = server.emulator.bench
-    return not any(bench.is_on(k) for k in range(len(JOINT_NAMES)))
 
 
 def angles(server) -> np.ndarray:
