@@ -159,7 +159,7 @@ def polled(robot: EmulatedRobot) -> Calibration:
 
 def told(seed: int) -> tuple[dict, Evidence] | None:
     """One robot: the truth, and what the twin test says; None if it fell."""
-    rng = np.random.default_rng([20261123, seed])
+    rng = np.random.default_rng([20261124, seed])
     kind, ground = ("trot", "tones")[seed % 2], bool(seed // 2 % 2)
     zero = (0.0, 0.005, 0.02)[seed // 4 % 3]
     robot = draw_robot(rng, replace(random_spec(rng), offset_sd_rad=0.0))
