@@ -83,14 +83,21 @@ def run_command(
 def overview(program: str, description: str, commands: Mapping[str, Command]) -> str:
     """A program's help: its commands, by group, one line each."""
     group_width = 2 + max(len(c.group) for c in commands.values())
-    width = 2 + max(map(len, commands))
+    together: dict[str, str] = {}  # a command without summary is shown with the one before it
+    for word, command in commands.items():
+        if command.summary:
+            together[word] = word
+        else:
+            together[[*together][-1]] += f" / {word}"
+    width = 2 + max(map(len, together.values()))
     usage = f"usage: {program} COMMAND [OPTIONS | --help]"
     told = description.strip()
     first = f"{usage}   {told}"
     lines, last = ([first] if len(first) <= _SCREEN else [usage, told]), None
-    for word, (group, summary, *_) in commands.items():
+    for word, shown_words in together.items():
+        group, summary, *_ = commands[word]
         shown = "" if group == last else group
-        lines.append(f"{shown:{group_width}}{word:{width}}{summary}")
+        lines.append(f"{shown:{group_width}}{shown_words:{width}}{summary}")
         last = group
     return "\n".join(lines)
 

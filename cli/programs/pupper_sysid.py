@@ -24,10 +24,11 @@ _SUMMARIES = {
     "recording": {
         "sweep": "Record joints that move, also without a robot.",
         "import": "Turn another project's log into a recording.",
+        "view": "Write a file for Rerun or Foxglove.",
         "doctor": "Check whether a recording is usable.",
         "delay": "Split the lag into bus, sensor and servo.",
-        "bode": "Measure the frequency response.",
-        "backlash": "Measure hysteresis, dead zone and play.",
+        "bode": "Measure frequency response; hysteresis and play.",
+        "backlash": "",
         "plan": "Plan the sweep that narrows the intervals most.",
     },
     "model": {

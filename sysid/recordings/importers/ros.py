@@ -136,7 +136,7 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
     start = state_s[0]
     state_s = (state_s - start) * 1e-9
     positions = _by_joint(state, ())
-    order = state.messages[0].names
+    order = tuple(dict.fromkeys(joint for m in state.messages for joint in m.names))
     found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], str]] = {}
     clocks = {f"{state_name}: {state_by}"}
     several = 0
@@ -172,14 +172,16 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
     for theirs, name in zip(chosen, ours, strict=True):
         times, values, _ = found[theirs]
         held = np.isfinite(values)
-        send, command, kept = held_commands(times[held], values[held], state_s)
-        inside = (times[held] >= state_s[0]) & (times[held] <= state_s[-1])
-        lost = max(lost, 1 - np.sum(send != state_s[kept]) / max(int(inside.sum()), 1))
+        # a message may be of some joints only, as where they move one after the other
+        named = np.array([theirs in message.names for message in state.messages])
+        read_s, read = state_s[named], positions[theirs][named]
+        send, command, kept = held_commands(times[held], values[held], read_s)
+        inside = (times[held] >= read_s[0]) & (times[held] <= read_s[-1])
+        lost = max(lost, 1 - np.sum(send != read_s[kept]) / max(int(inside.sum()), 1))
         given = options.unit_of(theirs, name)
         scale, zero = (given.scale, given.zero) if given else (1.0, 0.0)
         parts.append(
-            rows(name, send, state_s[kept], (command - zero) * scale,
-                 (positions[theirs][kept] - zero) * scale)
+            rows(name, send, read_s[kept], (command - zero) * scale, (read[kept] - zero) * scale)
         )  # fmt: skip
     if lost > _MANY_LOST:
         warnings.append(

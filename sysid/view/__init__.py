@@ -1,0 +1,1 @@
+"""Recordings as files of other viewers: Rerun (`.rrd`) and Foxglove (`.mcap`)."""

@@ -1,0 +1,225 @@
+"""Recordings as MCAP and Rerun files, opened again by the libraries of those formats."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.view.channels import channels, guard_events
+from pupper_sysid.sysid.view.mcap_file import write_mcap
+from pupper_sysid.sysid.view.rerun_file import write_rerun
+from support.command_line import run
+
+SAMPLES = Path(__file__).parents[3] / "data/samples"
+ROUNDED_S = 0.6e-9  # both formats keep times in whole nanoseconds
+
+
+def made(seed: int, joints=("LF_hip", "RB_calf"), metadata=None) -> Recording:
+    """Joints that move together, with lost readings and repeated ones."""
+    rng = np.random.default_rng(seed)
+    time_s = np.cumsum(rng.uniform(0.005, 0.03, 300))
+    command = {j: rng.uniform(-1, 1, 300) for j in joints}
+    position = {j: np.repeat(rng.uniform(-1, 1, 150), 2) for j in joints}
+    for values in position.values():
+        values[rng.choice(300, 20, replace=False)] = np.nan
+    return Recording.from_arrays(
+        time_s, command, position, trial=np.arange(300) // 100, metadata=metadata
+    )
+
+
+def topics_of(path):
+    """Times [s] and values by joint and channel of an MCAP file, by the ROS 2 library's reader."""
+    reader = pytest.importorskip("mcap_ros2.reader")
+    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    texts = []
+    names = {"/joint_commands": "command_rad", "/joint_states": "position_rad"}
+    for message in reader.read_ros2_messages(str(path)):
+        content, topic = message.ros_msg, message.channel.topic
+        time_s = message.log_time_ns * 1e-9
+        if topic in names:
+            stamp = content.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == message.log_time_ns
+            for joint, value in zip(content.name, content.position, strict=True):
+                found.setdefault((joint, names[topic]), []).append((time_s, value))
+        elif topic == "/rosout":
+            texts.append(content.msg)
+        else:
+            joint, name = topic.strip("/").split("/")
+            found.setdefault((joint, name), []).append((time_s, content.data))
+    return {k: np.array(v).T for k, v in found.items()}, texts
+
+
+def entities_of(path):
+    """Columns by entity and component of a Rerun file, by Rerun's own reader."""
+    chunk = pytest.importorskip("rerun.chunk")
+    found: dict[str, list[tuple[np.ndarray, list]]] = {}
+    for part in chunk.RrdReader(path).stream().to_chunks():
+        batch = part.to_record_batch()
+        names = batch.schema.names
+        if "time" not in names:
+            continue
+        times = batch.column("time").cast("int64").to_numpy() * 1e-9
+        for name in names:
+            if ":" in name:
+                key = f"{part.entity_path}|{name.split(':')[-1]}"
+                found.setdefault(key, []).append((times, batch.column(name).to_pylist()))
+    return {
+        key: (np.concatenate([t for t, _ in parts]), [v for _, vs in parts for v in vs])
+        for key, parts in found.items()
+    }
+
+
+RECORDINGS = [
+    pytest.param(lambda: load(SAMPLES / "playback.csv"), id="all joints together"),
+    pytest.param(lambda: load(SAMPLES / "sweep.csv"), id="one joint after the other"),
+    pytest.param(lambda: made(7), id="lost readings"),
+]
+
+
+@pytest.mark.parametrize("recording", RECORDINGS)
+def test_an_mcap_file_holds_every_channel_of_the_table(tmp_path, recording):
+    recording = recording()
+    write_mcap(recording, tmp_path / "a.mcap")
+    found, _ = topics_of(tmp_path / "a.mcap")
+    for joint, rows in recording.table.groupby("joint"):
+        for column, clock in (("command_rad", "send_time_s"), ("position_rad", "read_time_s")):
+            time_s, values = found[str(joint), column]
+            np.testing.assert_allclose(time_s, rows[clock], rtol=0, atol=ROUNDED_S)
+            np.testing.assert_allclose(values, rows[column], rtol=0, atol=1e-9)
+    assert set(found) == {(c.joint, c.name) for c in channels(recording)}
+    for channel in channels(recording):
+        np.testing.assert_array_equal(found[channel.joint, channel.name][1], channel.values)
+
+
+@pytest.mark.parametrize("recording", RECORDINGS)
+def test_a_rerun_file_holds_every_channel_of_the_table(tmp_path, recording):
+    recording = recording()
+    write_rerun(recording, tmp_path / "a.rrd")
+    found = entities_of(tmp_path / "a.rrd")
+    for joint, rows in recording.table.groupby("joint"):
+        for column, clock in (("command_rad", "send_time_s"), ("position_rad", "read_time_s")):
+            time_s, values = found[f"/joints/{joint}/{column}|scalars"]
+            np.testing.assert_allclose(time_s, rows[clock], rtol=0, atol=ROUNDED_S)
+            np.testing.assert_allclose(np.ravel(values), rows[column], rtol=0, atol=1e-9)
+    for channel in channels(recording):
+        _, values = found[f"/joints/{channel.joint}/{channel.name}|scalars"]
+        np.testing.assert_array_equal(np.ravel(values), channel.values)
+
+
+@pytest.mark.parametrize("recording", RECORDINGS)
+def test_import_reads_the_mcap_file_back(tmp_path, recording):
+    recording = recording()
+    write_mcap(recording, tmp_path / "a.mcap")
+    again = load(tmp_path / "a.mcap")
+    assert again.joints == recording.joints
+    start = recording.table["read_time_s"].min()
+    for joint in recording.joints:
+        ours = recording.table[recording.table["joint"] == joint]
+        theirs = again.table[again.table["joint"] == joint]
+        np.testing.assert_allclose(theirs["read_time_s"], ours["read_time_s"] - start, atol=2e-9)
+        for column in ("command_rad", "position_rad"):
+            np.testing.assert_allclose(theirs[column], ours[column], rtol=0, atol=1e-9)
+
+
+def test_the_age_is_the_time_since_a_reading_changed():
+    time_s = 0.1 * np.arange(40)
+    position = np.repeat(np.arange(10) * 0.01, 4)  # one fresh reading, then three stale ones
+    recording = Recording.from_arrays(
+        time_s, {"LF_hip": np.zeros(40)}, {"LF_hip": position}, read_time_s=time_s + 0.01
+    )
+    (age,) = (c.values for c in channels(recording) if c.name == "reading_age_s")
+    assert np.isnan(age[:4]).all()  # the first value may be of any age
+    np.testing.assert_allclose(age[4:], np.tile([0, 0.1, 0.2, 0.3], 9), atol=1e-12)
+
+
+def test_what_the_guard_changed_is_in_both_files(tmp_path):
+    counts = {"clipped": 3, "slowed": 0, "unsent": 1}
+    recording = made(1, metadata={"completed": {"rows": 600, "guard": counts}})
+    sentences = ["Guard: 3 commands held at the limits.", "Guard: 1 commands lost."]
+    assert guard_events(recording) == sentences
+    write_mcap(recording, tmp_path / "a.mcap")
+    assert topics_of(tmp_path / "a.mcap")[1] == sentences
+    write_rerun(recording, tmp_path / "a.rrd")
+    assert np.ravel(entities_of(tmp_path / "a.rrd")["/guard|text"][1]).tolist() == sentences
+
+
+def test_trials_that_overlap_in_time_are_refused(tmp_path):
+    table = made(3).table.copy()
+    for column in ("send_time_s", "read_time_s"):
+        table[column] -= table.groupby(["joint", "trial"])["send_time_s"].transform("min")
+    with pytest.raises(InputError, match="overlap in time"):
+        write_mcap(Recording.from_frame(table), tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(
+    ("module", "write", "name"),
+    [("mcap_ros2.writer", write_mcap, "a.mcap"), ("rerun", write_rerun, "a.rrd")],
+)
+def test_what_is_missing_is_named_and_nothing_is_replaced(
+    tmp_path, monkeypatch, module, write, name
+):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(FileExistsRefusal):
+        write(made(1), tmp_path / name)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r"pip install 'pupper-sysid\[live\]'"):
+        write(made(1), tmp_path / f"new_{name}")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_the_robot_of_the_rerun_file_stands_where_its_servos_were_read(tmp_path):
+    """Feet by the closed-form kinematics of the leg, against the calves of the file."""
+    import mujoco
+
+    from pupper_sysid.policies.twin.drawing import robot_over_time
+    from pupper_sysid.sim.robot.servo_robot import compiled, mini_pupper_robot
+
+    recording = load(SAMPLES / "playback.csv")
+    time_s, bodies = robot_over_time(recording)
+    assert np.diff(time_s).min() > 0 and len(time_s) <= 30 * np.ptp(time_s) + 2
+    model = compiled(mini_pupper_robot(), 0.0, fixed=True)
+    data = mujoco.MjData(model)
+    by_name = {body.name: body for body in bodies}
+    k = len(time_s) // 2
+    for joint in recording.joints:
+        rows = recording.table[recording.table["joint"] == joint]
+        held = rows["position_rad"].to_numpy()[rows["read_time_s"].to_numpy() <= time_s[k]][-1]
+        # the calf's servo holds thigh + calf, recorded with the thigh at its neutral
+        data.qpos[model.joint(joint).qposadr[0]] = held
+    for leg in ("LF", "RF", "LB", "RB"):
+        thigh = model.joint(f"{leg}_thigh").qposadr[0]
+        neutral = recording.metadata["start_pose_rad"][f"{leg}_thigh"]
+        data.qpos[model.joint(f"{leg}_calf").qposadr[0]] -= data.qpos[thigh] - neutral
+    mujoco.mj_kinematics(model, data)
+    for number in range(1, model.nbody):
+        body = by_name[model.body(number).name]
+        np.testing.assert_allclose(body.position[k], data.xpos[number], atol=1e-9)
+        assert body.vertices.shape[1] == 3 and body.triangles.max() < len(body.vertices)
+    write_rerun(recording, tmp_path / "a.rrd", time_s, bodies)
+    found = entities_of(tmp_path / "a.rrd")
+    for body in bodies:
+        _, values = found[f"/robot/{body.name}|translation"]
+        np.testing.assert_allclose(np.squeeze(values), body.position, atol=1e-6)  # 32 bit
+
+
+def test_the_command_writes_both_files_and_says_what_is_wrong(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    sample = str(SAMPLES / "playback.csv")
+    code, out, _ = run(capsys, "view", sample, "--rerun", "a.rrd", "--mcap", "a.mcap")
+    assert code == 0 and "rerun a.rrd" in out
+    assert any(key.startswith("/robot/") for key in entities_of(tmp_path / "a.rrd"))
+    for options, sentence in [
+        ((), "Nothing to write"),
+        (("--mcap", "a.mcap"), "exists already"),
+        (("--mcap", "b.csv"), "must end in .mcap"),
+        (("--mcap", "b.mcap", "--model", "x.xml"), "only a Rerun file"),
+    ]:
+        code, _, err = run(capsys, "view", sample, *options)
+        assert code == 2 and sentence in " ".join(err.split())
