@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from random_robots import random_spec
 
+from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.twin.actuators import Actuator, robot_for
 from pupper_sysid.policies.twin.evidence import Evidence
@@ -158,12 +159,15 @@ def polled(robot: EmulatedRobot) -> Calibration:
 
 
 def told(seed: int) -> tuple[dict, Evidence] | None:
-    """One robot: the truth, and what the twin test says; None if it fell."""
+    """One robot: the truth, and what the twin test says; None if it fell or was stopped."""
     rng = np.random.default_rng([20261124, seed])
     kind, ground = ("trot", "tones")[seed % 2], bool(seed // 2 % 2)
     zero = (0.0, 0.005, 0.02)[seed // 4 % 3]
     robot = draw_robot(rng, replace(random_spec(rng), offset_sd_rad=0.0))
-    walk, up = recorded(robot, rng, kind, ground, zero)
+    try:
+        walk, up = recorded(robot, rng, kind, ground, zero)
+    except SafetyStop:
+        return None
     if not up:
         return None
     found = twin(walk, {"calibration": mistaken(robot, rng)}, robot_for(walk), copies=8, threads=1)
@@ -179,9 +183,11 @@ def main() -> None:
     parser.add_argument("--each", action="store_true", help="a line per robot")
     given = parser.parse_args()
     counts: dict[tuple, Counter] = {}
+    left_out = 0
     for seed in range(given.robots):
         found = told(seed)
         if found is None:
+            left_out += 1
             continue
         truth, evidence = found
         key = ("ground" if truth["ground"] else "air", truth["kind"], truth["zero"])
@@ -189,6 +195,7 @@ def main() -> None:
         if given.each:
             share = evidence.motion[0].correlation if evidence.motion[0] else None
             print(seed, *key, evidence.verdict, share, evidence.load_share[0], flush=True)
+    print(f"{left_out} fell, or were stopped by the guard, and are left out.\n")
     print("| truth | commands | zeros mrad | ground | air | cannot tell |")
     print("|---|---|---|---|---|---|")
     for (truth, kind, zero), own in sorted(counts.items()):
