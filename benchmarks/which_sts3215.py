@@ -10,7 +10,8 @@ Every model is a servo card. It runs freely from the first reading on, at the re
 where the card knows its own, at the card's supply voltage, and with the arm as its load: inertia
 and gravity of each joint, which no recording states, and the offset are fitted to the first 40 s of
 three motions, for every model alike. Scored is what nobody fitted: the rest of these, and
-`frequency_sweep`.
+`frequency_sweep`. The limit on the set-point's acceleration, which our card has, may be another in
+the PRBS: the share that suits its first 40 s best.
 
 What is wrong with a model is asked in three ways: what the best shift in time and the best gain
 leave of its error; which lag per speed and which dead band it shows in slow motion, beside the
@@ -41,7 +42,7 @@ from pupper_sysid.sysid.compare.under_load import slewed
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.loaded import kernel
 from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
-from pupper_sysid.sysid.loaded.runs import Run, at_steps, prepare, simulate
+from pupper_sysid.sysid.loaded.runs import RAMP_SHARES, Run, at_steps, prepare, simulate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -69,8 +70,8 @@ DUTY, DUTY_S, STALL, EMF, ARMATURE, DRY = range(6)
 RAMP = COLUMNS.index("acceleration_limit")
 TORQUE_LIMIT = COLUMNS.index("torque_limit")
 QUADRATIC = COLUMNS.index("load_friction_quadratic")
-WITHOUT_RAMP = ("prbs_excitation",)
-"""Where the set-point's acceleration is not limited, as whole recordings show."""
+OTHER_RAMP = "prbs_excitation"
+"""Where the set-point's acceleration has another limit, as whole recordings show."""
 TERMS = ("stiffness", "inertia", "damping", "friction", "largest torque", "dead time", "ramp")
 
 
@@ -277,8 +278,9 @@ def evaluate(joint: str) -> dict:
     runs = {m: _run(t, lattice) for m, t in trials.items()}
     early = {m: _run(first(trials[m]), lattice) for m in MOTIONS[:3]}
     bare = {name: card_model(card, joint) for name, card in MODELS.items()}
-    for motion in WITHOUT_RAMP:
-        early[motion], runs[motion] = (replace(r[motion], ramp_share=np.inf) for r in (early, runs))
+    share = ramp_share(bare[OURS], early)
+    for found in (early, runs):
+        found[OTHER_RAMP] = replace(found[OTHER_RAMP], ramp_share=share)
     fitted = list(early.values())
     loaded = {name: with_load(model, fitted) for name, model in bare.items()}
     ours, sweep = loaded[OURS], runs[MOTIONS[3]]
@@ -288,17 +290,24 @@ def evaluate(joint: str) -> dict:
         if name != OURS:
             models[name]["terms"] = terms(model, bare[name], ours, fitted, runs)
     free = np.where(np.arange(WIDTH) == RAMP, np.inf, bare[OURS].row)
-    other = {
-        m: replace(r, ramp_share=1.0 if np.isinf(r.ramp_share) else np.inf) for m, r in runs.items()
-    }
     return {
         "command": still,
         "robot": slow_motion(sweep, sweep.row_rad),
         "without ramp": score(with_load(replace(bare[OURS], row=free), fitted), runs),
-        "other register": score(ours, other),
         "models": models,
         "jump": jump(loaded, runs["prbs_excitation"]) if joint == SHOWN else None,
     }
+
+
+def ramp_share(model: Model, early: Mapping[str, Run]) -> float:
+    """Limit of `OTHER_RAMP` over that of the model which leaves the least of the fitted part."""
+    left = []
+    for share in RAMP_SHARES:
+        own = {**early, OTHER_RAMP: replace(early[OTHER_RAMP], ramp_share=share)}
+        fitted = with_load(model, list(own.values()), starts=1)
+        run = own[OTHER_RAMP]
+        left.append(rms(at_steps(fitted.track(run), run.row_step) - run.row_rad))
+    return RAMP_SHARES[int(np.argmin(left))]
 
 
 def described(model: Model, runs: Mapping[str, Run]) -> dict:
