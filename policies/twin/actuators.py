@@ -67,8 +67,7 @@ def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
     if is_servo_model(name):
         raise InputError(
             f"{name} is a learned servo model: it predicts positions, whatever the servo carries. "
-            f"Compare it by `pupper-sysid compare {recording.name} --models {name}`, and give a "
-            "calibration here."
+            "`pupper-sysid compare` takes it; give a calibration here."
         )
     if name == IDEAL:
         count = len(robot.joints)

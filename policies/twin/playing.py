@@ -203,7 +203,7 @@ def _played(
 def _too_much(robots: int, steps: int) -> InputError:
     return InputError(
         f"{robots} robots over {steps * TIME_STEP_S:.0f} s do not fit the memory. Take fewer "
-        "--robots, or a part of the recording."
+        "`robots`, or a part of the recording."
     )
 
 
