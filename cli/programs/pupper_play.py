@@ -17,9 +17,10 @@ if sys.platform == "linux":
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from pupper_sysid.cli.policy_choice import policy_at, simulator, warn_of_fallbacks
-from pupper_sysid.cli.terminal import err, need_positive, out, warn
+from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
@@ -29,7 +30,6 @@ DESCRIPTION = """Watch a policy walk in the simulator it was trained in.
 
 Example: pupper-play runs/<name> --command 0.15 0 0 --video walk.mp4
 """
-_SIZE = (480, 640)
 
 
 @dataclass(frozen=True)
@@ -88,18 +88,21 @@ def _run(options: Play) -> None:
     policy.reset(env.action)
     start = env.robots.qpos[0, :2].copy()
     velocities, ended, away = [], "", np.zeros(2)
-    for step in range(round(options.seconds / task.control_step_s)):
-        found = env.step(policy.act(observation))
-        observation = found.observation
-        if found.done[0]:
-            what = "Left the ground's edge" if found.timed_out[0] else "Fell"
-            ended = f"{what} after {(step + 1) * task.control_step_s:.1f} s."
-            break
-        away = env.robots.qpos[0, :2] - start
-        facts = found.facts
-        velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
-        if not screen.show(task.control_step_s):
-            break
+    step_s = task.control_step_s
+    with seconds_progress("walking", options.seconds) as advance:
+        for step in range(1, round(options.seconds / step_s) + 1):
+            found = env.step(policy.act(observation))
+            observation = found.observation
+            if found.done[0]:
+                what = "Left the ground's edge" if found.timed_out[0] else "Fell"
+                ended = f"{what} after {step * step_s:.1f} s."
+                break
+            away = env.robots.qpos[0, :2] - start
+            facts = found.facts
+            velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
+            if not screen.show(step_s, np.array(velocities[-1])):
+                break
+            advance(step * step_s, options.seconds, "")
     screen.close()
     moved = np.mean(velocities, axis=0) if velocities else np.zeros(3)
     if ended:
@@ -117,15 +120,14 @@ class _Screen:
     def __init__(self, env: Any, options: Play):
         self._env = env
         self._path = options.video or Path()
-        self._renderer: Any = None
-        self._writer: Any = None
+        self._film: Any = None
         self._viewer: Any = None
         self._model = env.robots.batch.get_model(0)
         self._data: Any = None
         if options.viewer:
             self._open_viewer()
         if options.video:
-            self._open_video()
+            self._open_video(options)
 
     def _open_viewer(self) -> None:
         try:
@@ -137,41 +139,27 @@ class _Screen:
                 f"No window could be opened ({error}). Use --video walk.mp4 instead."
             ) from error
 
-    def _open_video(self) -> None:
-        try:
-            mujoco: Any = importlib.import_module("mujoco")
-            self._renderer = mujoco.Renderer(self._model, *_SIZE)
-        except Exception as error:  # EGL, OSMesa and GLFW each fail in their own way
-            warn(
-                [
-                    f"No frames can be drawn here ({type(error).__name__}: {error}), so there will "
-                    "be no video. Install EGL or OSMesa, or set MUJOCO_GL; the walk goes on."
-                ]
-            )
-            return
-        try:
-            imageio: Any = importlib.import_module("imageio.v2")
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            # a picture per action: the video runs as fast as the robot
-            self._writer = imageio.get_writer(
-                self._path, fps=1 / self._env.config.control_step_s, codec="libx264",
-                macro_block_size=None,
-            )  # fmt: skip
-        except (ImportError, ValueError, RuntimeError) as error:  # no imageio, or no ffmpeg
-            raise InputError(
-                "Writing video needs the package imageio: pip install 'pupper-sysid[video]'."
-            ) from error
+    def _open_video(self, options: Play) -> None:
+        from pupper_sysid.policies.walks.film import Film
 
-    def show(self, span_s: float) -> bool:
+        step_s = self._env.config.control_step_s
+        lines = (f"{options.policy.name} on {Path(self._env.servos.source).name}",)
+        try:
+            self._film = Film(self._path, self._model, step_s, lines, options.command)
+        except InputError as error:
+            if "imageio" in str(error):
+                raise
+            warn([f"{error} The walk goes on."])
+
+    def show(self, span_s: float, velocity: NDArray[np.float64]) -> bool:
         """Show one more picture; False when the window was closed."""
-        if self._viewer is None and self._writer is None:
+        if self._viewer is None and self._film is None:
             return True
         self._data = self._env.robots.batch.get_data(0, self._data)
         mujoco: Any = importlib.import_module("mujoco")
         mujoco.mj_forward(self._model, self._data)
-        if self._writer is not None:
-            self._renderer.update_scene(self._data, camera="track")
-            self._writer.append_data(self._renderer.render())
+        if self._film is not None:
+            self._film.add(self._data, velocity)
         if self._viewer is not None:
             if not self._viewer.is_running():
                 return False
@@ -181,8 +169,8 @@ class _Screen:
 
     def close(self) -> None:
         """Finish the video."""
-        if self._writer is not None:
-            self._writer.close()
+        if self._film is not None:
+            self._film.close()
             err.print(f"Wrote {self._path}.", soft_wrap=True)
         if self._viewer is not None:
             self._viewer.close()

@@ -105,7 +105,7 @@ def robot_xml(
         MJCF inside `<asset>` that the ground needs.
     physics : {"training", "evaluation"}
         The model of training has nothing that it does not simulate: no geoms but feet and ground,
-        no camera and no light.
+        and no light.
     imu : bool
         Whether it has sensors `gyro` and `accelerometer`; `<leg>_foot_touch` [N] it always has.
     """
@@ -125,23 +125,28 @@ def robot_xml(
         sensors += '<gyro name="gyro" site="imu"/><accelerometer name="accelerometer" site="imu"/>'
     scale = TRUNK_KG / _TRUNK_URDF_KG
     trunk = _inertial(TRUNK_KG, _TRUNK_CENTRE, tuple(scale * x for x in _TRUNK_INERTIA))
-    light = shape = ""
+    shape = ""
     if whole:
-        light = '<light pos="0 0 3" dir="0 0 -1" directional="true" castshadow="true"/>'
         shape = (
+            # it goes with the robot, and so does the part of the ground that shadows are drawn on
+            '<light mode="trackcom" pos="-0.3 -0.2 1.2" dir="0.25 0.17 -1" directional="true" '
+            'diffuse="0.75 0.75 0.75" specular="0.1 0.1 0.1" castshadow="true"/>'
             f'<geom name="trunk" type="box" size="{_numbers(TRUNK_BOX_M)}" '
-            f'pos="{_numbers(TRUNK_BOX_AT_M)}" rgba="0.2 0.35 0.6 1"/><camera name="track" '
-            'mode="trackcom" pos="0.1 -0.55 0.22" xyaxes="1 0.2 0 -0.06 0.3 1"/>'
+            f'pos="{_numbers(TRUNK_BOX_AT_M)}" rgba="0.2 0.35 0.6 1"/>'
         )
     return f"""<mujoco model="mini_pupper_2">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{time_step_s!r}" integrator="{INTEGRATOR}" cone="pyramidal"
     {_SOLVERS[physics]}/>
-  <visual><global offwidth="1280" offheight="720"/><headlight ambient="0.4 0.4 0.4"/></visual>
+  <visual>
+    <global offwidth="1280" offheight="720"/><quality shadowsize="4096"/>
+    <map shadowclip="12" shadowscale="0.6" znear="0.01"/>
+    <headlight ambient="0.3 0.3 0.3" diffuse="0.15 0.15 0.15" specular="0 0 0"/>
+  </visual>
   <asset>
-    <texture name="grid" type="2d" builtin="checker" rgb1="0.85 0.87 0.90" rgb2="0.75 0.78 0.82"
+    <texture name="grid" type="2d" builtin="checker" rgb1="0.80 0.83 0.87" rgb2="0.68 0.72 0.77"
       width="300" height="300"/>
-    <material name="grid" texture="grid" texrepeat="20 20" texuniform="true"/>
+    <material name="grid" texture="grid" texrepeat="5 5" texuniform="true"/>
     <texture name="sky" type="skybox" builtin="gradient" rgb1="0.95 0.97 1" rgb2="0.7 0.8 0.95"
       width="64" height="64"/>
     {assets}
@@ -151,7 +156,6 @@ def robot_xml(
     <default class="visual"><geom contype="0" conaffinity="0" group="2" mass="0"/></default>
   </default>
   <worldbody>
-    {light}
     {ground}
     <body name="trunk" pos="0 0 {STANDING_HEIGHT_M}">
       <freejoint name="root"/>

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -18,6 +19,7 @@ from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.battery import BATTERY
 from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset
+from pupper_sysid.policies.walks.film import SIZE
 from support.browser import looks_right
 from support.command_line import refused
 from support.command_line import run_program as run
@@ -378,7 +380,8 @@ def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, 
     class Screen:
         def __init__(self, *_): ...
         def update_scene(self, *_, **__): ...
-        def render(self): ...
+        def render(self):
+            return np.zeros((*SIZE, 3), np.uint8)
 
     told = {}
 
@@ -388,6 +391,7 @@ def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, 
 
         def append_data(self, picture):
             told["pictures"] = told.get("pictures", 0) + 1
+            told["written"] = picture.any(axis=2).sum(axis=1)
 
         def close(self): ...
 
@@ -401,6 +405,8 @@ def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, 
     code, _, err = run(capsys, pupper_play, here / "slow", *arguments)
     assert code == 0, err
     assert told["fps"] == pytest.approx(25) and told["pictures"] == 10
+    # policy, speeds and time stand at the top of each picture
+    assert told["written"][:160].sum() > 500 and not told["written"][200:].any()
 
 
 def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):

@@ -28,7 +28,7 @@ class Report:
     out: Path | None = None
     """Folder to write; by default reports/ and the first recording's name."""
     calibration: Path | None = None
-    """Calibration made from these recordings: its numbers are shown, and nothing is fitted again."""
+    """Calibration made from these recordings: it is shown, and nothing is fitted again."""
     servo: tuple[str, ...] = ()
     """Servo models of fit-servo to show on these recordings, beside the calibration."""
     open: bool = False
