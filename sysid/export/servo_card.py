@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from pupper_sysid.common.data_sheet import stall_torque
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
@@ -17,6 +19,8 @@ from pupper_sysid.sysid.recordings.recording import Recording
 _TORQUES = (
     "stall_torque", "back_emf", "armature", "friction_loss", "stribeck_friction", "torque_limit",
 )  # fmt: skip
+
+_GRAIN_S = 0.002  # dead times closer than that are alike
 
 
 def to_card(
@@ -55,7 +59,7 @@ def to_card(
     gains : Gains, optional
         I and D gain of the recordings; the P gain is the fit's.
     default : str, optional
-        Specimen that stands for the servo type; by default that of the median stiffness.
+        Specimen that stands for the servo type; by default the one nearest to the medians of all.
     notes : sequence of str
         Sentences for the reader.
 
@@ -79,7 +83,7 @@ def to_card(
         if why and (sentence := f"Torques have their {why}.") not in told:
             told.append(sentence)
             told.append("The armature holds the inertia of what the joint moved.")
-    middle = sorted(fits, key=lambda s: _stiffness(specimens[s], fits[s].p_gain))[len(fits) // 2]
+    middle = _middle({s: loop.as_pd(fits[s].p_gain) for s, loop in specimens.items()})
     return _card(
         name, servo, fits, recordings, source, specimens, load=load, supply_v=float(volts),
         gains=(gains or Gains()).model_copy(update={"p": float(first.p_gain)}),
@@ -221,8 +225,13 @@ def _loop(fit: LoadedFit, scale: float, why: str) -> LoadedLoop:
     return LoadedLoop(model="loaded_servo", **made)
 
 
-def _stiffness(loop: LoadedLoop, p_gain: float) -> float:
-    return loop.as_pd(p_gain).stiffness_nm_per_rad.value
+def _middle(specimens: Mapping[str, TorquePD]) -> str:
+    """The specimen nearest to the medians of stiffness, back-EMF, friction and dead time."""
+    own = [pd.parameters for pd in specimens.values()]
+    rows = [(p.stiffness, p.back_emf, p.friction_loss, p.dead_time_s + _GRAIN_S) for p in own]
+    logs = np.log(np.maximum(np.array(rows, float), 1e-9))
+    away = np.abs(logs - np.median(logs, axis=0)).sum(axis=1)
+    return list(specimens)[int(np.argmin(away))]
 
 
 def _scores(specimen: str, fit: LoadedFit) -> list[Score]:
