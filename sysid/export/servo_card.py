@@ -228,8 +228,8 @@ def _loop(fit: LoadedFit, scale: float, why: str) -> LoadedLoop:
 def _middle(specimens: Mapping[str, TorquePD]) -> str:
     """The specimen nearest to the medians of stiffness, back-EMF, friction and dead time."""
     own = [pd.parameters for pd in specimens.values()]
-    rows = [(p.stiffness, p.back_emf, p.friction_loss, p.dead_time_s + _GRAIN_S) for p in own]
-    logs = np.log(np.maximum(np.array(rows, float), 1e-9))
+    rows = [(p.stiffness, p.back_emf, p.friction_loss, p.dead_time_s) for p in own]
+    logs = np.log(np.maximum(np.array(rows, float) + np.array([0, 0, 0, _GRAIN_S]), 1e-9))
     away = np.abs(logs - np.median(logs, axis=0)).sum(axis=1)
     return list(specimens)[int(np.argmin(away))]
 
