@@ -325,7 +325,8 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(
     builder = types.SimpleNamespace(
         joint_label=labels, joint_qd_start=[0, 6, 7, 8], joint_q_start=[0, 7, 8, 9],
         joint_armature=[0.0] * 9, joint_friction=[0.0] * 9, joint_damping=[0.0] * 9,
-        joint_target_ke=[1.0] * 9, joint_target_kd=[1.0] * 9, add_actuator=lambda drive, **given: added.append(given),
+        joint_target_ke=[1.0] * 9, joint_target_kd=[1.0] * 9,
+        add_actuator=lambda drive, **given: added.append(given),
     )  # fmt: skip
     space["add_actuators"](builder)  # type: ignore[operator]
     assert [(a["index"], a["pos_index"]) for a in added] == [(6, 7), (7, 8), (8, 9)]
