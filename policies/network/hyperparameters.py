@@ -135,6 +135,9 @@ class Imitation:
     """Parts of the data per pass."""
     learning_rate: float = 1e-3
     """Of Adam, at the start; it falls to a tenth."""
+    correction_rate: float = 0.1
+    """Share of the policy's errors of speed by which the teacher's commands change per round, in
+    the second half of the rounds."""
 
     def __post_init__(self):
         for name, least in (("iterations", 0), ("epochs", 1), ("minibatches", 1)):

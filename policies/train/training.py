@@ -26,7 +26,7 @@ from pupper_sysid.common.errors import PupperError
 from pupper_sysid.common.memory import keep_freed_memory
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
-from pupper_sysid.policies.train.imitation import imitate
+from pupper_sysid.policies.train.imitation import Teacher, imitate
 from pupper_sysid.policies.train.learner import Learner, Ranks
 from pupper_sysid.policies.train.run_file import Run, refuse_taken, resume_run, save_run
 from pupper_sysid.policies.train.selection import Judge
@@ -179,12 +179,14 @@ class _Session:
     def learn_first_gait(self, stop_requested: Callable[[], bool]) -> None:
         """The remaining rounds of imitation."""
         learner, rounds = self.learner, self.run.imitation.iterations
+        teacher = Teacher(learner.env.env, self.counters.get("teacher"))
         self.phase_began = time.monotonic()
         while self.counters["imitated"] < rounds and not self.ranks.any(stop_requested()):
             before = learner.networks()
-            error = imitate(learner, self.run.imitation, self.counters["imitated"])
+            error = imitate(learner, teacher, self.run.imitation, self.counters["imitated"])
             self.refuse_nan(before, [error])
             self.counters["imitated"] += 1
+            self.counters["teacher"] = teacher.state
             if self.counters["imitated"] == rounds:
                 learner.fresh_optimiser()
             self.report("imitation", self.counters["imitated"], rounds, {"difference": error})

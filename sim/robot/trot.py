@@ -5,6 +5,9 @@ commanded speed, so the trunk moves evenly; in the air it swings back and is lif
 sine. Feet stand for more than half of a cycle: while all four carry, the trunk does not turn on a
 diagonal. It is the reference of `sim.walking.env` and `policies.train.imitation`.
 
+The defaults were found by a search (`benchmarks/trot_search.py`) for the smallest errors of speed
+and turn rate of this robot with calibrated servos.
+
 `phase_of` finds the phase of joint set-points, so that the trot can be continued from any action
 without a clock.
 """
@@ -12,13 +15,14 @@ without a clock.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import LEGS
-from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position, joint_angles
+from pupper_sysid.sim.robot.mini_pupper import SIDE, default_pose, foot_position, joint_angles
 
 _BEHIND = np.array([0.0, 0.5, 0.5, 0.0])[:, None]  # LF, RF, LB, RB: share of a cycle
 _GRID = np.linspace(0.0, 2 * np.pi, 96, endpoint=False)
@@ -28,18 +32,24 @@ _GRID = np.linspace(0.0, 2 * np.pi, 96, endpoint=False)
 class Trot:
     """A trot."""
 
-    frequency_hz: float = 3.25
+    frequency_hz: float = 3.58
     """Strides per second."""
-    lift_m: float = 0.012
+    lift_m: float = 0.011
     """Height of a swinging foot."""
-    duty: float = 0.65
+    duty: float = 0.767
     """Share of a cycle in which a foot stands."""
-    gain: float = 0.95
+    crouch_m: float = 0.01
+    """How much lower than in the default pose the trunk is carried."""
+    spread_m: float = 0.007
+    """How much farther than in the default pose each foot is to its side."""
+    even_swing: float = 0.55
+    """How evenly a foot swings back: 0 as half a cosine, 1 at constant speed."""
+    gain: float = 0.895
     """Speed of the feet over the commanded speed; this robot walks a little farther than its feet
     while it trots."""
-    turn_gain: float = 0.83
+    turn_gain: float = 0.785
     """The same of turning: this robot turns farther than its feet while it trots."""
-    turn_dead_band_rad_s: float = 0.13
+    turn_dead_band_rad_s: float = 0.087
     """Turn rate that is lost where feet do not step sideways: strokes of 1 mm lie in the dead band
     of the hips' friction. A turning command gets it on top."""
 
@@ -68,7 +78,7 @@ class Trot:
         angles = []
         for i, leg in enumerate(LEGS):
             path = np.concatenate([stroke[:, i] * along[i][:, None], up[i][:, None]], axis=1)
-            angles.append(joint_angles(leg, _NEUTRAL[i] + path))
+            angles.append(joint_angles(leg, self._centre[i] + path))
         return np.where(moving[:, None], np.concatenate(angles, axis=1), default_pose())
 
     def phase_of(
@@ -97,7 +107,7 @@ class Trot:
         for targets, phase in ((joints, _GRID), (earlier, _GRID - step)):
             along, up = self._cycle(phase)
             for i, leg in enumerate(LEGS):
-                away = foot_position(leg, *targets[:, 3 * i : 3 * i + 3].T) - _NEUTRAL[i]
+                away = foot_position(leg, *targets[:, 3 * i : 3 * i + 3].T) - self._centre[i]
                 # |away - path|² without the part that is the same at every phase
                 distance -= 2 * (away[:, :2] * stroke[:, i]).sum(axis=1)[:, None] * along[i]
                 distance += (stroke[:, i] ** 2).sum(axis=1)[:, None] * along[i] ** 2
@@ -114,12 +124,21 @@ class Trot:
         own = (phase / (2 * np.pi) + _BEHIND) % 1.0
         stands = own < self.duty
         swing = np.pi * (own - self.duty) / (1.0 - self.duty)
-        along = np.where(stands, 1.0 - 2.0 * own / self.duty, -np.cos(swing))
+        even, round_ = 2.0 / np.pi * swing - 1.0, -np.cos(swing)
+        back = round_ + self.even_swing * (even - round_)
+        along = np.where(stands, 1.0 - 2.0 * own / self.duty, back)
         return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
+
+    @cached_property
+    def _centre(self) -> NDArray[np.float64]:
+        """Middle of each foot's stroke in the trunk's frame [m], shape (4, 3)."""
+        side = np.array([SIDE[leg] for leg in LEGS])
+        moved = [np.zeros(4), self.spread_m * side, np.full(4, self.crouch_m)]
+        return _NEUTRAL + np.column_stack(moved)
 
     def _strokes(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
-        x, y = _NEUTRAL[:, 0], _NEUTRAL[:, 1]
+        x, y = self._centre[:, 0], self._centre[:, 1]
         forward, left = self.gain * command[:, :1], self.gain * command[:, 1:2]
         turn = self._turn(command)[:, None]
         speed = np.stack([forward - turn * y, left + turn * x], axis=-1)
@@ -128,9 +147,15 @@ class Trot:
 
     def _turn(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Turn rate of the feet [rad/s], shape (n,): a gain that depends on the command."""
+        more = self.turn_dead_band_rad_s * self.turning_in_place(command)
+        return self.turn_gain * command[:, 2] + more
+
+    @staticmethod
+    def turning_in_place(command: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sign of the turn where feet do not step sideways, 0 where they do; smooth, shape (n,)."""
         sideways, turn = command[:, 1], command[:, 2]
         within = np.maximum(1.0 - (sideways / _BREAKS_LOOSE_M_S) ** 2, 0.0)
-        return self.turn_gain * turn + self.turn_dead_band_rad_s * within * np.tanh(turn / _SOFT)
+        return within * np.tanh(turn / _SOFT)
 
 
 _BREAKS_LOOSE_M_S = 0.025  # speed sideways from which steps move the hips in any case

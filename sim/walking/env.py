@@ -247,6 +247,11 @@ class PupperEnv:
         self._until_command[:] = np.inf
 
     @property
+    def stride_velocity(self) -> Array:
+        """Forward and sideways speed [m/s] and turn rate [rad/s] over about a stride, (n, 3)."""
+        return self._average.copy()
+
+    @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, as arrays and strings; `restore` takes it back exactly."""
         found = self.robots.state

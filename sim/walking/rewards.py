@@ -174,8 +174,8 @@ class Rewards:
 
 
 DEFAULT = Rewards(
-    tracking_shape="gaussian", linear_sigma=0.05, stride_linear_sigma=0.025, angular_sigma=0.25,
-    stride_angular_sigma=0.1,
+    tracking_shape="gaussian", linear_sigma=0.035, stride_linear_sigma=0.015, angular_sigma=0.16,
+    stride_angular_sigma=0.06,
 )  # fmt: skip
 """With widths of about an imitated trot's errors, where the slope of a Gaussian is largest."""
 

@@ -189,7 +189,8 @@ def test_policy_trot_and_standing_robots_share_an_environment_and_differ_in_thei
     own, trot, standing = np.split(np.array(actions), 3, axis=1)
     np.testing.assert_allclose(own[:, 0, 3], 0.2 * np.sin(0.4 * np.arange(1, 21) + 3), rtol=1e-6)
     assert not standing.any() and np.ptp(trot, axis=0).max() > 0.1
-    joints = Trot().joints(2 * np.pi * 3.25 * 0.02 * np.arange(20), np.tile([0.1, 0, 0], (20, 1)))
+    clock = 2 * np.pi * Trot().frequency_hz * 0.02 * np.arange(20)
+    joints = Trot().joints(clock, np.tile([0.1, 0, 0], (20, 1)))
     np.testing.assert_allclose(trot[:, 1] * TASK.action_scale + default_pose(), joints, atol=1e-6)
     # the same robots before they have acted differently
     firsts = np.array([walked.velocity[0] for walked in found])

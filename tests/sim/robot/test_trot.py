@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,8 +13,9 @@ from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position, limi
 from pupper_sysid.sim.robot.trot import Trot
 
 TROT = Trot(
-    frequency_hz=2.5, lift_m=0.020, duty=0.6, gain=1.0, turn_gain=1.0, turn_dead_band_rad_s=0.0
-)
+    frequency_hz=2.5, lift_m=0.020, duty=0.6, crouch_m=0.0, spread_m=0.0, even_swing=0.0, gain=1.0,
+    turn_gain=1.0, turn_dead_band_rad_s=0.0,
+)  # fmt: skip
 STEP_S = 0.02
 COMMANDS = {
     "forward": (0.2, 0.0, 0.0),
@@ -102,6 +105,25 @@ def test_over_a_stance_the_ground_passes_under_the_trunk_as_commanded(command):
     np.testing.assert_allclose(speed, np.tile([vx - turn * y, vy + turn * x], (6, 1)), atol=1e-6)
 
 
+def test_crouch_lowers_the_trunk_and_spread_moves_the_feet_to_their_sides():
+    other = replace(TROT, crouch_m=0.01, spread_m=0.007)
+    phase = np.linspace(0, 2 * np.pi, 30)
+    command = along((0.15, 0.05, 0.0), 30)
+    moved = feet(other.joints(phase, command)) - feet(TROT.joints(phase, command))
+    np.testing.assert_allclose(moved[..., 0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(moved[..., 1] * [1, -1, 1, -1], 0.007, atol=1e-9)
+    np.testing.assert_allclose(moved[..., 2], 0.01, atol=1e-9)
+
+
+def test_an_even_swing_brings_a_foot_back_at_constant_speed():
+    phase = np.linspace(2 * np.pi * TROT.duty, 2 * np.pi, 9)
+    x = feet(replace(TROT, even_swing=1.0).joints(phase, along((0.2, 0.0, 0.0), 9)))[:, 0, 0]
+    np.testing.assert_allclose(np.diff(x), np.ptp(x) / 8, atol=1e-9)
+    half = feet(TROT.joints(phase, along((0.2, 0.0, 0.0), 9)))[:, 0, 0]
+    assert half[[0, -1]] == pytest.approx(x[[0, -1]])
+    assert np.diff(half).max() > 1.4 * np.diff(half).mean()
+
+
 def test_feet_do_not_jump_at_touch_down_or_lift_off():
     phase = np.linspace(0, 2 * np.pi, 2001)
     path = feet(TROT.joints(phase, along((0.2, 0.1, 0.3), 2001)))
@@ -117,11 +139,7 @@ def test_a_duty_that_cannot_be_is_refused(duty):
 def test_a_turn_gets_the_dead_band_on_top_unless_feet_step_sideways():
     def stroke(command: tuple[float, float, float]) -> float:
         plain, banded = (
-            feet(
-                Trot(turn_gain=1.0, turn_dead_band_rad_s=band).joints(
-                    np.zeros(1), along(command, 1)
-                )
-            )
+            feet(replace(TROT, turn_dead_band_rad_s=band).joints(np.zeros(1), along(command, 1)))
             for band in (0.0, 0.13)
         )
         return float(np.ptp((banded - NEUTRAL)[0, :, 1]) / np.ptp((plain - NEUTRAL)[0, :, 1]))
@@ -133,7 +151,9 @@ def test_a_turn_gets_the_dead_band_on_top_unless_feet_step_sideways():
 
 def test_gain_lengthens_the_stroke_in_proportion():
     command, phase = along((0.1, 0.0, 0.0), 1), np.zeros(1)
-    one, more = (feet(Trot(gain=g).joints(phase, command))[0, 0] - NEUTRAL[0] for g in (1, 1.5))
+    one, more = (
+        feet(replace(TROT, gain=g).joints(phase, command))[0, 0] - NEUTRAL[0] for g in (1, 1.5)
+    )
     assert more[0] == pytest.approx(1.5 * one[0], rel=1e-6)
 
 
