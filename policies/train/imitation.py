@@ -6,9 +6,10 @@ clock: it computes the phase of the trot from the last two actions and returns t
 rewards of PPO afterwards contain nothing of the trot.
 
 A policy that imitates a trot does not walk at its speeds: its strokes and its rhythm differ a
-little. So the teacher corrects the commands that it follows by how fast the policy walks (iterative
-learning control): after each round the errors of speed are fitted as a function of the command, and
-a share of the fit is added to the correction.
+little, and noise of the actions loosens dry friction, so that a robot with it walks at other speeds
+than without. So some robots act without noise, and the teacher corrects the commands that it
+follows by how fast they walk (iterative learning control): after each round the errors of speed are
+fitted as a function of the command, and a share of the fit is added to the correction.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ _SETTLED_S = 1.0  # after a new command
 _RANGE = np.array([0.2, 0.1, 0.5])  # of commands [m/s, m/s, rad/s], so that features are of order 1
 _MOST = 0.6  # of a coefficient of the correction
 _RIDGE = 0.02  # in shares of the data
+_FEWEST = 1000  # errors that are fitted
+_QUIET = 4  # every so many robots act without noise
 
 
 class Teacher:
@@ -42,12 +45,15 @@ class Teacher:
 
     Attributes
     ----------
+    quiet : ndarray of bool, shape (n,)
+        Robots that are to act without noise, whose speeds count.
     correction : ndarray, shape (3, 6)
         Coefficients of the correction, in shares of the largest commands.
     """
 
     def __init__(self, env: PupperEnv, state: dict[str, torch.Tensor] | None = None):
         self._env, self._command = env, env.command.copy()
+        self.quiet = np.arange(env.environments) % _QUIET == 0
         self.correction, self._since = np.zeros((3, 6)), np.zeros(env.environments)
         if state:
             self.correction, self._since = (
@@ -82,7 +88,7 @@ class Teacher:
         changed = (env.command != self._command).any(axis=1) | (env.episode_step == 0)
         self._since = np.where(changed, 0.0, self._since + env.config.control_step_s)
         self._command = env.command.copy()
-        walks = (self._since > _SETTLED_S) & env.command.any(axis=1)
+        walks = self.quiet & (self._since > _SETTLED_S) & env.command.any(axis=1)
         self._features.append(_features(env.command[walks]))
         self._errors.append((env.command - env.stride_velocity)[walks] / _RANGE)
 
@@ -90,7 +96,7 @@ class Teacher:
         """Add a share `rate` of the errors since the last time, fitted, to the correction."""
         features, errors = np.concatenate(self._features), np.concatenate(self._errors)
         self._features, self._errors = [], []
-        if not rate or len(errors) < 1000:
+        if not rate or len(errors) < _FEWEST:
             return
         for axis in range(3):
             x = features[:, axis]
@@ -126,13 +132,15 @@ def imitate(learner: Learner, teacher: Teacher, how: Imitation, round_: int) -> 
     env, ppo = learner.env.env, learner.ppo
     share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
     led = torch.from_numpy(env.rng.random(env.environments) < share)
+    quiet = torch.from_numpy(teacher.quiet)
     targets: list[torch.Tensor] = []
     with torch.inference_mode():
         for _ in range(learner.hyper.steps_per_environment):
             shown = torch.from_numpy(teacher.actions().astype(np.float32))
             targets.append(shown)
-            actions = learner.act()
-            actions = torch.where(led[:, None], shown + learner.env.noise, actions)
+            centre = learner.act() - learner.env.noise
+            learner.env.noise[quiet] = 0.0
+            actions = torch.where(led[:, None], shown, centre) + learner.env.noise
             learner.observations, rewards, dones, extras = learner.env.step(actions)
             ppo.process_env_step(learner.observations, rewards, dones, extras)
             teacher.watch()
