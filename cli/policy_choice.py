@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pupper_sysid.cli.terminal import err, warn
 from pupper_sysid.common.border import read_json
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import sha256
+from pupper_sysid.common.files import resolved, sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped
 from pupper_sysid.sim.walking.config import Walking
@@ -35,7 +35,7 @@ def is_policy(folder: Path) -> bool:
 
 def run_folder(path: Path) -> Path:
     """The run that a policy is in (`policy_best`, `policy_last`), else the folder itself."""
-    path = path.resolve()
+    path = resolved(path)
     return path.parent if path.name.startswith("policy_") else path
 
 
@@ -116,7 +116,7 @@ def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | No
 
 def _near(name: str, path: Path) -> list[Path]:
     """Paths of this name from here, from `path` or from a folder above that."""
-    folder = path.resolve()
+    folder = resolved(path)
     return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
 
 

@@ -21,6 +21,14 @@ _LONGEST_NAME = 100  # bytes; file systems take 255, and endings are added
 _SYNC_S = 1.0  # at most this much is lost with the power
 
 
+def resolved(path: Path) -> Path:
+    """`path` as an absolute one without links.
+
+    A link to itself stays one (`Path.resolve` raises for it): it is refused where it is opened.
+    """
+    return Path(os.path.realpath(path))
+
+
 def refuse_overwrite(path: Path, force: bool = False) -> None:
     """Raise unless `path` is free, or a file and `force` was given.
 

@@ -15,6 +15,7 @@ import stat
 from pathlib import Path
 
 from pupper_sysid.common.errors import BusError
+from pupper_sysid.common.files import resolved
 
 LOG = "watchdog.log"
 """File of this folder in which the watchdog says what it could not do."""
@@ -68,7 +69,7 @@ def open_here(name: str, flags: int) -> int:
 
 def lock_name(robot: Path) -> str:
     """Name of the lock's file of a robot at this path, whatever link leads to it."""
-    return hashlib.sha256(os.fsencode(robot.resolve())).hexdigest()[:16] + ".lock"
+    return hashlib.sha256(os.fsencode(resolved(robot))).hexdigest()[:16] + ".lock"
 
 
 def own(robot: Path) -> int:

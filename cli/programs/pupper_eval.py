@@ -18,7 +18,7 @@ from pupper_sysid.cli.policy_choice import policy_at, run_folder, simulator, war
 from pupper_sysid.cli.terminal import err, need_positive, number, out, print_json
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.sim.robot.terrain import Terrain
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def _run(options: Eval) -> None:
         folder = run_folder(options.policy)
         sections = walking_sections(policy, run, folder, found)
         title = f"Walking report: {folder.name}"
-        name = options.policy.resolve().name
+        name = resolved(options.policy).name
         write_page(page, title, f"{name}, seed {options.seed}", sections, options.force)
     if options.json:
         about = {"quick": options.quick, "battery": options.battery}

@@ -25,6 +25,7 @@ from typing import Any
 import serial
 
 from pupper_sysid.common.errors import BusError, MissingDevice
+from pupper_sysid.common.files import resolved
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.registers import (
     BROADCAST_ID,
@@ -359,7 +360,7 @@ def _cannot_open(device: str, error: BaseException) -> str:
 
 def _latency_s(device: str) -> float:
     """Latency timer of a USB adapter; 0 if unknown."""
-    timer = Path("/sys/class/tty") / Path(device).resolve().name / "device" / "latency_timer"
+    timer = Path("/sys/class/tty") / resolved(Path(device)).name / "device" / "latency_timer"
     try:
         return float(timer.read_text()) / 1e3
     except (OSError, ValueError):

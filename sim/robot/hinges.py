@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import resolved
 
 _LARGEST_BYTES = 50_000_000
 _MEMORY_BYTES = 2 << 30
@@ -58,7 +59,7 @@ def hinges_of(path: Path) -> list[Hinge]:
         raise InputError(f"{path} is no file. Give your robot's MJCF or URDF.")
     if path.stat().st_size > _LARGEST_BYTES:
         raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB: no robot's MJCF.")
-    command = [sys.executable, "-m", __name__, str(path.resolve())]
+    command = [sys.executable, "-m", __name__, str(resolved(path))]
     try:
         ended = subprocess.run(command, capture_output=True, timeout=2 * _TIME_S, check=False)
         lines = ended.stdout.decode(errors="replace").splitlines()

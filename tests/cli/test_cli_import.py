@@ -125,3 +125,15 @@ def test_a_column_that_does_not_exist_is_named(capsys, arm):
     )
     other = [c.replace("y {joint}", "y pa{joint}") for c in COLUMNS]
     assert "no joint has both" in refused(capsys, pupper_sysid, "import", arm, *other)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("import", "loop.csv"), ("doctor", "loop.csv"), ("calibrate", "loop.csv"),
+     ("fit-servo", "loop.csv"), ("export", "loop.csv", "--to", "json")],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_a_link_to_itself_is_answered_in_a_sentence(capsys, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop.csv").symlink_to("loop.csv")
+    assert "loop.csv" in refused(capsys, pupper_sysid, *words)

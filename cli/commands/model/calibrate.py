@@ -11,7 +11,7 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class Calibrate:
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
-        out = self.out or root.resolve().with_name(f"{root.resolve().name}_calibrated")
+        out = self.out or resolved(root).with_name(f"{resolved(root).name}_calibrated")
         settings = Settings(self.seed, self.stall_torque)
         if self.cluster is not None:
             terminal.warn([trust(self.cluster)])

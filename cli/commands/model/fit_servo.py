@@ -12,7 +12,7 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, resolved
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
@@ -123,7 +123,7 @@ class FitServo:
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
         started = time.perf_counter()
-        out = self.out or root.resolve().with_name(f"{root.resolve().name}_servos")
+        out = self.out or resolved(root).with_name(f"{resolved(root).name}_servos")
         if self.cluster is not None:
             terminal.warn([trust(self.cluster)])
         settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)

@@ -10,7 +10,7 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, resolved
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Import:
             read_mapping,
         )
 
-        name = self.log.resolve().stem
+        name = resolved(self.log).stem
         out = self.out or Path(f"{name}.csv")
         if _same(out, self.log):
             if self.out:

@@ -10,7 +10,7 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import write_text
+from pupper_sysid.common.files import resolved, write_text
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import Calibration
@@ -83,7 +83,7 @@ class Export:
         from pupper_sysid.policies.network.policy_export import ENDINGS, export_policy
 
         policy, _ = policy_at(folder)
-        target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
+        target = self.out or Path(f"{resolved(folder).name}{ENDINGS[self.to]}")
         worst = export_policy(policy, self.to, target, self.force)
         terminal.err.print(f"Its actions equal the policy's to {worst:.1e}.")
         return target
@@ -100,7 +100,7 @@ class Export:
             )
         saved = load_servo_model(folder)
         # not with_suffix: a folder may be called servo-0.5
-        target = self.out or Path(f"{folder.resolve().name}{ENDINGS[self.to]}")
+        target = self.out or Path(f"{resolved(folder).name}{ENDINGS[self.to]}")
         export_servo_model(saved, self.to, target, self.force)
         return target
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, resolved
 
 
 @dataclass(frozen=True)
@@ -68,5 +68,5 @@ class Report:
         else:
             hint = "" if self.open else " Open it in a browser, or add --open."
             terminal.err.print(f"Wrote {written.path}.{hint}", soft_wrap=True)
-        if self.open and not webbrowser.open(written.path.resolve().as_uri()):
+        if self.open and not webbrowser.open(resolved(written.path).as_uri()):
             terminal.warn([f"No browser could be started here; open {written.path} yourself."])

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import resolved
 from pupper_sysid.common.reading.budget import allowed, refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.ros_messages import KINDS, plain_type
@@ -130,7 +131,7 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
     InputError
         If it is no such database.
     """
-    address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+    address = f"{resolved(path).as_uri()}?mode=ro&immutable=1"
     steps = 0.0
 
     def enough() -> bool:
