@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import time
 
-import cma
 import numpy as np
 
 from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, evaluation_task
@@ -113,6 +112,8 @@ def trot_of(scaled: np.ndarray) -> Trot:
 
 
 def search(minutes: float, seed: int, calibration: str, candidates: int, robots: int) -> Trot:
+    import cma  # no dependency of the project
+
     bench = Bench(candidates, robots, seed, calibration, 0)
     bounds = [((LOW - START) / SCALE).tolist(), ((HIGH - START) / SCALE).tolist()]
     es = cma.CMAEvolutionStrategy(

@@ -75,7 +75,6 @@ KINDS = (
     Kind("calibration", "calibrated.yaml", "calibrated.yaml",
          (_sysid("export", "{}", "--to", "csv"), _sysid("export", "{}", "--to", "mjcf"),
           _sysid("plan", "{}", "--joints", "LF_hip", "--seconds", "10"),
-          ("pupper_train", "--print-config", "--actuator", "{}"),
           ("pupper_play", "policy", "--seconds", "0.1", "--actuator", "{}"))),
     Kind("joint map", "joints.yaml", "joints.yaml",
          (_sysid("sweep", "--joints", "LF_hip", "--freqs", "5", "--duration", "1",

@@ -87,6 +87,9 @@ class Deploy:
     """Drive: w/s forward, a/d sideways, q/e turn, space stands, x ends."""
     seconds: float = 20.0
     """Duration of the walk."""
+    live: bool = False
+    """Show commands and readings of each joint in the terminal; an emulated robot walks in real
+    time then."""
     playback: Path | None = None
     """Instead of a policy: play the commands of this CSV three times and record the servos, for
     `pupper-sysid fit-servo`."""
@@ -120,6 +123,8 @@ def _run(options: Deploy) -> None:
         return
     if options.name is not None:
         refuse_path(options.name, "--name")
+    if options.live and options.keyboard:
+        raise InputError("--live and --keyboard: both draw in the terminal; give one of the two.")
     if options.policy is None:
         raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
     import torch
@@ -193,7 +198,9 @@ def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, Joi
         from pupper_sysid.sim.walking.bus import WalkingBus
 
         rng = np.random.default_rng(options.seed)
-        inner = WalkingBus(draw_robot(rng), rng, real_time=options.keyboard)
+        inner = WalkingBus(
+            draw_robot(rng), rng, real_time=options.keyboard or (options.live and err.is_terminal)
+        )
         bus = open_things.enter_context(closing(GuardedBus(inner)))
         return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
     address = parse_address(options.bus)
@@ -253,6 +260,17 @@ def _show_servos(match: ServoMatch | None, carried: bool) -> None:
         err.print(*match.sentences(), soft_wrap=True)
 
 
+def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
+    """What shows each tick in the terminal."""
+    from pupper_sysid.cli.oscilloscope import Oscilloscope
+
+    if not err.is_terminal:
+        warn(["--live needs a terminal to draw in; it was left out."])
+        return []
+    scope = open_things.enter_context(Oscilloscope(bus.name, bus.joint_names))
+    return [lambda t: scope.tick(t.elapsed_s, t.sent, t.reading, t.missed_deadlines)]
+
+
 def _walk(
     options: Deploy, bus: GuardedBus, imu: Imu, controller: Any, header: dict[str, Any],
     folder: Path, truth: Any,
@@ -276,6 +294,8 @@ def _walk(
         if options.keyboard:
             driver = open_things.enter_context(Driver().driving())
             commands, watchers = driver, [*watchers, driver.watch]
+        if options.live:
+            watchers += _live(open_things, bus)
         rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
             bus,

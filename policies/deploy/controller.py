@@ -148,14 +148,16 @@ class Controller:
         force = senses.acceleration if answered else np.zeros(3)
         attitude = self._attitude.step(self._rate, force, since)
         joints = self._estimate(senses)
-        observation = np.concatenate(
-            [
-                self._speed(senses.command), attitude.rate_rad_s, attitude.gravity,
-                senses.command, joints.position - self.default, joints.velocity, joints.effort,
-                self._action,
-            ],
-            dtype=np.float32,
-        )  # fmt: skip
+        # a reading beyond the range of single precision becomes infinite; the output tells
+        with np.errstate(over="ignore"):
+            observation = np.concatenate(
+                [
+                    self._speed(senses.command), attitude.rate_rad_s, attitude.gravity,
+                    senses.command, joints.position - self.default, joints.velocity, joints.effort,
+                    self._action,
+                ],
+                dtype=np.float32,
+            )  # fmt: skip
         action = self.policy.act(observation[None])[0]
         if not np.isfinite(action).all():
             raise SafetyStop(

@@ -60,6 +60,8 @@ class Tick:
     sent: Array
     """Targets that passed the guard [rad]; shape (12,)."""
     reading: BusSample
+    missed_deadlines: int = 0
+    """So far."""
 
 
 @dataclass
@@ -208,7 +210,10 @@ def _walk(
             if rows:
                 rows.append(_rows(controller, sent, reading))
             for watch in watchers:
-                watch(Tick(elapsed, senses, decision, sent.position_rad, reading))
+                watch(
+                    Tick(elapsed, senses, decision, sent.position_rad, reading,
+                         loop.missed_deadlines)
+                )  # fmt: skip
             outcome.seconds = elapsed
             if decision.observation[_GRAVITY][2] > -FALLEN_TILT:
                 outcome.fell = True

@@ -48,6 +48,10 @@ _CHECK_LINE = "Check the cable; cut the servos' power if they still hold."
 Progress = Callable[[float, float, str], None]
 """Called with seconds done, seconds in all, and the name of the present work."""
 
+Observe = Callable[[float, NDArray[np.float64], BusSample, int], None]
+"""Called with each tick of a trial: time [s], positions sent [rad] (NaN while limp), reading, and
+the deadlines missed so far."""
+
 
 def record(
     bus: ServoBus,
@@ -59,6 +63,7 @@ def record(
     force: bool = False,
     resume: Resume | None = None,
     progress: Progress | None = None,
+    observe: Observe | None = None,
 ) -> Path:
     """Execute `plan` on `bus` and write the recording to `path`.
 
@@ -79,6 +84,8 @@ def record(
         Continue the unfinished recording at `path` instead.
     progress : callable, optional
         See `Progress`.
+    observe : callable, optional
+        See `Observe`; it must not wait.
 
     Returns
     -------
@@ -98,7 +105,7 @@ def record(
     """
     guard = guarded(bus)
     try:
-        session = _Session(guard, plan, loop_period_s, resume, progress)
+        session = _Session(guard, plan, loop_period_s, resume, progress, observe)
         return session.run(path, metadata or {}, force)
     finally:
         guard.close()
@@ -114,6 +121,7 @@ class _Session:
         period_s: float,
         resume: Resume | None,
         progress: Progress | None,
+        observe: Observe | None,
     ):
         self._loop = FixedRateLoop(bus, period_s)
         # moves between the trials keep the rate, too, but are not recorded
@@ -130,6 +138,7 @@ class _Session:
         refuse_more("The recording, by its plan,", len(plan.trials), MOST_TRIALS, "trials")
         self._bus, self._plan, self._resume = bus, plan, resume
         self._progress: Progress = progress or (lambda done, total, what: None)
+        self._observe: Observe = observe or (lambda time_s, sent, reading, missed: None)
         # a joint without a start pose in the plan stays where it is
         self._start = np.array([plan.start_pose_rad.get(j, np.nan) for j in bus.joint_names])
         self._sent = self._start.copy()
@@ -219,6 +228,8 @@ class _Session:
             if self._on_a_bench:
                 made = [r | {"p_gain": trial.p_gain, "torque_enabled": float(on)} for r in made]
             writer.append(made)
+            shown = self._sent if on else np.full(len(goal), np.nan)
+            self._observe(bus.now(), shown, sample, self._loop.missed_deadlines)
             rows += len(index)
             self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
         return rows

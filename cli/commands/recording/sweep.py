@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -46,6 +46,9 @@ from pupper_sysid.sysid.sweep.excitation import (
     parse_frequencies,
     plan,
 )
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.sweep.recorder import Observe, Progress
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,9 @@ class Sweep:
     """Registers of the emulated robot's STS3215 that differ from the factory's, e.g. p=16."""
     real_time: bool = False
     """Run the emulated robot in real time."""
+    live: bool = False
+    """Show commands, readings and lag of each joint in the terminal while they move; an emulated
+    robot moves in real time then."""
     force: bool = False
     """Replace files that exist."""
     json: bool = False
@@ -173,13 +179,13 @@ class Sweep:
         try:
             with (
                 _priority(request) as priority,
-                terminal.seconds_progress("recording", chosen.duration_s) as advance,
+                self._shown(bus, chosen) as (advance, observe),
             ):
                 record(
                     bus, chosen, path, loop_period_s=request["loop_period_s"],
                     metadata={"seed": request["seed"], "sweep": request, "priority": priority}
                     | loads_of(request),
-                    force=self.force, resume=point, progress=advance,
+                    force=self.force, resume=point, progress=advance, observe=observe,
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
             _say_what_stays(bus)
@@ -193,6 +199,24 @@ class Sweep:
         if self.truth and isinstance(bus, EmulatedBus):
             written += bus.write_truth(path.with_suffix(""), self.force)
         return chosen, written
+
+    @property
+    def _draws(self) -> bool:
+        return self.live and terminal.err.is_terminal
+
+    @contextmanager
+    def _shown(self, bus: ServoBus, chosen: Plan) -> Iterator[tuple[Progress, Observe | None]]:
+        """What shows the progress, and each tick if --live."""
+        if self._draws:
+            from pupper_sysid.cli.oscilloscope import Oscilloscope
+
+            with Oscilloscope(bus.name, bus.joint_names) as scope:
+                yield scope.stage, scope.tick
+            return
+        if self.live:
+            terminal.warn(["--live needs a terminal to draw in; it was left out."])
+        with terminal.seconds_progress("recording", chosen.duration_s) as advance:
+            yield advance, None
 
     def _request(self) -> dict[str, Any]:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
@@ -228,7 +252,7 @@ class Sweep:
         return {
             "bus": bus,
             "joint_map": self._map(),
-            "real_time": self.real_time,
+            "real_time": self.real_time or (bus == EMULATED and self._draws),
             "seed": self.seed,
             "loop_period_s": loop_period_s,
             "kind": self.kind or ("sine" if self.load is None else BENCH),

@@ -1,15 +1,13 @@
-"""`monitor`: a live table of every servo; it only reads."""
+"""`monitor`: live traces of every servo; it only reads."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Group
-from rich.live import Live
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
@@ -22,10 +20,12 @@ from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 
+if TYPE_CHECKING:
+    from pupper_sysid.cli.oscilloscope import Oscilloscope
+
 _RATES_HZ = (0.1, 1000.0)
 _ONCE_S = 0.3  # voltage and temperature are not in every reply
 _GOALS_EVERY_S = 1.0  # one request per servo, and only another program could change them
-_DRAW_EVERY_S = 0.1
 _PLAIN_EVERY_S = 1.0
 
 
@@ -33,7 +33,8 @@ _PLAIN_EVERY_S = 1.0
 class Monitor:
     """Show every servo: goal position, position, load, voltage, temperature, errors.
 
-    It only reads: no command is sent and no torque is switched. Ctrl-C ends it. Angles are each
+    It only reads: no command is sent and no torque is switched. Ctrl-C ends it. In a terminal
+    positions and goals are traces, else a table is printed each second. Angles are each
     servo's own, as in a sweep: a calf's is given as if its thigh were at its neutral.
     Example: pupper-sysid monitor --bus feetech:/dev/ttyUSB0
     """
@@ -74,24 +75,23 @@ class Monitor:
             bus.close()
 
     def _show(self, watched: Watched) -> None:
-        live = None
-        if terminal.out.is_terminal:
-            live = Live(console=terminal.out, auto_refresh=False, vertical_overflow="visible")
+        """Traces in a terminal, else tables."""
+        if terminal.err.is_terminal:
+            from pupper_sysid.cli.oscilloscope import Oscilloscope
+
+            title = f"{bus_name(self.bus)}, only read"
+            with Oscilloscope(title, watched.bus.joint_names, lag=False) as scope:
+                self._watch(watched, self.seconds or np.inf, lambda: watched.draw(scope))
+            return
         shown_s = -np.inf
 
         def show() -> None:
             nonlocal shown_s
-            every = _DRAW_EVERY_S if live else _PLAIN_EVERY_S
-            if watched.now_s - shown_s < every:
-                return
-            shown_s = watched.now_s
-            if live:
-                live.update(watched.table(bus_name(self.bus)), refresh=True)
-            else:
+            if watched.now_s - shown_s >= _PLAIN_EVERY_S:
+                shown_s = watched.now_s
                 terminal.out.print(watched.table(bus_name(self.bus)))
 
-        with live or nullcontext():
-            self._watch(watched, self.seconds or np.inf, show)
+        self._watch(watched, self.seconds or np.inf, show)
 
     def _watch(self, watched: Watched, seconds: float, show=lambda: None) -> None:
         bus = watched.bus
@@ -144,6 +144,20 @@ class Watched:
         if goals and self.bus.now() - self._goal_s > _GOALS_EVERY_S:
             self._goal, self._goal_s = goals(), self.bus.now()
         self.now_s = self.bus.now()
+
+    def draw(self, scope: Oscilloscope) -> None:
+        """Show the last reading as traces, and what there is no trace for beside them."""
+        sample = self._sample
+        assert sample is not None
+        latest = replace(sample, voltage_v=self._voltage, temperature_c=self._temperature)
+        scope.tick(self.now_s, self._goal, latest)
+        notes = []
+        for k, row in enumerate(self.rows()):
+            word = "age" if self.answers_now else "same"
+            age = self._age(k, row["age_s" if self.answers_now else "unchanged_s"])
+            count = "" if row["count"] is None else f"count {row['count']}"
+            notes.append(" ".join(filter(None, [row["errors"], word, age, count])))
+        scope.notes(notes)
 
     def as_data(self, bus_name: str) -> dict[str, Any]:
         """The table as plain data."""
