@@ -82,9 +82,9 @@ class Hyperparameters:
     """Passes over the data of an update."""
     minibatches: int = 4
     """Parts of the data per pass."""
-    learning_rate: float = 1e-5
+    learning_rate: float = 1e-6
     """Of the policy, at the start; then adapted to the KL divergence."""
-    learning_rates: tuple[float, float] = (1e-6, 1e-3)
+    learning_rates: tuple[float, float] = (1e-7, 1e-3)
     """Smallest and largest learning rate of the policy."""
     critic_learning_rate: float = 1e-3
     """Of the critic."""

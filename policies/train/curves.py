@@ -14,10 +14,13 @@ import torch
 from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
+from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.numbers import whole
 
 LARGEST_BYTES = 100e6
 """Of a table of curves."""
+_NUMBER = 40  # characters of a row that may hold its number
+MOST_ROWS = 1_000_000
 PROGRESS, IMITATION = "progress.csv", "imitation.csv"
 
 
@@ -100,8 +103,10 @@ def _drop_rows(path: Path, last: int) -> None:
     """Keep a table's header and its rows up to update `last`."""
     if not path.exists():
         return
-    header, *rows = read_text(path, LARGEST_BYTES).splitlines(keepends=True) or [""]
-    kept = [row for row in rows if _update(row) <= last]
+    text = read_text(path, LARGEST_BYTES)
+    refuse_more(path, text.count("\n"), MOST_ROWS, "rows")
+    header, *rows = text.splitlines(keepends=True) or [""]
+    kept = [row for row in rows if _update(row[:_NUMBER]) <= last]
     if kept != rows:
         write_text(path, "".join([header, *kept]), force=True)
 

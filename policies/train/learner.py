@@ -2,7 +2,8 @@
 
 - Noise of the actions persists (`policies.network.exploration`); its size is scheduled.
 - After each update the KL divergence and the share of clipped ratios are measured at the first step
-  of its data; the policy's learning rate follows the former. The critic has a rate of its own.
+  of its data; the policy's learning rate follows the former, and a policy that went much too far is
+  taken back. The critic has a rate of its own.
 - At a time-out the value of the state reached is added, not that of the state before it.
 - A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
   rate, random numbers, recurrent state, environments with their delay lines, the last observation
@@ -46,6 +47,7 @@ _PARTS = (
 
 
 _TOO_FAR, _TOO_NEAR, _FACTOR = 2.0, 0.5, 1.3
+_LOST, _MUCH = 10.0, 3.0  # beyond so many times the desired KL a policy is taken back
 
 
 class TerminalPPO(PPO):
@@ -296,11 +298,17 @@ class Learner:
             for network in (ppo.actor, ppo.critic):
                 network.obs_normalizer.until = 0  # pyright: ignore[reportArgumentType]
         probe = _Probe.of(ppo)
+        before = [parameter.detach().clone() for parameter in ppo.actor.parameters()]
         losses = ppo.update()
         self.iteration += 1
         found = {name: self.ranks.mean(value) for name, value in probe.compare(ppo).items()}
         if actor_learns:
             self._adapt(found["kl"])
+            # Adam's first steps are as long as its rate, whatever the gradient
+            if found["kl"] > _LOST * self.hyper.desired_kl:
+                with torch.no_grad():
+                    for parameter, value in zip(ppo.actor.parameters(), before, strict=True):
+                        parameter.copy_(value)
         return losses | found
 
     @property
@@ -311,7 +319,8 @@ class Learner:
         """Let the policy's learning rate follow the divergence of an update."""
         ppo, (least, most) = self.ppo, self.hyper.learning_rates
         if kl > _TOO_FAR * self.hyper.desired_kl:
-            ppo.learning_rate = max(ppo.learning_rate / _FACTOR, least)
+            factor = _MUCH if kl > _LOST * self.hyper.desired_kl else _FACTOR
+            ppo.learning_rate = max(ppo.learning_rate / factor, least)
         elif kl < _TOO_NEAR * self.hyper.desired_kl:
             ppo.learning_rate = min(ppo.learning_rate * _FACTOR, most)
         ppo.optimizer.param_groups[0]["lr"] = ppo.learning_rate

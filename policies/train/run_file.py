@@ -101,8 +101,8 @@ def _first_gait_imitated(kind: Kind) -> Run:
     return Run(
         architecture=Architecture(kind, hidden, 64, (256, 128, 64)), task=PRESETS["fast"],
         learner=Hyperparameters(
-            epochs=3, desired_kl=0.004, critic_warmup=20, freeze_normaliser=True,
-            learning_rate=3e-5,
+            epochs=3, desired_kl=0.02, critic_warmup=20, freeze_normaliser=True,
+            learning_rate=1e-6,
             # more noise loosens dry friction, and the policy walks at other speeds without it
             exploration=Exploration((0.02, 0.015), (0.0, 20.0), 0.3),
         ),

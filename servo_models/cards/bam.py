@@ -142,15 +142,30 @@ def load_bam(path: Path) -> ServoCard:
         ),
         date=datetime.now(UTC).date().isoformat(),
         as_published=data,
-        specimens={"servo": from_bam(parameters, kind)},
+        specimens={"servo": from_bam(parameters, kind, path)},
     )
 
 
-def from_bam(parameters: BamParameters, kind: Actuator) -> PositionLoop:
-    """Numbers of a card from BAM's; see the module's text."""
+def from_bam(
+    parameters: BamParameters, kind: Actuator, name: Path | str = "The parameters"
+) -> PositionLoop:
+    """Numbers of a card from BAM's; see the module's text.
+
+    Parameters
+    ----------
+    parameters : BamParameters
+    kind : Actuator
+    name : Path or str
+        Of their file, for messages.
+
+    Raises
+    ------
+    InputError
+        If a number is impossible.
+    """
     p = parameters
     if p.R == 0 or p.kt == 0:
-        raise InputError("A BAM parameter file needs kt and R above 0. Fit it again.")
+        raise InputError(f"{name}: kt and R must be above 0. Fit it again.")
     both = p.load_friction_base, p.load_friction_stribeck
     ours = {
         "duty_per_rad": kind.error_gain * (p.error_gain_ratio or 1.0),
@@ -172,8 +187,10 @@ def from_bam(parameters: BamParameters, kind: Actuator) -> PositionLoop:
         "velocity_limit_rad_s": p.max_velocity,
         "dead_time_s": p.command_delay,
     }
-    given = {name: stated(value) for name, value in ours.items() if value is not None}
-    return PositionLoop(model="position_loop", **given)
+    given = {key: stated(value) for key, value in ours.items() if value is not None}
+    return validated(
+        PositionLoop, {"model": "position_loop", **given}, name, remedy="Fit it again."
+    )
 
 
 def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:

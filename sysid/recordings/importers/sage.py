@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.common.reading.csv_table import MOST_CELLS
+from pupper_sysid.common.reading.csv_table import LONGEST_CELL, MOST_CELLS
 from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
@@ -119,8 +119,10 @@ def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], N
     """Times [s] and positions, shape (rows, joints), of one of the two tables."""
     text = text_of(path, data)
     refuse_more(path, text.count("\n") * joints, MOST_CELLS, "values", "Split the log.")
+    first = text.find("\n")
+    refuse_more(f"{path}, line 1", first if first >= 0 else len(text), LONGEST_CELL, "characters")
     reader = csv.reader(io.StringIO(text))
-    header = [cell.strip() for cell in next(reader, [])]
+    header = [cell.strip() for cell in _next(reader, path) or []]
     lacking = [c for c in ("timestamp", "positions") if c not in header]
     if lacking:
         raise InputError(
@@ -129,13 +131,7 @@ def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], N
         )
     at, where = header.index("timestamp"), header.index("positions")
     times, values = [], []
-    while True:
-        try:
-            cells = next(reader)
-        except StopIteration:
-            break
-        except csv.Error as error:
-            raise InputError(f"{path}, line {reader.line_num}: {error}. Mend the line.") from error
+    while (cells := _next(reader, path)) is not None:
         if cells:
             times.append(_value(path, reader.line_num, cells, at, decimal, "a time"))
             wanted = f"a list of {joints} numbers, one per joint of {_JOINTS}"
@@ -145,6 +141,14 @@ def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], N
     if not times:
         raise InputError(f"{path} has column names but no rows. Record it again.")
     return 1e-6 * np.array(times), np.array(values)
+
+
+def _next(reader: Any, path: Path) -> list[str] | None:
+    """Cells of the next line of a `csv.reader`; None at the end."""
+    try:
+        return next(reader, None)
+    except csv.Error as error:
+        raise InputError(f"{path}, line {reader.line_num}: {error}. Mend the line.") from error
 
 
 def _list(cell: str, count: int) -> list[float]:

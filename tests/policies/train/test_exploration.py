@@ -94,7 +94,9 @@ def changed(before: dict[str, torch.Tensor], network) -> set[str]:
 
 
 def test_first_only_the_critic_learns_and_then_the_policy_too():
-    learner = learning(critic_warmup=1, learning_rate=1e-3, learning_rates=(1e-6, 1e-2))
+    learner = learning(
+        critic_warmup=1, learning_rate=1e-3, learning_rates=(1e-6, 1e-2), desired_kl=1e3
+    )  # fmt: skip
     actor, critic = weights(learner.ppo.actor), weights(learner.ppo.critic)
     found = learner.update()
     assert changed(actor, learner.ppo.actor) == {"obs_normalizer"}
@@ -107,7 +109,7 @@ def test_first_only_the_critic_learns_and_then_the_policy_too():
 
 
 def test_a_frozen_normaliser_stays_and_a_scheduled_deviation_is_not_learned():
-    learner = learning(freeze_normaliser=True, learning_rate=1e-3)
+    learner = learning(freeze_normaliser=True, learning_rate=1e-3, desired_kl=1e3)
     actor = weights(learner.ppo.actor)
     learner.update()
     assert changed(actor, learner.ppo.actor) == {"mlp"}

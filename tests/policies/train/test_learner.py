@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import os
 import pickle
@@ -184,7 +185,8 @@ def test_it_learns_on_the_processor_though_the_machine_has_a_gpu(monkeypatch):
 
 
 def test_what_was_learned_can_be_taken_back():
-    learner = make_learner(tiny_run(), Ranks())
+    run = tiny_run()
+    learner = make_learner(replace(run, learner=replace(run.learner, desired_kl=1e3)), Ranks())
     learner.rollout()
     before = learner.networks()
     weights = learner.actor.mlp[0].weight.detach().clone()
@@ -360,3 +362,20 @@ def test_a_recurrent_policy_needs_an_environment_per_minibatch():
     with pytest.raises(InputError, match="1 environments cannot be split into 2 minibatches"):
         make_learner(run, Ranks())
     make_learner(tiny_run("mlp", environments=1), Ranks())
+
+
+def test_an_update_that_went_much_too_far_is_taken_back_and_the_rate_falls(tmp_path):
+    """Adam's first step is as long as its rate, however small the gradient."""
+    run = tiny_run(learner=replace(tiny_run().learner, learning_rate=0.1, desired_kl=0.01))
+    learner = make_learner(run, Ranks())
+    before = copy.deepcopy(learner.actor.mlp.state_dict())
+    learner.rollout()
+    found = learner.update()
+    assert found["kl"] > 0.1
+    for name, value in learner.actor.mlp.state_dict().items():
+        torch.testing.assert_close(value, before[name])
+    assert learner.ppo.learning_rate == pytest.approx(0.1 / 3)
+    learner.hyper = replace(learner.hyper, desired_kl=1e6)
+    learner.rollout()
+    learner.update()
+    assert any((v != before[name]).any() for name, v in learner.actor.mlp.state_dict().items())

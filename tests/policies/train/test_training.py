@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -360,6 +361,15 @@ def test_a_curve_that_cannot_be_written_is_said_in_a_sentence(tmp_path, begun):
         block()
     with pytest.raises(InputError, match=r"imitation\.csv (cannot be written|is not a file)"):
         train(tmp_path, tiny_run(), block)
+
+
+def test_a_table_of_curves_of_a_million_lines_is_refused_at_once(tmp_path):
+    train(tmp_path, tiny_run(), stop_after("imitation", 1))
+    (tmp_path / PROGRESS).write_bytes(b"update\n" + b"\n" * 20_000_000)
+    begun = time.process_time()
+    with pytest.raises(InputError, match=r"progress\.csv .* rows"):
+        train(tmp_path, None)
+    assert time.process_time() - begun < 5
 
 
 # ------------------------------------------------------------------------------ run.yaml

@@ -114,6 +114,16 @@ def test_a_bam_parameter_file_is_read_as_a_card(tmp_path):
         load_card(path)
 
 
+def test_an_impossible_number_in_a_bam_parameter_file_names_the_file(tmp_path):
+    path = tmp_path / "servo.json"
+    path.write_text(json.dumps(load_card("sts3215-bam-m4").as_published | {"armature": 2**63}))
+    with pytest.raises(InputError, match=r"servo\.json: armature"):
+        load_card(path)
+    path.write_text(json.dumps(load_card("sts3215-bam-m4").as_published | {"kt": 0}))
+    with pytest.raises(InputError, match=r"servo\.json: kt and R must be above 0"):
+        load_card(path)
+
+
 def test_torques_of_a_simulator_cannot_become_bam_parameters():
     with pytest.raises(InputError, match="states torques of a simulator"):
         to_bam(load_card("sts3215-open-duck"))

@@ -70,6 +70,21 @@ def test_a_file_that_is_missing_or_a_torn_cell_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "start,says",
+    [("x" * 99_000 + ",", "where a time belongs"), ("{}," * 50_000, "characters"),
+     ("a\rb,", "line 1: new-line")],
+    ids=["a long cell", "many cells", "old line ends"],
+)  # fmt: skip
+def test_impossible_column_names_are_answered_in_a_sentence(tmp_path, start, says):
+    broken = folder(tmp_path)
+    text = (broken / "control.csv").read_text()
+    (broken / "control.csv").write_text(start + text, newline="")
+    with pytest.raises(InputError, match=says) as refusal:
+        load(broken)
+    assert "control.csv" in str(refusal.value) and len(str(refusal.value)) < 1000
+
+
+@pytest.mark.parametrize(
     "motion", ["chirp_sweep", "frequency_sweep", "prbs_excitation", "step_response"]
 )
 def test_every_motion_of_the_so101_is_read_in_radians(motion):
