@@ -15,7 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.segment import Segment
 from rich.table import Table
@@ -94,9 +95,30 @@ def warn(sentences: Iterable[str]) -> None:
         err.print(Text.assemble(("warning: ", "yellow"), spell(sentence)))
 
 
+class _FittingTable(Table):
+    """Table whose columns give way at spaces before any word or number is broken."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        self._fit(options.max_width)
+        yield from super().__rich_console__(console, options)
+
+    def _fit(self, width: int) -> None:
+        left = width - 2 * (len(self.columns) - 1)  # a space on both sides of each gap
+        texts = [[str(text) for text in (c.header, *c.cells)] for c in self.columns]
+        words = [[w for t in ts for w in (t.split() if k else [t])] for k, ts in enumerate(texts)]
+        natural = [max(map(cell_len, ts)) for ts in texts]
+        least = [max(map(cell_len, ws), default=0) for ws in words]
+        while sum(natural) > left and natural != least:
+            spare = [n if n > m else 0 for n, m in zip(natural, least, strict=True)]
+            natural[spare.index(max(spare))] -= 1
+        if sum(natural) <= left:
+            for column, own in zip(self.columns, natural, strict=True):
+                column.width = own
+
+
 def table(title: str, *columns: str) -> Table:
     """Empty table; the first column is left-aligned text, the others numbers."""
-    made = Table(
+    made = _FittingTable(
         title=title, title_justify="left", title_style="bold", box=None, pad_edge=False,
         min_width=min(len(title), out.width),  # a title is broken at the table's width
     )  # fmt: skip

@@ -8,7 +8,7 @@ import re
 import shutil
 import sys
 import tomllib
-from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
 from types import GenericAlias
@@ -19,6 +19,7 @@ from pupper_sysid.cli.dispatch import words
 
 HERE = Path(__file__).resolve().parent
 REFERENCE = HERE / "reference"  # written by `setup`
+GALLERY = HERE / "gallery"  # the same
 _PLAIN = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
 
 project = "pupper-sysid"
@@ -155,8 +156,10 @@ def setup(app) -> None:
     """Write the generated pages before any page is read."""
     (HERE / "commands.md").write_text(reference())
     write_api_pages()
-    with chdir(HERE.parent):
-        example = import_module("notebook").page(HERE / "examples/example.py", HERE / "figures")
-    (HERE / "example.md").write_text(example)
+    shutil.rmtree(GALLERY, ignore_errors=True)
+    GALLERY.mkdir()
+    for script in sorted((HERE.parent / "examples").glob("*.py")):
+        page = import_module("notebook").page(script, GALLERY / "figures")
+        (GALLERY / f"{script.stem}.md").write_text(page)
     app.connect("autodoc-process-docstring", _as_rst, priority=100)  # before numpydoc
     app.connect("autodoc-skip-member", _skip_aliases)

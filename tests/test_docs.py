@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from support import docs_conf
+from support import docs_conf, docs_outputs
 from support.command_line import run_program
 from support.package import MODULES, ROOMS, ROOT, public_names
 
@@ -22,11 +22,11 @@ DOCS = ROOT / "docs"
 WRITTEN = [  # pages written by hand
     path
     for path in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))
-    if path.name not in ("commands.md", "example.md") and "_build" not in path.parts
+    if path.name != "commands.md" and not {"_build", "gallery"} & set(path.parts)
 ]
 SOURCES = [
     path
-    for folder in ("api", *ROOMS, "reproduction", "tests", "benchmarks", "docs")
+    for folder in ("api", *ROOMS, "reproduction", "tests", "benchmarks", "docs", "examples")
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 
@@ -47,10 +47,20 @@ EXAMPLES = {
 @pytest.mark.parametrize("page", EXAMPLES, ids=lambda p: p.stem)
 def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    printed = {}
     for words in EXAMPLES[page]:
         module = importlib.import_module(f"pupper_sysid.cli.programs.{words[0].replace('-', '_')}")
-        code, _, err = run_program(capsys, module, *words[1:])
+        code, out, err = run_program(capsys, module, *words[1:])
         assert code == 0, f"{shlex.join(words)}: {err}"
+        printed[shlex.join(words)] = out
+    for found in docs_outputs.BLOCK.finditer(page.read_text()):
+        (line,) = found["commands"].splitlines()
+        difference = docs_outputs.differs(
+            found["output"], printed[shlex.join(shlex.split(line[2:]))]
+        )
+        assert not difference, (
+            f"{page}, {line}: {difference}\nMend it: python docs/outputs.py {page}"
+        )
     if page.stem == "tutorial":
         made = ("calibrated.yaml", "report/report.html", "calibrated_isaaclab.py", "servo")
         assert all((tmp_path / name).exists() for name in made)
@@ -86,6 +96,14 @@ def test_python_examples_run_in_the_repository(tmp_path, monkeypatch):
             exec(compile(block, str(page), "exec"), names)
             ran += 1
     assert ran > 0
+
+
+def test_outputs_of_other_processors_are_the_same_and_others_are_not():
+    shown = "lag  80.1 ms, use\nRecorded 4 trials in 0.3 s."
+    assert not docs_outputs.differs(shown, "lag 80.3 ms, use\nRecorded 4 trials in 12 s.\n")
+    assert docs_outputs.differs(shown, "lag 99.1 ms, use\nRecorded 4 trials in 0.3 s.")
+    assert docs_outputs.differs(shown, "lag 80.1 ms, do not use\nRecorded 4 trials in 0.3 s.")
+    assert len(list(docs_outputs.BLOCK.finditer((DOCS / "tutorial.md").read_text()))) >= 6
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.servo_models.servo_file import physical_model
+from pupper_sysid.servo_models.servo_file import ARCHITECTURES, physical_model
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
@@ -163,6 +163,8 @@ def fit_servo(
         If the data cannot support a fit.
     """
     recordings, joints = as_sequence(recordings), chosen_joints(recordings, joints)
+    if arch not in ARCHITECTURES:
+        raise InputError(f"`arch` is {arch}; it must be one of {', '.join(ARCHITECTURES)}.")
     if preset == "paper" and arch not in ("mlp", "lstm"):
         raise InputError(f"`preset='paper'` has an mlp and an lstm; there is no published {arch}.")
     if preset == "paper" and (other := [j for j in joints if j not in DEFAULT_POSE]):

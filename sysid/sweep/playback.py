@@ -22,6 +22,7 @@ from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, MOST_LOOPS, Plan, TrialPlan
 
+_ENDING = "_command_rad"
 _LARGEST_RAD = 2 * np.pi
 _LARGEST_BYTES = 100e6
 
@@ -41,15 +42,19 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
         If the file cannot be read, lacks a column, or has values that are not angles or times.
     """
     table = read_table(path, read_text(path, _LARGEST_BYTES), strict=False)
+    named = [str(c).removesuffix(_ENDING) for c in table.columns if str(c).endswith(_ENDING)]
+    known = JOINT_NAMES if joints is None else joints
     columns: dict[str, str] = {}
-    for joint in JOINT_NAMES:
-        for name in (f"{joint}_command_rad", joint):
+    for joint in dict.fromkeys((*known, *named)):
+        for name in (f"{joint}{_ENDING}", joint):
             if name in table.columns and joint not in columns:
                 columns[joint] = name
-    moving = [j for j in JOINT_NAMES if j in (columns if joints is None else joints)]
+    # those of a Mini Pupper in its order, whatever the order of the columns
+    order = [j for j in JOINT_NAMES if j in columns] + [j for j in columns if j not in JOINT_NAMES]
+    moving = list(dict.fromkeys(order if joints is None else joints))
     missing = [j for j in moving if j not in columns]
     if "time_s" not in table.columns or not moving or missing or not len(table):
-        wanted = f"{(missing or ['LF_hip'])[0]}_command_rad"
+        wanted = f"{(missing or ['LF_hip'])[0]}{_ENDING}"
         raise InputError(
             f"{path} is not a file of commands: it needs rows with columns time_s and {wanted}; "
             f"it has {len(table)} rows of {', '.join(map(str, table.columns[:8]))}."
@@ -91,7 +96,8 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
         trials.append(
             TrialPlan(tuple(moving), float("nan"), duration, _held(time, command - first))
         )
-    pose = dict(DEFAULT_POSE) | {j: float(x) for j, x in zip(moving, first, strict=True)}
+    rest = DEFAULT_POSE if set(moving) <= set(DEFAULT_POSE) else {}
+    pose = dict(rest) | {j: float(x) for j, x in zip(moving, first, strict=True)}
     description = {"kind": "playback", "file": path.name, "sha256": sha256(path)}
     return Plan(tuple(trials), pose, description | {"lead_in_s": LEAD_IN_S})
 

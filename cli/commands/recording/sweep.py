@@ -335,8 +335,9 @@ class Sweep:
                 }
             )  # fmt: skip
             return
+        trials = _counted(len(chosen.trials), "trial")
         terminal.out.print(
-            f"Recorded {len(chosen.trials)} trials of {len(joints)} joints, "
+            f"Recorded {trials} of {_counted(len(joints), 'joint')}, "
             f"{chosen.duration_s:.0f} s of motion, in {elapsed:.1f} s.",
             soft_wrap=True,
         )
@@ -349,6 +350,10 @@ class Sweep:
             f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid {last}",
             soft_wrap=True,
         )
+
+
+def _counted(number: int, name: str) -> str:
+    return f"{number} {name}{'' if number == 1 else 's'}"
 
 
 def say_how_to_resume(path: Path) -> None:

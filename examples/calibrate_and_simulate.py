@@ -1,49 +1,14 @@
 # ruff: noqa: E402
 # %% [markdown]
-# # An example in Python
+# # Calibrate and simulate
 #
-# Load a recording, split its lag, calibrate a servo model, plot it and simulate it. This page is
-# `docs/examples/example.py`, run when the documentation is built: what you see below each
-# piece of code is what it printed. The recording is one of the samples, of an emulated robot.
-#
-# Everything starts at one import. A `Recording` also comes from arrays
-# (`ps.Recording.from_arrays`) or a table (`from_frame`).
+# Fit servo models to a sweep, and simulate the chosen one with its feedback. This page is
+# `examples/calibrate_and_simulate.py`, run when the documentation is built.
 # %%
 import pupper_sysid as ps
+from pupper_sysid.data import SAMPLES
 
-recording = ps.load("data/samples/sweep.csv")
-print(recording.joints, f"at {1 / recording.loop_period_s:.1f} Hz")
-
-# %% [markdown]
-# ## Is it usable?
-# %%
-found = ps.examine(recording, "LF_thigh")["LF_thigh"]
-print(found.verdict)
-for reason in found.reasons:
-    print("-", reason)
-
-# %% [markdown]
-# ## How late, and which part is the servo's?
-#
-# Functions take some of the joints, or by default all, and return results by joint. Times are in
-# seconds; a number with an interval has `value`, `low` and `high`.
-# %%
-lags = ps.lag(recording, "LF_thigh")
-print(lags)
-
-lag = lags["LF_thigh"]
-print(f"stale readings {1e3 * lag.stale_lag_s:.1f} ms")
-print(f"command hold {1e3 * lag.command_hold_s:.1f} ms")
-print(f"servo        {1e3 * lag.lag_s.value:.1f} ms")
-low_s, high_s = lag.dead_time_s.low, lag.dead_time_s.high
-print(f"  of it dead time {1e3 * low_s:.1f} to {1e3 * high_s:.1f} ms (90 % interval)")
-
-# %% [markdown]
-# `to_dict()` is what `pupper-sysid delay --json` prints, `to_frame()` a table.
-# %%
-tones = [(tone.frequency_hz, round(tone.gain, 3), tone.lag_s) for tone in lag.by_frequency]
-for frequency_hz, gain, lag_s in tones:
-    print(f"{frequency_hz:4.1f} Hz  gain {gain:.3f}  lag {1e3 * lag_s.value:.1f} ms")
+recording = ps.load(SAMPLES / "sweep.csv")
 
 # %% [markdown]
 # ## Calibrate
