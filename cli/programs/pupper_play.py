@@ -19,6 +19,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from pupper_sysid.cli.commands.recording.view import refuse_other_ending
 from pupper_sysid.cli.policy_choice import policy_at, simulator, warn_of_fallbacks
 from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
 from pupper_sysid.cli.user_errors import run_program
@@ -44,6 +45,10 @@ class Play:
     """Duration."""
     video: Path | None = None
     """Write an .mp4 file."""
+    rerun: Path | None = None
+    """Write commands, readings and the robot's motion for Rerun, .rrd."""
+    mcap: Path | None = None
+    """Write commands and readings in ROS 2's messages for Foxglove, .mcap."""
     viewer: bool = False
     """Open a window."""
     actuator: str | None = None
@@ -69,6 +74,10 @@ def _run(options: Play) -> None:
         if options.video.suffix.lower() != ".mp4":
             raise InputError(f"--video {options.video}: give a name that ends in .mp4.")
         refuse_overwrite(options.video, options.force)
+    for option, path in (("rerun", options.rerun), ("mcap", options.mcap)):
+        if path is not None:
+            refuse_other_ending(option, path)
+            refuse_overwrite(path, options.force)
     import torch
 
     from pupper_sysid.policies.walks.conditions import evaluation_task
@@ -83,7 +92,7 @@ def _run(options: Play) -> None:
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)
     env.set_command(np.array(options.command))
-    screen = _Screen(env, options)
+    screen, track = _Screen(env, options), _Track(env)
     observation, _ = env.observe()
     policy.reset(env.action)
     start = env.robots.qpos[0, :2].copy()
@@ -91,7 +100,8 @@ def _run(options: Play) -> None:
     step_s = task.control_step_s
     with seconds_progress("walking", options.seconds) as advance:
         for step in range(1, round(options.seconds / step_s) + 1):
-            found = env.step(policy.act(observation))
+            action = policy.act(observation)
+            found = env.step(action)
             observation = found.observation
             if found.done[0]:
                 what = "Left the ground's edge" if found.timed_out[0] else "Fell"
@@ -99,11 +109,13 @@ def _run(options: Play) -> None:
                 break
             away = env.robots.qpos[0, :2] - start
             facts = found.facts
+            track.add(step * step_s, action)
             velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
             if not screen.show(step_s, np.array(velocities[-1])):
                 break
             advance(step * step_s, options.seconds, "")
     screen.close()
+    track.write(options)
     moved = np.mean(velocities, axis=0) if velocities else np.zeros(3)
     if ended:
         out.print(ended)
@@ -112,6 +124,48 @@ def _run(options: Play) -> None:
         + "{:.2f}, {:.2f}, {:.2f}".format(*moved)
         + f"; {np.linalg.norm(away):.2f} m from the start"
     )
+
+
+class _Track:
+    """Commands, readings and poses of a walk, for other viewers."""
+
+    def __init__(self, env: Any):
+        self._env = env
+        self._time_s: list[float] = []
+        self._rows: list[tuple[NDArray[np.float64], ...]] = []
+
+    def add(self, time_s: float, action: NDArray[np.floating]) -> None:
+        """Keep one step."""
+        env = self._env
+        sent = env.set_points(np.asarray(action, float))[0]
+        self._time_s.append(time_s)
+        self._rows.append((sent, env.readings[0].copy(), env.robots.qpos[0].copy()))
+
+    def write(self, options: Play) -> None:
+        """Write what was asked for."""
+        if not self._rows or (options.rerun is None and options.mcap is None):
+            return
+        from pupper_sysid.common.joints import JOINT_NAMES
+        from pupper_sysid.policies.twin.drawing import bodies_over_time
+        from pupper_sysid.sysid.recordings.recording import Recording
+        from pupper_sysid.sysid.view.mcap_file import write_mcap
+        from pupper_sysid.sysid.view.rerun_file import write_rerun
+
+        time_s = np.array(self._time_s)
+        sent, read, qpos = (np.array(part) for part in zip(*self._rows, strict=True))
+        # a command holds for the step that ends with the reading
+        recording = Recording.from_arrays(
+            time_s - self._env.config.control_step_s, dict(zip(JOINT_NAMES, sent.T, strict=True)),
+            dict(zip(JOINT_NAMES, read.T, strict=True)), read_time_s=time_s,
+            metadata={"bus": {"kind": "simulated", "coordinates": "joint"}}, name="walk",
+        )  # fmt: skip
+        if options.mcap is not None:
+            write_mcap(recording, options.mcap, options.force)
+        if options.rerun is not None:
+            bodies = bodies_over_time(self._env.robots.batch.get_model(0), qpos)
+            write_rerun(recording, options.rerun, time_s, bodies, options.force)
+        for path in filter(None, (options.rerun, options.mcap)):
+            err.print(f"Wrote {path}.", soft_wrap=True)
 
 
 class _Screen:

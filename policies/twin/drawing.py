@@ -1,7 +1,7 @@
-"""The robot of a recording in three dimensions: surfaces of its bodies, and where they were read.
+"""A robot in three dimensions: surfaces of its bodies, and where they were.
 
-The trunk is fixed in the air, since servos do not say where it was. Joints that were not recorded
-stay in the pose the robot is described in.
+Of a recording the trunk is fixed in the air, since servos do not say where it was; joints that were
+not recorded stay in the pose the robot is described in. Of a simulated walk all is known.
 """
 
 from __future__ import annotations
@@ -63,18 +63,36 @@ def robot_over_time(recording: Recording, model: Path | None = None) -> tuple[Ar
     data = mujoco.MjData(made)
     angle = _joint_angles(made, data, robot.joints, servo + robot.shift_rad)
     at = [int(made.joint(name).qposadr[0]) for name in robot.joints]
-    position = np.empty((len(time_s), made.nbody, 3))
-    quaternion = np.empty((len(time_s), made.nbody, 4))
-    for k, row in enumerate(angle):  # kinematics only, 30 times a second
-        data.qpos[at] = row
-        mujoco.mj_kinematics(made, data)
+    qpos = np.tile(data.qpos, (len(time_s), 1))
+    qpos[:, at] = angle
+    return time_s, bodies_over_time(made, qpos)
+
+
+def bodies_over_time(model: Any, qpos: Array) -> list[Body]:
+    """Bodies of a robot that have a shape, in its poses.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    qpos : ndarray, shape (n, model.nq)
+
+    Returns
+    -------
+    list of Body
+    """
+    data = mujoco.MjData(model)
+    position = np.empty((len(qpos), model.nbody, 3))
+    quaternion = np.empty((len(qpos), model.nbody, 4))
+    for k, row in enumerate(qpos):  # kinematics only
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
         position[k], quaternion[k] = data.xpos, np.roll(data.xquat, -1, axis=1)
     bodies = []
-    for body in range(1, made.nbody):
-        if (surface := _surface_of(made, body)) is not None:
-            name = made.body(body).name or f"body_{body}"
+    for body in range(1, model.nbody):
+        if (surface := _surface_of(model, body)) is not None:
+            name = model.body(body).name or f"body_{body}"
             bodies.append(Body(name, *surface, position[:, body], quaternion[:, body]))
-    return time_s, bodies
+    return bodies
 
 
 def _joint_angles(model: Any, data: Any, joints: tuple[str, ...], servo: Array) -> Array:

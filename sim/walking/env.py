@@ -247,6 +247,11 @@ class PupperEnv:
         self._until_command[:] = np.inf
 
     @property
+    def readings(self) -> Array:
+        """Joint angles as the bus reports them now [rad], shape (n, 12)."""
+        return self._read(slice(None))
+
+    @property
     def stride_velocity(self) -> Array:
         """Forward and sideways speed [m/s] and turn rate [rad/s] over about a stride, (n, 3)."""
         return self._average.copy()

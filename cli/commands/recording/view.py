@@ -13,6 +13,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES
 
+_ENDINGS = {"rerun": ".rrd", "mcap": ".mcap"}
+
+
+def refuse_other_ending(option: str, path: Path) -> None:
+    """Refuse a file for a viewer whose name has not the ending that the viewer knows."""
+    if path.suffix != _ENDINGS[option]:
+        raise InputError(f"--{option} {path}: its name must end in {_ENDINGS[option]}.")
+
 
 @dataclass(frozen=True)
 class View:
@@ -39,15 +47,14 @@ class View:
         from pupper_sysid.sysid.view.mcap_file import write_mcap
         from pupper_sysid.sysid.view.rerun_file import write_rerun
 
-        wanted = {"rerun": (self.rerun, ".rrd"), "mcap": (self.mcap, ".mcap")}
+        wanted = {"rerun": self.rerun, "mcap": self.mcap}
         if self.rerun is None and self.mcap is None:
             raise InputError("Nothing to write: give --rerun FILE.rrd, --mcap FILE.mcap or both.")
         if self.model is not None and self.rerun is None:
             raise InputError("--model: only a Rerun file shows the robot; add --rerun FILE.rrd.")
-        for option, (path, suffix) in wanted.items():
+        for option, path in wanted.items():
             if path is not None:
-                if path.suffix != suffix:
-                    raise InputError(f"--{option} {path}: its name must end in {suffix}.")
+                refuse_other_ending(option, path)
                 refuse_overwrite(path, self.force)
         recordings = terminal.load_all(self.recordings)
         if len(recordings) != 1:
@@ -62,7 +69,7 @@ class View:
 
                 time_s, bodies = robot_over_time(recording, self.model)
             write_rerun(recording, self.rerun, time_s, bodies, self.force)
-        for path, _ in wanted.values():
+        for path in wanted.values():
             if path is not None:
                 terminal.out.print(f"Wrote {path}", soft_wrap=True)
         if self.rerun is not None:

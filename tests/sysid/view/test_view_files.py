@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.cli.programs import pupper_play
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.view.channels import channels, guard_events
 from pupper_sysid.sysid.view.mcap_file import write_mcap
 from pupper_sysid.sysid.view.rerun_file import write_rerun
-from support.command_line import run
+from support.command_line import run, run_program
 
 SAMPLES = Path(__file__).parents[3] / "data/samples"
 ROUNDED_S = 0.6e-9  # both formats keep times in whole nanoseconds
@@ -223,3 +224,27 @@ def test_the_command_writes_both_files_and_says_what_is_wrong(tmp_path, monkeypa
     ]:
         code, _, err = run(capsys, "view", sample, *options)
         assert code == 2 and sentence in " ".join(err.split())
+
+
+def test_a_simulated_walk_is_written_with_its_trunk_moving_as_it_walked(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    policy = SAMPLES / "policies/mlp"
+    words = (str(policy), "--seconds", "2", "--rerun", "w.rrd", "--mcap", "w.mcap")
+    code, out, err = run_program(capsys, pupper_play, *words)
+    assert code == 0 and "Wrote w.rrd" in err and "Wrote w.mcap" in err
+    away = float(out.split("; ")[-1].split(" m ")[0])
+    _, values = next(
+        v for k, v in entities_of(tmp_path / "w.rrd").items()
+        if k.startswith("/robot/") and k.endswith("translation") and np.ptp(v[1], axis=0).max() > 0
+    )  # fmt: skip
+    trunk = np.squeeze(values)
+    assert len(trunk) == 100 and 0.05 < away < 0.5
+    assert np.linalg.norm(trunk[-1, :2] - trunk[0, :2]) == pytest.approx(away, abs=0.03)
+    found, _ = topics_of(tmp_path / "w.mcap")
+    times, commands = found["LF_thigh", "command_rad"]
+    assert len(times) == 100 and np.ptp(commands) > 0.1
+    assert np.isfinite(found["LF_thigh", "position_rad"][1]).all()
+    code, _, err = run_program(capsys, pupper_play, str(policy), "--mcap", "w.csv")
+    assert code == 2 and "must end in .mcap" in err
