@@ -309,7 +309,7 @@ def _walk(
             watchers,
             options.force,
         )
-        rows.close({"stop_reason": outcome.stop_reason})
+        rows.close({"stop_reason": outcome.stop_reason} | bus.report.footer())
     steps = outcome.steps
     # only the true motion of an emulated robot is known
     motion: dict[str, Any] = score.summary() if score else dict.fromkeys(ERRORS)

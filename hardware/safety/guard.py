@@ -17,7 +17,7 @@ to what was found, and the watchdog does if this process dies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 _HEARTBEAT_S = 0.1
+_MOST_EVENTS = 500  # that a report keeps; all are counted
 _PARK_PERIOD_S = 0.02
 _TORQUE_OFF_TRIES = 10
 _STALE_S = 0.1  # older than any feedback age
@@ -49,10 +50,24 @@ class GuardReport:
     """Commands that could not be sent."""
     missing: int = 0
     """Missing readings of single joints."""
+    events: list[tuple[float, str]] = field(default_factory=list)
+    """Times on the bus's clock [s] of the first commands that were changed or lost, and how:
+    `clipped`, `slowed` or `unsent`."""
+
+    def add(self, kind: str, time_s: float) -> None:
+        """Count a command that was changed or lost."""
+        setattr(self, kind, getattr(self, kind) + 1)
+        if len(self.events) < _MOST_EVENTS:
+            self.events.append((time_s, kind))
 
     def summary(self) -> dict[str, int]:
-        """As plain numbers."""
-        return dict(vars(self))
+        """The counts."""
+        return {name: value for name, value in vars(self).items() if name != "events"}
+
+    def footer(self, shift_s: float = 0.0) -> dict[str, Any]:
+        """Counts and events for a recording whose times are the bus's and `shift_s`."""
+        events = [[round(time_s + shift_s, 4), kind] for time_s, kind in self.events]
+        return {"guard": self.summary()} | ({"guard_events": events} if events else {})
 
 
 class GuardedBus:
@@ -138,14 +153,16 @@ class GuardedBus:
             wanted = f"{len(self.joint_names)} numbers"
             raise BusError(f"{self.name}: a command must be {wanted}, got {command}.")
         allowed = self.limits.clip(command)
-        self.report.clipped += int(np.any(allowed != command))
         now = self.bus.now()
+        if np.any(allowed != command):
+            self.report.add("clipped", now)
         if self._sent is None:
             self._check_first(allowed)
             self._rates.rest()
         else:
             slower = self._rates.limited(allowed, self._sent, now - self._sent_s)
-            self.report.slowed += slower is not allowed
+            if slower is not allowed:
+                self.report.add("slowed", now)
             allowed = slower
         sent = self.bus.write(allowed)
         self._beat()
@@ -153,7 +170,7 @@ class GuardedBus:
             self._sent, self._sent_s = sent.position_rad, now
             self._monitor.add_command(now, sent.position_rad)
         else:
-            self.report.unsent += 1
+            self.report.add("unsent", now)
         return sent
 
     def torque(self, on: bool) -> bool:

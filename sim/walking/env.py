@@ -75,6 +75,10 @@ class PupperEnv:
         Which robots are the same one; by default all differ.
     extra_jitter_s : ndarray, shape (n,), optional
         Added to the jitter of a robot's commands, a standard deviation [s].
+    device : str, optional
+        Of the physics by mujoco-warp (extra `gpu`): `cuda`, `cuda:1`, or `cpu` to try it; by
+        default MuJoCo steps it on `threads`. Readings and rewards are NumPy either way, from the
+        state that comes back after each control step.
 
     Attributes
     ----------
@@ -93,7 +97,8 @@ class PupperEnv:
     ------
     InputError
         If there is no environment, a servo is not stable in such physics steps, a delay does not
-        fit its buffer, or the servo model is of other joints or another rate.
+        fit its buffer, the servo model is of other joints or another rate, or the device or its
+        extra is not there.
 
     Notes
     -----
@@ -128,6 +133,7 @@ class PupperEnv:
         extra_dead_time_s: float | Array = 0.0,
         twins: Twins | None = None,
         extra_jitter_s: Array | None = None,
+        device: str | None = None,
     ):
         if environments < 1:
             raise InputError(f"There are {environments} environments; at least 1 is needed.")
@@ -135,10 +141,13 @@ class PupperEnv:
         self.rng = generator(seed, twins)
         # terrain is the same for every run of a seed, whatever the number of environments
         self.ground = make_ground(config.terrain, np.random.default_rng([seed, 1]))
-        self.robots = RobotBatch(
-            config, servos, self.ground, environments, threads, servo_model, extra_dead_time_s,
-            extra_jitter_s,
-        )  # fmt: skip
+        late = (servo_model, extra_dead_time_s, extra_jitter_s)
+        if device is None:
+            self.robots = RobotBatch(config, servos, self.ground, environments, threads, *late)
+        else:
+            from pupper_sysid.sim.gpu.warp_robots import WarpRobots
+
+            self.robots = WarpRobots(config, servos, self.ground, environments, device, *late)
         self.default, (self._low, self._high) = default_pose(), limits()
         self.trot = config.trot
         n = environments

@@ -183,7 +183,7 @@ class _Session:
             finally:
                 bus.park()  # before the disk, which may be slow
             writer.close(
-                {"rows": rows, "loop": self._loop.summary(), "guard": bus.report.summary()}
+                {"rows": rows, "loop": self._loop.summary()} | bus.report.footer(self._shift_s)
             )
         return path
 

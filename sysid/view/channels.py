@@ -69,10 +69,22 @@ def channels(recording: Recording) -> list[Channel]:
     return found
 
 
-def guard_events(recording: Recording) -> list[str]:
-    """Sentences on commands that the guard changed; a recording's footer counts them."""
-    counts = (recording.metadata.get("completed") or {}).get("guard") or {}
-    return [f"Guard: {counts[k]} commands {text}." for k, text in _GUARD.items() if counts.get(k)]
+def guard_events(recording: Recording, last_s: float) -> list[tuple[float, str]]:
+    """Times [s] of commands that the guard changed, and what it did; a recording's footer has them.
+
+    The numbers of all of them, which may be more, are given at `last_s`.
+    """
+    footer = recording.metadata.get("completed") or {}
+    counts, events = footer.get("guard") or {}, footer.get("guard_events") or []
+    found = []
+    for event in events if isinstance(events, list) else []:
+        time_s, kind = event if isinstance(event, list) and len(event) == 2 else (None, None)
+        if isinstance(time_s, int | float) and np.isfinite(time_s) and kind in _GUARD:
+            found.append((float(time_s), f"Guard: a command {_GUARD[kind]}."))
+    return found + [
+        (last_s, f"Guard: {counts[k]} commands {text}.")
+        for k, text in _GUARD.items() if counts.get(k)
+    ]  # fmt: skip
 
 
 def poses(recording: Recording, rate_hz: float) -> tuple[Array, dict[str, Array]]:

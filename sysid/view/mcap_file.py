@@ -62,7 +62,8 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
             "Writing MCAP needs mcap-ros2-support: pip install 'pupper-sysid[live]'."
         ) from None
     found = channels(recording)
-    messages = sorted(_messages(found, guard_events(recording)), key=lambda m: m[0])
+    events = guard_events(recording, max(channel.time_s[-1] for channel in found))
+    messages = sorted(_messages(found, events), key=lambda m: m[0])
     shift_ns = -min(0, messages[0][0])  # a time stamp of MCAP has no sign
     file = io.BytesIO()
     writer = Writer(file)
@@ -79,12 +80,10 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
     write_bytes(path, file.getvalue(), force)
 
 
-def _messages(found: Sequence[Channel], events: Sequence[str]) -> Iterator[_Message]:
-    last_ns = 0
+def _messages(found: Sequence[Channel], events: Sequence[tuple[float, str]]) -> Iterator[_Message]:
     joined: dict[tuple[int, str], dict[str, float]] = {}
     for channel in found:
         times_ns = np.rint(channel.time_s * 1e9).astype(np.int64).tolist()
-        last_ns = max(last_ns, times_ns[-1])
         for time_ns, value in zip(times_ns, channel.values.tolist(), strict=True):
             if topic := _TOPICS.get(channel.name):
                 joined.setdefault((time_ns, topic), {})[channel.joint] = value
@@ -94,8 +93,8 @@ def _messages(found: Sequence[Channel], events: Sequence[str]) -> Iterator[_Mess
     for (time_ns, topic), values in joined.items():
         state = {"name": [*values], "position": [*values.values()], "velocity": [], "effort": []}
         yield time_ns, topic, "sensor_msgs/msg/JointState", state
-    for text in events:
+    for time_s, text in events:
         yield (
-            last_ns, "/rosout", "rcl_interfaces/msg/Log",
+            round(time_s * 1e9), "/rosout", "rcl_interfaces/msg/Log",
             {"level": _WARN, "name": "guard", "msg": text, "file": "", "function": "", "line": 0},
         )  # fmt: skip

@@ -100,11 +100,14 @@ def write_rerun(
                 columns=rr.Scalars.columns(scalars=channel.values), recording=stream,
             )  # fmt: skip
         last_s = max(channel.time_s[-1] for channel in found)
-        for text in guard_events(recording):
+        events = guard_events(recording, last_s)
+        if events:
+            times = np.array([at for at, _ in events])
+            texts = [text for _, text in events]
             rr.send_columns(
-                "guard",
-                indexes=[rr.TimeColumn("time", duration=_nanoseconds(np.array([last_s])))],
-                columns=rr.TextLog.columns(text=[text], level=["WARN"]), recording=stream,
+                "guard", indexes=[rr.TimeColumn("time", duration=_nanoseconds(times))],
+                columns=rr.TextLog.columns(text=texts, level=["WARN"] * len(texts)),
+                recording=stream,
             )  # fmt: skip
         for body in bodies:
             place = f"robot/{body.name}"

@@ -141,13 +141,20 @@ def test_the_age_is_the_time_since_a_reading_changed():
 
 def test_what_the_guard_changed_is_in_both_files(tmp_path):
     counts = {"clipped": 3, "slowed": 0, "unsent": 1}
-    recording = made(1, metadata={"completed": {"rows": 600, "guard": counts}})
-    sentences = ["Guard: 3 commands held at the limits.", "Guard: 1 commands lost."]
-    assert guard_events(recording) == sentences
+    events = [[0.5, "clipped"], [0.7, "unsent"], ["x", "clipped"], [1.0, "exploded"], 5]
+    completed = {"rows": 600, "guard": counts, "guard_events": events}
+    recording = made(1, metadata={"completed": completed})
+    sentences = [
+        "Guard: a command held at the limits.", "Guard: a command lost.",
+        "Guard: 3 commands held at the limits.", "Guard: 1 commands lost.",
+    ]  # fmt: skip
+    assert guard_events(recording, 9.0) == list(zip([0.5, 0.7, 9, 9], sentences, strict=True))
     write_mcap(recording, tmp_path / "a.mcap")
     assert topics_of(tmp_path / "a.mcap")[1] == sentences
     write_rerun(recording, tmp_path / "a.rrd")
-    assert np.ravel(entities_of(tmp_path / "a.rrd")["/guard|text"][1]).tolist() == sentences
+    times, texts = entities_of(tmp_path / "a.rrd")["/guard|text"]
+    assert np.ravel(texts).tolist() == sentences
+    np.testing.assert_allclose(times[:2], [0.5, 0.7])
 
 
 def test_trials_that_overlap_in_time_are_refused(tmp_path):
