@@ -1,0 +1,1 @@
+"""The robots on another engine: mujoco-warp, on a CUDA device."""

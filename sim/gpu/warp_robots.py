@@ -1,0 +1,161 @@
+"""WarpRobots: the robots of `sim.robot.robot_batch`, with their physics on a Warp device.
+
+All that is drawn, placed and written is `RobotBatch`'s own, by MuJoCo on the host, so that both
+engines have one task. A control step sends commands, state and servos to the device, takes all
+its physics steps there (on CUDA as one graph) and brings back what `RobotBatch` gives: positions,
+torques and forces on the feet at each physics step. Delay lines and the solver's warm start stay
+on the device. It computes in single precision; on CUDA the order of sums, and so the last bits, may
+differ between runs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.joint_arrays import JointArrays
+from pupper_sysid.sim.gpu.worlds import Worlds
+from pupper_sysid.sim.robot.motion import Moved
+from pupper_sysid.sim.robot.robot_batch import RobotBatch
+from pupper_sysid.sim.robot.terrain import Ground
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+Array = NDArray[np.float64]
+
+_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0")
+"""What MuJoCo computes from masses, centres and rotor inertias, for the solver."""
+
+
+class WarpRobots(RobotBatch):
+    """Robots on one piece of ground, stepped by mujoco-warp.
+
+    Parameters
+    ----------
+    config : Walking
+    servos : ServoRanges
+    ground : Ground
+    environments : int
+    device : str
+        Warp's name: `cuda`, `cuda:1`, or `cpu` to try it.
+    servo_model : JointArrays, optional
+    extra_dead_time_s : float or ndarray, shape (n,)
+    extra_jitter_s : ndarray, shape (n,), optional
+        As `RobotBatch`.
+
+    Raises
+    ------
+    InputError
+        As `RobotBatch`, or if there is no such device.
+    """
+
+    def __init__(
+        self,
+        config: Walking,
+        servos: ServoRanges,
+        ground: Ground,
+        environments: int,
+        device: str,
+        servo_model: JointArrays | None = None,
+        extra_dead_time_s: float | Array = 0.0,
+        extra_jitter_s: Array | None = None,
+    ):
+        super().__init__(
+            config, servos, ground, environments, 1, servo_model, extra_dead_time_s, extra_jitter_s
+        )
+        self._hash += " on Warp"  # what follows a state is not exactly the same there
+        for name in _DERIVED:
+            if getattr(self.model, name).size:
+                super().field(name)
+        self._worlds = Worlds(self.model, self._fields, environments, config.substeps, device)
+        self._host = {
+            name: self.batch.bind(name) for name in ("history", "time", "qacc_warmstart", "act")
+        }
+        self._host_sites, self._site_position = self._site_position, self._site_position.copy()
+        self._ahead = np.ones(environments, bool)  # rows that the host has written
+        self._broken = np.zeros(environments, bool)
+
+    def field(self, name: str) -> Array:
+        """Live values of a model field that differs between robots, shape (n, …).
+
+        Raises
+        ------
+        InputError
+            If it is the same for all robots.
+        """
+        if name not in self._fields:
+            raise InputError(
+                f"`{name}` is one value for all robots on a Warp device; those of each robot are "
+                f"{', '.join(self._fields)}."
+            )
+        return self._fields[name]
+
+    def move(self, ids: NDArray[np.intp], place: Array) -> None:
+        """As `RobotBatch.move`."""
+        super().move(ids, place)
+        self._site_position[ids] = self._host_sites[ids]
+
+    def place(
+        self,
+        ids: NDArray[np.intp],
+        joints: Array,
+        joint_velocity: Array,
+        margin_m: float,
+        rng: np.random.Generator,
+    ) -> None:
+        """As `RobotBatch.place`."""
+        super().place(ids, joints, joint_velocity, margin_m, rng)
+        self._ahead[ids] = True
+        self._site_position[ids] = self._host_sites[ids]
+
+    def broken(self) -> NDArray[np.bool_]:
+        """Robots that have been reset in the last step, because they became NaN."""
+        return self._broken.copy()
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """As `RobotBatch.state`."""
+        behind = ~self._ahead
+        for name, value in self._worlds.read().items():
+            self._host[name][behind] = value[behind]
+        return super().state
+
+    def restore(self, state: dict[str, Any]) -> bool:
+        """As `RobotBatch.restore`."""
+        exact = super().restore(state)
+        self._ahead[:] = True
+        self._site_position[:] = self._host_sites
+        return exact
+
+    def _rollout(self, part: int, start: Array, control: Array | None) -> Moved:
+        ahead = np.flatnonzero(self._ahead)
+        if len(ahead):
+            self._worlds.write(ahead, {name: own[ahead] for name, own in self._host.items()})
+            self._ahead[:] = False
+        self._worlds.write_fields(self._fields)
+        commands = self._control if control is None else control
+        found = {
+            name: own.astype(float)
+            for name, own in self._worlds.advance(self.qpos, self.qvel, commands).items()
+        }
+        if control is not None:
+            self._control[:] = control[:, -1]
+        self.qpos[:], self.qvel[:] = found["qpos"][:, -1], found["qvel"]
+        self._activation[:], self._site_position[:] = found["act"], found["site_xpos"]
+        self._mend(found)
+        touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
+        return Moved(self._parts[part], start, found["qpos"], found["actuator_force"], touch)
+
+    def _mend(self, found: dict[str, Array]) -> None:
+        """Reset robots that became NaN, as MuJoCo does."""
+        self._broken = ~np.isfinite(self.qpos.sum(axis=1) + self.qvel.sum(axis=1))
+        ids = np.flatnonzero(self._broken)
+        if len(ids):
+            self.batch.reset(ids)
+            self._ahead[ids] = True
+            self._site_position[ids] = self._host_sites[ids]
+            found["qpos"][ids] = self.model.qpos0
+            found["actuator_force"][ids] = found["sensordata"][ids] = 0.0
