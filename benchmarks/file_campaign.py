@@ -1,7 +1,7 @@
 """Give every command hostile files, option values and outputs, and say what came of it.
 
 Good files of every kind (`hostile.kit`) are spoiled in content and place (`hostile.spoil`), files
-are made to hurt one format (`hostile.bombs`), options take values that nobody means
+are made to hurt one format (`hostile.bombs`), options take impossible values
 (`hostile.options`), and every command prints to a full disk. Each command runs in a process of its
 own with limits on memory and time. Repeatable by its seed; exits with 1 if anything was wrong.
 

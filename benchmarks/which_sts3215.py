@@ -9,7 +9,7 @@ found through PUPPER_REAL_DATA, else in ../shared/real.
 Every model is a servo card. It runs freely from the first reading on, at the recordings' P gain
 where the card knows its own, at the card's supply voltage, and with the arm as its load: inertia
 and gravity of each joint, which no recording states, and the offset are fitted to the first 40 s of
-three motions, for every model alike. Scored is what nobody fitted: the rest of these, and
+three motions, for every model alike. Scored is what was not fitted: the rest of these, and
 `frequency_sweep`. The limit on the set-point's acceleration, which our card has, may be another in
 the PRBS: the share that suits its first 40 s best.
 

@@ -41,7 +41,7 @@ _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])  # of
 _BRAILLE = 0x2800
 _SAMPLE, _TEXTS = b"S", b"T"
 _SHOWN = {"load": "load {:.0%}", "voltage": "{:.1f} V", "temperature": "{:.0f} °C"}
-_CHANNELS = ("command", "position", "load", "voltage", "temperature")
+_CHANNELS: tuple[str, ...] = ("command", "position", "load", "voltage", "temperature")
 
 
 # ------------------------------------------------------------------------- the loop's side
@@ -164,8 +164,8 @@ class Screen:
         text.append_text(legend).append("\n")
         if not len(table):
             return text
-        data = dict(zip(_CHANNELS, table[:, 2:].reshape(len(table), len(_CHANNELS), -1)
-                        .transpose(1, 0, 2), strict=True))  # fmt: skip
+        values = table[:, 2:].reshape(len(table), len(_CHANNELS), -1)
+        data = dict(zip(_CHANNELS, values.transpose(1, 0, 2), strict=True))
         known = np.isfinite(data["position"]) | np.isfinite(data["command"])
         shown = [k for k in range(len(self.joints)) if known[:, k].any()]
         extent = [max(_extent(data[c][:, k]) for c in ("command", "position")) for k in shown]

@@ -193,7 +193,7 @@ def _of_the_system(error: OSError) -> str:
 
 
 def _open_closed() -> None:
-    """Open streams that were closed by whoever started the program, to nowhere.
+    """Open streams that were closed before the program started, to nowhere.
 
     Otherwise the next file that is opened takes the number of standard output.
     """

@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 _SEED = 2_000_003  # added to a seed: a training with the same one has other robots
+_MOST_ROBOT_S = 1e6
+_MOST_DELAY_S = 2.0
 _AT_A_TIME = 2  # environments: one steps while the other acts
 _COMMAND = OBSERVATION_PARTS["command"]
 
@@ -87,6 +89,7 @@ def walk_together(
     InputError
         If `seconds` is shorter than a step, or an environment cannot be made.
     """
+    _refuse_impossible(conditions, seconds, threads)
     step_s = max(c.task.control_step_s for c in conditions)
     if round(seconds / step_s) < 1:
         raise InputError(f"A rollout of {seconds} s is shorter than one step of {step_s} s.")
@@ -126,6 +129,23 @@ def walk_together(
         for one in running:
             one.result()
     return [found[i] for i in range(len(conditions))]
+
+
+def _refuse_impossible(conditions: Sequence[Condition], seconds: float, threads: int) -> None:
+    """Refuse what no machine could walk."""
+    robots = sum(c.robots for c in conditions)
+    if not robots * seconds <= _MOST_ROBOT_S:
+        raise InputError(
+            f"{robots:.3g} robots for {seconds:g} s each are more than {_MOST_ROBOT_S:g} s of "
+            "walking. Give fewer of them, or less time."
+        )
+    if threads < 0:
+        raise InputError(f"--threads is {threads}; it must be 0 (all cores) or more.")
+    extra = max(c.extra_dead_time_s for c in conditions)
+    if not extra <= _MOST_DELAY_S:
+        raise InputError(
+            f"A dead time of {1e3 * extra:g} ms more is beyond {1e3 * _MOST_DELAY_S:g} ms."
+        )
 
 
 @dataclass(frozen=True)

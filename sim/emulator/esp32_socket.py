@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import threading
@@ -13,6 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 
 _BACKLOG, _BUFFER, _IDLE_S = 20, 38, 0.05
+_LONGEST_PATH = 107  # bytes, of a socket on Linux
 
 
 class ProxySocket:
@@ -119,6 +121,11 @@ class ProxySocket:
 
     def _listen(self) -> None:
         self._server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        if len(os.fsencode(self.path)) > _LONGEST_PATH:
+            raise InputError(
+                f"{str(self.path)[:40]}… is too long for a socket, whose path has at most "
+                f"{_LONGEST_PATH} bytes. Choose a shorter one."
+            )
         self._server.bind(str(self.path))
         self._server.listen(_BACKLOG)
 

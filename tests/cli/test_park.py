@@ -129,7 +129,7 @@ def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, 
         end(processes)
         supervisor.send_signal(signal.SIGTERM)
         said = supervisor.communicate(timeout=20)[1].decode()
-    assert "nobody drove it any more" in said and supervisor.returncode == 143
+    assert "its driver was gone" in said and supervisor.returncode == 143
 
 
 @pytest.mark.wall_clock

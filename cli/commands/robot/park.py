@@ -1,4 +1,4 @@
-"""`park`: switch a robot's torque off, once or whenever nobody is left to do it."""
+"""`park`: switch a robot's torque off, once, or whenever its driver and watchdog are gone."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _take(note: Note, seconds: float, say: bool = True) -> bool:
     where = note.address.where
     try:
         on = _until_limp(note.address, note.joint_map, note.joints, seconds)
-        told = may_be_on(on) if on else "nobody drove it any more; its torque was switched off."
+        told = may_be_on(on) if on else "its driver was gone; its torque was switched off."
         settled = not on
     except PupperError as error:
         told, settled = str(error), False

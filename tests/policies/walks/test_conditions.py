@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.evaluation.figures import Recorder
 from pupper_sysid.policies.walks import together as module
 from pupper_sysid.policies.walks.conditions import (
@@ -196,3 +197,15 @@ def test_policy_trot_and_standing_robots_share_an_environment_and_differ_in_thei
     firsts = np.array([walked.velocity[0] for walked in found])
     assert np.ptp(firsts, axis=0).max() < 0.05
     assert np.abs(found[1].velocity - found[2].velocity).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    "robots,seconds,threads,extra,says",
+    [(10**30, 1.0, 1, 0.0, "robots for 1 s"), (1, 1e12, 1, 0.0, "1 robots for 1e"),
+     (1, 1.0, -1, 0.0, "--threads is -1"), (1, 1.0, 1, 1e9, "dead time of 1e")],
+    ids=["robots", "seconds", "threads", "dead time"],
+)  # fmt: skip
+def test_walks_that_no_machine_could_do_are_refused(robots, seconds, threads, extra, says):
+    given = [Condition(TASK, robots, (0.1, 0.0, 0.0), extra, walker="trot")]
+    with pytest.raises(InputError, match=says):
+        together(given, seconds=seconds, threads=threads, recorder=Recorder)
