@@ -140,7 +140,7 @@ def _refuse_impossible(conditions: Sequence[Condition], seconds: float, threads:
             "walking. Give fewer of them, or less time."
         )
     if threads < 0:
-        raise InputError(f"--threads is {threads}; it must be 0 (all cores) or more.")
+        raise InputError(f"`threads` is {threads}; it must be 0 (all cores) or more.")
     extra = max(c.extra_dead_time_s for c in conditions)
     if not extra <= _MOST_DELAY_S:
         raise InputError(

@@ -37,13 +37,9 @@ def trot(seconds: float, hz: float = 3.25, start: float = 0.0):
     time = STEP_S * np.arange(round(seconds / STEP_S), dtype=np.float64)
     phase = np.asarray(2 * np.pi * hz * time + start, np.float64)
     joints = own.joints(phase, np.tile([0.15, 0.0, 0.0], (len(phase), 1)))
-    rest = default_pose()
-    height = [
-        foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T)[:, 2]
-        - foot_position(leg, *rest[3 * i : 3 * i + 3])[2]
-        for i, leg in enumerate(LEGS)
-    ]
-    return joints, np.stack(height, axis=1) < 1e-9
+    feet = [foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T)[:, 2] for i, leg in enumerate(LEGS)]
+    height = np.stack(feet, axis=1)
+    return joints, height < height.min(axis=0) + 1e-9
 
 
 def red_noise(memory: float, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
