@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.cli.commands.robot import park
 from pupper_sysid.cli.commands.robot.park import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
@@ -172,6 +173,20 @@ def test_a_robot_that_is_gone_for_good_is_settled(tmp_path, monkeypatch, capsys)
     write_note(orders("/dev/pts/99999", 0), ["LF_hip"], 0)
     Park(seconds=0.1).run()
     assert notes() == [] and "gone for good; the torque of LF_hip" in capsys.readouterr().err
+
+
+def test_a_supervisor_that_is_ended_has_said_what_it_switched_off(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    write_note(orders("/dev/pts/99999", 0), ["LF_hip"], 0)
+
+    def ended(text, **_):
+        assert "the torque of LF_hip" in text
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(park.terminal.err, "print", ended)
+    with pytest.raises(KeyboardInterrupt):
+        Park(seconds=0.1).run()
+    assert len(notes()) == 1, "it is settled only once it was said"
 
 
 def test_a_note_is_removed_after_its_device_was_unplugged(tmp_path, monkeypatch):

@@ -107,10 +107,10 @@ def _take(note: Note, seconds: float, say: bool = True) -> bool:
         told, settled = str(error), False
     if not settled and not is_there(note.address) and not can_come_back(note.address):
         told, settled = f"gone for good; {may_be_on(note.joints)}", True
-    if settled:
-        note.remove()
     if settled or say:
         terminal.err.print(f"{where}: {told}", soft_wrap=True)
+    if settled:  # last: what is interrupted here is said again, not lost
+        note.remove()
     return settled
 
 
