@@ -127,21 +127,24 @@ class Hyperparameters:
 class Imitation:
     """Settings of the first gait's imitation."""
 
-    iterations: int = 80
+    iterations: int = 12
     """Rounds; 0 to start PPO from random weights."""
-    epochs: int = 12
+    rollouts: int = 5
+    """Rollouts per round, each of as many steps as one of PPO."""
+    epochs: int = 10
     """Passes over the data of a round."""
     minibatches: int = 16
-    """Parts of the data per pass."""
-    learning_rate: float = 1e-3
-    """Of Adam, at the start; it falls to a tenth."""
-    correction_rate: float = 0.1
+    """Parts of each rollout per pass."""
+    learning_rate: float = 1e-2
+    """Of Muon (matrices) and Adam (biases) at the start; it falls to 0 with the last step."""
+    correction_rate: float = 0.3
     """Share of the policy's errors of speed by which the teacher's commands change per round, in
     the second half of the rounds."""
 
     def __post_init__(self):
-        for name, least in (("iterations", 0), ("epochs", 1), ("minibatches", 1)):
-            if getattr(self, name) < least:
+        least = {"iterations": 0, "rollouts": 1, "epochs": 1, "minibatches": 1}
+        for name in least:
+            if getattr(self, name) < least[name]:
                 raise InputError(
-                    f"imitation.{name} is {getattr(self, name)}; it must be at least {least}."
+                    f"imitation.{name} is {getattr(self, name)}; it must be at least {least[name]}."
                 )

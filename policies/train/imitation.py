@@ -14,9 +14,13 @@ fitted as a function of the command, and a share of the fit is added to the corr
 
 from __future__ import annotations
 
+import copy
+from itertools import chain
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rsl_rl.storage import RolloutStorage
 
 from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.train.learner import Learner
@@ -129,8 +133,51 @@ def imitate(learner: Learner, teacher: Teacher, how: Imitation, round_: int) -> 
     In early rounds the teacher acts in some environments, so that the data contain a walk; once the
     policy walks alone, its speeds correct the teacher's commands.
     """
-    env, ppo = learner.env.env, learner.ppo
+    ppo = learner.ppo
     share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
+    rollouts = [_shown(learner, teacher, share) for _ in range(how.rollouts)]
+    teacher.adapt(0.0 if share else how.correction_rate)
+    networks = (ppo.actor, ppo.critic)
+    for rollout in rollouts:
+        for network in networks:
+            network.update_normalization(rollout.observations.flatten(0, 1))
+    parts = how.minibatches
+    if ppo.actor.is_recurrent:
+        parts = min(parts, learner.env.num_envs)  # it divides robots, not steps
+        batches = [r.recurrent_mini_batch_generator(parts, how.epochs) for r in rollouts]
+    else:
+        batches = [r.mini_batch_generator(parts, how.epochs) for r in rollouts]
+    # all of them in turn, so that the last is not remembered best
+    ordered = chain.from_iterable(zip(*batches, strict=True))
+    steps = parts * how.epochs * how.rollouts
+    optimisers = _optimisers([p for n in networks for p in n.parameters() if p.requires_grad])
+    errors = []
+    for step, batch in enumerate(ordered):
+        done = (round_ + step / steps) / how.iterations
+        for optimiser in optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = how.learning_rate * (1.0 - done)
+        mean = ppo.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0])
+        value = ppo.critic(batch.observations, masks=batch.masks)
+        error = (mean - batch.actions).pow(2).mean()
+        loss = error + (value - batch.returns).pow(2).mean()
+        for network in networks:
+            network.zero_grad()
+        loss.backward()
+        if ppo.is_multi_gpu:
+            ppo.reduce_parameters()
+        for optimiser in optimisers:
+            optimiser.step()
+        errors.append(float(error.detach()))
+    return float(np.sqrt(np.mean(errors[-parts * how.rollouts :])))
+
+
+def _shown(learner: Learner, teacher: Teacher, share: float) -> RolloutStorage:
+    """One rollout, with the teacher's actions in place of those taken.
+
+    The teacher acts for a share of the robots.
+    """
+    env, ppo = learner.env.env, learner.ppo
     led = torch.from_numpy(env.rng.random(env.environments) < share)
     quiet = torch.from_numpy(teacher.quiet)
     targets: list[torch.Tensor] = []
@@ -145,38 +192,21 @@ def imitate(learner: Learner, teacher: Teacher, how: Imitation, round_: int) -> 
             ppo.process_env_step(learner.observations, rewards, dones, extras)
             teacher.watch()
         ppo.compute_returns(learner.observations)
-    teacher.adapt(0.0 if share else how.correction_rate)
-    # the teacher's actions in place of those taken
-    storage = ppo.storage
-    storage.actions = torch.stack(targets)
-    seen = storage.observations.flatten(0, 1)
-    if round_ == 0:
-        ppo.actor.update_normalization(seen)
-        ppo.critic.update_normalization(seen)
-    for group in ppo.optimizer.param_groups:
-        group["lr"] = how.learning_rate * (1.0 - 0.9 * round_ / how.iterations)
-    parts = how.minibatches
-    if ppo.actor.is_recurrent:
-        parts = min(parts, env.environments)  # it divides robots, not steps
-        batches = storage.recurrent_mini_batch_generator(parts, how.epochs)
-    else:
-        batches = storage.mini_batch_generator(parts, how.epochs)
-    errors = []
-    for batch in batches:
-        mean = ppo.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0])
-        value = ppo.critic(batch.observations, masks=batch.masks)
-        error = (mean - batch.actions).pow(2).mean()
-        loss = error + 0.1 * (value - batch.returns).pow(2).mean()
-        ppo.optimizer.zero_grad()
-        loss.backward()
-        if ppo.is_multi_gpu:
-            ppo.reduce_parameters()
-        torch.nn.utils.clip_grad_norm_(ppo.actor.parameters(), learner.hyper.gradient_norm)
-        torch.nn.utils.clip_grad_norm_(ppo.critic.parameters(), learner.hyper.gradient_norm)
-        ppo.optimizer.step()
-        errors.append(float(error.detach()))
-    if round_ > 0:
-        ppo.actor.update_normalization(seen)
-        ppo.critic.update_normalization(seen)
-    storage.clear()
-    return float(np.sqrt(np.mean(errors[-parts:])))
+    found = copy.deepcopy(ppo.storage)
+    found.actions = torch.stack(targets)
+    ppo.storage.clear()
+    return found
+
+
+def _optimisers(parameters: list[torch.nn.Parameter]) -> list[torch.optim.Optimizer]:
+    """Muon for matrices, Adam for the rest.
+
+    The trot bends sharply in its twelve joints, and Adam needs ten times as many steps to follow.
+    """
+    return [
+        torch.optim.Muon(
+            [p for p in parameters if p.ndim == 2], weight_decay=0.0,
+            adjust_lr_fn="match_rms_adamw",
+        ),
+        torch.optim.Adam([p for p in parameters if p.ndim != 2]),
+    ]  # fmt: skip

@@ -34,6 +34,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "learner.discount": (0, 1),
     "learner.gae_lambda": (0, 1),
     "imitation.iterations": (0, 1_000_000),
+    "imitation.rollouts": (1, 1_000),
     "imitation.epochs": (1, 10_000),
     "imitation.learning_rate": (1e-12, 10),
 }

@@ -187,11 +187,8 @@ class _Session:
             self.refuse_nan(before, [error])
             self.counters["imitated"] += 1
             self.counters["teacher"] = teacher.state
-            if self.counters["imitated"] == rounds:
-                learner.fresh_optimiser()
             self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
-            if self.counters["imitated"] % _SAVE_EVERY == 0:
-                self.save(LAST)
+            self.save(LAST)
 
     def improve(self, stop_requested: Callable[[], bool]) -> None:
         """Updates of PPO, until they are done, time is up or a stop is requested."""

@@ -167,15 +167,13 @@ def test_after_a_power_cut_nothing_is_repeated_in_the_curves_and_the_best_stays_
     assert [row["update"] for row in rows(cut / "imitation.csv")] == ["1", "2"]
 
 
-def test_a_power_cut_in_a_long_imitation_does_not_lose_all_of_it(tmp_path):
-    run = tiny_run(imitation=Imitation(iterations=12, epochs=1), iterations=1)
+def test_a_power_cut_in_imitation_loses_one_round(tmp_path):
+    run = tiny_run(imitation=Imitation(iterations=4, epochs=1), iterations=1)
     with pytest.raises(PowerCut):
-        train(tmp_path, run, cut_power_after("imitation", 11))
-    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 10
+        train(tmp_path, run, cut_power_after("imitation", 3))
+    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 2
     train(tmp_path, None)
-    assert [row["update"] for row in rows(tmp_path / "imitation.csv")] == [
-        str(i + 1) for i in range(12)
-    ]
+    assert [row["update"] for row in rows(tmp_path / "imitation.csv")] == ["1", "2", "3", "4"]
 
 
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
@@ -557,11 +555,11 @@ def test_speeds_count_from_a_second_after_a_new_command_on():
 
 
 def test_imitation_brings_the_policy_nearer_to_the_trot():
-    rounds = 30
+    rounds = 6
     run = tiny_run(
         environments=8, task=Walking(),
         learner=Hyperparameters(steps_per_environment=24, minibatches=4),
-        imitation=Imitation(iterations=rounds),
+        imitation=Imitation(rounds, rollouts=2, epochs=5, minibatches=4),
         architecture=Architecture("mlp", (64,), 8, (16,)),
     )  # fmt: skip
     learner = make_learner(run, Ranks())
@@ -570,8 +568,8 @@ def test_imitation_brings_the_policy_nearer_to_the_trot():
     for i in range(rounds):
         reported = imitate(learner, teacher, run.imitation, i)
     ended = difference_when_alone(learner, run)
-    # over twelve seeds 0.38 to 0.79, and the reported one 0.3 to 0.8 of that when alone
-    assert ended < 0.85 * begun
+    # over eight seeds 0.35 to 0.69, and the reported one 0.48 to 0.98 of that when alone
+    assert ended < 0.75 * begun
     assert 0.2 * ended < reported < 2 * ended
 
 
