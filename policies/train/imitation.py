@@ -9,7 +9,9 @@ A policy that imitates a trot does not walk at its speeds: its strokes and its r
 little, and noise of the actions loosens dry friction, so that a robot with it walks at other speeds
 than without. So some robots act without noise, and the teacher corrects the commands that it
 follows by how fast they walk (iterative learning control): after each round the errors of speed are
-fitted as a function of the command, and a share of the fit is added to the correction.
+fitted as a function of the command, and a share of the fit is added to the correction. Where some
+robots have no differences from the calibrated one, only these count: a low battery and a weak leg
+slow a robot down, and no correction is right for it and for the calibrated one.
 """
 
 from __future__ import annotations
@@ -93,6 +95,8 @@ class Teacher:
         self._since = np.where(changed, 0.0, self._since + env.config.control_step_s)
         self._command = env.command.copy()
         walks = self.quiet & (self._since > _SETTLED_S) & env.command.any(axis=1)
+        if env.config.differences.as_calibrated:
+            walks &= env.robots.bodies.as_calibrated
         self._features.append(_features(env.command[walks]))
         self._errors.append((env.command - env.stride_velocity)[walks] / _RANGE)
 

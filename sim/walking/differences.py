@@ -56,12 +56,14 @@ class Differences:
     """Chance that a control tick is missed: the set-points stay for one more."""
     without_effort: float = 0.0
     """Share of robots whose effort readings are 0, as on a bus that gives none."""
+    as_calibrated: float = 0.0
+    """Share of robots with none of these in body, servos and ticks."""
 
     def __post_init__(self):
         for name in ("joint_zero_rad", "imu_mounting_rad", "gyro_bias_rad_s"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"differences.{name} must be from 0 to below 1.")
-        for name in ("weak_leg_share", "missed_ticks", "without_effort"):
+        for name in ("weak_leg_share", "missed_ticks", "without_effort", "as_calibrated"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"differences.{name} is a share: from 0 to 1.")
         for name, least in (
@@ -127,6 +129,8 @@ class Bodies:
         Factors on the commands' jitter and on the period of the readings.
     effort : ndarray, shape (n,)
         1 with effort readings, 0 without.
+    as_calibrated : ndarray of bool, shape (n,)
+        Robots without differences.
     """
 
     def __init__(self, settings: Differences, robots: int):
@@ -134,13 +138,14 @@ class Bodies:
         self.zero_rad = np.zeros((robots, len(JOINT_NAMES)))
         self.centre_m = np.zeros((robots, 3))
         self.jitter, self.poll, self.effort = np.ones(robots), np.ones(robots), np.ones(robots)
+        self.as_calibrated = np.zeros(robots, bool)
 
     @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, live."""
         return {
             "zero_rad": self.zero_rad, "centre_m": self.centre_m, "jitter": self.jitter,
-            "poll": self.poll, "effort": self.effort,
+            "poll": self.poll, "effort": self.effort, "as_calibrated": self.as_calibrated,
         }  # fmt: skip
 
     def draw(
@@ -156,23 +161,28 @@ class Bodies:
         rng : numpy.random.Generator
         """
         own, n = self._settings, len(ids)
+        differ = np.ones(n, bool)
+        if own.as_calibrated:
+            differ = rng.random(n) >= own.as_calibrated
+            self.as_calibrated[ids] = ~differ
         if own.joint_zero_rad:
-            most = own.joint_zero_rad
-            self.zero_rad[ids] = rng.uniform(-most, most, (n, len(JOINT_NAMES)))
+            error = rng.uniform(-own.joint_zero_rad, own.joint_zero_rad, (n, len(JOINT_NAMES)))
+            self.zero_rad[ids] = error * differ[:, None]
         if any(own.centre_of_mass_m):
-            self.centre_m[ids] = rng.uniform(-1, 1, (n, 3)) * own.centre_of_mass_m
+            shift = rng.uniform(-1, 1, (n, 3)) * own.centre_of_mass_m
+            self.centre_m[ids] = shift * differ[:, None]
         for name, values in (("command_jitter", self.jitter), ("poll_period", self.poll)):
             ends = getattr(own, name)
             if ends != (1.0, 1.0):
-                values[ids] = rng.uniform(ends[0], ends[1], n)
+                values[ids] = np.where(differ, rng.uniform(ends[0], ends[1], n), 1.0)
         if own.without_effort:
-            self.effort[ids] = rng.random(n) >= own.without_effort
+            self.effort[ids] = (rng.random(n) >= own.without_effort) | ~differ
         if own.battery != (1.0, 1.0):
-            voltage = rng.uniform(*own.battery, (n, 1))
+            voltage = np.where(differ[:, None], rng.uniform(*own.battery, (n, 1)), 1.0)
             for name in _OF_VOLTAGE:
                 servos[name] *= voltage
         if own.weak_leg_share and own.weak_leg != (1.0, 1.0):
-            weak = rng.random(n) < own.weak_leg_share
+            weak = differ & (rng.random(n) < own.weak_leg_share)
             leg, factor = rng.integers(0, len(LEGS), n), rng.uniform(*own.weak_leg, n)
             strength = np.ones((n, len(LEGS)))
             strength[weak, leg[weak]] = factor[weak]

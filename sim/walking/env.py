@@ -209,6 +209,7 @@ class PupperEnv:
         self.action = np.array(action, float)
         if config.differences.missed_ticks:
             missed = self.rng.random(self.environments) < config.differences.missed_ticks
+            missed &= ~self.robots.bodies.as_calibrated
             self.action[missed] = self.last_action[missed]
         before = self.robots.joint_velocity.copy()
         self.robots.draw_latency(self.level.delay, self.rng)

@@ -202,7 +202,7 @@ def test_policy_trot_and_standing_robots_share_an_environment_and_differ_in_thei
 @pytest.mark.parametrize(
     "robots,seconds,threads,extra,says",
     [(10**30, 1.0, 1, 0.0, "robots for 1 s"), (1, 1e12, 1, 0.0, "1 robots for 1e"),
-     (1, 1.0, -1, 0.0, "--threads is -1"), (1, 1.0, 1, 1e9, "dead time of 1e")],
+     (1, 1.0, -1, 0.0, "`threads` is -1"), (1, 1.0, 1, 1e9, "dead time of 1e")],
     ids=["robots", "seconds", "threads", "dead time"],
 )  # fmt: skip
 def test_walks_that_no_machine_could_do_are_refused(robots, seconds, threads, extra, says):

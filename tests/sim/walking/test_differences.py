@@ -163,6 +163,27 @@ def test_some_robots_have_no_effort_readings():
     np.testing.assert_array_equal(none, env.robots.bodies.effort == 0)
 
 
+def test_a_share_of_robots_is_as_calibrated():
+    env = make(
+        "paper", 200, as_calibrated=0.5, joint_zero_rad=0.05, centre_of_mass_m=(0.01, 0.01, 0.01),
+        command_jitter=(1.5, 2.0), poll_period=(1.5, 2.0), battery=(0.7, 0.8), missed_ticks=1.0,
+        weak_leg_share=1.0, weak_leg=(0.3, 0.3), without_effort=1.0,
+    )  # fmt: skip
+    bodies, same = env.robots.bodies, env.robots.bodies.as_calibrated
+    assert 0.32 < same.mean() < 0.68  # five standard deviations
+    stiffness = env.robots.drawn["stiffness"] / env.servos.value["stiffness"]
+    for robots, differ in ((same, False), (~same, True)):
+        assert (bodies.zero_rad[robots] != 0).all() == differ
+        assert (bodies.centre_m[robots] != 0).all() == differ
+        for factor in (bodies.jitter, bodies.poll, bodies.effort):
+            assert (factor[robots] != 1).all() == differ
+        assert (stiffness[robots] < 0.9).any(axis=1).all() == differ
+    assert (stiffness[same] == 1).all()
+    env = make(as_calibrated=0.5, missed_ticks=1.0)
+    env.step(np.full((40, 12), 0.3))
+    np.testing.assert_array_equal(env.action[:, 0] != 0, env.robots.bodies.as_calibrated)
+
+
 def test_a_robot_of_longer_rounds_is_read_more_rarely():
     feedback = servo_ranges(MEASURED).feedback
     ages = []
