@@ -34,6 +34,7 @@ from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, StackName, suited
 
 if TYPE_CHECKING:
+    from pupper_sysid.policies.deploy.assembly import Assembly
     from pupper_sysid.policies.deploy.servo_match import ServoMatch
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
@@ -166,7 +167,7 @@ def _run(options: Deploy) -> None:
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
             "servo_match": match and match.to_dict(),
         }  # fmt: skip
-        _walk(options, bus, imu, parts.controller, header, folder, truth)
+        _walk(options, bus, imu, parts, header, folder, truth)
 
 
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
@@ -272,7 +273,7 @@ def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
 
 
 def _walk(
-    options: Deploy, bus: GuardedBus, imu: Imu, controller: Any, header: dict[str, Any],
+    options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, header: dict[str, Any],
     folder: Path, truth: Any,
 ) -> None:  # fmt: skip
     """Walk, log, and show the result."""
@@ -290,7 +291,7 @@ def _walk(
         priority = open_things.enter_context(real_time_priority())
         if options.bus != EMULATED:
             err.print(f"Running with {priority}.")
-        watchers: list[Any] = [score] if score else []
+        watchers: list[Any] = [parts.frozen_readings, *([score] if score else [])]
         if options.keyboard:
             driver = open_things.enter_context(Driver().driving())
             commands, watchers = driver, [*watchers, driver.watch]
@@ -300,7 +301,7 @@ def _walk(
         outcome = deploy(
             bus,
             imu,
-            controller,
+            parts.controller,
             commands,
             options.seconds,
             log,

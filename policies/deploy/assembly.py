@@ -12,8 +12,9 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.policies.deploy.controller import Controller
+from pupper_sysid.policies.deploy.frozen_readings import FrozenReadings
 from pupper_sysid.policies.deploy.observer_match import Match, compare
-from pupper_sysid.policies.deploy.observers import make_observer
+from pupper_sysid.policies.deploy.observers import SyntheticPD, make_observer
 from pupper_sysid.policies.deploy.servo_match import ServoMatch, servo_match
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy
@@ -34,6 +35,8 @@ class Assembly:
     """A controller, with the comparison of its observer and the header of its log."""
 
     controller: Controller
+    frozen_readings: FrozenReadings
+    """To be a watcher of the walk."""
     match: Match
     """The observer on this robot compared with the actuator the policy was trained with."""
     servo_match: ServoMatch | None
@@ -90,6 +93,8 @@ def assemble(
         of_training = DelayedPDParameters(**servo_ranges(trained).value)
         match = compare(observer, of_training, period, parameters)
     controller = Controller(policy, stack, observer, joint_map, _stall_torque(servos))
+    moving = SyntheticPD(parameters, period, limits_rad=(limits.low_rad, limits.high_rad))
+    frozen = FrozenReadings(moving, controller.to_servo)
     header = {
         "policy_sha256": contract.weights_sha256, "stack": asdict(stack),
         "joint_map": joint_map.file.name, "actuator": actuator,
@@ -97,7 +102,7 @@ def assemble(
         "servo": str(servo) if model else None,
         "servo_sha256": _hash(servo / WEIGHTS) if servo and model else None,
     }  # fmt: skip
-    return Assembly(controller, match, _servo_match(policy, servos, trained), header)
+    return Assembly(controller, frozen, match, _servo_match(policy, servos, trained), header)
 
 
 def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:

@@ -96,6 +96,6 @@ def walk_once(
         score = WalkScore(bus, inner.robot)
         outcome = deploy(
             bus, inner, parts.controller, constant(command), seconds,
-            log or Path(folder) / "walk.csv", parts.header, rows, [score],
+            log or Path(folder) / "walk.csv", parts.header, rows, [score, parts.frozen_readings],
         )  # fmt: skip
     return outcome, score

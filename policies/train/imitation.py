@@ -182,12 +182,12 @@ def _shown(learner: Learner, teacher: Teacher, share: float) -> RolloutStorage:
     The teacher acts for a share of the robots.
     """
     env, ppo = learner.env.env, learner.ppo
-    led = torch.from_numpy(env.rng.random(env.environments) < share)
-    quiet = torch.from_numpy(teacher.quiet)
+    led = learner.env.tensor(env.rng.random(env.environments) < share)
+    quiet = learner.env.tensor(teacher.quiet)
     targets: list[torch.Tensor] = []
     with torch.inference_mode():
         for _ in range(learner.hyper.steps_per_environment):
-            shown = torch.from_numpy(teacher.actions().astype(np.float32))
+            shown = learner.env.tensor(teacher.actions().astype(np.float32))
             targets.append(shown)
             centre = learner.act() - learner.env.noise
             learner.env.noise[quiet] = 0.0

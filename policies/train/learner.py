@@ -189,7 +189,7 @@ class Learner:
             )
         storage = RolloutStorage(
             "rl", env.num_envs, hyper.steps_per_environment, self.observations,
-            [env.num_actions],
+            [env.num_actions], env.device,
         )  # fmt: skip
         group = None
         if self.ranks.size > 1:
@@ -203,6 +203,7 @@ class Learner:
             lam=hyper.gae_lambda, value_loss_coef=hyper.value_weight, entropy_coef=hyper.entropy,
             learning_rate=hyper.learning_rate, max_grad_norm=hyper.gradient_norm,
             schedule="fixed", use_mixed_precision=hyper.mixed_precision, multi_gpu_cfg=group,
+            device=env.device,
         )  # fmt: skip
         if hyper.mirror:
             if actor.is_recurrent:
@@ -213,11 +214,12 @@ class Learner:
             self.ppo.symmetry = MirrorImages()
         self.fresh_optimiser()
         env.env.processes = self.ranks.size
-        self._joint_share = torch.ones(env.num_actions)
+        share = torch.ones(env.num_actions)
         if hyper.exploration.by_dead_band:
-            self._joint_share = torch.from_numpy(env.env.servos.dead_band_share).float()
+            share = torch.from_numpy(env.env.servos.dead_band_share).float()
         if hyper.mirror:  # or an image would have another likelihood than its original
-            self._joint_share = 0.5 * (self._joint_share + mirrored(self._joint_share).abs())
+            share = 0.5 * (share + mirrored(share).abs())
+        self._joint_share = share.to(env.device)
         self._explore()
         if group:
             self.ppo.broadcast_parameters()
@@ -408,9 +410,14 @@ class Learner:
             self.exact = self.env.restore(state)
         except InputError as error:
             raise InputError(f"{path} does not fit this run's environments: {error}") from error
-        hidden = content["hidden"]
-        self.actor.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
-        self.observations = TensorDict(content["observations"], batch_size=[self.env.num_envs])
+        hidden, device = content["hidden"], self.env.device
+        if isinstance(hidden, list):
+            hidden = tuple(state.to(device) for state in hidden)
+        elif hidden is not None:
+            hidden = hidden.to(device)
+        self.actor.reset(hidden_state=hidden)
+        found = TensorDict(content["observations"], batch_size=[self.env.num_envs])
+        self.observations = found.to(device)
         torch.set_rng_state(content["torch_rng"])
         return content["more"]
 

@@ -69,7 +69,7 @@ def mirrored(values: torch.Tensor, group: str = "noise") -> torch.Tensor:
         several = values.unflatten(-1, (-1, len(JOINT_NAMES)))
         return mirrored(several).flatten(-2)
     order, signs = _OF_GROUP[group]
-    return values[..., order] * signs
+    return values[..., order] * signs.to(values.device)
 
 
 class MirrorImages(Symmetry):
@@ -86,4 +86,4 @@ class MirrorImages(Symmetry):
 
     def compute_loss(self, actor, batch, original_batch_size: int) -> torch.Tensor:
         """No loss besides; the samples suffice."""
-        return torch.zeros(())
+        return torch.zeros((), device=next(actor.parameters()).device)

@@ -31,6 +31,9 @@ from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Wa
 Start = Literal["imitation", "scratch"]
 """How a policy comes to its first gait."""
 
+Device = Literal["cpu", "cuda", "warp-cpu"]
+LearnerDevice = Literal["as-device", "cpu", "cuda"]
+
 RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 2
 RUN_FILE = "run.yaml"
@@ -64,6 +67,11 @@ class Run:
     """Training ends after this time, too."""
     threads: int = 0
     """Of physics and of torch, each; 0 for all cores (one per process with torchrun)."""
+    device: Device = "cpu"
+    """Where the physics is computed: `cpu` by MuJoCo; `cuda` by mujoco-warp on a GPU, `warp-cpu`
+    by mujoco-warp on one core, to try it (extra `gpu`)."""
+    learner_device: LearnerDevice = "as-device"
+    """Where the networks learn; by default where the physics is computed."""
     seed: int = 0
     """Of everything that is drawn."""
 

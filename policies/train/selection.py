@@ -44,6 +44,7 @@ class Judge:
     threads : int
     servo_model : JointArrays, optional
     action_history : int
+    device : str
         As for `WalkingVecEnv`.
     """
 
@@ -55,6 +56,7 @@ class Judge:
         threads: int,
         servo_model: JointArrays | None = None,
         action_history: int = 0,
+        device: str = "cpu",
     ):
         # longer than it walks, so that no episode ends but by a fall
         seconds = min(_SECONDS, task.episode_s)
@@ -64,7 +66,7 @@ class Judge:
         env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
         self._command = np.repeat(_COMMANDS, _EACH, axis=0)
         env.set_command(self._command)
-        self._env = WalkingVecEnv(env, action_history)
+        self._env = WalkingVecEnv(env, action_history, device)
         self._start = self._env.state
 
     def __call__(self, actor: MLPModel) -> dict[str, float]:
@@ -89,7 +91,7 @@ class Judge:
             observations = env.get_observations()
             for _ in range(self._steps):
                 observations, _, dones, extras = env.step(actor(observations))
-                alive &= ~dones.numpy()
+                alive &= ~dones.cpu().numpy()
                 velocity.append(planar_velocity(extras["facts"]))
                 up.append(alive.copy())
                 actor.reset(dones)

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from pupper_sysid.common.errors import PupperError
+from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.memory import keep_freed_memory
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
@@ -59,7 +59,32 @@ def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> Puppe
         run.task, servos or servo_ranges(run.actuator, run.feedback), run.environments,
         run.seed + 7919 * ranks.rank, threads,
         servo_model_of(run.actuator, run.task.control_step_s),
+        device={"cpu": None, "warp-cpu": "cpu"}.get(run.device, _local(run.device, ranks)),
     )  # fmt: skip
+
+
+def learner_device(run: Run, ranks: Ranks) -> str:
+    """Torch's name of the device on which the networks of this process learn.
+
+    Raises
+    ------
+    InputError
+        If there is no such device.
+    """
+    wanted = run.device if run.learner_device == "as-device" else run.learner_device
+    if wanted != "cuda":
+        return "cpu"
+    if not torch.cuda.is_available():
+        raise InputError(
+            "torch finds no CUDA device here. Leave out --device and --learner-device, or install "
+            "a build of torch for CUDA on a machine that has one."
+        )
+    return _local(wanted, ranks)
+
+
+def _local(device: str, ranks: Ranks) -> str:
+    """The device of this process among those of its machine."""
+    return f"{device}:{ranks.local_rank}" if ranks.size > 1 else device
 
 
 def threads_of(run: Run, ranks: Ranks) -> int:
@@ -73,8 +98,8 @@ def make_learner(run: Run, ranks: Ranks) -> Learner:
     keep_freed_memory()
     env = make_env(run, ranks)
     return Learner(
-        WalkingVecEnv(env, action_history(run, env.servos)), run.architecture, run.learner,
-        run.seed, ranks,
+        WalkingVecEnv(env, action_history(run, env.servos), learner_device(run, ranks)),
+        run.architecture, run.learner, run.seed, ranks,
     )  # fmt: skip
 
 
@@ -151,6 +176,7 @@ class _Session:
         self.judge = Judge(
             run.task, env.servos, run.seed, threads_of(run, self.ranks),
             servo_model_of(run.actuator, run.task.control_step_s), action_history(run, env.servos),
+            self.learner.env.device,
         )  # fmt: skip
         self.counters: dict[str, Any] = {
             "elapsed_s": 0.0, "imitated": 0, "best": None, "scores": {},

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -25,6 +26,8 @@ class WalkingVecEnv:
     env : PupperEnv
     action_history : int
         How many past actions the group `actions` holds; 0 leaves the group out.
+    device : str
+        Torch's name of where the learner wants its tensors.
 
     Attributes
     ----------
@@ -34,14 +37,14 @@ class WalkingVecEnv:
 
     num_actions = 12
 
-    def __init__(self, env: PupperEnv, action_history: int = 0):
-        self.env = env
+    def __init__(self, env: PupperEnv, action_history: int = 0, device: str = "cpu"):
+        self.env, self.device = env, device
         self.num_envs = env.environments
         self.max_episode_length = env.config.episode_steps
         self.cfg: dict[str, Any] = {}
         self._past = np.zeros((env.environments, action_history, self.num_actions))
         self._past[:] = env.action[:, None]
-        self.noise = torch.zeros(env.environments, self.num_actions)
+        self.noise = torch.zeros(env.environments, self.num_actions, device=device)
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -75,19 +78,20 @@ class WalkingVecEnv:
             self._past = ended.copy()
             self._past[found.done] = self.env.action[found.done][:, None]
         late, noise = found.terminal["ids"], self.noise
-        self.noise = noise * torch.from_numpy(~found.done)[:, None]
+        self.noise = noise * self.tensor(~found.done)[:, None]
+        ids = self.tensor(late)
         extras: dict[str, Any] = {
-            "terms": found.terms, "facts": found.facts, "terminal_ids": torch.from_numpy(late),
+            "terms": found.terms, "facts": found.facts, "terminal_ids": ids,
         }  # fmt: skip
         if len(late):
             extras["terminal_observations"] = self._groups(
                 found.terminal["observation"], found.terminal["privileged"], ended[late],
-                noise[torch.from_numpy(late)],
+                noise[ids],
             )  # fmt: skip
         return (
             self._groups(found.observation, found.privileged, self._past, self.noise),
-            torch.from_numpy(found.reward.astype(np.float32)),
-            torch.from_numpy(found.done),
+            self.tensor(found.reward.astype(np.float32)),
+            self.tensor(found.done),
             extras,
         )
 
@@ -95,7 +99,7 @@ class WalkingVecEnv:
     def state(self) -> dict[str, Any]:
         """The whole state, for `restore`."""
         return self.env.state | {
-            "past_actions": self._past.copy(), "noise": self.noise.numpy().copy(),
+            "past_actions": self._past.copy(), "noise": self.noise.cpu().numpy().copy(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> bool:
@@ -108,14 +112,18 @@ class WalkingVecEnv:
         """
         own = dict(state)
         past = own.pop("past_actions", self._past)
-        noise = own.pop("noise", self.noise.numpy())
+        noise = own.pop("noise", self.noise.cpu().numpy())
         exact = self.env.restore(own)
-        self._past[:], self.noise = past, torch.from_numpy(np.array(noise, np.float32))
+        self._past[:], self.noise = past, self.tensor(np.array(noise, np.float32))
         return exact
+
+    def tensor(self, values: NDArray) -> torch.Tensor:
+        """An array as a tensor on the learner's device."""
+        return torch.from_numpy(values).to(self.device)
 
     def _groups(self, observation, privileged, past, noise: torch.Tensor) -> TensorDict:
         groups = {"policy": observation, "privileged": privileged}
         if past.shape[1]:
             groups["actions"] = past.reshape(len(past), -1).astype(np.float32)
-        tensors = {k: torch.from_numpy(v) for k, v in groups.items()}
+        tensors = {k: self.tensor(v) for k, v in groups.items()}
         return TensorDict(tensors | {"noise": noise}, batch_size=[len(observation)])

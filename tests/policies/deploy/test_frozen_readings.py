@@ -1,0 +1,129 @@
+"""A frozen hip is found where a model of its servo moves, and nothing is found where none does."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import SafetyStop
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.deploy.assembly import assemble
+from pupper_sysid.policies.deploy.commands import constant
+from pupper_sysid.policies.deploy.controller import Decision, Senses
+from pupper_sysid.policies.deploy.deployment import Outcome, Tick, deploy
+from pupper_sysid.policies.deploy.frozen_readings import WINDOW_S, FrozenReadings
+from pupper_sysid.policies.deploy.observers import SyntheticPD
+from pupper_sysid.policies.deploy.stacks import STACKS, suited
+from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.tiny_training import CALIBRATION
+
+POLICY = Path(__file__).parents[3] / "data/samples/policies/lstm"
+HIP = JOINT_NAMES.index("RF_hip")
+PERIOD_S = 0.02
+
+
+class Frozen(WalkingBus):
+    """A robot whose hip reports one position from a time on."""
+
+    def __init__(self, from_s: float):
+        rng = np.random.default_rng(0)
+        super().__init__(draw_robot(rng), rng)
+        self.from_s, self.last = from_s, 0.0
+
+    def read(self) -> BusSample:
+        sample = super().read()
+        if self.now() < self.from_s:
+            self.last = float(sample.position_rad[HIP])
+            return sample
+        position = sample.position_rad.copy()
+        position[HIP] = self.last
+        return replace(sample, position_rad=position)
+
+
+def walk(bus: WalkingBus, command: tuple[float, float, float], folder: Path) -> Outcome:
+    policy = load_policy(POLICY)
+    stack = STACKS[suited(policy.contract)]
+    parts = assemble(policy, stack, load_joint_map("mini_pupper_2"), CALIBRATION, None)
+    with closing(GuardedBus(bus)) as guard:
+        return deploy(
+            guard, bus, parts.controller, constant(command), 7.0, folder / "walk.csv",
+            parts.header, watchers=[parts.frozen_readings],
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("from_s", "command", "found"),
+    [
+        (8.0, (0.0, 0.0, 0.5), True),
+        (99.0, (0.0, 0.0, 0.5), False),
+        # within the dead band of its friction a hip does not move: nothing can be told
+        (8.0, (0.15, 0.0, 0.0), False),
+    ],
+)
+def test_a_hip_that_freezes_is_found_where_its_servo_must_move(tmp_path, from_s, command, found):
+    bus = Frozen(from_s)
+    outcome = walk(bus, command, tmp_path)
+    assert ("RF_hip has reported the same position for 2 s" in outcome.stop_reason) is found
+    if found:
+        assert bus.now() - from_s < WINDOW_S + 0.5
+    else:
+        assert outcome.stop_reason == "time is up"
+
+
+def ticks(goals: np.ndarray, readings: np.ndarray) -> list[Tick]:
+    """Ticks in which the hip is commanded and read so, and the other joints rest."""
+    made = []
+    for goal, reading in zip(goals, readings, strict=True):
+        sent, position = np.zeros(12), np.zeros(12)
+        sent[HIP], position[HIP] = goal, reading
+        sample = BusSample(np.zeros(12), position, np.zeros(12))
+        made.append(Tick(0.0, Senses(0.0, *[sent] * 5), Decision(*[sent] * 4), sent, sample))
+    return made
+
+
+def watched(made: list[Tick]) -> bool:
+    """Whether they end in a stop."""
+    servos = SyntheticPD(DelayedPDParameters(**servo_ranges(CALIBRATION).value), PERIOD_S)
+    watch = FrozenReadings(servos, lambda angles: angles)
+    try:
+        for tick in made:
+            watch(tick)
+    except SafetyStop as stop:
+        assert "RF_hip" in str(stop)
+        return True
+    return False
+
+
+TIME = PERIOD_S * np.arange(200)
+
+
+def test_less_than_the_guard_sees_is_found_and_friction_is_allowed_for():
+    still = np.zeros(len(TIME))
+    for swing, found in ((0.045, True), (0.012, False)):  # below the guard's 0.1 rad, both
+        goals = swing * np.sin(2 * np.pi * 1.5 * TIME)
+        assert watched(ticks(goals, still)) is found
+
+
+def test_one_step_of_the_encoder_in_two_seconds_is_a_live_reading():
+    goals = 0.045 * np.sin(2 * np.pi * 1.5 * TIME)
+    alive = 0.0057 * (np.arange(len(TIME)) // 90 % 2)
+    assert not watched(ticks(goals, alive))
+    missing = np.where(np.arange(len(TIME)) % 3, np.nan, alive)
+    assert not watched(ticks(goals, missing))
+    assert not watched(ticks(goals, np.full(len(TIME), np.nan))), "silence is the guard's business"
+
+
+def test_a_command_that_has_just_moved_is_given_time():
+    goals = np.where(np.arange(len(TIME)) < len(TIME) - 12, 0.0, 0.09)
+    assert not watched(ticks(goals, np.zeros(len(TIME))))
