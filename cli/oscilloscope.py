@@ -10,7 +10,6 @@ import contextlib
 import json
 import signal
 import socket
-import subprocess
 import sys
 import time
 from collections import deque
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.side_process import LONGEST_MESSAGE, SideProcess
 from pupper_sysid.hardware.bus import BusSample
 
 Array = NDArray[np.float64]
@@ -62,29 +62,17 @@ class Oscilloscope:
     def __init__(self, title: str, joints: Sequence[str], lag: bool = True):
         self._about = {"title": title, "joints": list(joints), "lag": lag}
         self._joints = len(joints)
-        self._here, self._there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._process: subprocess.Popen | None = None
+        self._process: SideProcess | None = None
         self._stage_s = -np.inf
 
     def __enter__(self) -> Oscilloscope:
-        descriptor = self._there.fileno()
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __spec__.name, str(descriptor)], pass_fds=[descriptor],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        )  # fmt: skip
-        self._there.close()
-        self._here.setblocking(False)
+        self._process = SideProcess(__spec__.name)
         self._texts(self._about)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._here.close()
         assert self._process is not None
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.end(_END_S)
 
     def tick(
         self, time_s: float, command: NDArray[np.floating], reading: BusSample, missed: int = 0
@@ -120,8 +108,8 @@ class Oscilloscope:
         self._send(_TEXTS + json.dumps(texts).encode())
 
     def _send(self, message: bytes) -> None:
-        with contextlib.suppress(OSError):  # behind, or ended: the loop goes on
-            self._here.send(message)
+        assert self._process is not None
+        self._process.send(message)
 
 
 # ------------------------------------------------------------------------- the drawing process
@@ -310,7 +298,7 @@ def main() -> None:
     with Live(console=console, auto_refresh=False, transient=True) as live:
         while True:
             with contextlib.suppress(TimeoutError):
-                message = source.recv(65536)
+                message = source.recv(LONGEST_MESSAGE)
                 if not message:
                     return
                 screen.take(message)

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from pupper_sysid.cli.commands.recording.view import refuse_other_ending
+from pupper_sysid.cli.live_views import refuse_file
 from pupper_sysid.cli.policy_choice import policy_at, simulator, warn_of_fallbacks
 from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
 from pupper_sysid.cli.user_errors import run_program
@@ -76,8 +76,7 @@ def _run(options: Play) -> None:
         refuse_overwrite(options.video, options.force)
     for option, path in (("rerun", options.rerun), ("mcap", options.mcap)):
         if path is not None:
-            refuse_other_ending(option, path)
-            refuse_overwrite(path, options.force)
+            refuse_file(option, path, options.force)
     import torch
 
     from pupper_sysid.policies.walks.conditions import evaluation_task

@@ -6,12 +6,14 @@ not recorded stay in the pose the robot is described in. Of a simulated walk all
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from pupper_sysid.policies.twin.actuators import robot_for
 from pupper_sysid.sim.robot.engine import mujoco
@@ -19,6 +21,9 @@ from pupper_sysid.sim.robot.servo_robot import compiled
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.view.channels import poses
 from pupper_sysid.sysid.view.rerun_file import Body
+
+if TYPE_CHECKING:
+    from pupper_sysid.sim.robot.servo_robot import ServoRobot
 
 Array = NDArray[np.float64]
 Surface = tuple[Array, NDArray[np.int64]]
@@ -55,26 +60,57 @@ def robot_over_time(recording: Recording, model: Path | None = None) -> tuple[Ar
         If the robot cannot be read, or lacks a recorded joint.
     """
     robot = robot_for(recording, model)
-    made = compiled(robot, 0.0, fixed=True)
     time_s, held = poses(recording, POSES_PER_S)
     servo = np.tile(robot.rest_rad, (len(time_s), 1))
     for k, joint in enumerate(robot.joints):
         servo[:, k] = held.get(joint, servo[:, k])
-    data = mujoco.MjData(made)
-    angle = _joint_angles(made, data, robot.joints, servo + robot.shift_rad)
-    at = [int(made.joint(name).qposadr[0]) for name in robot.joints]
-    qpos = np.tile(data.qpos, (len(time_s), 1))
-    qpos[:, at] = angle
-    return time_s, bodies_over_time(made, qpos)
+    return time_s, HungRobot(robot).bodies(servo)
 
 
-def bodies_over_time(model: Any, qpos: Array) -> list[Body]:
+class HungRobot:
+    """A robot with its trunk fixed in the air, in poses of its servos.
+
+    Parameters
+    ----------
+    robot : ServoRobot
+    """
+
+    def __init__(self, robot: ServoRobot):
+        self.robot = robot
+        self._model = compiled(robot, 0.0, fixed=True)
+        self._surfaces = _surfaces(self._model)
+
+    def bodies(self, servo_rad: Array, gravity: Array | None = None) -> list[Body]:
+        """Its bodies that have a shape.
+
+        Parameters
+        ----------
+        servo_rad : ndarray, shape (n, joints)
+            Servo angles as recordings have them, in the order of the robot's joints.
+        gravity : ndarray, shape (n, 3), optional
+            Direction of gravity in the trunk's frame, which gives roll and pitch; the heading stays
+            forward. By default, and where it is NaN, the trunk is level.
+        """
+        model, joints = self._model, self.robot.joints
+        data = mujoco.MjData(model)
+        qpos = np.tile(data.qpos, (len(servo_rad), 1))
+        at = [int(model.joint(name).qposadr[0]) for name in joints]
+        qpos[:, at] = _joint_angles(model, data, joints, servo_rad + self.robot.shift_rad)
+        found = bodies_over_time(model, qpos, self._surfaces)
+        return found if gravity is None else _tilted(found, gravity)
+
+
+def bodies_over_time(
+    model: Any, qpos: Array, surfaces: dict[int, Surface] | None = None
+) -> list[Body]:
     """Bodies of a robot that have a shape, in its poses.
 
     Parameters
     ----------
     model : mujoco.MjModel
     qpos : ndarray, shape (n, model.nq)
+    surfaces : dict, optional
+        The shapes, by number of the body, where they are known already.
 
     Returns
     -------
@@ -87,12 +123,35 @@ def bodies_over_time(model: Any, qpos: Array) -> list[Body]:
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         position[k], quaternion[k] = data.xpos, np.roll(data.xquat, -1, axis=1)
-    bodies = []
-    for body in range(1, model.nbody):
-        if (surface := _surface_of(model, body)) is not None:
-            name = model.body(body).name or f"body_{body}"
-            bodies.append(Body(name, *surface, position[:, body], quaternion[:, body]))
-    return bodies
+    return [
+        Body(
+            model.body(body).name or f"body_{body}", *surface, position[:, body],
+            quaternion[:, body],
+        )
+        for body, surface in (surfaces or _surfaces(model)).items()
+    ]  # fmt: skip
+
+
+def _tilted(bodies: list[Body], gravity: Array) -> list[Body]:
+    """Bodies turned about the first one's place, the trunk's, by roll and pitch."""
+    down = np.where(np.isfinite(gravity), gravity, [0.0, 0.0, -1.0])
+    roll = np.arctan2(-down[:, 1], -down[:, 2])
+    pitch = np.arctan2(down[:, 0], np.hypot(down[:, 1], down[:, 2]))
+    turn = Rotation.from_euler("xy", np.stack([roll, pitch], axis=1))  # about the world's axes
+    trunk = bodies[0].position
+    return [
+        replace(
+            body, position=trunk + turn.apply(body.position - trunk),
+            quaternion=(turn * Rotation.from_quat(body.quaternion)).as_quat(),
+        )
+        for body in bodies
+    ]  # fmt: skip
+
+
+def _surfaces(model: Any) -> dict[int, Surface]:
+    """Shapes of the bodies that have one, by their numbers."""
+    every = ((body, _surface_of(model, body)) for body in range(1, model.nbody))
+    return {body: surface for body, surface in every if surface is not None}
 
 
 def _joint_angles(model: Any, data: Any, joints: tuple[str, ...], servo: Array) -> Array:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import BusError, InputError, SafetyStop
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS
-from pupper_sysid.hardware.bus import BusSample, ServoBus, header_entries
+from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
 from pupper_sysid.hardware.loop import FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
@@ -48,9 +48,9 @@ _CHECK_LINE = "Check the cable; cut the servos' power if they still hold."
 Progress = Callable[[float, float, str], None]
 """Called with seconds done, seconds in all, and the name of the present work."""
 
-Observe = Callable[[float, NDArray[np.float64], BusSample, int], None]
-"""Called with each tick of a trial: time [s], positions sent [rad] (NaN while limp), reading, and
-the deadlines missed so far."""
+Observe = Callable[[int, Sent, BusSample, int], None]
+"""Called with each tick of a trial: its number, what was sent (angles NaN while limp), reading, and
+the deadlines missed so far. Times are the bus's."""
 
 
 def record(
@@ -138,7 +138,7 @@ class _Session:
         refuse_more("The recording, by its plan,", len(plan.trials), MOST_TRIALS, "trials")
         self._bus, self._plan, self._resume = bus, plan, resume
         self._progress: Progress = progress or (lambda done, total, what: None)
-        self._observe: Observe = observe or (lambda time_s, sent, reading, missed: None)
+        self._observe: Observe = observe or (lambda number, sent, reading, missed: None)
         # a joint without a start pose in the plan stays where it is
         self._start = np.array([plan.start_pose_rad.get(j, np.nan) for j in bus.joint_names])
         self._sent = self._start.copy()
@@ -229,7 +229,7 @@ class _Session:
                 made = [r | {"p_gain": trial.p_gain, "torque_enabled": float(on)} for r in made]
             writer.append(made)
             shown = self._sent if on else np.full(len(goal), np.nan)
-            self._observe(bus.now(), shown, sample, self._loop.missed_deadlines)
+            self._observe(number, Sent(sent_s, shown), sample, self._loop.missed_deadlines)
             rows += len(index)
             self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
         return rows

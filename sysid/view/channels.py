@@ -7,6 +7,7 @@ time since the last fresh one was read, and NaN before the first.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,9 @@ from pupper_sysid.sysid.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 
-_READ = ("voltage_v", "temperature_c", "load")
+READ = ("voltage_v", "temperature_c", "load")
+"""Channels that some buses have."""
+
 _GUARD = {"clipped": "held at the limits", "slowed": "delayed by the speed limit", "unsent": "lost"}
 
 
@@ -62,7 +65,7 @@ def channels(recording: Recording) -> list[Channel]:
         found.append(Channel(joint, "command_rad", sent, rows["command_rad"].to_numpy(float)))
         found.append(Channel(joint, "position_rad", read, rows["position_rad"].to_numpy(float)))
         found.append(Channel(joint, "reading_age_s", read, _ages(recording, joint)))
-        for name in _READ:
+        for name in READ:
             values = rows[name].to_numpy(float) if name in rows else np.array([])
             if np.isfinite(values).any():
                 found.append(Channel(joint, name, read, values))
@@ -80,11 +83,18 @@ def guard_events(recording: Recording, last_s: float) -> list[tuple[float, str]]
     for event in events if isinstance(events, list) else []:
         time_s, kind = event if isinstance(event, list) and len(event) == 2 else (None, None)
         if isinstance(time_s, int | float) and np.isfinite(time_s) and kind in _GUARD:
-            found.append((float(time_s), f"Guard: a command {_GUARD[kind]}."))
-    return found + [
-        (last_s, f"Guard: {counts[k]} commands {text}.")
-        for k, text in _GUARD.items() if counts.get(k)
-    ]  # fmt: skip
+            found.append((float(time_s), guard_text(kind)))
+    return found + [(last_s, text) for text in guard_counts(counts)]
+
+
+def guard_text(kind: str) -> str:
+    """Sentence on one command that the guard changed: `clipped`, `slowed` or `unsent`."""
+    return f"Guard: a command {_GUARD[kind]}."
+
+
+def guard_counts(counts: Mapping[str, int]) -> list[str]:
+    """Sentences on all commands that the guard changed, by kind."""
+    return [f"Guard: {counts[k]} commands {text}." for k, text in _GUARD.items() if counts.get(k)]
 
 
 def poses(recording: Recording, rate_hz: float) -> tuple[Array, dict[str, Array]]:

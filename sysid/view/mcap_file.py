@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -55,29 +55,57 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
         If the library is not installed, the file exists, or trials overlap in time.
     """
     refuse_overwrite(path, force)
-    try:
-        from mcap_ros2.writer import Writer
-    except ImportError:
-        raise InputError(
-            "Writing MCAP needs mcap-ros2-support: pip install 'pupper-sysid[live]'."
-        ) from None
+    file = io.BytesIO()
+    stream = McapStream(file)
     found = channels(recording)
     events = guard_events(recording, max(channel.time_s[-1] for channel in found))
-    messages = sorted(_messages(found, events), key=lambda m: m[0])
-    shift_ns = -min(0, messages[0][0])  # a time stamp of MCAP has no sign
-    file = io.BytesIO()
-    writer = Writer(file)
-    schemas = {k: writer.register_msgdef(k, text) for k, text in _DEFINITIONS.items()}
-    for time_ns, topic, kind, content in messages:
-        time_ns += shift_ns
-        stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
-        if kind.endswith("JointState"):
-            content = content | {"header": {"stamp": stamp, "frame_id": ""}}
-        elif kind.endswith("Log"):
-            content = content | {"stamp": stamp}
-        writer.write_message(topic, schemas[kind], content, time_ns, time_ns)
-    writer.finish()
+    stream.add(found, events)
+    stream.close()
     write_bytes(path, file.getvalue(), force)
+
+
+class McapStream:
+    """MCAP in ROS 2's messages that grows by channels.
+
+    Parameters
+    ----------
+    file : binary file
+        To write to; it stays open.
+
+    Raises
+    ------
+    InputError
+        If the library is not installed.
+    """
+
+    def __init__(self, file: IO[bytes]):
+        try:
+            from mcap_ros2.writer import Writer
+        except ImportError:
+            raise InputError(
+                "Writing MCAP needs mcap-ros2-support: pip install 'pupper-sysid[live]'."
+            ) from None
+        self._writer = Writer(file)
+        self._schemas = {k: self._writer.register_msgdef(k, t) for k, t in _DEFINITIONS.items()}
+        self._shift_ns: int | None = None
+
+    def add(self, found: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
+        """Write what follows: channels, and sentences with their times [s]."""
+        messages = sorted(_messages(found, events), key=lambda m: m[0])
+        if messages and self._shift_ns is None:
+            self._shift_ns = -min(0, messages[0][0])  # a time stamp of MCAP has no sign
+        for time_ns, topic, kind, content in messages:
+            time_ns = max(time_ns + (self._shift_ns or 0), 0)
+            stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
+            if kind.endswith("JointState"):
+                content = content | {"header": {"stamp": stamp, "frame_id": ""}}
+            elif kind.endswith("Log"):
+                content = content | {"stamp": stamp}
+            self._writer.write_message(topic, self._schemas[kind], content, time_ns, time_ns)
+
+    def close(self) -> None:
+        """Write the end of the file: it is whole only then."""
+        self._writer.finish()
 
 
 def _messages(found: Sequence[Channel], events: Sequence[tuple[float, str]]) -> Iterator[_Message]:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.view.channels import channels, guard_events
+from pupper_sysid.sysid.view.channels import Channel, channels, guard_events
 
 Array = NDArray[np.float64]
 
@@ -77,14 +78,8 @@ def write_rerun(
         time.
     """
     refuse_overwrite(path, force)
-    try:
-        import rerun as rr
-    except ImportError:
-        raise InputError(
-            "Writing a Rerun file needs rerun-sdk: pip install 'pupper-sysid[live]'."
-        ) from None
+    stream = RerunStream(recording.sha256)
     found = channels(recording)
-    stream = rr.RecordingStream("pupper-sysid", recording_id=recording.sha256)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -92,40 +87,110 @@ def write_rerun(
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
     try:
-        stream.save(temporary)
-        for channel in found:
-            rr.send_columns(
-                f"joints/{channel.joint}/{channel.name}",
-                indexes=[rr.TimeColumn("time", duration=_nanoseconds(channel.time_s))],
-                columns=rr.Scalars.columns(scalars=channel.values), recording=stream,
-            )  # fmt: skip
+        stream.save(Path(temporary))
         last_s = max(channel.time_s[-1] for channel in found)
-        events = guard_events(recording, last_s)
-        if events:
-            times = np.array([at for at, _ in events])
-            texts = [text for _, text in events]
-            rr.send_columns(
-                "guard", indexes=[rr.TimeColumn("time", duration=_nanoseconds(times))],
-                columns=rr.TextLog.columns(text=texts, level=["WARN"] * len(texts)),
-                recording=stream,
-            )  # fmt: skip
-        for body in bodies:
-            place = f"robot/{body.name}"
-            shape = rr.Mesh3D(vertex_positions=body.vertices, triangle_indices=body.triangles)
-            stream.log(place, shape, static=True)
-            rr.send_columns(
-                place, indexes=[rr.TimeColumn("time", duration=_nanoseconds(time_s))],
-                columns=rr.Transform3D.columns(
-                    translation=body.position, quaternion=body.quaternion
-                ), recording=stream,
-            )  # fmt: skip
-        stream.flush()
-        stream.disconnect()
+        stream.add(found, guard_events(recording, last_s))
+        stream.show(bodies)
+        stream.move(time_s, bodies)
+        stream.close()
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     finally:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
+
+
+class RerunStream:
+    """Channels and a robot for Rerun, in a file or in a viewer.
+
+    Parameters
+    ----------
+    name : str
+        Different for every recording: a viewer joins those of one name.
+
+    Raises
+    ------
+    InputError
+        If the library is not installed.
+    """
+
+    def __init__(self, name: str):
+        try:
+            import rerun
+        except ImportError:
+            raise InputError(
+                "Writing for Rerun needs rerun-sdk: pip install 'pupper-sysid[live]'."
+            ) from None
+        self._rr = rerun
+        self._stream = rerun.RecordingStream("pupper-sysid", recording_id=name)
+
+    def save(self, path: Path) -> None:
+        """Send everything to a file, which is replaced."""
+        self._stream.save(path)
+
+    def connect(self, url: str) -> None:
+        """Send everything to a viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
+
+        Raises
+        ------
+        InputError
+            If it is no such address.
+        """
+        try:
+            self._stream.connect_grpc(url)
+        except (RuntimeError, ValueError) as error:
+            raise InputError(f"{url} is no address of a Rerun viewer: {error}.") from error
+
+    def add(self, found: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
+        """Write what follows: channels, and sentences with their times [s]."""
+        rr = self._rr
+        for channel in found:
+            self._send(
+                f"joints/{channel.joint}/{channel.name}", channel.time_s,
+                rr.Scalars.columns(scalars=channel.values),
+            )  # fmt: skip
+        if events:
+            texts = [text for _, text in events]
+            columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+            self._send("guard", np.array([at for at, _ in events]), columns)
+
+    def show(self, bodies: Sequence[Body]) -> None:
+        """Write the shapes of bodies."""
+        for body in bodies:
+            shape = self._rr.Mesh3D(vertex_positions=body.vertices, triangle_indices=body.triangles)
+            self._stream.log(f"robot/{body.name}", shape, static=True)
+
+    def move(self, time_s: Array, bodies: Sequence[Body]) -> None:
+        """Write where bodies were at times [s], shape (n,)."""
+        for body in bodies:
+            columns = self._rr.Transform3D.columns(
+                translation=body.position, quaternion=body.quaternion
+            )
+            self._send(f"robot/{body.name}", time_s, columns)
+
+    def close(self, within_s: float | None = None) -> None:
+        """Send the rest and end.
+
+        Parameters
+        ----------
+        within_s : float, optional
+            Longest wait for a viewer [s].
+
+        Raises
+        ------
+        InputError
+            If not everything could be sent.
+        """
+        try:
+            self._stream.flush(**({} if within_s is None else {"timeout_sec": within_s}))
+        except (RuntimeError, ValueError) as error:
+            raise InputError(f"Rerun did not take everything: {error}.") from error
+        finally:
+            self._stream.disconnect()
+
+    def _send(self, place: str, time_s: Array, columns: Any) -> None:
+        index = self._rr.TimeColumn("time", duration=_nanoseconds(time_s))
+        self._rr.send_columns(place, indexes=[index], columns=columns, recording=self._stream)
 
 
 def _nanoseconds(time_s: Array) -> NDArray[np.timedelta64]:

@@ -96,22 +96,22 @@ def test_dots_are_where_the_points_are():
 def test_a_drawing_process_that_stands_still_delays_no_tick():
     with Oscilloscope("bus", JOINT_NAMES) as scope:
         assert scope._process is not None
-        os.kill(scope._process.pid, signal.SIGSTOP)
+        os.kill(scope._process.process.pid, signal.SIGSTOP)
         took = []
         for k in range(5000):
             began = time.thread_time()
             scope.tick(0.02 * k, np.zeros(12), sample(np.zeros(12)))
             took.append(time.thread_time() - began)
         assert np.median(took) < 2e-4 and max(took) < 0.01
-        process, began = scope._process, time.monotonic()
+        process, began = scope._process.process, time.monotonic()
     assert time.monotonic() - began < 10 and process.returncode is not None
 
 
 def test_a_drawing_process_that_died_ends_nothing():
     with Oscilloscope("bus", JOINT_NAMES) as scope:
         assert scope._process is not None
-        scope._process.kill()
-        scope._process.wait()
+        scope._process.process.kill()
+        scope._process.process.wait()
         for k in range(50):
             scope.tick(0.02 * k, np.zeros(12), sample(np.zeros(12)))
             scope.stage(1.0, 2.0, "LF_hip")

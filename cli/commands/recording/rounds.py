@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.recording.sweep import say_how_to_resume
+from pupper_sysid.cli.commands.recording.sweeping import say_how_to_resume
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 

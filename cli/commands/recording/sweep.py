@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
-
-import numpy as np
+from typing import Any, Literal
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import JOINTS_FILE, connect, parse_registers
-from pupper_sysid.cli.commands.recording.bench import (
-    BENCH_MAP,
-    BENCH_RATE_HZ,
-    loads_of,
-    open_bench,
-    open_emulated,
-    plan_of_bench,
+from pupper_sysid.cli.buses import JOINTS_FILE, parse_registers
+from pupper_sysid.cli.commands.recording.bench import BENCH_MAP, BENCH_RATE_HZ, loads_of
+from pupper_sysid.cli.commands.recording.sweeping import (
+    guard_warnings,
+    in_virtual_time,
+    open_bus_of,
+    plan_of,
+    priority_of,
+    say_how_to_resume,
+    say_what_stays,
+    shown,
 )
+from pupper_sysid.cli.live_views import Wanted
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
-from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.loop import real_time_priority
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import guarded
 from pupper_sysid.sysid.sweep.bench import (
     BENCH,
     BENCH_KINDS,
@@ -39,16 +37,11 @@ from pupper_sysid.sysid.sweep.bench import (
 from pupper_sysid.sysid.sweep.excitation import (
     LOOP_PERIOD_S,
     MOST_LOOPS,
-    POLL_RATE_HZ,
     RATES_HZ,
     TRIAL_S,
     Plan,
     parse_frequencies,
-    plan,
 )
-
-if TYPE_CHECKING:
-    from pupper_sysid.sysid.sweep.recorder import Observe, Progress
 
 
 @dataclass(frozen=True)
@@ -115,6 +108,11 @@ class Sweep:
     live: bool = False
     """Show commands, readings and lag of each joint in the terminal while they move; an emulated
     robot moves in real time then."""
+    rerun: str | None = None
+    """Show all joints and the robot in Rerun while they move: a .rrd file to write, `viewer` (of
+    this machine), or a viewer's address, rerun+http://HOST:9876/proxy."""
+    mcap: Path | None = None
+    """Write all joints in ROS 2's messages for Foxglove while they move, .mcap."""
     force: bool = False
     """Replace files that exist."""
     json: bool = False
@@ -128,6 +126,7 @@ class Sweep:
         from pupper_sysid.sysid.sweep.resume import header_of
 
         started = time.perf_counter()
+        self._views.check()
         if self.resume:
             path = self.resume
             metadata = header_of(path)
@@ -147,6 +146,11 @@ class Sweep:
         if self.truth and (self.resume or request["bus"] != EMULATED):
             raise InputError("--truth: only a new recording of the emulated robot has true values.")
         if request.get("until"):
+            if self._views:
+                raise InputError(
+                    "--until makes several recordings, and --rerun and --mcap show one. Leave "
+                    "them out, and give the recordings to `pupper-sysid view`."
+                )
             from pupper_sysid.cli.commands.recording.rounds import run_rounds
 
             run_rounds(
@@ -163,9 +167,9 @@ class Sweep:
         from pupper_sysid.sysid.sweep.recorder import record
         from pupper_sysid.sysid.sweep.resume import resume_point
 
-        bus = _open(request)
+        bus = guarded(open_bus_of(request))
         try:
-            chosen = _plan(request, bus)
+            chosen = plan_of(request, bus)
             point = resume_point(path, chosen, request["loop_period_s"]) if resume else None
         except BaseException:
             bus.close()
@@ -178,45 +182,34 @@ class Sweep:
         existed = path.exists()
         try:
             with (
-                _priority(request) as priority,
-                self._shown(bus, chosen) as (advance, observe),
+                priority_of(request) as priority,
+                shown(bus, chosen, self._views, self.live, in_virtual_time(request)) as shows,
             ):
                 record(
                     bus, chosen, path, loop_period_s=request["loop_period_s"],
                     metadata={"seed": request["seed"], "sweep": request, "priority": priority}
                     | loads_of(request),
-                    force=self.force, resume=point, progress=advance, observe=observe,
+                    force=self.force, resume=point, progress=shows[0], observe=shows[1],
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
-            _say_what_stays(bus)
+            say_what_stays(bus)
             if path.exists() and (point or not existed or self.force):
                 say_how_to_resume(path)
             raise
-        _say_what_stays(bus)
-        terminal.warn(_guard_warnings(path))
+        say_what_stays(bus)
+        terminal.warn(guard_warnings(path))
         written = [path]
-        bus = bus.bus if isinstance(bus, GuardedBus) else bus
-        if self.truth and isinstance(bus, EmulatedBus):
-            written += bus.write_truth(path.with_suffix(""), self.force)
+        if self.truth and isinstance(bus.bus, EmulatedBus):
+            written += bus.bus.write_truth(path.with_suffix(""), self.force)
         return chosen, written
 
     @property
     def _draws(self) -> bool:
         return self.live and terminal.err.is_terminal
 
-    @contextmanager
-    def _shown(self, bus: ServoBus, chosen: Plan) -> Iterator[tuple[Progress, Observe | None]]:
-        """What shows the progress, and each tick if --live."""
-        if self._draws:
-            from pupper_sysid.cli.oscilloscope import Oscilloscope
-
-            with Oscilloscope(bus.name, bus.joint_names) as scope:
-                yield scope.stage, scope.tick
-            return
-        if self.live:
-            terminal.warn(["--live needs a terminal to draw in; it was left out."])
-        with terminal.seconds_progress("recording", chosen.duration_s) as advance:
-            yield advance, None
+    @property
+    def _views(self) -> Wanted:
+        return Wanted(self.rerun, self.mcap, self.force)
 
     def _request(self) -> dict[str, Any]:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
@@ -354,82 +347,3 @@ class Sweep:
 
 def _counted(number: int, name: str) -> str:
     return f"{number} {name}{'' if number == 1 else 's'}"
-
-
-def say_how_to_resume(path: Path) -> None:
-    """Print the command that continues a recording."""
-    terminal.err.print(
-        f"The recording up to here is in {path}; continue it with\n"
-        f"  pupper-sysid sweep --resume {path}",
-        soft_wrap=True,
-    )
-
-
-def _say_what_stays(bus: ServoBus) -> None:
-    """Warn of registers that could not be set back."""
-    if isinstance(bus, GuardedBus):
-        terminal.warn(
-            f"{joint}: its register {name} could not be set back to {value}. Switch the servo's "
-            f"power off and on; if `scan` still shows another value, write {value} yourself."
-            for joint, own in bus.registers.found.items()
-            for name, value in own.items()
-        )
-
-
-def _open(request: dict[str, Any]) -> ServoBus:
-    """The bus that a request names."""
-    if request.get("load"):
-        return open_bench(request)
-    if request["bus"] == EMULATED:
-        return open_emulated(request)
-    return connect(request["bus"], request["joint_map"], request["joints"])
-
-
-def _plan(request: dict[str, Any], bus: ServoBus) -> Plan:
-    """The plan that a request describes, within the limits of the bus."""
-    joints = request["joints"]
-    if request["playback"]:
-        from pupper_sysid.sysid.sweep.playback import playback
-
-        chosen = playback(Path(request["playback"]), joints)
-        return replace(chosen, trials=chosen.trials * request.get("loops", 1))
-    pose = bus.metadata["rest_pose_rad"]
-    free = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
-    margin = dict(zip(bus.joint_names, map(float, free), strict=True))
-    speed_limit = bus.metadata["speed_limit_rad_s"]
-    if request.get("load"):
-        return plan_of_bench(request, bus)
-    if request.get("plan"):
-        from pupper_sysid.sysid.plan.plan_file import executable, load_plan
-
-        path = Path(request["plan"])
-        return executable(load_plan(path), path, joints, margin, pose, speed_limit)
-    return plan(
-        request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
-        request["duration_s"], request["loop_period_s"], speed_limit,
-        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ), margin, pose,
-    )  # fmt: skip
-
-
-@contextmanager
-def _priority(request: dict[str, Any]) -> Iterator[str]:
-    if request["bus"] == EMULATED and not request["real_time"]:
-        yield "none: virtual time"
-        return
-    with real_time_priority() as priority:
-        terminal.err.print(f"Control loop at {priority}.")
-        yield priority
-
-
-def _guard_warnings(path: Path) -> list[str]:
-    """Sentences on commands that the guard changed."""
-    from pupper_sysid.sysid.sweep.resume import footer
-
-    counts = footer(path).get("guard", {})
-    sentences = {
-        "clipped": "were outside the joints' limits and were held at them.",
-        "slowed": "were delayed by the guard's speed and acceleration limits; the recording holds "
-        "the commands that were sent.",
-        "unsent": "could not be sent; the servos kept the last set-point.",
-    }
-    return [f"{counts[k]} commands {text}" for k, text in sentences.items() if counts.get(k)]

@@ -9,17 +9,9 @@ import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.live_views import refuse_file
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES
-
-_ENDINGS = {"rerun": ".rrd", "mcap": ".mcap"}
-
-
-def refuse_other_ending(option: str, path: Path) -> None:
-    """Refuse a file for a viewer whose name has not the ending that the viewer knows."""
-    if path.suffix != _ENDINGS[option]:
-        raise InputError(f"--{option} {path}: its name must end in {_ENDINGS[option]}.")
 
 
 @dataclass(frozen=True)
@@ -54,8 +46,7 @@ class View:
             raise InputError("--model: only a Rerun file shows the robot; add --rerun FILE.rrd.")
         for option, path in wanted.items():
             if path is not None:
-                refuse_other_ending(option, path)
-                refuse_overwrite(path, self.force)
+                refuse_file(option, path, self.force)
         recordings = terminal.load_all(self.recordings)
         if len(recordings) != 1:
             raise InputError(f"view: {len(recordings)} recordings were given; give one.")

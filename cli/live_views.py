@@ -1,0 +1,220 @@
+"""Rerun and MCAP while a loop runs: the channels of `view`, from a process of its own.
+
+`cli.live_writer` writes. The loop only hands it a message per tick, which is dropped where the
+writer is behind: a slow disk or viewer delays no servo. How many were dropped is said at the end.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.side_process import SideProcess
+from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
+from pupper_sysid.hardware.safety.guard import GuardedBus
+
+TICK, TEXTS = b"S", b"T"
+VIEWER = "viewer"
+VIEWER_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
+
+_WRITER = "pupper_sysid.cli.live_writer"
+_ENDINGS = {"rerun": ".rrd", "mcap": ".mcap"}
+_START_S = 60.0  # libraries on a slow memory card
+_END_S = 30.0  # for what the writer is behind; the robot is parked by then
+_WAIT_S = 10.0  # in virtual time
+
+
+def refuse_file(option: str, path: Path, force: bool) -> None:
+    """Refuse a file for a viewer that is there, or has not the ending that the viewer knows."""
+    if path.suffix != _ENDINGS[option]:
+        raise InputError(f"--{option} {path}: its name must end in {_ENDINGS[option]}.")
+    refuse_overwrite(path, force)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a command was asked to show while it runs.
+
+    Parameters
+    ----------
+    rerun : str or None
+        A .rrd file, `viewer`, or a viewer's address.
+    mcap : Path or None
+    force : bool
+        Replace files that exist.
+    """
+
+    rerun: str | None
+    mcap: Path | None
+    force: bool = False
+
+    def __bool__(self) -> bool:
+        return self.rerun is not None or self.mcap is not None
+
+    @property
+    def rerun_file(self) -> Path | None:
+        """The file for Rerun, if it is no viewer."""
+        return None if self.rerun is None or self.rerun_address else Path(self.rerun)
+
+    @property
+    def rerun_address(self) -> str | None:
+        """Address of the viewer, if it is one."""
+        if self.rerun == VIEWER:
+            return VIEWER_ADDRESS
+        return self.rerun if self.rerun and "://" in self.rerun else None
+
+    def check(self) -> None:
+        """Refuse files that are there or have another ending."""
+        if self.mcap is not None:
+            refuse_file("mcap", self.mcap, self.force)
+        if self.rerun_file is not None:
+            if self.rerun_file.suffix != _ENDINGS["rerun"]:
+                raise InputError(
+                    f"--rerun {self.rerun}: give a file whose name ends in .rrd, the word "
+                    f"{VIEWER}, or a viewer's address such as {VIEWER_ADDRESS}."
+                )
+            refuse_overwrite(self.rerun_file, self.force)
+
+
+@contextmanager
+def live_views(bus: ServoBus, wanted: Wanted, waits: bool = False) -> Iterator[LiveViews]:
+    """Start the writer, and finish the files at the end of the block.
+
+    Parameters
+    ----------
+    bus : ServoBus
+    wanted : Wanted
+    waits : bool
+        Wait for a writer that is behind: of a bus in virtual time, where that delays nothing.
+    """
+    views = LiveViews(bus, wanted, waits)
+    reason = ""
+    try:
+        yield views
+    except PupperError as error:
+        reason = str(error)
+        raise
+    finally:
+        views.close(reason)
+
+
+class LiveViews:
+    """The loop's side; see `live_views`, which closes it."""
+
+    def __init__(self, bus: ServoBus, wanted: Wanted, waits: bool):
+        from pupper_sysid.sysid.view.ticks import packed
+
+        self._packed = packed
+        self._wanted, self._within_s = wanted, _WAIT_S if waits else 0.0
+        self._report = bus.report if isinstance(bus, GuardedBus) else None
+        self._dropped = self._told = 0
+        self._last_s = 0.0
+        joints = bus.joint_names
+        knee = "serial" if bus.metadata.get("linkage") == "none" else "linkage"
+        about = {
+            "mcap": wanted.mcap and str(wanted.mcap),
+            "rerun_file": wanted.rerun_file and str(wanted.rerun_file),
+            "rerun_address": wanted.rerun_address,
+            "force": wanted.force,
+            "joints": list(joints),
+            "live": bus.metadata.get("readings") == "live",
+            "knee": knee if set(joints) <= set(JOINT_NAMES) else None,
+        }
+        self._process = SideProcess(_WRITER)
+        try:
+            self._process.send(json.dumps(about).encode())
+            refused = self._answer(_START_S)
+        except BaseException:
+            self._process.end(_END_S)
+            raise
+        if refused:
+            self._process.end(_END_S)
+            raise InputError(refused)
+
+    @property
+    def dropped(self) -> int:
+        """Ticks that the writer had no time for."""
+        return self._dropped
+
+    def tick(
+        self,
+        trial: int,
+        sent: Sent,
+        reading: BusSample,
+        gravity: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Show one tick.
+
+        Parameters
+        ----------
+        trial : int
+            Ages of readings begin anew with each.
+        sent : Sent
+            NaN where nothing was sent.
+        reading : BusSample
+        gravity : ndarray, shape (3,), optional
+            Its direction in the trunk's frame.
+        """
+        more = () if gravity is None else (gravity,)
+        # a tick that was dropped may have held the first reading of a value
+        row = self._packed(trial + self._dropped, sent, reading, *more)
+        self._dropped += not self._process.send(TICK + row.tobytes(), self._within_s)
+        self._last_s = float(np.nanmax([sent.time_s, self._last_s, reading.time_s.max()]))
+        if self._report and len(self._report.events) > self._told:
+            self._tell_events()
+
+    def close(self, reason: str = "") -> None:
+        """Finish what was written, and print where it is, or why it is not whole."""
+        from pupper_sysid.sysid.view.channels import guard_counts
+
+        texts = guard_counts(self._report.summary()) if self._report else []
+        if self._report:
+            self._tell_events()
+        end = [[self._last_s, text] for text in [*texts, *filter(None, [reason])]]
+        self._process.send(TEXTS + json.dumps({"events": end, "end": True}).encode(), _WAIT_S)
+        try:
+            wrong = self._answer(_END_S)
+        except InputError:
+            wrong = f"the writer was still behind after {_END_S:.0f} s and was ended."
+        self._process.end(1.0 if wrong else _END_S)
+        wanted = self._wanted
+        names = [str(name) for name in (wanted.rerun, wanted.mcap) if name is not None]
+        if wrong:
+            terminal.warn([f"{' and '.join(names)}: {wrong}"])
+            return
+        for path in filter(None, (wanted.rerun_file, wanted.mcap)):
+            terminal.err.print(f"Wrote {path}.", soft_wrap=True)
+        if self._dropped:
+            terminal.warn(
+                [f"{' and '.join(names)}: {self._dropped} ticks were dropped, for the writer was "
+                 "behind. Recordings of this command are whole."]
+            )  # fmt: skip
+
+    def _tell_events(self) -> None:
+        """Send what the guard changed since the last time."""
+        from pupper_sysid.sysid.view.channels import guard_text
+
+        assert self._report is not None
+        found = self._report.events[self._told :]
+        texts = [[time_s, guard_text(kind)] for time_s, kind in found]
+        if self._process.send(TEXTS + json.dumps({"events": texts}).encode(), self._within_s):
+            self._told += len(found)
+
+    def _answer(self, within_s: float) -> str:
+        """What the writer says is wrong; empty if nothing is."""
+        message = self._process.answer(within_s)
+        if not message:
+            return "the writer ended by itself; what it printed says why."
+        said: dict[str, Any] = json.loads(message)
+        return said["error"]
