@@ -76,8 +76,8 @@ def learner_device(run: Run, ranks: Ranks) -> str:
         return "cpu"
     if not torch.cuda.is_available():
         raise InputError(
-            "torch finds no CUDA device here. Leave out --device and --learner-device, or install "
-            "a build of torch for CUDA on a machine that has one."
+            "torch finds no CUDA device here. Leave `device` and `learner_device` at cpu, or "
+            "install a build of torch for CUDA on a machine that has one."
         )
     return _local(wanted, ranks)
 

@@ -28,7 +28,7 @@ def tiny_run(kind: str = "mlp", **changes) -> Run:
         architecture=Architecture(kind, (16,), 8, (16,)),
         task=Walking(episode_s=0.2),
         learner=Hyperparameters(steps_per_environment=6, epochs=2, minibatches=2),
-        imitation=Imitation(iterations=2, epochs=1),
+        imitation=Imitation(iterations=2, rollouts=1, epochs=1, minibatches=2),
         environments=4, iterations=3, threads=1,
     )  # fmt: skip
     return replace(run, **changes)

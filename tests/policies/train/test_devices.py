@@ -31,7 +31,7 @@ def test_networks_learn_where_the_physics_is_unless_told_otherwise(
 
 def test_a_device_that_torch_does_not_find_is_answered_in_a_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match="no CUDA device here. Leave out --device"):
+    with pytest.raises(InputError, match="no CUDA device here. Leave `device`"):
         train(tmp_path / "run", tiny_run(learner_device="cuda"))
 
 

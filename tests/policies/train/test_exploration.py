@@ -146,7 +146,7 @@ def test_a_policy_is_judged_without_noise_and_always_on_the_same_walks():
 
 def test_a_robot_that_stands_scores_about_nothing_and_one_that_falls_less():
     learner = make_learner(tiny_run(), Ranks())
-    judge = Judge(Walking(), learner.env.env.servos, 0, 1)
+    judge = Judge(Walking(episode_s=2.0), learner.env.env.servos, 0, 1)
     last = learner.actor.mlp[-1]
     with torch.no_grad():
         last.weight.zero_()
