@@ -168,7 +168,8 @@ def test_after_a_power_cut_nothing_is_repeated_in_the_curves_and_the_best_stays_
 
 
 def test_a_power_cut_in_imitation_loses_one_round(tmp_path):
-    run = tiny_run(imitation=Imitation(iterations=4, rollouts=1, epochs=1, minibatches=2), iterations=1)
+    short = Imitation(iterations=4, rollouts=1, epochs=1, minibatches=2)
+    run = tiny_run(imitation=short, iterations=1)
     with pytest.raises(PowerCut):
         train(tmp_path, run, cut_power_after("imitation", 3))
     assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 2
