@@ -7,11 +7,11 @@ writer is behind: a slow disk or viewer delays no servo. How many were dropped i
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,11 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.safety.guard import GuardedBus
+
+if TYPE_CHECKING:
+    from pupper_sysid.policies.deploy.deployment import Tick
+
+Array = NDArray[np.float64]
 
 TICK, TEXTS = b"S", b"T"
 VIEWER = "viewer"
@@ -152,7 +157,7 @@ class LiveViews:
         trial: int,
         sent: Sent,
         reading: BusSample,
-        gravity: NDArray[np.float64] | None = None,
+        gravity: Array | None = None,
     ) -> None:
         """Show one tick.
 
@@ -174,15 +179,35 @@ class LiveViews:
         if self._report and len(self._report.events) > self._told:
             self._tell_events()
 
+    def walk_tick(self, to_servo: Callable[[Array], Array], tick: Tick) -> None:
+        """Show one tick of a walk, in the servos' own angles.
+
+        Parameters
+        ----------
+        to_servo : callable
+            From joint angles to those of the servos.
+        tick : Tick
+        """
+        from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+
+        reading = replace(tick.reading, position_rad=to_servo(tick.reading.position_rad))
+        gravity = tick.decision.observation[OBSERVATION_PARTS["projected_gravity"]]
+        self.tick(0, Sent(tick.sent_s, to_servo(tick.sent)), reading, gravity.astype(float))
+
+    def say(self, *texts: str, within_s: float = 1.0) -> None:
+        """Show sentences at the time of the last tick; after the loop, since it may wait."""
+        events = [[self._last_s, text] for text in texts]
+        self._process.send(TEXTS + json.dumps({"events": events}).encode(), within_s)
+
     def close(self, reason: str = "") -> None:
         """Finish what was written, and print where it is, or why it is not whole."""
         from pupper_sysid.sysid.view.channels import guard_counts
 
-        texts = guard_counts(self._report.summary()) if self._report else []
         if self._report:
             self._tell_events()
-        end = [[self._last_s, text] for text in [*texts, *filter(None, [reason])]]
-        self._process.send(TEXTS + json.dumps({"events": end, "end": True}).encode(), _WAIT_S)
+        texts = guard_counts(self._report.summary()) if self._report else []
+        self.say(*texts, *filter(None, [reason]), within_s=_WAIT_S)
+        self._process.send(TEXTS + json.dumps({"events": [], "end": True}).encode(), _WAIT_S)
         try:
             wrong = self._answer(_END_S)
         except InputError:

@@ -10,7 +10,6 @@ import signal
 import socket
 import sys
 import threading
-import time
 import uuid
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from pupper_sysid.sysid.view.ticks import TickChannels
 
 Array = NDArray[np.float64]
 
-_EVERY_S = 0.2  # a part for each
+_VIEWED_EVERY_S, _FILED_EVERY_S = 0.2, 1.0  # a part for each: in a file few large ones are smaller
 _MOST_TOGETHER = 500
 _MOST_WAITING = 20_000  # ticks; minutes of a slow disk
 _NICENESS = 5
@@ -44,6 +43,11 @@ class Writer:
     about : dict
         As `live_views` sends it.
 
+    Attributes
+    ----------
+    every_s : float
+        Time between two parts [s].
+
     Raises
     ------
     InputError
@@ -51,6 +55,7 @@ class Writer:
     """
 
     def __init__(self, about: dict[str, Any]):
+        self.every_s = _VIEWED_EVERY_S if about["rerun_address"] else _FILED_EVERY_S
         self._joints = list(about["joints"])
         self._channels = TickChannels(self._joints, about["live"])
         self._rerun: RerunStream | None = None
@@ -175,10 +180,11 @@ def main() -> None:
         return
     answer("")
     waiting: queue.Queue[bytes] = queue.Queue(_MOST_WAITING)
-    threading.Thread(target=_receive, args=(source, waiting), daemon=True).start()
+    over = threading.Event()
+    threading.Thread(target=_receive, args=(source, waiting, over), daemon=True).start()
     wrong = ""
     try:
-        _write(writer, waiting)
+        _write(writer, waiting, over)
     except (OSError, InputError) as error:
         wrong = f"{getattr(error, 'strerror', None) or error}".rstrip(".")
         wrong = f"what follows could not be written: {wrong}."
@@ -189,7 +195,7 @@ def main() -> None:
     answer(wrong)
 
 
-def _receive(source: socket.socket, waiting: queue.Queue[bytes]) -> None:
+def _receive(source: socket.socket, waiting: queue.Queue[bytes], over: threading.Event) -> None:
     """Take messages as they come: the socket itself has space for few."""
     message = b"-"
     while message:
@@ -197,16 +203,19 @@ def _receive(source: socket.socket, waiting: queue.Queue[bytes]) -> None:
             message = source.recv(LONGEST_MESSAGE)
         except OSError:
             message = b""
+        if not message or message[:1] != TICK:  # perhaps the end
+            over.set()
         waiting.put(message)
 
 
-def _write(writer: Writer, waiting: queue.Queue[bytes]) -> None:
+def _write(writer: Writer, waiting: queue.Queue[bytes], over: threading.Event) -> None:
     """Write parts until the end is said, or the loop's process has ended."""
     ended = False
     while not ended:
         messages = [waiting.get()]
         if waiting.qsize() < _MOST_TOGETHER:
-            time.sleep(_EVERY_S)
+            over.wait(writer.every_s)
+            over.clear()
         with contextlib.suppress(queue.Empty):
             while len(messages) < _MOST_TOGETHER:
                 messages.append(waiting.get_nowait())

@@ -1,4 +1,4 @@
-"""The policy, servos and task that the arguments of a program mean."""
+"""The policy, servos and task that the arguments of a program mean, and how they compare."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pupper_sysid.cli.terminal import err, warn
+from pupper_sysid.cli.terminal import cell, err, table, warn
 from pupper_sysid.common.border import read_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import resolved, sha256
@@ -18,6 +18,8 @@ from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
 if TYPE_CHECKING:
+    from pupper_sysid.policies.deploy.observer_match import Match
+    from pupper_sysid.policies.deploy.servo_match import ServoMatch
     from pupper_sysid.policies.network.policy_file import Policy
 
 _CONTRACT = "contract.json"
@@ -153,3 +155,31 @@ def warn_of_fallbacks(servos: Iterable[ServoRanges]) -> None:
             if s.fallbacks
         )
     )
+
+
+def show_match(match: Match) -> None:
+    """Print how an observer answers beside the robot of the training."""
+    if match.fits:
+        err.print(match.sentence())
+        return
+    warn([match.sentence()])
+    rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
+    titles = (name.replace("_", " ") for name in rows[0])
+    shown = table("Swing over command, and phase", *titles)
+    for row in rows:
+        shown.add_row(*(cell(v, 2) for v in row.values()))
+    err.print(shown)
+
+
+def show_servos(match: ServoMatch | None, carried: bool) -> None:
+    """The robot's servos beside those of the training."""
+    if match is None:
+        err.print(
+            "The robot's servos were not compared with those of the training: "
+            + ("a learned model has no numbers." if carried else "the policy's file has none."),
+            soft_wrap=True,
+        )
+    elif match.outside:
+        warn([f"{match.here} is not what the policy was trained for:", *match.sentences()])
+    else:
+        err.print(*match.sentences(), soft_wrap=True)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,7 +19,14 @@ import tyro
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.commands.recording.sweep import Sweep
-from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, trained_actuator
+from pupper_sysid.cli.live_views import Wanted, live_views
+from pupper_sysid.cli.policy_choice import (
+    chosen_actuator,
+    policy_at,
+    show_match,
+    show_servos,
+    trained_actuator,
+)
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
@@ -35,7 +43,6 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
-    from pupper_sysid.policies.deploy.servo_match import ServoMatch
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -91,6 +98,11 @@ class Deploy:
     live: bool = False
     """Show commands and readings of each joint in the terminal; an emulated robot walks in real
     time then."""
+    rerun: str | None = None
+    """Show all joints and the robot in Rerun as it walks: a .rrd file to write, `viewer` (of this
+    machine), or a viewer's address, rerun+http://HOST:9876/proxy."""
+    mcap: Path | None = None
+    """Write all joints in ROS 2's messages for Foxglove as it walks, .mcap."""
     playback: Path | None = None
     """Instead of a policy: play the commands of this CSV three times and record the servos, for
     `pupper-sysid fit-servo`."""
@@ -104,6 +116,16 @@ class Deploy:
     """Print one JSON object."""
     force: bool = False
     """Replace an existing log."""
+
+    @property
+    def views(self) -> Wanted:
+        """What other viewers show."""
+        return Wanted(self.rerun, self.mcap, self.force)
+
+    @property
+    def in_real_time(self) -> bool:
+        """Whether an emulated robot must walk as fast as a real one."""
+        return self.bus != EMULATED or self.keyboard or (self.live and err.is_terminal)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -120,12 +142,14 @@ def _run(options: Deploy) -> None:
             playback=options.playback, loops=PLAYBACK_LOOPS, joint_map=options.joint_map,
             bus=options.bus, seed=options.seed,
             rate=options.rate or PLAYBACK_HZ, json=options.json, force=options.force,
+            live=options.live, rerun=options.rerun, mcap=options.mcap,
         ).run()  # fmt: skip
         return
     if options.name is not None:
         refuse_path(options.name, "--name")
     if options.live and options.keyboard:
         raise InputError("--live and --keyboard: both draw in the terminal; give one of the two.")
+    options.views.check()
     if options.policy is None:
         raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
     import torch
@@ -159,10 +183,10 @@ def _run(options: Deploy) -> None:
                 ]
             )
         else:
-            _show_match(parts.match)
+            show_match(parts.match)
         match = parts.servo_match if options.actuator else None
         if options.actuator:
-            _show_servos(match, policy.contract.servo is not None)
+            show_servos(match, policy.contract.servo is not None)
         header = parts.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
             "servo_match": match and match.to_dict(),
@@ -199,9 +223,7 @@ def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, Joi
         from pupper_sysid.sim.walking.bus import WalkingBus
 
         rng = np.random.default_rng(options.seed)
-        inner = WalkingBus(
-            draw_robot(rng), rng, real_time=options.keyboard or (options.live and err.is_terminal)
-        )
+        inner = WalkingBus(draw_robot(rng), rng, real_time=options.in_real_time)
         bus = open_things.enter_context(closing(GuardedBus(inner)))
         return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
     address = parse_address(options.bus)
@@ -234,33 +256,6 @@ def _replay(path: Path, policy: Any) -> None:
     out.print(f"{len(walk.senses)} ticks repeated, every action equal bit for bit ({ended}).")
 
 
-def _show_match(match: Any) -> None:
-    if match.fits:
-        err.print(match.sentence())
-        return
-    warn([match.sentence()])
-    rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
-    titles = (name.replace("_", " ") for name in rows[0])
-    table = terminal.table("Swing over command, and phase", *titles)
-    for row in rows:
-        table.add_row(*(terminal.cell(v, 2) for v in row.values()))
-    err.print(table)
-
-
-def _show_servos(match: ServoMatch | None, carried: bool) -> None:
-    """The robot's servos beside those of the training."""
-    if match is None:
-        err.print(
-            "The robot's servos were not compared with those of the training: "
-            + ("a learned model has no numbers." if carried else "the policy's file has none."),
-            soft_wrap=True,
-        )
-    elif match.outside:
-        warn([f"{match.here} is not what the policy was trained for:", *match.sentences()])
-    else:
-        err.print(*match.sentences(), soft_wrap=True)
-
-
 def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
     """What shows each tick in the terminal."""
     from pupper_sysid.cli.oscilloscope import Oscilloscope
@@ -287,6 +282,7 @@ def _walk(
     score = WalkScore(bus, truth) if truth else None
     log, table = folder / "walk.csv", folder / "recording.csv"
     about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
+    views = None
     with ExitStack() as open_things:
         priority = open_things.enter_context(real_time_priority())
         if options.bus != EMULATED:
@@ -297,6 +293,10 @@ def _walk(
             commands, watchers = driver, [*watchers, driver.watch]
         if options.live:
             watchers += _live(open_things, bus)
+        if options.views:
+            waits = not options.in_real_time
+            views = open_things.enter_context(live_views(bus, options.views, waits))
+            watchers.append(partial(views.walk_tick, parts.controller.to_servo))
         rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
             bus,
@@ -310,6 +310,8 @@ def _walk(
             watchers,
             options.force,
         )
+        if views:
+            views.say(f"Walk: {outcome.stop_reason}")
         rows.close({"stop_reason": outcome.stop_reason} | bus.report.footer())
     steps = outcome.steps
     # only the true motion of an emulated robot is known

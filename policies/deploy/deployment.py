@@ -62,6 +62,8 @@ class Tick:
     reading: BusSample
     missed_deadlines: int = 0
     """So far."""
+    sent_s: float = float("nan")
+    """When they were sent, on the bus's clock [s]; NaN if that failed."""
 
 
 @dataclass
@@ -212,7 +214,7 @@ def _walk(
             for watch in watchers:
                 watch(
                     Tick(elapsed, senses, decision, sent.position_rad, reading,
-                         loop.missed_deadlines)
+                         loop.missed_deadlines, sent.time_s)
                 )  # fmt: skip
             outcome.seconds = elapsed
             if decision.observation[_GRAVITY][2] > -FALLEN_TILT:

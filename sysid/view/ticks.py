@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 _HEAD = 5  # stretch, send time, direction of gravity
 _ROWS = ("command_rad", "read_time_s", "position_rad", *READ)
+_SAME_RAD = 1e-6  # recordings have as many digits; angles behind a linkage are converted
 _LEVEL = np.full(3, np.nan)
 
 
@@ -119,7 +120,7 @@ class TickChannels:
                 self._stretch = stretch
                 self._last, self._fresh_s = np.full((2, len(self._joints)), np.nan)
             known = np.isfinite(here)
-            fresh = known & (self._live | ((here != self._last) & np.isfinite(self._last)))
+            fresh = known & (self._live | (np.abs(here - self._last) > _SAME_RAD))  # NaN is not
             self._fresh_s = np.where(fresh, now, self._fresh_s)
             self._last = np.where(known, here, self._last)
             ages[k] = np.where(known, now - self._fresh_s, np.nan)

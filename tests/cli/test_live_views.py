@@ -13,17 +13,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pupper_sysid.cli import live_views as module
 from pupper_sysid.cli.live_views import Wanted, live_views
-from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.cli.programs import pupper_deploy, pupper_sysid
 from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.view.channels import channels
-from support.command_line import run
+from support.command_line import run, run_program
 from support.viewer_files import entities_of, topics_of
 
 SWEEP = ("sweep", "--joints", "LF_hip,RB_calf", "--freqs", "2", "--duration", "2", "--out", "a.csv")
@@ -253,3 +257,38 @@ def test_a_viewer_gets_what_a_file_would_hold(tmp_path):
         server.wait()
     time_s, values = entities_of(tmp_path / "seen.rrd")["/joints/RB_calf/position_rad|scalars"]
     assert len(time_s) == 100 and np.isfinite(np.ravel(values)).any()
+
+
+def test_monitor_writes_what_it_reads_and_sends_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ("monitor", "--bus", "emulated", "--seconds", "1", "--mcap", "m.mcap")
+    code, _, err = run(capsys, *words, "--rerun", "m.rrd")
+    assert code == 0 and "Wrote m.rrd." in err and "dropped" not in err
+    topics, _ = topics_of(tmp_path / "m.mcap")
+    assert {joint for joint, name in topics if name == "position_rad"} == set(JOINT_NAMES)
+    assert not any(name == "command_rad" for _, name in topics)  # its goals are not known
+    assert 15 <= len(topics["RB_calf", "position_rad"][0]) <= 21
+    assert "/joints/RB_calf/position_rad|scalars" in entities_of(tmp_path / "m.rrd")
+    code, _, err = run(capsys, *words, "--force", "--once")
+    assert code == 2 and "Give one of the two" in err
+
+
+def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    policy = str(Path(__file__).parents[2] / "data/samples/policies/mlp")
+    words = (policy, "--seconds", "3", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
+    code, _, err = run_program(capsys, pupper_deploy, *words)
+    assert code == 0 and "Wrote w.mcap." in err and "dropped" not in err
+    topics, texts = topics_of(tmp_path / "w.mcap")
+    same_as_recording(topics, load(Path("walks/w/recording.csv")), lambda c: (c.joint, c.name))
+    assert "Walk: time is up" in texts
+    walk = read_walk(Path("walks/w/walk.csv"))
+    down = walk.observation[:, OBSERVATION_PARTS["projected_gravity"]]
+    entities = entities_of(tmp_path / "w.rrd")
+    trunk = np.squeeze(entities["/robot/trunk|quaternion"][1])
+    seen = Rotation.from_quat(trunk).inv().apply([0.0, 0.0, -1.0])
+    # every pose is of a tick: the nearest direction of gravity is that of the controller
+    apart = np.linalg.norm(seen[:, None] - down / np.linalg.norm(down, axis=1)[:, None], axis=2)
+    assert apart.min(axis=1).max() < 1e-5 and np.ptp(seen[:, :2], axis=0).min() > 0.01

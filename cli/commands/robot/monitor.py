@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,9 +15,10 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
+from pupper_sysid.cli.live_views import LiveViews, Wanted, live_views
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
-from pupper_sysid.hardware.bus import BusSample, ServoBus
+from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -48,6 +52,13 @@ class Monitor:
     """Readings per second."""
     seconds: float | None = None
     """End after this long [s]; by default only with Ctrl-C."""
+    rerun: str | None = None
+    """Show all joints and the robot in Rerun, too: a .rrd file to write, `viewer` (of this
+    machine), or a viewer's address, rerun+http://HOST:9876/proxy."""
+    mcap: Path | None = None
+    """Write all joints in ROS 2's messages for Foxglove, too, .mcap."""
+    force: bool = False
+    """Replace files that exist."""
     once: bool = False
     """Print one table and end."""
     json: bool = False
@@ -58,6 +69,13 @@ class Monitor:
         terminal.need_within("--rate", self.rate, *_RATES_HZ, "Hz")
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
+        wanted = Wanted(self.rerun, self.mcap, self.force)
+        if wanted and (self.once or self.json):
+            raise InputError(
+                "--once and --json print one table, and --rerun and --mcap show what follows. "
+                "Give one of the two."
+            )
+        wanted.check()
         bus = _open(self.bus, self.joint_map)
         try:
             watched = Watched(bus)
@@ -68,30 +86,38 @@ class Monitor:
                 else:
                     terminal.out.print(watched.table(bus_name(self.bus)))
                 return
-            self._show(watched)
+            with live_views(bus, wanted) if wanted else nullcontext() as views:
+                self._show(watched, views)
         except KeyboardInterrupt:  # the usual way to end a monitor
             terminal.err.print("Stopped.")
         finally:
             bus.close()
 
-    def _show(self, watched: Watched) -> None:
-        """Traces in a terminal, else tables."""
+    def _show(self, watched: Watched, views: LiveViews | None) -> None:
+        """Traces in a terminal, else tables; and what other viewers show."""
+
+        def show(here: Callable[[], None]) -> None:
+            if views:
+                views.tick(0, *watched.tick())
+            here()
+
         if terminal.err.is_terminal:
             from pupper_sysid.cli.oscilloscope import Oscilloscope
 
             title = f"{bus_name(self.bus)}, only read"
             with Oscilloscope(title, watched.bus.joint_names, lag=False) as scope:
-                self._watch(watched, self.seconds or np.inf, lambda: watched.draw(scope))
+                until = self.seconds or np.inf
+                self._watch(watched, until, lambda: show(lambda: watched.draw(scope)))
             return
         shown_s = -np.inf
 
-        def show() -> None:
+        def table() -> None:
             nonlocal shown_s
             if watched.now_s - shown_s >= _PLAIN_EVERY_S:
                 shown_s = watched.now_s
                 terminal.out.print(watched.table(bus_name(self.bus)))
 
-        self._watch(watched, self.seconds or np.inf, show)
+        self._watch(watched, self.seconds or np.inf, lambda: show(table))
 
     def _watch(self, watched: Watched, seconds: float, show=lambda: None) -> None:
         bus = watched.bus
@@ -144,6 +170,11 @@ class Watched:
         if goals and self.bus.now() - self._goal_s > _GOALS_EVERY_S:
             self._goal, self._goal_s = goals(), self.bus.now()
         self.now_s = self.bus.now()
+
+    def tick(self) -> tuple[Sent, BusSample]:
+        """The goals as they were last read, as if sent now, and the last reading."""
+        assert self._sample is not None
+        return Sent(self.now_s, self._goal), self._sample
 
     def draw(self, scope: Oscilloscope) -> None:
         """Show the last reading as traces, and what there is no trace for beside them."""
