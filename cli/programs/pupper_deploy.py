@@ -150,6 +150,8 @@ def _run(options: Deploy) -> None:
     if options.live and options.keyboard:
         raise InputError("--live and --keyboard: both draw in the terminal; give one of the two.")
     options.views.check()
+    if options.replay and options.views:
+        raise InputError("--replay moves nothing: give --rerun and --mcap to a walk.")
     if options.policy is None:
         raise InputError("No policy was named. Give a folder: pupper-deploy runs/<name>.")
     import torch

@@ -292,3 +292,6 @@ def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
     # every pose is of a tick: the nearest direction of gravity is that of the controller
     apart = np.linalg.norm(seen[:, None] - down / np.linalg.norm(down, axis=1)[:, None], axis=2)
     assert apart.min(axis=1).max() < 1e-5 and np.ptp(seen[:, :2], axis=0).min() > 0.01
+    words = (policy, "--replay", "walks/w/walk.csv", "--mcap", "again.mcap")
+    code, _, err = run_program(capsys, pupper_deploy, *words)
+    assert code == 2 and "moves nothing" in err
