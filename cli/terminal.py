@@ -31,12 +31,23 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
+_COMMAND = re.compile(r"(^|\s)(pupper-[a-z]+|rerun|python|systemctl) ")
 _LINE_S = 10.0  # between lines of progress where there is no terminal
 _CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
 class _PlainConsole(Console):
-    """Console on which text from files cannot move the cursor, set colours or reverse lines."""
+    """Console on which text from files cannot move the cursor, set colours or reverse lines.
+
+    Sentences that are one line for other programs (`soft_wrap`) are broken between words on a
+    terminal, unless they hold a command, which would then be copied in parts.
+    """
+
+    def print(self, *objects: Any, soft_wrap: bool | None = None, **how: Any) -> None:
+        """As rich's."""
+        if soft_wrap and self.is_terminal and not _COMMAND.search(" ".join(map(str, objects))):
+            soft_wrap = False
+        super().print(*objects, soft_wrap=soft_wrap, **how)
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None

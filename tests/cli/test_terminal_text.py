@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import pytest
@@ -32,3 +33,17 @@ def test_a_hostile_cell_is_quoted_without_its_escape(capsys, tmp_path):
     with path.open("a") as file:
         file.write("0,0,0,a,1,\x1b[2Jhello,0\n" * 30)
     assert "\x1b" not in refused(capsys, pupper_sysid, "doctor", path)
+
+
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_sentences_are_broken_between_words_on_a_terminal_and_commands_are_not(on_terminal):
+    sentence = "error: results/a.csv does not exist. Check the name."
+    command = "Next: pupper-sysid calibrate a.csv b.csv c.csv"
+    file = io.StringIO()
+    console = type(terminal.out)(file=file, force_terminal=on_terminal, width=20)
+    console.print(sentence, soft_wrap=True)
+    console.print(command, soft_wrap=True)
+    lines = file.getvalue().splitlines()
+    assert lines[-1] == command
+    assert " ".join(line.strip() for line in lines[:-1]) == sentence
+    assert (len(lines) > 2) is on_terminal
