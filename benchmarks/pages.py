@@ -45,7 +45,9 @@ look();</script></body>"""
 def look(pages: list[Path], dark: bool, folder: Path) -> tuple[list[list], list[str]]:
     """Measures of each page and width, and what the console said."""
     probe = folder / "probe.html"
-    probe.write_text(_PROBE.format(pages=json.dumps([p.as_uri() for p in pages]), widths=WIDTHS))
+    probe.write_text(
+        _PROBE.format(pages=json.dumps([p.as_uri() for p in pages]), widths=json.dumps(WIDTHS))
+    )
     done = subprocess.run(
         [*_CHROMIUM, "--virtual-time-budget=600000", "--window-size=1400,1000",
          f"--user-data-dir={folder / 'profile'}", _mode(dark), "--dump-dom", str(probe)],

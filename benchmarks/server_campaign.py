@@ -128,7 +128,7 @@ LINES: dict[str, Answer] = {
 }
 PLACES = (
     "a file", "a FIFO", "a link to nowhere", "a folder", "/dev/zero", "/dev/null",
-    "a stream socket", "a socket that nobody serves", "a socket that never accepts",
+    "a stream socket", "a socket without a server", "a socket that never accepts",
 )  # fmt: skip
 
 
@@ -215,7 +215,7 @@ def hostile(name: str, folder: Path, rng: np.random.Generator) -> Iterator[BusAd
             kind = socket.SOCK_STREAM if name == "a stream socket" else socket.SOCK_SEQPACKET
             server = held.enter_context(socket.socket(socket.AF_UNIX, kind))
             server.bind(str(path))
-            if name != "a socket that nobody serves":
+            if name != "a socket without a server":
                 server.listen(0 if name == "a socket that never accepts" else 20)
             if name in PROXIES or name == "a stream socket":
                 answer = PROXIES.get(name, PROXIES["zeros"])

@@ -308,7 +308,7 @@ class GuardedBus:
             raise interrupted
 
     def _protect(self) -> None:
-        """Switch servos' own protections on that somebody has switched off, until `close`."""
+        """Switch on the servos' own protections that are off, until `close`."""
         weak = getattr(self.bus, "protections_to_set", dict)()
         for joint, own in weak.items():
             for name, value in own.items():

@@ -128,7 +128,7 @@ def _follow(orders: _Orders, pipe: int, answers: int) -> None:
         *lines, received = (received + data).split(b"\n")
         for line in lines:
             orders.take(line)
-        with contextlib.suppress(OSError):  # nobody reads, or the driver is gone
+        with contextlib.suppress(OSError):  # the pipe has no reader, or the driver is gone
             os.write(answers, b"." * len(lines))
         if not data:
             return
