@@ -164,3 +164,41 @@ def test_the_wheel_works_beside_folders_of_the_same_names(wheel, tmp_path):
     program = "from pupper_sysid.cli.programs.pupper_sysid import main; main()"
     assert run(program, "--version").startswith("pupper-sysid")
     assert "LF_hip" in run(program, "doctor", ROOT / "data/samples/sweep.csv")
+
+
+# ----- clocks
+
+DATES = {"cli/programs/pupper_train.py", "servo_models/calibration/calibration.py"}
+DATES |= {"servo_models/cards/bam.py", "sysid/recordings/files.py", "sysid/sweep/resume.py"}
+"""Names and dates in files, and the pause before a sweep that is resumed (a file has no other)."""
+
+WALL_CLOCK = {"time.time", "time.time_ns", "time.localtime", "time.gmtime"}
+WALL_CLOCK |= {"datetime.now", "datetime.utcnow", "datetime.today", "date.today"}
+
+
+def wall_clock(source: str) -> set[str]:
+    """Functions of a clock that may be set, called or imported by name in `source`."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute):
+            found.add(".".join(ast.unparse(node).split(".")[-2:]))
+        elif isinstance(node, ast.ImportFrom) and node.module == "time":
+            found.update(f"time.{name.name}" for name in node.names)
+    return found & WALL_CLOCK
+
+
+def test_nothing_that_waits_or_measures_reads_a_clock_that_may_be_set():
+    used = {
+        path.relative_to(ROOT).as_posix()
+        for room in ROOMS
+        for path in (ROOT / room).rglob("*.py")
+        if wall_clock(path.read_text())
+    }
+    assert used == DATES
+
+
+def test_a_clock_that_may_be_set_would_be_found():
+    assert wall_clock("import time\nend = time.time() + 3") == {"time.time"}
+    assert wall_clock("from time import time") == {"time.time"}
+    assert wall_clock("import datetime as d\nd.datetime.now()") == {"datetime.now"}
+    assert wall_clock("import time\ntime.monotonic()") == set()

@@ -124,7 +124,9 @@ def _main() -> None:
     except MemoryError:
         found = {"out_of": "memory"}
     except Exception as error:  # whatever MuJoCo raises is about the file
-        found = {"reason": str(error)}
+        # a failed allocation comes in MuJoCo's own words or as pybind11's "unknown exception"
+        memory = any(words in str(error) for words in ("allocate memory", "unknown exception"))
+        found = {"out_of": "memory"} if memory else {"reason": str(error)}
     print(json.dumps(found))
 
 

@@ -22,6 +22,7 @@ from pupper_sysid.sysid.recordings.table import TITLE, header, parse
 from pupper_sysid.sysid.sweep.excitation import Plan
 
 _LEAST_PAUSE_S = 0.5
+_LONGEST_PAUSE_S = 86_400.0  # beyond it the computer's clock was set in between
 
 
 class Series(BaseModel):
@@ -91,7 +92,8 @@ class Resume:
 
     def now_s(self) -> float:
         """The present time on the recording's clock [s]."""
-        return self.last_time_s + max(time.time() - self.written_at, _LEAST_PAUSE_S)
+        pause_s = time.time() - self.written_at
+        return self.last_time_s + min(max(pause_s, _LEAST_PAUSE_S), _LONGEST_PAUSE_S)
 
 
 def header_of(path: Path) -> dict[str, Any]:

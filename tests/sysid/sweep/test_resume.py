@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,16 @@ def test_a_cut_recording_is_continued_to_its_end(whole, trial, rows, torn):
         assert before.equals(after), "what had been recorded was changed"
     if rows:
         assert any(f"trial {trial} was interrupted" in w for w in resumed.warnings)
+
+
+@pytest.mark.parametrize("years", [-50, 50])
+def test_a_clock_that_was_set_during_the_interruption_does_not_move_the_recording(whole, years):
+    cut(whole, 1, 30)
+    written = whole.stat().st_mtime + years * 365.25 * 86_400
+    os.utime(whole, (written, written))
+    run("sweep", "--resume", str(whole))
+    times = load(whole).table["send_time_s"].to_numpy()
+    assert (np.diff(times) > 0).all() and times[-1] - times[0] < 2 * 86_400
 
 
 def test_rows_of_the_interrupted_trial_stay_in_the_file(whole):
