@@ -41,6 +41,8 @@ autosummary_generate = False
 suppress_warnings = ["ref.python"]
 html_theme = "furo"
 html_title = "pupper-sysid"
+html_static_path = ["style"]
+html_css_files = ["pages.css"]
 # code that no highlighter knows is shown as it is
 highlight_language = "text"
 
