@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -228,6 +229,8 @@ def _error(error: Interval) -> str:
 
 def _within(interval: Interval, scale: float) -> str:
     half = scale * (interval.high - interval.value)
+    if not math.isfinite(interval.value):
+        return number(interval.value)
     return f"{number(scale * interval.value, 0 if scale > 1 else 1)} ±{number(half, 0)}"
 
 

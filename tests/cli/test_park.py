@@ -221,7 +221,8 @@ def test_a_note_that_cannot_be_read_is_left_out(tmp_path, monkeypatch):
 def test_every_command_that_opens_a_bus_is_stopped_as_by_ctrl_c():
     """`end_politely` installs the handlers; a script's `&` has SIGINT ignored."""
     openers = {
-        "open_bus_of", "open_guarded", "connect", "Esp32Bus", "scan_line", "switch_off",
+        "open_bus", "open_bus_of", "open_guarded", "connect", "Esp32Bus", "scan_line",
+        "switch_off",
     }  # fmt: skip
     servers = {"FeetechPty", "ProxySocket"}
     for word, command in COMMANDS.items():

@@ -186,7 +186,7 @@ class Watched:
         for k, row in enumerate(self.rows()):
             word = "age" if self.answers_now else "same"
             age = self._age(k, row["age_s" if self.answers_now else "unchanged_s"])
-            count = "" if row["count"] is None else f"count {row['count']}"
+            count = "" if row["count"] is None else f"{row['count']} cts"
             notes.append(" ".join(filter(None, [row["errors"], word, age, count])))
         scope.notes(notes)
 
