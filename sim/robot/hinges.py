@@ -61,7 +61,7 @@ def hinges_of(path: Path) -> list[Hinge]:
         raise InputError(f"{path} has more than {_LARGEST_BYTES / 1e6:.0f} MB: no robot's MJCF.")
     command = [sys.executable, "-m", __name__, str(resolved(path))]
     try:
-        ended = subprocess.run(command, capture_output=True, timeout=2 * _TIME_S, check=False)
+        ended = subprocess.run(command, capture_output=True, timeout=_TIME_S, check=False)
         lines = ended.stdout.decode(errors="replace").splitlines()
         found: dict[str, Any] = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
     except (subprocess.TimeoutExpired, ValueError):
