@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 import struct
 import time
 from dataclasses import replace
@@ -309,3 +310,18 @@ def test_a_list_of_a_million_tensors_is_refused_at_once(tmp_path):
     with pytest.raises(InputError, match="its list of tensors, has"):
         load_policy(folder)
     assert time.process_time() - started < 2
+
+
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_the_shipped_policies_find_their_servos_wherever_the_samples_are_copied(
+    tmp_path, monkeypatch, kind
+):
+    shipped = Path(CALIBRATION).parent
+    (tmp_path / "samples").mkdir()
+    shutil.copy(CALIBRATION, tmp_path / "samples")
+    shutil.copytree(shipped / "policies", tmp_path / "samples/policies")
+    monkeypatch.chdir(tmp_path)
+    folder = Path("samples/policies") / kind
+    policy, run = policy_at(folder)
+    found, same = trained_actuator(folder, policy, run)
+    assert same and found == str(tmp_path / "samples/calibrated.yaml")
