@@ -98,7 +98,7 @@ def _run(options: Options, given: list[str]) -> None:
         check_actuator(run.actuator)
     # torch and rsl_rl take seconds to import: only after the settings were checked
     warnings.filterwarnings("ignore", category=UserWarning, module="torch")
-    from pupper_sysid.policies.train.learner import Ranks
+    from pupper_sysid.policies.train.ranks import Ranks
     from pupper_sysid.policies.train.training import train
 
     if options.benchmark:

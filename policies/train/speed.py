@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from pupper_sysid.data import SAMPLES
-from pupper_sysid.policies.train.learner import Ranks
+from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.sim.walking.env import PupperEnv

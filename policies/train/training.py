@@ -27,7 +27,8 @@ from pupper_sysid.common.memory import keep_freed_memory
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
 from pupper_sysid.policies.train.imitation import Teacher, imitate
-from pupper_sysid.policies.train.learner import Learner, Ranks
+from pupper_sysid.policies.train.learner import Learner
+from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import Run, refuse_taken, resume_run, save_run
 from pupper_sysid.policies.train.selection import Judge
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv

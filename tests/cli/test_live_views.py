@@ -180,7 +180,7 @@ def test_the_files_are_whole_however_the_sweep_ends(tmp_path, number):
     _, err = process.communicate(timeout=60)
     if number != signal.SIGKILL:
         assert "Wrote a.mcap." in err and process.returncode in (1, 143)
-    for _ in range(100):  # after SIGKILL nobody waits for the writer
+    for _ in range(100):  # after SIGKILL the writer ends by itself
         try:
             topics, _ = topics_of(tmp_path / "a.mcap")
             entities = entities_of(tmp_path / "a.rrd")

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def shown(
     bus: GuardedBus, chosen: Plan, wanted: Wanted, live: bool, waits: bool
 ) -> Iterator[tuple[Progress, Observe]]:
-    """What shows the progress, and each tick where that was asked for."""
+    """What shows the progress, and each tick where live views are on."""
     watchers: list[Observe] = []
 
     def observe(number: int, sent: Sent, reading: BusSample, missed: int) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.train.learner import Ranks
+from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import learner_device, train
 from pupper_sysid.sim.gpu.warp_robots import WarpRobots
 from support.tiny_training import tiny_run

@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, Ranks, read_checkpoint
+from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, read_checkpoint
+from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import Walking

@@ -27,7 +27,8 @@ from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.imitation import Teacher, imitate
-from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
+from pupper_sysid.policies.train.learner import Learner, read_checkpoint
+from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import RUN_FILE, load_run, preset, save_run
 from pupper_sysid.policies.train.training import LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
