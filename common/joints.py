@@ -29,6 +29,8 @@ STALL_TORQUE_SOURCE = (
 
 # names become names of files, of XML elements and of columns
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
+# a number of its own, not part of a name ("STS3215"), a date or a range
+_NUMBER = re.compile(r"(?<![\w.:/…–-])[-−]?\d+(?:\.\d+)?(?![\w:/…–-]|\.\.?\d)")
 
 
 def in_order(names: Iterable[str]) -> list[str]:
@@ -70,19 +72,44 @@ def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
 def share_sentences(by_joint: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
     """Sentences on joints, each once, with the joints that it is about.
 
+    Sentences that differ in nothing but their numbers become one, with the range of each.
+
     Examples
     --------
     >>> share_sentences({"LF_hip": ["slow.", "weak."], "LF_thigh": ["slow."]})
     [('LF_hip, LF_thigh', 'slow.'), ('LF_hip', 'weak.')]
+    >>> share_sentences({"LF_hip": ["late by 3.5 ms."], "LF_thigh": ["late by 4 ms."]})
+    [('LF_hip, LF_thigh', 'late by 3.5 to 4 ms.')]
     """
-    joints: dict[str, list[str]] = {}
+    joints: dict[str, dict[str, str]] = {}
     for joint, sentences in by_joint.items():
-        for sentence in sentences:
-            joints.setdefault(sentence, []).append(joint)
+        given = list(sentences)
+        kinds = [_NUMBER.sub("0", sentence) for sentence in given]
+        for sentence, kind in zip(given, kinds, strict=True):
+            # two of a kind about one joint, e.g. on two of its trials, are told apart
+            shared = kind if kinds.count(kind) == 1 else sentence
+            joints.setdefault(shared, {}).setdefault(joint, sentence)
     return [
-        ("All joints" if len(own) == len(by_joint) > 2 else ", ".join(own), sentence)
-        for sentence, own in joints.items()
+        ("All joints" if len(own) == len(by_joint) > 2 else ", ".join(own), _ranged(own.values()))
+        for own in joints.values()
     ]
+
+
+def _ranged(sentences: Iterable[str]) -> str:
+    """One sentence for some that differ in their numbers alone."""
+    given = list(sentences)
+    numbers = zip(*(_NUMBER.findall(sentence) for sentence in given), strict=True)
+    ends = iter([(min(own, key=_value), max(own, key=_value)) for own in numbers])
+
+    def written(_: re.Match[str]) -> str:
+        low, high = next(ends)
+        return low if _value(low) == _value(high) else f"{low} to {high}"
+
+    return _NUMBER.sub(written, given[0])
+
+
+def _value(number: str) -> float:
+    return float(number.replace("−", "-"))
 
 
 def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str]:

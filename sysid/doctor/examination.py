@@ -273,7 +273,7 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
                               f"are in doubt by {1e3 * lattice.time_doubt_s:.0f} ms, which widens "
                               "lags and dead times. Record at least four tones of 3 s, with a "
                               "loop faster than the poll.")]  # fmt: skip
-    text = f"the bus reads this servo every {1e3 * lattice.poll_period_s:.2f} ms"
+    text = f"the bus reads each servo every {1e3 * lattice.poll_period_s:.2f} ms"
     if math.isfinite(lattice.loss):
         text += (
             f" and {100 * lattice.loss:.0f} % of the reads fail silently, so a reading is "

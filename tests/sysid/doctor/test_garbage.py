@@ -130,7 +130,7 @@ def test_a_resolved_poll_asks_for_no_care_and_its_consequence_is_told_once():
     found = ps.examine(ps.load("data/samples/sweep.csv"), "LF_hip")
     (joint,) = found.values()
     assert joint.verdict == "use"
-    assert "the bus reads this servo every" in " ".join(joint.reasons)
+    assert "the bus reads each servo every" in " ".join(joint.reasons)
     assert "Do not compute lag" in found.advice[0] and "Do not" not in " ".join(joint.reasons)
 
 
