@@ -28,6 +28,8 @@ class Options:
     """Runs (`runs/<name>`) or policy folders."""
     recordings: tuple[Path, ...] = ()
     """Sweeps and a playback of a robot."""
+    imu: tuple[str, ...] = ()
+    """IMU logs of walks of the robot, each with the kind of policy that walked: lstm=FILE."""
     servo: Path | None = None
     """Servo model of the emulated robot of --seed, to compare its stack with the closed loop."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)

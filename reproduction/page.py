@@ -41,6 +41,7 @@ def write_claims(options: Options, tries: Tries) -> None:
     """Gather, judge, draw and write."""
     from pupper_sysid.common.page import write_page
     from reproduction import servos as servo_claims
+    from reproduction import walks as walk_claims
     from reproduction.evidence import KINDS, gather
     from reproduction.policies import judge
 
@@ -56,12 +57,17 @@ def write_claims(options: Options, tries: Tries) -> None:
                 f"Leave it out; claims are about {', '.join(KINDS)}."
             )
     recordings = terminal.load_all(options.recordings) if options.recordings else []
+    walks = walk_claims.gather(options.imu)
     robot = servo_claims.gather(recordings, options.seed, _show_step)
     evidence = []
     for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True):
         evidence.append(gather(name, policy, trial, run_folder(path), _show_step))
     stacks = _stacks(options)
-    found = [*servo_claims.judge(robot), *judge(evidence, _played(robot), stacks)]
+    found = [
+        *servo_claims.judge(robot),
+        *judge(evidence, _played(robot), stacks),
+        *walk_claims.judge(walks),
+    ]
     pictures = _draw(evidence, robot)
     inputs = _inputs(options, tries)
     text = _page(found, evidence, pictures, inputs, options)
@@ -279,7 +285,7 @@ _MORE = ("torch", "pandas")  # packages that shape these numbers beside the usua
 _ABOUT = (
     "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
     "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
-    "claims that need the physical one say so."
+    "claims about the physical one are judged by its recordings and the logs of its IMU."
 )
 
 
@@ -294,6 +300,8 @@ def _command(options: Options) -> str:
     parts = ["python -m reproduction", *(str(p) for p in options.policies)]
     if options.recordings:
         parts += ["--recordings", *(p.name for p in options.recordings)]
+    if options.imu:
+        parts += ["--imu", *(f"{kind}={Path(name).name}" for kind, name in _logs(options))]
     if options.servo:
         parts += ["--servo", options.servo.name]
     for flag in ("actuator", "feedback"):
@@ -303,6 +311,11 @@ def _command(options: Options) -> str:
     for flag in ("robots", "seconds", "seed"):
         parts += [f"--{flag}", f"{getattr(options, flag):g}"]
     return " ".join([*parts, "--out", str(options.out)])
+
+
+def _logs(options: Options) -> list[tuple[str, str]]:
+    """Kind of policy and file of each IMU log."""
+    return [(kind, name) for kind, _, name in (text.partition("=") for text in options.imu)]
 
 
 def _versions() -> str:
@@ -320,7 +333,7 @@ def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     if options.servo:
         servos.add(options.servo)
     files = [p / WEIGHTS if p.is_dir() else p for p in sorted(servos)]
-    files += options.recordings
+    files += [*options.recordings, *(Path(name) for _, name in _logs(options))]
     return found | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
 
 

@@ -169,9 +169,5 @@ _BEYOND = tuple(
             "N4", "A GRU fails because it has no shift register", "explained so",
             "The failure does not show here (T1), so there is nothing to explain.",
         ),
-        (
-            "N5", "The policy transfers to the physical robot", "shown in a video",
-            "Needs the robot; the emulated one is walked by `pupper-deploy`.",
-        ),
     )
 )  # fmt: skip

@@ -27,6 +27,7 @@ from pupper_sysid.policies.network.hyperparameters import (
 )
 from pupper_sysid.policies.train.ranges import refuse_impossible
 from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
+from pupper_sysid.sim.walking.rewards import Rewards
 
 Start = Literal["imitation", "scratch"]
 """How a policy comes to its first gait."""
@@ -41,6 +42,7 @@ _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
     Hyperparameters: {"initial_std"},
     Curriculum: {"on", "stages", "stage_steps", "easiest", "action_scale"},
+    Rewards: {"flight"},
 }
 """Settings of older files that say nothing of how a policy walks."""
 

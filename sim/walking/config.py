@@ -241,7 +241,7 @@ _SCRATCH = Walking(
         angular_sigma=Ramp(3.0, 0.6, 2.0, 24.0),
     ),
     rewards=Rewards(
-        progress=3.0, turn_progress=1.5, alive=0.1, gait=2.0, gait_sigma=0.03, flight=-2.0,
+        progress=3.0, turn_progress=1.5, alive=0.1, gait=2.0, gait_sigma=0.03, unsupported=-4.0,
         short_swing=-4.0, shortest_swing=0.12, short_stance=-4.0, shortest_stance=0.16,
         tracking_shape="gaussian",
         base_linear_velocity=1.0, linear_sigma=0.1, base_angular_velocity=2.0, angular_sigma=0.5,

@@ -110,8 +110,8 @@ class Rewards:
     """The same of the turn rate."""
     alive: float = 0.5
     """Be upright."""
-    flight: float = 0.0
-    """No foot on the ground."""
+    unsupported: float = 0.0
+    """Fewer than two feet on the ground."""
     short_swing: float = 0.0
     """Feet that come down after less than `shortest_swing`, by the share that was missing."""
     shortest_swing: float = 0.1
@@ -237,9 +237,9 @@ def _share(along: Array, wanted: Array) -> Array:
     return np.clip(np.divide(along, wanted, out=np.zeros_like(along), where=whole), -1.0, 1.0)
 
 
-def flight(s: Step, p: Rewards) -> Array:
-    """1 while no foot is on the ground."""
-    return (~s.contact.any(axis=1)).astype(float)
+def unsupported(s: Step, p: Rewards) -> Array:
+    """0 with two or more feet on the ground, a half with one, 1 in flight."""
+    return np.maximum(1.0 - 0.5 * s.contact.sum(axis=1), 0.0)
 
 
 def short_swing(s: Step, p: Rewards) -> Array:
@@ -362,7 +362,7 @@ TERMS = {
     f.__name__: f
     for f in (
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
-        stride_angular_velocity, progress, turn_progress, alive, flight, short_swing,
+        stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
         short_stance, air_time, gait, foot_clearance, swing_height, action_smoothness,
         action_rate, action_jerk, air_time_variance, base_motion, base_orientation, foot_slip,
         joint_position, hip_abduction, joint_torques, joint_acceleration, joint_velocity,

@@ -74,9 +74,11 @@ def test_progress_is_the_share_of_the_commanded_speed_along_the_command():
     assert wr.turn_progress(step(angular_velocity=(0, 0, 1.0)), P)[0] == 0.0
 
 
-def test_flight_is_all_feet_up_and_short_swings_and_stances_count_where_they_end():
-    assert wr.flight(step(), P)[0] == 1.0
-    assert wr.flight(step(contact=(False, True, False, False)), P)[0] == 0.0
+def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
+    assert wr.unsupported(step(), P)[0] == 1.0
+    assert wr.unsupported(step(contact=(False, True, False, False)), P)[0] == 0.5
+    assert wr.unsupported(step(contact=(False, True, True, False)), P)[0] == 0.0
+    assert wr.unsupported(step(contact=(True, True, True, True)), P)[0] == 0.0
     p = replace(P, shortest_swing=0.1)
     s = step(landed=(True, True, False, True), last_air_s=(0.025, 0.2, 0.0, 0.05))
     assert wr.short_swing(s, p)[0] == pytest.approx(0.75 + 0.5)

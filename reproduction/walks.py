@@ -1,0 +1,163 @@
+"""The published claims about the robot's own walks, judged by its IMU's logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.content import content
+from pupper_sysid.common.reading.csv_table import read_table
+from pupper_sysid.policies.twin.gyro import Gyro, read_imu, spectrum
+from reproduction.claims import Claim, Finding, NotTestable, claim, holds
+from reproduction.evidence import KINDS
+
+_YAW = 2
+_PAPER_HZ = 2.8
+_MEAN_S = 1.0  # longer than a stride: what is left of the accelerations is gravity
+_MOST_BYTES = 100e6
+_UPRIGHT_DEG = 45.0
+
+
+@dataclass(frozen=True)
+class ImuWalk:
+    """One log of a walk.
+
+    Attributes
+    ----------
+    kind : str
+        Architecture of the policy that walked.
+    seconds : float
+    gyro : Gyro
+    tilt_deg : float
+        Largest angle of the trunk's vertical axis from gravity, averaged over a second; NaN if the
+        log has no accelerations.
+    """
+
+    kind: str
+    seconds: float
+    gyro: Gyro
+    tilt_deg: float
+
+
+def gather(given: Sequence[str]) -> list[ImuWalk]:
+    """Read logs given as `KIND=FILE`.
+
+    Raises
+    ------
+    InputError
+        If the kind is none of `KINDS`, or the file is no IMU log (see `policies.twin.gyro`).
+    """
+    found = []
+    for text in given:
+        kind, equals, name = text.partition("=")
+        if not equals or kind not in KINDS:
+            raise InputError(
+                f"`imu`: {text} does not say which policy walked. Write KIND=FILE, for example "
+                f"lstm={name or kind}; kinds are {', '.join(KINDS)}."
+            )
+        path = Path(name)
+        time, rate = read_imu(path)
+        gyro = spectrum(time, [rate])
+        assert gyro is not None  # `read_imu` refuses what is too short for one
+        found.append(ImuWalk(kind, float(time[-1]), gyro, _largest_tilt(path)))
+    return found
+
+
+def _largest_tilt(path: Path) -> float:
+    numbers = read_table(
+        path, content(path, _MOST_BYTES, "Give a shorter log.").decode("utf-8", errors="replace")
+    ).numbers
+    if not {"ax", "ay", "az"} <= numbers.keys():
+        return float("nan")
+    acceleration = np.stack([numbers[n] for n in ("ax", "ay", "az")], axis=1)
+    acceleration = acceleration[np.isfinite(acceleration).all(axis=1)]
+    if not len(acceleration) or np.ptp(acceleration, axis=0).max() == 0:  # not recorded: constant
+        return float("nan")
+    time = numbers["timestamp" if "timestamp" in numbers else "time_s"]
+    rows = max(round(_MEAN_S / float(np.median(np.diff(time)))), 1)
+    sums = np.cumsum(acceleration, axis=0)
+    mean = sums[rows:] - sums[:-rows]
+    # whether z points up or down is the log's own convention
+    share = np.abs(mean[:, 2]) / np.linalg.norm(mean, axis=1)
+    return float(np.degrees(np.arccos(share.min())))
+
+
+def judge(walks: Sequence[ImuWalk]) -> list[Claim]:
+    """A row per claim."""
+    return [rate(walks), steadiness(walks), transfer(walks)]
+
+
+@claim(
+    "G4", "On hardware the LSTM walks at 2.8 Hz", "2.8 Hz",
+    "IMU logs of the robot's walks: strongest sine in the trunk's turn rate after 2 s, 0.5 to "
+    "10 Hz, and the share of its variance that it explains.",
+)  # fmt: skip
+def rate(walks: Sequence[ImuWalk]) -> Finding:
+    """G4."""
+    lstm = [w.gyro.peak_hz[_YAW] for w in _of(walks, "lstm")]
+    near = [abs(hz / _PAPER_HZ - 1) < 0.05 for hz in lstm]
+    return Finding(
+        "; ".join(_shown(walks, kind) for kind in KINDS if any(w.kind == kind for w in walks)),
+        None, holds(all(near), any(near)), "Holds if within 5 % of 2.8 Hz in each log.",
+    )  # fmt: skip
+
+
+@claim(
+    "G5", "On hardware the LSTM's rhythm is the steadier one",
+    "LSTM one rhythm on all joints, MLP erratic",
+    "As G4: the share of the turn rate's variance that one sine explains.",
+)  # fmt: skip
+def steadiness(walks: Sequence[ImuWalk]) -> Finding:
+    """G5."""
+    lstm = [w.gyro.peak_share[_YAW] for w in _of(walks, "lstm")]
+    mlp = [w.gyro.peak_share[_YAW] for w in _of(walks, "mlp")]
+    return Finding(
+        f"LSTM {_range(lstm, 2)}, MLP {_range(mlp, 2)}", None,
+        holds(min(lstm) > max(mlp), bool(np.mean(lstm) > np.mean(mlp))),
+        "Holds if it is larger in each of the LSTM's logs, partly if on average.",
+    )  # fmt: skip
+
+
+@claim(
+    "N5", "The policy transfers to the physical robot", "shown in a video",
+    "IMU logs of the robot's walks: whether its trunk stays upright while it moves.",
+)  # fmt: skip
+def transfer(walks: Sequence[ImuWalk]) -> Finding:
+    """N5."""
+    seen = [w for w in walks if np.isfinite(w.tilt_deg)]
+    if not seen:
+        raise NotTestable("Give IMU logs with accelerations with --imu.")
+    ours = "; ".join(
+        f"{KINDS[w.kind]} {w.seconds:.0f} s, trunk within {w.tilt_deg:.0f}° of upright, turn rate "
+        f"{w.gyro.deviation_rad_s[_YAW]:.1f} rad/s (standard deviation)"
+        for w in seen
+    )
+    upright = [w.tilt_deg < _UPRIGHT_DEG for w in seen]
+    return Finding(
+        ours, None, holds(False, all(upright)),
+        "Partly if all stay upright: a log of the IMU does not tell whether the robot goes where "
+        "it is told.",
+    )  # fmt: skip
+
+
+def _of(walks: Sequence[ImuWalk], kind: str) -> list[ImuWalk]:
+    mine = [w for w in walks if w.kind == kind]
+    if not mine:
+        raise NotTestable(f"Give IMU logs of a robot that the {KINDS[kind]} walked with --imu.")
+    return mine
+
+
+def _shown(walks: Sequence[ImuWalk], kind: str) -> str:
+    mine = _of(walks, kind)
+    hertz = _range([w.gyro.peak_hz[_YAW] for w in mine], 2)
+    shares = _range([w.gyro.peak_share[_YAW] for w in mine], 2)
+    return f"{KINDS[kind]} {hertz} Hz ({shares} of the variance)"
+
+
+def _range(values: Sequence[float], digits: int) -> str:
+    low, high = (f"{end:.{digits}f}" for end in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
