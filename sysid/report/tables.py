@@ -296,7 +296,7 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
         number("loop jitter, ms", "jitter_s", 2, _MS),
         number("fresh rows, %", "fresh_fraction", 0, 100.0),
         number("missing rows, %", "missing_fraction", 0, 100.0),
-        number("reading − command, mrad", "reading_minus_command_rad", 1, 1e3),
+        number("offset, mrad", "reading_minus_command_rad", 1, 1e3),
         number("fastest command, rad/s", "peak_command_rad_s", 1),
     )
     return Table("doctor", "The recordings' health", columns, rows)

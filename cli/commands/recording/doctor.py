@@ -38,7 +38,7 @@ class Doctor:
         title = found.recording if len(recordings) < 4 else f"{len(recordings)} recordings"
         shown = terminal.table(
             title, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
-            "loss", "step mrad", "reading − command mrad",
+            "loss", "step mrad", "offset mrad",
         )  # fmt: skip
         for name, j in found.items():
             shown.add_row(
