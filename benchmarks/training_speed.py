@@ -27,8 +27,8 @@ import numpy as np
 import torch
 
 from pupper_sysid.common.memory import keep_freed_memory
+from pupper_sysid.policies.network.attention import CONTEXT, CausalAttention
 from pupper_sysid.policies.network.hyperparameters import Kind
-from pupper_sysid.policies.network.transformer import CONTEXT, CausalAttention
 from pupper_sysid.policies.train.run_file import preset
 from pupper_sysid.policies.train.speed import Paces, load, measure, ratios
 from pupper_sysid.sim.walking.config import Walking

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
+from pupper_sysid.policies.network.attention import CONTEXT, WIDTH, CausalAttention, step
+
 ACTIONS = 12
 _EPSILON = 1e-2  # of rsl_rl's normaliser
 
@@ -64,8 +66,6 @@ class PolicyNetwork(nn.Module):
             self.rnn = nn.ModuleDict({"rnn": cell(observation_size, memory)})
             before = memory
         elif kind == "transformer":
-            from pupper_sysid.policies.network.transformer import WIDTH, CausalAttention
-
             self.attention = CausalAttention(observation_size)
             before = WIDTH
         layers: list[nn.Module] = []
@@ -82,8 +82,6 @@ class PolicyNetwork(nn.Module):
     def initial_state(self, count: int) -> tuple[torch.Tensor, ...]:
         """State at the start of an episode of `count` robots; all zeros."""
         if self.kind == "transformer":
-            from pupper_sysid.policies.network.transformer import CONTEXT
-
             return (torch.zeros(CONTEXT - 1, count, self.observation_size + 1),)
         return tuple(torch.zeros(1, count, self.memory) for _ in self.state_names)
 
@@ -102,8 +100,6 @@ class PolicyNetwork(nn.Module):
         *state : tensors
         """
         if self.kind == "transformer":
-            from pupper_sysid.policies.network.transformer import step
-
             latent, context = step(self.attention, self.obs_normalizer, observation, state[0])
             return self.mlp(latent), context
         x = self.obs_normalizer(observation)

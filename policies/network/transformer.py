@@ -1,13 +1,8 @@
-"""A Transformer policy with a context of 16 steps, trained on whole sequences.
+"""A Transformer policy for rsl_rl, trained on whole sequences.
 
-One layer of causal attention over the last `CONTEXT` observations of the episode. With one layer,
-an output depends on exactly those observations, so the update runs one pass over a rollout (each
-step attends to the band of 16 before it) instead of one window per sample, at a tenth of the cost.
-Rollout and update have the same window, which ends on the present observation and begins not before
-the episode.
-
-The state between steps is the last 15 raw observations and a flag for each; an empty place is never
-attended to.
+An update runs one pass over a rollout instead of one window per sample, at a tenth of the cost; see
+`policies.network.attention`. Rollout and update have the same window, which ends on the present
+observation and begins not before the episode.
 """
 
 from __future__ import annotations
@@ -18,76 +13,8 @@ import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.utils import unpad_trajectories
 from tensordict import TensorDict
-from torch import nn
 
-CONTEXT = 16
-WIDTH, HEADS = 128, 4
-
-
-class CausalAttention(nn.Module):
-    """One pre-norm layer of multi-head attention and a feed-forward part, banded and causal.
-
-    Parameters
-    ----------
-    size : int
-        Numbers per observation.
-    width, heads : int
-        Of the layer.
-    """
-
-    def __init__(self, size: int, width: int = WIDTH, heads: int = HEADS):
-        super().__init__()
-        self.heads, self.width = heads, width
-        self.embed = nn.Linear(size, width)
-        # bias per head and age in steps: positions are relative, so that a sequence and a window
-        # give the same
-        self.age_bias = nn.Parameter(torch.zeros(heads, CONTEXT))
-        self.before_attention = nn.LayerNorm(width)
-        self.query_key_value = nn.Linear(width, 3 * width)
-        self.merge = nn.Linear(width, width)
-        self.before_feed_forward = nn.LayerNorm(width)
-        self.feed_forward = nn.Sequential(
-            nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width)
-        )
-        self.final = nn.LayerNorm(width)
-
-    def forward(self, tokens: torch.Tensor, present: torch.Tensor, last: int) -> torch.Tensor:
-        """Latents of the last `last` steps.
-
-        Parameters
-        ----------
-        tokens : tensor, shape (batch, steps, size)
-            Normalised observations, oldest first.
-        present : tensor of bool, shape (batch, steps)
-            Which of them belong to the episode.
-        last : int
-
-        Returns
-        -------
-        tensor, shape (batch, last, width)
-        """
-        batch, steps, _ = tokens.shape
-        x = self.embed(tokens)
-        q, k, v = self.query_key_value(self.before_attention(x)).chunk(3, dim=-1)
-
-        def split(t: torch.Tensor) -> torch.Tensor:
-            return t.reshape(batch, -1, self.heads, self.width // self.heads).transpose(1, 2)
-
-        q = q[:, steps - last :]
-        age = (
-            torch.arange(steps - last, steps, device=x.device)[:, None]
-            - torch.arange(steps, device=x.device)[None, :]
-        )
-        inside = (age >= 0) & (age < CONTEXT)
-        bias = self.age_bias[:, age.clamp(0, CONTEXT - 1)]
-        allowed = inside[None, None] & present[:, None, None, :]
-        # a step always attends to itself, or padding would divide by zero
-        allowed = allowed | (age == 0)[None, None]
-        mask = torch.where(allowed, bias[None], torch.full_like(bias[None], -1e9))
-        mixed = nn.functional.scaled_dot_product_attention(split(q), split(k), split(v), mask)
-        x = x[:, steps - last :] + self.merge(mixed.transpose(1, 2).reshape(batch, last, -1))
-        x = x + self.feed_forward(self.before_feed_forward(x))
-        return self.final(x)
+from pupper_sysid.policies.network.attention import WIDTH, CausalAttention, empty_context, step
 
 
 class TransformerModel(MLPModel):
@@ -137,19 +64,3 @@ class TransformerModel(MLPModel):
 
     def detach_hidden_state(self, dones: torch.Tensor | None = None) -> None:
         """Nothing to do: the context holds observations, not results."""
-
-
-def empty_context(count: int, size: int, like: torch.Tensor) -> torch.Tensor:
-    """State before an episode's first step, shape (CONTEXT - 1, count, size + 1)."""
-    return torch.zeros(CONTEXT - 1, count, size + 1, device=like.device)
-
-
-def step(
-    attention: CausalAttention, normalise: nn.Module, raw: torch.Tensor, context: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Latent of one more observation, shape (n, width), and the context after it."""
-    now = torch.cat([raw, torch.ones_like(raw[:, :1])], dim=1)
-    whole = torch.cat([context, now[None]], dim=0)
-    rows = whole.transpose(0, 1)
-    latent = attention(normalise(rows[..., :-1]), rows[..., -1] > 0.5, 1)
-    return latent[:, 0], whole[1:]

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import onnx
 import pytest
 import torch
 
-from pupper_sysid.policies.network.policy_export import export_policy, write_policy
-from pupper_sysid.policies.network.policy_file import load_policy
-from pupper_sysid.policies.network.policy_network import PolicyNetwork
-from pupper_sysid.policies.network.transformer import (
+from pupper_sysid.policies.network.attention import (
     CONTEXT,
     WIDTH,
     CausalAttention,
     empty_context,
     step,
 )
+from pupper_sysid.policies.network.policy_export import export_policy, write_policy
+from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.policies.train.training import action_history
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import (
@@ -208,13 +210,18 @@ def test_only_the_network_with_past_actions_sees_them():
 
 
 @pytest.fixture(scope="module", params=ALL_KINDS)
-def policy(request, tmp_path_factory):
+def folder(request, tmp_path_factory):
     run = tiny_run(request.param)
     run = replace(run, architecture=replace(run.architecture, hidden=(32, 16), memory=24))
     actor, _ = networks(request.param)
     folder = tmp_path_factory.mktemp(request.param) / "policy"
     history = HISTORY if request.param == "mlp-actions" else 0
     write_policy(folder, actor.state_dict(), run, servo_ranges(CALIBRATION), history, {"seed": 0})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def policy(folder):
     return load_policy(folder)
 
 
@@ -222,6 +229,17 @@ INPUTS = {
     "mlp": ["obs"], "mlp-actions": ["obs"], "lstm": ["obs", "h_in", "c_in"],
     "gru": ["obs", "h_in"], "transformer": ["obs", "context_in"],
 }  # fmt: skip
+
+
+def test_a_policy_is_loaded_without_its_trainer(folder):
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from pupper_sysid.policies.network.policy_file import load_policy\n"
+        "load_policy(Path(sys.argv[1]))\n"
+        "assert 'rsl_rl' not in sys.modules and 'tensordict' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_an_onnx_file_acts_like_the_policy_and_carries_its_contract(policy, tmp_path):

@@ -11,10 +11,10 @@ import torch
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.analysis.trial import outcome
 from pupper_sysid.policies.evaluation.evaluate import walk
+from pupper_sysid.policies.network.attention import WIDTH
 from pupper_sysid.policies.network.hyperparameters import Architecture
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import Policy, load_policy
-from pupper_sysid.policies.network.transformer import WIDTH
 from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
 from pupper_sysid.policies.walks.rollouts import collect, replay
 from pupper_sysid.sim.walking.config import Walking
