@@ -2,8 +2,8 @@
 
 The emulators of both protocols use the same servos as `EmulatedBus`, with the same truth, in free
 air or in a robot that walks (`sim.emulator.servo_plant`). A bench adds the encoder's counts, the
-duty, the supply, and a hand that moves limp joints (`by_hand`), so that a calibration of the joints
-can be tried without a robot.
+duty, the supply, and a hand that moves limp joints (`move_by_hand`), so that a calibration of the
+joints can be rehearsed without a robot.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from pupper_sysid.sim.emulator.robot import EmulatedRobot
 from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
 
 AMBIENT_C, SUPPLY_V = 27.0, 7.4
-_HAND_RAD, _HAND_PERIOD_S = 0.6, 6.0
 
 
 class ServoBench:
@@ -32,8 +31,6 @@ class ServoBench:
         What counts mean; used in servo coordinates, all joints of the robot.
     rng : numpy.random.Generator
         Reading noise.
-    by_hand : bool
-        Whether limp joints swing as if moved by hand.
     keep_log : bool
         Whether commands and readings are remembered: for tests, not for runs of days.
     plant : ServoPlant, optional
@@ -43,6 +40,8 @@ class ServoBench:
     ----------
     commands : list of (float, int, int)
         Every command: time [s], servo index, count.
+    hand_rad : ndarray, shape (joints,)
+        How far each limp servo was moved by hand [rad], servo coordinates; see `move_by_hand`.
     """
 
     def __init__(
@@ -50,16 +49,16 @@ class ServoBench:
         robot: EmulatedRobot,
         joint_map: JointMap,
         rng: np.random.Generator,
-        by_hand: bool = False,
         keep_log: bool = True,
         plant: ServoPlant | None = None,
     ):
         self.robot, self.map = robot, joint_map.select(robot.joint_names).per_servo()
-        self._rng, self._by_hand = rng, by_hand
+        self._rng = rng
         self.plant = plant or FreeAirServos(robot)
         self._offset = np.array([s.feedback.offset_rad for s in robot.servos])
         self._noise = robot.spec.reading_noise_rad
         self._limp_since = np.full(len(robot.servos), np.inf)
+        self.hand_rad = np.zeros(len(robot.servos))
         self._top = self.map.file.counts - 1
         self._scale = self.map.sign() * self.map.counts_per_rad()
         self._zero = self.map.to_counts(np.zeros(len(robot.servos)))
@@ -78,6 +77,7 @@ class ServoBench:
         if on == self.is_on(index):
             return
         self._limp_since[index] = np.inf if on else time_s
+        self.hand_rad[index] = 0.0
         self.plant.torque(index, time_s, on)
 
     def is_on(self, index: int) -> bool:
@@ -86,11 +86,11 @@ class ServoBench:
 
     def angle(self, index: int, time_s: float) -> float:
         """True angle of a servo [rad], servo coordinates."""
-        angle = self.plant.angle(index, time_s)
-        if self._by_hand and not self.is_on(index):
-            phase = 2 * np.pi * (time_s - self._limp_since[index]) / _HAND_PERIOD_S
-            angle += _HAND_RAD * np.sin(phase)
-        return angle
+        return self.plant.angle(index, time_s) + float(self.hand_rad[index])
+
+    def move_by_hand(self, index: int, by_rad: float | None) -> None:
+        """Move a limp servo by an angle [rad], or (None) back to where it went limp."""
+        self.hand_rad[index] = 0.0 if by_rad is None else self.hand_rad[index] + by_rad
 
     def count(self, index: int, time_s: float) -> int:
         """Count of the encoder: angle with offset and noise, rounded."""

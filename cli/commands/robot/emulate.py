@@ -6,7 +6,7 @@ import math
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -58,7 +58,7 @@ class Common:
     """The robot stands on the ground and walks where its servos carry it; otherwise its legs hang
     in free air."""
     by_hand: bool = False
-    """The joints swing while they are limp, as if moved by hand, for trying calibrate-joints."""
+    """Keys in this window move joints while they are limp, to rehearse calibrate-joints."""
     truth: Path | None = None
     """Write the true parameters of the robot to this YAML file."""
     force: bool = False
@@ -84,7 +84,8 @@ class Esp32(Common):
             _write_truth(self, bench)
             name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
             what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
-            _serve(server, f"{what} at {self.socket}.", name, self.walking)
+            with _hand_of(self, bench):
+                _serve(server, f"{what} at {self.socket}.", name, self.walking)
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class Feetech(Common):
             )  # fmt: skip
             plant = PendulumBench(loaded)
             own = rng.spawn(1)[0]
-            bench = ServoBench(loaded, layout, own, self.by_hand, keep_log=False, plant=plant)
+            bench = ServoBench(loaded, layout, own, keep_log=False, plant=plant)
         else:
             # read directly, a servo answers with its present position: no polls, none lost
             spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
@@ -172,6 +173,7 @@ class Feetech(Common):
         with (
             _imu_beside(bench, self.imu_socket, rng),
             closing(FeetechPty(emulator, link)) as server,
+            _hand_of(self, bench),
         ):
             _write_truth(self, bench)
             what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
@@ -206,7 +208,16 @@ def _bench(
         from pupper_sysid.sim.walking.robot import WalkingRobot
 
         plant = WalkingRobot(robot, imu)
-    return ServoBench(robot, layout, own, options.by_hand, keep_log=False, plant=plant)
+    return ServoBench(robot, layout, own, keep_log=False, plant=plant)
+
+
+def _hand_of(options: Common, bench: ServoBench) -> AbstractContextManager[None]:
+    """Keys that move limp joints, if they are to."""
+    if not options.by_hand:
+        return nullcontext()
+    from pupper_sysid.cli.hand import keys_move
+
+    return keys_move(bench)
 
 
 @contextmanager
