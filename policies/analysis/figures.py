@@ -32,7 +32,13 @@ _THIGH = 1  # LF thigh, as the paper draws
 @styled
 def delay_figure(curves: Mapping[str, Sequence[DelayPoint]]) -> Figure:
     """Survival, frequency and amplitude against more delay; a colour per policy."""
-    names = {"survival": "share still up", "frequency_hz": "gait [Hz]", "amplitude_rad": "rad"}
+    titles = {
+        "survival": "share still up", "frequency_hz": "gait [Hz]",
+        "amplitude_rad": "amplitude [rad]",
+    }  # fmt: skip
+    points = [row for rows in curves.values() for row in rows]
+    # walks too short for a rhythm have none to show
+    names = {n: t for n, t in titles.items() if any(np.isfinite(getattr(r, n)) for r in points)}
     figure, axes = axes_column(len(names), 2.2 * len(names))
     for (name, title), one in zip(names.items(), axes, strict=True):
         for k, (policy, rows) in enumerate(curves.items()):
@@ -46,8 +52,7 @@ def delay_figure(curves: Mapping[str, Sequence[DelayPoint]]) -> Figure:
                     )  # fmt: skip
         one.set_ylabel(title)
     axes[-1].set_xlabel("more delay [ms]")
-    if axes[1].lines:
-        axes[1].legend(fontsize=7)
+    axes[min(1, len(axes) - 1)].legend(fontsize=7)
     return figure
 
 

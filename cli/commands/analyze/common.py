@@ -53,12 +53,18 @@ class Drawn(ABC):
         picture = self.out / f"{self.word}.png"
         refuse_overwrite(picture, self.force)
         found, figure, table = self.analyse()
+        if caption := self.caption(str(table.title)):
+            figure.suptitle(caption, fontsize=8)
         save(figure, picture, self.force)
         if self.json:
             print_json({**self.about(), **found, "picture": picture})
             return
         out.print(table)
         err.print(f"Picture: {picture}", soft_wrap=True)
+
+    def caption(self, title: str) -> str:
+        """Title of the picture of a table with a title; none if it has its own."""
+        return ""
 
     @property
     def word(self) -> str:
@@ -91,6 +97,11 @@ class Analysis(Drawn):
             raise InputError(f"No policy was named: pupper-analyze {self.word} runs/<name>.")
         torch.set_num_threads(1)
         super().run()
+
+    def caption(self, title: str) -> str:
+        """What was done, by which policies on which servos."""
+        servos = f"; servos {Path(self.actuator).name}" if self.actuator else ""
+        return f"{title}\n{', '.join(path.name for path in self.policies)}{servos}"
 
 
 @dataclass(frozen=True)
@@ -151,6 +162,12 @@ class Commanded(OfPolicies):
 
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
     """Forward and sideways speed [m/s], turn rate [rad/s]."""
+
+    def caption(self, title: str) -> str:
+        """The same, and under which command."""
+        forward, left, turn = self.command
+        commanded = f"{forward:g} m/s forward, {left:g} m/s left, {turn:g} rad/s"
+        return f"{super().caption(title)}; command {commanded}"
 
 
 def _share_of_all(advance: Any, name: str, before: int, count: int, share: float) -> None:

@@ -181,3 +181,10 @@ def test_an_eighth_policy_is_drawn_as_well():
     )
     figure = figures.delay_figure({f"policy {k}": [row] for k in range(9)})
     assert [len(axes.lines) for axes in figure.axes] == [9, 9, 9]
+
+
+def test_what_no_walk_has_is_not_drawn():
+    row = DelayPoint(
+        mode="fixed", extra_delay_ms=0, survival=1.0, frequency_hz=np.nan, amplitude_rad=np.nan
+    )
+    assert len(figures.delay_figure({"policy": [row]}).axes) == 1
