@@ -97,8 +97,8 @@ def gyro_of(found: Twin) -> str:
     """Table of the spectra of the robot's IMU logs, and of the simulated gyro in the playback."""
     logs = {}
     for path in sorted((REAL / "mini_pupper_imu").glob("hw_[lm]*.csv")):
-        time, rate = read_imu(path)
-        logs[path.stem] = spectrum(time, [rate])
+        log = read_imu(path)
+        logs[path.stem] = spectrum(log.time_s, [log.rate_rad_s])
     for name, model in found.models.items():
         if model.ground is not None:
             logs[f"simulated playback, {name}"] = model.ground.gyro

@@ -29,8 +29,12 @@ STALL_TORQUE_SOURCE = (
 
 # names become names of files, of XML elements and of columns
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
-# a number of its own, not part of a name ("STS3215"), a date or a range
-_NUMBER = re.compile(r"(?<![\w.:/…–-])[-−]?\d+(?:\.\d+)?(?![\w:/…–-]|\.\.?\d)")
+# a quantity: not part of a name ("STS3215"), a date, a range or a larger number, and not which
+# trial, row or servo
+_NUMBER = re.compile(
+    r"(?<![\w.:/…–-])(?<!\d,)(?<!\btrial )(?<!\brow )(?<!\bline )(?<!\bservo )"
+    r"[-−]?\d+(?:\.\d+)?(?![\w:/…–-]|[.,]\.?\d)"
+)
 
 
 def in_order(names: Iterable[str]) -> list[str]:

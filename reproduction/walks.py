@@ -9,16 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.content import content
-from pupper_sysid.common.reading.csv_table import read_table
-from pupper_sysid.policies.twin.gyro import Gyro, read_imu, spectrum
+from pupper_sysid.policies.twin.gyro import Gyro, ImuLog, read_imu, spectrum
 from reproduction.claims import Claim, Finding, NotTestable, claim, holds
 from reproduction.evidence import KINDS
 
 _YAW = 2
 _PAPER_HZ = 2.8
 _MEAN_S = 1.0  # longer than a stride: what is left of the accelerations is gravity
-_MOST_BYTES = 100e6
 _UPRIGHT_DEG = 45.0
 
 
@@ -59,26 +56,19 @@ def gather(given: Sequence[str]) -> list[ImuWalk]:
                 f"`imu`: {text} does not say which policy walked. Write KIND=FILE, for example "
                 f"lstm={name or kind}; kinds are {', '.join(KINDS)}."
             )
-        path = Path(name)
-        time, rate = read_imu(path)
-        gyro = spectrum(time, [rate])
+        log = read_imu(Path(name))
+        gyro = spectrum(log.time_s, [log.rate_rad_s])
         assert gyro is not None  # `read_imu` refuses what is too short for one
-        found.append(ImuWalk(kind, float(time[-1]), gyro, _largest_tilt(path)))
+        found.append(ImuWalk(kind, float(log.time_s[-1]), gyro, _largest_tilt(log)))
     return found
 
 
-def _largest_tilt(path: Path) -> float:
-    numbers = read_table(
-        path, content(path, _MOST_BYTES, "Give a shorter log.").decode("utf-8", errors="replace")
-    ).numbers
-    if not {"ax", "ay", "az"} <= numbers.keys():
+def _largest_tilt(log: ImuLog) -> float:
+    known = np.isfinite(log.acceleration_m_s2).all(axis=1)
+    acceleration = log.acceleration_m_s2[known]
+    if not known.any() or np.ptp(acceleration, axis=0).max() == 0:  # not recorded: constant
         return float("nan")
-    acceleration = np.stack([numbers[n] for n in ("ax", "ay", "az")], axis=1)
-    acceleration = acceleration[np.isfinite(acceleration).all(axis=1)]
-    if not len(acceleration) or np.ptp(acceleration, axis=0).max() == 0:  # not recorded: constant
-        return float("nan")
-    time = numbers["timestamp" if "timestamp" in numbers else "time_s"]
-    rows = max(round(_MEAN_S / float(np.median(np.diff(time)))), 1)
+    rows = max(round(_MEAN_S / float(np.median(np.diff(log.time_s)))), 1)
     sums = np.cumsum(acceleration, axis=0)
     mean = sums[rows:] - sums[:-rows]
     # whether z points up or down is the log's own convention
@@ -139,8 +129,8 @@ def transfer(walks: Sequence[ImuWalk]) -> Finding:
     upright = [w.tilt_deg < _UPRIGHT_DEG for w in seen]
     return Finding(
         ours, None, holds(False, all(upright)),
-        "Partly if all stay upright: a log of the IMU does not tell whether the robot goes where "
-        "it is told.",
+        "Partly if all stay upright: a log of the IMU does not tell whether the robot follows "
+        "its commands.",
     )  # fmt: skip
 
 

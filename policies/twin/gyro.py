@@ -22,7 +22,7 @@ from pupper_sysid.common.results import Result
 
 Array = NDArray[np.float64]
 
-_RATES = ("gx", "gy", "gz")
+_RATES, _ACCELERATIONS = ("gx", "gy", "gz"), ("ax", "ay", "az")
 STEP_S = 0.02
 """Between samples of the simulated gyro: the rate at which robots log theirs."""
 
@@ -51,13 +51,32 @@ class Gyro(Result):
     peak_share: tuple[float, ...]
 
 
-def read_imu(path: Path) -> tuple[Array, Array]:
-    """Times [s], shape (n,), and rates [rad/s], shape (n, 3), of an IMU log.
+@dataclass(frozen=True)
+class ImuLog:
+    """Samples of an IMU.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        From the first sample on.
+    rate_rad_s : ndarray, shape (n, 3)
+    acceleration_m_s2 : ndarray, shape (n, 3)
+        NaN where none was logged.
+    """
+
+    time_s: Array
+    rate_rad_s: Array
+    acceleration_m_s2: Array
+
+
+def read_imu(path: Path) -> ImuLog:
+    """Read the log of an IMU.
 
     Parameters
     ----------
     path : Path
-        CSV file with the columns `timestamp` or `time_s` [s], and `gx`, `gy`, `gz` [rad/s].
+        CSV file with the columns `timestamp` or `time_s` [s], `gx`, `gy`, `gz` [rad/s], and perhaps
+        `ax`, `ay`, `az` [m/s²].
 
     Raises
     ------
@@ -74,7 +93,10 @@ def read_imu(path: Path) -> tuple[Array, Array]:
             "(s and rad/s)."
         )
     values = np.stack([table.numbers[n] for n in needed], axis=1)
-    values = values[np.isfinite(values).all(axis=1)]
+    whole = np.isfinite(values).all(axis=1)
+    values = values[whole]
+    nothing = np.full(len(whole), np.nan)
+    acceleration = np.stack([table.numbers.get(n, nothing) for n in _ACCELERATIONS], axis=1)
     time = values[:, 0]
     if (np.diff(time) <= 0).any():
         raise InputError(f"{path}: its times do not increase. Give one log per file.")
@@ -83,7 +105,7 @@ def read_imu(path: Path) -> tuple[Array, Array]:
             f"{path} is shorter than {_SETTLE_S + _SHORTEST_S:g} s, which a rhythm needs. Give a "
             "longer log."
         )
-    return time - time[0], values[:, 1:]
+    return ImuLog(time - time[0], values[:, 1:], acceleration[whole])
 
 
 def spectrum(time_s: Array, rates_rad_s: Sequence[Array]) -> Gyro | None:

@@ -57,7 +57,7 @@ class ServoBench:
         self.plant = plant or FreeAirServos(robot)
         self._offset = np.array([s.feedback.offset_rad for s in robot.servos])
         self._noise = robot.spec.reading_noise_rad
-        self._limp_since = np.full(len(robot.servos), np.inf)
+        self._on = np.ones(len(robot.servos), bool)
         self.hand_rad = np.zeros(len(robot.servos))
         self._top = self.map.file.counts - 1
         self._scale = self.map.sign() * self.map.counts_per_rad()
@@ -76,13 +76,13 @@ class ServoBench:
         """Hold the present position, or go limp."""
         if on == self.is_on(index):
             return
-        self._limp_since[index] = np.inf if on else time_s
+        self._on[index] = on
         self.hand_rad[index] = 0.0
         self.plant.torque(index, time_s, on)
 
     def is_on(self, index: int) -> bool:
         """Whether the servo holds."""
-        return not np.isfinite(self._limp_since[index])
+        return bool(self._on[index])
 
     def angle(self, index: int, time_s: float) -> float:
         """True angle of a servo [rad], servo coordinates."""

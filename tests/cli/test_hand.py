@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.hand import Hand
+from pupper_sysid.cli.commands.robot.hand import Hand
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.emulator.servo_bench import ServoBench

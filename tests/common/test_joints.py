@@ -23,7 +23,9 @@ def test_two_sentences_of_a_kind_about_one_joint_stay_apart():
 
 
 def test_names_dates_and_ranges_are_no_numbers():
-    texts = ["STS3215", "2026-11-23", "1-10 Hz", "44.4…45.0", "1e-3", "v1.2.3"]
-    others = ["STS3216", "2026-11-24", "1-11 Hz", "44.4…45.1", "1e-4", "v1.2.4"]
+    texts = ["STS3215", "2026-11-23", "1-10 Hz", "44.4…45.0", "1e-3", "v1.2.3", "1,280 rows"]
+    others = ["STS3216", "2026-11-24", "1-11 Hz", "44.4…45.1", "1e-4", "v1.2.4", "1,300 rows"]
+    texts += ["in trial 3 it slipped", "row 12 is late", "servo 4 is slow"]
+    others += ["in trial 7 it slipped", "row 15 is late", "servo 9 is slow"]
     for text, other in zip(texts, others, strict=True):
         assert share_sentences({"a": [text], "b": [other]}) == [("a", text), ("b", other)]

@@ -85,7 +85,7 @@ class Twin(Drawn):
                 copies=self.robots, seed=self.seed, threads=self.threads,
                 progress=lambda share: advance("simulating", share),
             )  # fmt: skip
-        seen = {name: spectrum(time, [rate]) for name, (time, rate) in logs.items()}
+        seen = {name: spectrum(log.time_s, [log.rate_rad_s]) for name, log in logs.items()}
         if not self.json:
             _explain(found, seen)
         return (

@@ -215,7 +215,7 @@ def _hand_of(options: Common, bench: ServoBench) -> AbstractContextManager[None]
     """Keys that move limp joints, if they are to."""
     if not options.by_hand:
         return nullcontext()
-    from pupper_sysid.cli.hand import keys_move
+    from pupper_sysid.cli.commands.robot.hand import keys_move
 
     return keys_move(bench)
 

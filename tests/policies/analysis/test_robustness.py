@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.cli.commands.analyze.robustness import Delay
 from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.attractor import orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response
@@ -188,3 +189,11 @@ def test_what_no_walk_has_is_not_drawn():
         mode="fixed", extra_delay_ms=0, survival=1.0, frequency_hz=np.nan, amplitude_rad=np.nan
     )
     assert len(figures.delay_figure({"policy": [row]}).axes) == 1
+
+
+def test_a_picture_says_which_policies_walked_on_what_under_which_command():
+    asked = Delay(policies=(Path("runs/a"), Path("b")), actuator="x/mine.yaml", command=(0, 0, 0.4))
+    assert asked.caption("Against more delay (2 robots)") == (
+        "Against more delay (2 robots)\na, b; servos mine.yaml; "
+        "command 0 m/s forward, 0 m/s left, 0.4 rad/s"
+    )

@@ -64,8 +64,10 @@ def log(path: Path, rows: int, head: str = "timestamp,gx,gy,gz", step: float = 0
 
 
 def test_an_imu_log_is_read_and_held_to_its_columns_length_and_times(tmp_path):
-    time, rate = read_imu(log(tmp_path / "a.csv", 400))
-    assert time[-1] == pytest.approx(7.98) and rate[3].tolist() == [0.1, 3.0, 0.0]
+    found = read_imu(log(tmp_path / "a.csv", 400))
+    assert found.time_s[-1] == pytest.approx(7.98)
+    assert found.rate_rad_s[3].tolist() == [0.1, 3.0, 0.0]
+    assert np.isnan(found.acceleration_m_s2).all() and found.acceleration_m_s2.shape == (400, 3)
     for rows, head, step, says in (
         (400, "timestamp,gx,gy,roll", 0.02, "has no column gz"),
         (300, "timestamp,gx,gy,gz", 0.02, "shorter than 7 s"),

@@ -7,15 +7,15 @@ import sys
 import termios
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.keyboard import terminal_without
 from pupper_sysid.sim.emulator.servo_bench import ServoBench
 
 HELP = (
-    "Keys move limp joints, in this window: a and d by 0.05 rad, A and D by 0.4 rad, 0 back to the "
-    "middle; n chooses the next joint (all at first)."
+    "Keys move limp joints, in this window: a and d by 0.05 rad, A and D by 0.4 rad, 0 back to "
+    "where they went limp; n chooses the next joint (all at first)."
 )
 _STEPS_RAD = {"a": -0.05, "d": 0.05, "A": -0.4, "D": 0.4}
 
@@ -60,10 +60,11 @@ def keys_move(bench: ServoBench) -> Iterator[None]:
     hand, fd = Hand(bench), sys.stdin.fileno()
 
     def listen() -> None:
-        while typed := os.read(fd, 64):
-            for key in typed.decode(errors="ignore"):
-                if said := hand.press(key):
-                    terminal.err.print(said)
+        with suppress(OSError):  # the terminal is gone
+            while typed := os.read(fd, 64):
+                for key in typed.decode(errors="ignore"):
+                    if said := hand.press(key):
+                        terminal.err.print(said)
 
     raw = terminal_without(termios.ICANON | termios.ECHO, fd) if os.isatty(fd) else nullcontext()
     with raw:
