@@ -94,9 +94,9 @@ def read_imu(path: Path) -> ImuLog:
         )
     values = np.stack([table.numbers[n] for n in needed], axis=1)
     whole = np.isfinite(values).all(axis=1)
-    values = values[whole]
-    nothing = np.full(len(whole), np.nan)
+    nothing = np.full(len(values), np.nan)
     acceleration = np.stack([table.numbers.get(n, nothing) for n in _ACCELERATIONS], axis=1)
+    values, acceleration = values[whole], acceleration[whole]
     time = values[:, 0]
     if (np.diff(time) <= 0).any():
         raise InputError(f"{path}: its times do not increase. Give one log per file.")
@@ -105,7 +105,7 @@ def read_imu(path: Path) -> ImuLog:
             f"{path} is shorter than {_SETTLE_S + _SHORTEST_S:g} s, which a rhythm needs. Give a "
             "longer log."
         )
-    return ImuLog(time - time[0], values[:, 1:], acceleration[whole])
+    return ImuLog(time - time[0], values[:, 1:], acceleration)
 
 
 def spectrum(time_s: Array, rates_rad_s: Sequence[Array]) -> Gyro | None:
