@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
@@ -17,6 +18,8 @@ from pupper_sysid.policies.network.exploration import (
     TransformerActor,
 )
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
+
+_FIRST_HEAD = 0.01  # factor on a policy's last weights (Andrychowicz et al., 2021)
 
 
 def build(
@@ -61,6 +64,11 @@ def build(
         actor = TransformerActor(observations, groups, "actor", actions, **own)
     else:
         actor = MLPActor(observations, groups, "actor", actions, **own)
+    # the first policy stands; another wide one would swing through its last action, and fast
+    head = [layer for layer in actor.mlp if isinstance(layer, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        head.weight.mul_(_FIRST_HEAD)
+        head.bias.zero_()
     critic = MLPModel(
         observations, groups, "critic", 1, hidden_dims=list(architecture.critic_hidden), **common
     )

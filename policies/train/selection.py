@@ -79,7 +79,9 @@ class Judge:
             errors relative to standing (mean of those at each instant and of those of the mean
             velocity) minus the share of falls. Beside it `score_falls`, the mean absolute errors
             `score_vx_m_s`, `score_vy_m_s` and `score_yaw_rad_s`, and `score_turn`, the turn rate
-            over the commanded one where robots are to turn on the spot.
+            over the commanded one where robots are to turn on the spot; of those that are to move,
+            `score_steps_hz`, how often each foot comes down per second, and `score_duty`, the share
+            of the time that it is on the ground.
         """
         env = self._env
         env.restore(self._start)
@@ -87,16 +89,23 @@ class Judge:
         actor.reset()
         first = round(_IGNORED * self._steps)
         alive, velocity, up = np.ones(env.num_envs, bool), [], []
+        feet: list[tuple[float, float]] = []
+        walks = self._command.any(axis=1)
         with torch.inference_mode():
             observations = env.get_observations()
             for _ in range(self._steps):
                 observations, _, dones, extras = env.step(actor(observations))
                 alive &= ~dones.cpu().numpy()
-                velocity.append(planar_velocity(extras["facts"]))
+                facts = extras["facts"]
+                velocity.append(planar_velocity(facts))
+                feet.append((facts.landed[walks].mean(), facts.contact[walks].mean()))
                 up.append(alive.copy())
                 actor.reset(dones)
         actor.reset(hidden_state=kept)
-        return _scored(np.array(velocity)[first:], np.array(up)[first:], self._command)
+        landed, duty = np.mean(feet[first:], axis=0)
+        found = _scored(np.array(velocity)[first:], np.array(up)[first:], self._command)
+        rate = float(landed / env.env.config.control_step_s)
+        return found | {"score_steps_hz": rate, "score_duty": float(duty)}
 
 
 def _scored(

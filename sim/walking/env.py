@@ -38,16 +38,14 @@ from pupper_sysid.sim.walking.observation import (
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from pupper_sysid.sim.walking.step import StepResult, Unfinished, empty_facts
+from pupper_sysid.sim.walking.strides import Strides
 
 Array = NDArray[np.float64]
 
-_FOOT_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
-_STRIDE_S = 0.2  # time constant of the average over a stride
 _EDGE_M = 0.5
 _ARRAYS = (
     "command", "episode_step", "action", "last_action", "earlier_action", "_until_command",
-    "_until_push", "_air", "_contact", "_last_air", "_last_contact", "_foot_at", "_seen",
-    "_average",
+    "_until_push", "_seen",
 )  # fmt: skip
 
 
@@ -156,6 +154,8 @@ class PupperEnv:
             self.robots.linked, config.differences.poll_period[0],
         )  # fmt: skip
         self._imu = Imu(config.differences, n, config.control_step_s)
+        self._strides = Strides(n, config.control_step_s, config.rewards)
+        self._parts = {"readings": self._readings, "imu": self._imu, "strides": self._strides}
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
         self.level = config.curriculum.at(0)
@@ -168,10 +168,6 @@ class PupperEnv:
         self.episode_step = np.zeros(n, int)
         self.action, self.last_action, self.earlier_action = zeros(12), zeros(12), zeros(12)
         self._until_command, self._until_push = zeros(), zeros()
-        self._air, self._contact = zeros(FEET), zeros(FEET)
-        self._last_air, self._last_contact = zeros(FEET), zeros(FEET)
-        self._foot_at = zeros(FEET, 2)
-        self._average = zeros(3)  # velocity over about a stride
         # readings in turn, the newest where `steps` says
         self._seen = np.zeros((VELOCITY_STEPS + 1, n, 12))
         self.reset()
@@ -264,14 +260,14 @@ class PupperEnv:
     @property
     def stride_velocity(self) -> Array:
         """Forward and sideways speed [m/s] and turn rate [rad/s] over about a stride, (n, 3)."""
-        return self._average.copy()
+        return self._strides.velocity.copy()
 
     @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, as arrays and strings; `restore` takes it back exactly."""
         found = self.robots.state
-        found |= {f"readings.{k}": v.copy() for k, v in self._readings.state.items()}
-        found |= {f"imu.{k}": v.copy() for k, v in self._imu.state.items()}
+        for part, holder in self._parts.items():
+            found |= {f"{part}.{k}": v.copy() for k, v in holder.state.items()}
         found |= {name: getattr(self, name).copy() for name in _ARRAYS}
         found["counters"] = np.array([self.nan_resets, self.steps])
         rngs = (self.rng, self._readings.rng)
@@ -292,10 +288,9 @@ class PupperEnv:
         if differ := sorted(state.keys() ^ self.state.keys()):
             raise InputError(f"they differ in {differ[0]}. Resume with the settings of the run.")
         exact = self.robots.restore(state)
-        for k, v in self._readings.state.items():
-            v[:] = state[f"readings.{k}"]
-        for k, v in self._imu.state.items():
-            v[:] = state[f"imu.{k}"]
+        for part, holder in self._parts.items():
+            for k, v in holder.state.items():
+                v[:] = state[f"{part}.{k}"]
         for name in _ARRAYS:
             getattr(self, name)[:] = state[name]
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
@@ -356,29 +351,13 @@ class PupperEnv:
         fallen |= touches_ground(qpos, gravity, self.ground)
         now.fallen[rows] = fallen
         facts = {name: value[rows] for name, value in now.facts.items()}
-        np.greater(moved.touch, _FOOT_N, out=facts["contact"])
-        np.logical_and(facts["contact"], self._air[rows] > 0, out=facts["landed"])
-        np.greater(self._contact[rows], 0, out=facts["lifted"])
-        np.logical_and(facts["lifted"], ~facts["contact"], out=facts["lifted"])
-        self._count_swings(rows, facts["contact"])
-        at, facts["foot_height_m"][:] = robots.feet(rows)
-        foot_speed = at - self._foot_at[rows]
-        self._foot_at[rows] = at
-        foot_speed *= foot_speed
-        np.sqrt(foot_speed.sum(axis=-1), out=facts["foot_speed_m_s"])
-        facts["foot_speed_m_s"] /= span
-        average = self._average[rows]
-        average[:, :2] += span / _STRIDE_S * (velocity[:, :2] - average[:, :2])
-        average[:, 2] += span / _STRIDE_S * (qvel[:, 5] - average[:, 2])
-        facts["stride_velocity"][:] = average
+        self._strides.advance(rows, moved.touch, robots.feet(rows), _planar(velocity, qvel), facts)
         facts["linear_velocity"][:], facts["gravity"][:] = velocity, gravity
         facts["angular_velocity"][:], facts["torque"][:] = qvel[:, 3:6], moved.load[:, -1]
         np.subtract(qpos[:, 7:], self.default, out=facts["position_relative"])
         facts["velocity"][:] = qvel[:, 6:]
         np.subtract(qvel[:, 6:], now.velocity_before[rows], out=facts["acceleration"])
         facts["acceleration"] /= span
-        for name in ("air_s", "contact_s", "last_air_s", "last_contact_s"):
-            facts[name][:] = getattr(self, f"_{name.removesuffix('_s')}")[rows]
         step = walking_rewards.Step(**facts)
         terms = walking_rewards.weighted(
             step, self._rewards, self.level.penalties, self.level.guides
@@ -402,17 +381,6 @@ class PupperEnv:
             (qpos, qvel, gravity, velocity),
         )
 
-    def _count_swings(self, rows: slice, contact: NDArray[np.bool_]) -> None:
-        """Times that feet have been in the air and on the ground."""
-        span = self.config.control_step_s
-        air, stance = self._air[rows], self._contact[rows]
-        np.copyto(self._last_air[rows], air, where=contact & (air > 0))
-        np.copyto(self._last_contact[rows], stance, where=~contact & (stance > 0))
-        air += span
-        stance += span
-        air[contact] = 0.0
-        stance[~contact] = 0.0
-
     # ------------------------------------------------------------------------- a new episode
 
     def _restart(self, ids: NDArray[np.intp]) -> None:
@@ -425,12 +393,9 @@ class PupperEnv:
         self._seen[:, ids] = self._read(ids)
         qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
         self._imu.reset(ids, qvel[:, 3:6], gravity_direction(qpos), self.rng)
-        self._average[ids, :2] = own_velocity(qpos, qvel)[:, :2]
-        self._average[ids, 2] = qvel[:, 5]
-        self._foot_at[ids] = self.robots.feet(ids)[0]
+        velocity = _planar(own_velocity(qpos, qvel), qvel)
+        self._strides.reset(ids, self.robots.feet(ids)[0], velocity)
         self._until_push[ids] = self.rng.uniform(*self.config.randomisation.push_every_s, len(ids))
-        for times in (self._air, self._contact, self._last_air, self._last_contact):
-            times[ids] = 0.0
         self.episode_step[ids] = 0
         command = self.robots.from_servo(self.robots.to_servo(start) - bodies.zero_rad[ids])
         relative = (command - self.default) / self.config.action_scale
@@ -464,7 +429,7 @@ class PupperEnv:
         angle = self._seen[newest, rows]
         moved = angle - self._seen[(newest + 1) % len(self._seen), rows]
         moved /= VELOCITY_STEPS * self.config.control_step_s
-        bodies = self.robots.bodies
+        bodies, strides = self.robots.bodies, self._strides
         rate, down = self._imu.read(rows, qvel[:, 3:6], gravity)
         effort = self._readings.load[rows] * bodies.effort[rows, None]
         observation = observed(
@@ -479,8 +444,9 @@ class PupperEnv:
         privileged = privileged_of(
             [
                 velocity, qpos[:, 7:] - self.default, qvel[:, 6:], height[:, None],
-                self._air[rows], self._contact[rows], self.robots.friction[rows, None],
-                self.robots.drawn["dead_time_s"][rows], *self._differing(rows), left[:, None],
+                strides.air_s[rows], strides.stance_s[rows], self.robots.friction[rows, None],
+                self.robots.drawn["dead_time_s"][rows], *self._differing(rows),
+                strides.clock(rows), left[:, None],
             ],
             privileged,
         )  # fmt: skip
@@ -504,3 +470,8 @@ class PupperEnv:
         """Joint angles as the controller reads them."""
         position = self._readings.position[rows] - self.robots.bodies.zero_rad[rows]
         return self.robots.from_servo(position)
+
+
+def _planar(velocity: Array, qvel: Array) -> Array:
+    """Forward and sideways speed and turn rate, shape (k, 3)."""
+    return np.column_stack([velocity[:, :2], qvel[:, 5]])

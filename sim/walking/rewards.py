@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 _HIPS = slice(0, 12, 3)
 # feet in the order LF, RF, LB, RB: diagonal pairs move together, sides and ends alternate
-_TOGETHER = ((0, 3), (1, 2))
+DIAGONALS = ((0, 3), (1, 2))
+"""Feet that a trot moves together, by index."""
 _APART = ((0, 1), (3, 2), (0, 2), (1, 3))
+_TURNS = np.array([1.0, -1.0, -1.0, 1.0])  # of the feet in the first half of the clock's cycle
+_SLOW = (0.05, 0.15)  # m/s, rad/s
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,9 @@ class Step:
         Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
     foot_height_m, foot_speed_m_s : ndarray, shape (n, 4)
         Of the sole above the ground; of the foot along it.
+    clock : ndarray, shape (n, 3)
+        Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1
+        to 1; see `Strides`.
     """
 
     command: Array
@@ -71,6 +77,7 @@ class Step:
     foot_height_m: Array
     foot_speed_m_s: Array
     stride_velocity: Array
+    clock: Array
 
     def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
         """Whether a robot is commanded to move, or moves, shape (n,)."""
@@ -105,9 +112,12 @@ class Rewards:
     fast_above: float = 0.15
     """Speed above which `fast_bonus` counts [m/s]."""
     progress: float = 0.0
-    """Speed along the command over the commanded speed: pays from the first step on."""
+    """How much nearer to the commanded speed the mean over a stride is than standing: pays from
+    the first step on."""
     turn_progress: float = 0.0
     """The same of the turn rate."""
+    progress_in_time: bool = False
+    """Whether progress of either kind pays only as far as feet step with the clock."""
     alive: float = 0.5
     """Be upright."""
     unsupported: float = 0.0
@@ -125,6 +135,17 @@ class Rewards:
     """Published: long swings and stances while moving, all feet down while standing."""
     air_time_most: float = 0.25
     """Longest swing that counts for `air_time` [s]."""
+    clock: float = 0.0
+    """Feet that are up when a trot's clock says so, less those that are when it does not, while
+    commanded to move. The policy does not see the clock, which follows the feet."""
+    clock_hz: float = 3.6
+    """Steps of each foot per second by that clock."""
+    clock_pull_hz: float = 0.5
+    """How far from that rate it follows feet."""
+    clock_duty: float = 0.6
+    """Share of the time that a foot is to be down by that clock."""
+    clock_height: float = 0.012
+    """Height of a foot that counts as up [m]; lower ones count in proportion."""
     gait: float = 0.3
     """Diagonal feet together, the two pairs in turn (a trot)."""
     gait_threshold: float = 0.1
@@ -221,20 +242,24 @@ def stride_angular_velocity(s: Step, p: Rewards) -> Array:
 
 
 def progress(s: Step, p: Rewards) -> Array:
-    """Speed along the command over the commanded speed, -1 to 1; 0 without a command to travel."""
-    wanted, along = s.command[:, :2], (s.command[:, :2] * s.linear_velocity[:, :2]).sum(axis=1)
-    return _share(along, (wanted**2).sum(axis=1))
+    """Share of the commanded speed by which the mean over a stride is nearer to it than 0, -1 to 1."""
+    return _nearer(s.command[:, :2], s.stride_velocity[:, :2], _SLOW[0]) * _stepping(s, p)
 
 
 def turn_progress(s: Step, p: Rewards) -> Array:
-    """Turn rate over the commanded one, -1 to 1; 0 without a command to turn."""
-    wanted = s.command[:, 2]
-    return _share(s.angular_velocity[:, 2] * wanted, wanted**2)
+    """The same of the turn rate."""
+    return _nearer(s.command[:, 2:], s.stride_velocity[:, 2:], _SLOW[1]) * _stepping(s, p)
 
 
-def _share(along: Array, wanted: Array) -> Array:
-    whole = wanted > 1e-6
-    return np.clip(np.divide(along, wanted, out=np.zeros_like(along), where=whole), -1.0, 1.0)
+def _stepping(s: Step, p: Rewards) -> Array | float:
+    return np.clip(s.clock[:, 2], 0.0, 1.0) if p.progress_in_time else 1.0
+
+
+def _nearer(wanted: Array, velocity: Array, slow: float) -> Array:
+    speed = np.linalg.norm(wanted, axis=1)
+    gained = speed - np.linalg.norm(wanted - velocity, axis=1)
+    # below `slow` the share of a small command would be that of the trunk's sway
+    return np.where(speed > 0, np.clip(gained / np.hypot(speed, slow), -1.0, 1.0), 0.0)
 
 
 def unsupported(s: Step, p: Rewards) -> Array:
@@ -274,12 +299,20 @@ def gait(s: Step, p: Rewards) -> Array:
     most = p.gait_most**2
     product = np.ones(len(s.command))
     air, contact = s.air_s, s.contact_s
-    for pairs, first, second in ((_TOGETHER, air, contact), (_APART, contact, air)):
+    for pairs, first, second in ((DIAGONALS, air, contact), (_APART, contact, air)):
         for a, b in pairs:
             gap = np.minimum((air[:, a] - first[:, b]) ** 2, most)
             gap = gap + np.minimum((contact[:, a] - second[:, b]) ** 2, most)
             product = product * np.exp(-gap / p.gait_sigma)
     return np.where(s.moving(p.gait_threshold), product, 0.0)
+
+
+def clock(s: Step, p: Rewards) -> Array:
+    """Sum over feet of their height, as a share of `clock_height`, times how far the clock wants
+    them up (1) or down (-1 and less); 0 for a robot that stands, or is to."""
+    up = s.clock[:, 1:2] * _TURNS - np.sin(np.pi * (p.clock_duty - 0.5))
+    share = np.clip(s.foot_height_m / p.clock_height, 0.0, 1.0)
+    return np.where(np.abs(s.command).max(axis=1) > 0, (up * share).sum(axis=1), 0.0)
 
 
 def foot_clearance(s: Step, p: Rewards) -> Array:
@@ -363,7 +396,7 @@ TERMS = {
     for f in (
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
         stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
-        short_stance, air_time, gait, foot_clearance, swing_height, action_smoothness,
+        short_stance, air_time, clock, gait, foot_clearance, swing_height, action_smoothness,
         action_rate, action_jerk, air_time_variance, base_motion, base_orientation, foot_slip,
         joint_position, hip_abduction, joint_torques, joint_acceleration, joint_velocity,
     )
@@ -371,7 +404,7 @@ TERMS = {
 """All terms by the name of their weight."""
 
 
-GUIDES = ("progress", "turn_progress", "gait")
+GUIDES = ("progress", "turn_progress", "clock", "gait")
 """Terms that lead to a first gait; a curriculum may fade them."""
 
 

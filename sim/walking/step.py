@@ -17,7 +17,7 @@ _COLUMNS = {
     "linear_velocity": 3, "angular_velocity": 3, "gravity": 3, "position_relative": 12,
     "velocity": 12, "acceleration": 12, "torque": 12, "air_s": FEET, "contact_s": FEET,
     "last_air_s": FEET, "last_contact_s": FEET, "foot_height_m": FEET, "foot_speed_m_s": FEET,
-    "stride_velocity": 3,
+    "stride_velocity": 3, "clock": 3,
 }  # fmt: skip
 _FLAGS = ("contact", "landed", "lifted")
 

@@ -1,0 +1,141 @@
+"""What feet and trunk of many robots did over the last strides: swings, stances, mean velocity.
+
+Rewards and the critic look back over more than one control step; this is what they look at.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sim.robot.robot_batch import FEET
+from pupper_sysid.sim.walking.rewards import DIAGONALS, Rewards
+
+Array = NDArray[np.float64]
+
+_TOUCH_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
+_STRIDE_S = 0.2  # time constant of the average over a stride
+
+
+class Strides:
+    """Counters of n robots.
+
+    Parameters
+    ----------
+    robots : int
+    span_s : float
+        Control step [s].
+    rewards : Rewards
+        Whose `clock_hz`, `clock_pull_hz` and `clock_height` count.
+
+    Attributes
+    ----------
+    air_s, stance_s : ndarray, shape (n, 4)
+        Time that each foot has been in the air, on the ground; 0 if it is not.
+    velocity : ndarray, shape (n, 3)
+        Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
+    phase : ndarray, shape (n,)
+        φ, of a trot's clock, from 0 to 1: left front and right rear are to be up in its first
+        half, the others in its second. A phase-locked loop: it runs at `clock_hz` and follows what
+        diagonal pairs do in turn, x, the difference of their heights as shares of `clock_height`
+        (-1 to 1), by 2·`clock_pull_hz`·x·cos 2πφ. Feet that step as x = sin 2πft draw it along for
+        f within `clock_pull_hz` of `clock_hz`; at other rates it passes them by.
+    in_time : ndarray, shape (n,)
+        2x·sin 2πφ, averaged over about a stride: 1 for such feet.
+    """
+
+    def __init__(self, robots: int, span_s: float, rewards: Rewards):
+        self._span, self._rewards = span_s, rewards
+        self.air_s, self.stance_s = np.zeros((2, robots, FEET))
+        self._last_air, self._last_stance = np.zeros((2, robots, FEET))
+        self._feet_at = np.zeros((robots, FEET, 2))
+        self.velocity = np.zeros((robots, 3))
+        self.phase, self.in_time = np.zeros((2, robots))
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Everything that changes, live."""
+        return {
+            "air_s": self.air_s, "stance_s": self.stance_s, "last_air_s": self._last_air,
+            "last_stance_s": self._last_stance, "feet_at": self._feet_at,
+            "velocity": self.velocity, "phase": self.phase, "in_time": self.in_time,
+        }  # fmt: skip
+
+    def clock(self, rows: slice) -> Array:
+        """Cosine and sine of the phase, and `in_time`, of some robots, shape (k, 3)."""
+        angle = 2 * np.pi * self.phase[rows]
+        return np.column_stack([np.cos(angle), np.sin(angle), self.in_time[rows]])
+
+    def reset(self, ids: NDArray[np.intp], feet_at: Array, velocity: Array) -> None:
+        """Begin anew with some robots, whose feet are there and whose trunks move so."""
+        for value in (
+            self.air_s, self.stance_s, self._last_air, self._last_stance, self.phase,
+            self.in_time,
+        ):  # fmt: skip
+            value[ids] = 0.0
+        self._feet_at[ids], self.velocity[ids] = feet_at, velocity
+
+    def advance(
+        self,
+        rows: slice,
+        touch: Array,
+        feet: tuple[Array, Array],
+        velocity: Array,
+        facts: dict[str, Any],
+    ) -> None:
+        """Let one control step pass for robots `rows`, and write what happened into `facts`.
+
+        Parameters
+        ----------
+        rows : slice
+        touch : ndarray, shape (k, 4)
+            Forces of the ground on the feet at the end of the step [N].
+        feet : (ndarray, ndarray), shapes (k, 4, 2) and (k, 4)
+            Places of the soles, heights above the ground [m].
+        velocity : ndarray, shape (k, 3)
+            Forward and sideways speed and turn rate of the trunk [m/s, rad/s].
+        facts : dict of str to ndarray
+            Of a `rewards.Step`, for these robots.
+        """
+        span, (at, height) = self._span, feet
+        np.greater(touch, _TOUCH_N, out=facts["contact"])
+        np.logical_and(facts["contact"], self.air_s[rows] > 0, out=facts["landed"])
+        np.logical_and(~facts["contact"], self.stance_s[rows] > 0, out=facts["lifted"])
+        self._count(rows, facts["contact"])
+        moved = at - self._feet_at[rows]
+        self._feet_at[rows] = at
+        moved *= moved
+        np.sqrt(moved.sum(axis=-1), out=facts["foot_speed_m_s"])
+        facts["foot_speed_m_s"] /= span
+        facts["foot_height_m"][:] = height
+        self.velocity[rows] += span / _STRIDE_S * (velocity - self.velocity[rows])
+        self._tick(rows, height)
+        for name, value in (
+            ("air_s", self.air_s), ("contact_s", self.stance_s), ("last_air_s", self._last_air),
+            ("last_contact_s", self._last_stance), ("stride_velocity", self.velocity),
+        ):  # fmt: skip
+            facts[name][:] = value[rows]
+        facts["clock"][:] = self.clock(rows)
+
+    def _count(self, rows: slice, contact: NDArray[np.bool_]) -> None:
+        air, stance = self.air_s[rows], self.stance_s[rows]
+        np.copyto(self._last_air[rows], air, where=contact & (air > 0))
+        np.copyto(self._last_stance[rows], stance, where=~contact & (stance > 0))
+        air += self._span
+        stance += self._span
+        air[contact] = 0.0
+        stance[~contact] = 0.0
+
+    def _tick(self, rows: slice, height: Array) -> None:
+        rewards = self._rewards
+        share = np.clip(height / rewards.clock_height, 0.0, 1.0)
+        (a, b), (c, d) = DIAGONALS
+        swing = 0.5 * (share[:, a] + share[:, b] - share[:, c] - share[:, d])
+        phase, in_time = self.phase[rows], self.in_time[rows]
+        angle = 2 * np.pi * phase
+        in_time += self._span / _STRIDE_S * (2 * swing * np.sin(angle) - in_time)
+        phase += self._span * rewards.clock_hz
+        phase += 2 * self._span * rewards.clock_pull_hz * swing * np.cos(angle)
+        phase %= 1.0
