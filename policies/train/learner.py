@@ -38,7 +38,7 @@ from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
-CHECKPOINT_VERSION = 2
+CHECKPOINT_VERSION = 3
 _ANOTHER = "Resume from another checkpoint of the run."
 _PARTS = (
     "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
@@ -398,9 +398,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is damaged and cannot be read. {_ANOTHER}") from error
     if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
         raise InputError(f"{path} is not a checkpoint of pupper-train.")
-    if content.get("schema_version") == 1:
+    if content.get("schema_version") in (1, 2):
         raise InputError(
-            f"{path} is of an older version of pupper-train, whose exploration was another: this "
+            f"{path} is of an older version of pupper-train, whose critic saw other things: this "
             "one cannot go on with it. Its policies can be played and evaluated; train anew."
         )
     refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)

@@ -122,7 +122,8 @@ class Curriculum:
     penalties: Ramp = Ramp()
     """On rewards of negative weight."""
     guides: Ramp = Ramp()
-    """On the rewards that lead to a first gait: `progress`, `turn_progress` and `gait`."""
+    """On the rewards that lead to a first gait: `progress`, `turn_progress`, `clock` and
+    `gait`."""
     linear_sigma: Ramp = Ramp()
     """On the widths of the speed's tracking terms."""
     angular_sigma: Ramp = Ramp()

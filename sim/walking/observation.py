@@ -104,12 +104,13 @@ def privileged_of(
         strength of the legs and of the battery relative to the model, errors of the joints' zeros
         [rad], rotation of the IMU [rad], errors of its rates [rad/s], its latency and period [s],
         factors on the readings' periods and on the commands' jitter with whether efforts are read,
-        clock of a trot (see `Strides`), share of the episode that is left: the parts of `PRIVILEGED`.
+        clock of a trot (see `Strides`), share of the episode that is left: the parts of
+        `PRIVILEGED`.
     out : ndarray of float32, shape (n, 85), optional
         Where to write it.
     """
-    velocity, angle, speed, height, air, stance, friction, dead_time, *differs, clock, left = parts
-    mass, centre, legs, battery, zero, turn, bias, age, factors = differs
+    velocity, angle, speed, height, air, stance, friction, dead_time, *differs = parts
+    mass, centre, legs, battery, zero, turn, bias, age, factors, clock, left = differs
     if out is None:
         out = np.empty((len(velocity), PRIVILEGED_SIZE), np.float32)
     scaled = [velocity, angle, 0.1 * speed, 10 * height, air, stance.clip(0, 1), friction]

@@ -242,7 +242,7 @@ def stride_angular_velocity(s: Step, p: Rewards) -> Array:
 
 
 def progress(s: Step, p: Rewards) -> Array:
-    """Share of the commanded speed by which the mean over a stride is nearer to it than 0, -1 to 1."""
+    """Share of the commanded speed by which the mean over a stride is nearer than 0, -1 to 1."""
     return _nearer(s.command[:, :2], s.stride_velocity[:, :2], _SLOW[0]) * _stepping(s, p)
 
 
@@ -309,7 +309,8 @@ def gait(s: Step, p: Rewards) -> Array:
 
 def clock(s: Step, p: Rewards) -> Array:
     """Sum over feet of their height, as a share of `clock_height`, times how far the clock wants
-    them up (1) or down (-1 and less); 0 for a robot that stands, or is to."""
+    them up (1) or down (-1 and less); 0 for a robot that stands, or is to.
+    """
     up = s.clock[:, 1:2] * _TURNS - np.sin(np.pi * (p.clock_duty - 0.5))
     share = np.clip(s.foot_height_m / p.clock_height, 0.0, 1.0)
     return np.where(np.abs(s.command).max(axis=1) > 0, (up * share).sum(axis=1), 0.0)

@@ -312,6 +312,8 @@ def test_what_is_no_checkpoint_or_of_another_version_or_incomplete_is_refused(tm
     good = torch.load(path, weights_only=True)
     for change, words in [
         ({"schema": "something else"}, "not a checkpoint"),
+        ({"schema_version": 1}, "older version"),
+        ({"schema_version": 2}, "older version"),
         ({"schema_version": CHECKPOINT_VERSION + 1}, f"reads {CHECKPOINT_VERSION}). Upgrade"),
     ]:
         torch.save(good | change, path)

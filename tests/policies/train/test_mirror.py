@@ -44,6 +44,7 @@ def test_a_robot_with_mirrored_commands_and_actions_sees_the_mirror_image():
     servos = replace(servos, low=servos.value, high=servos.value)
     env = PupperEnv(task, servos, 2, seed=0, threads=1)
     env.set_command(np.array([[0.1, 0.05, 0.3], [0.1, -0.05, -0.3]]))
+    env._strides.phase[1] = 0.5  # the mirrored clock
     pose = torch.from_numpy(np.random.default_rng(1).uniform(-0.5, 0.5, 12))
     for k in range(10):
         action = pose * k / 20
@@ -57,9 +58,9 @@ def test_a_robot_with_mirrored_commands_and_actions_sees_the_mirror_image():
 
 def test_the_image_of_an_image_is_the_original():
     seen = observations(5, torch.Generator().manual_seed(0))
-    privileged = torch.randn(5, 82)
+    privileged = torch.randn(5, 85)
     for name, values in (*seen.items(), ("privileged", privileged)):
-        if values.shape[1] in (60, 82, 12, 12 * HISTORY):
+        if values.shape[1] in (60, 85, 12, 12 * HISTORY):
             assert torch.equal(mirrored(mirrored(values, name), name), values)
             assert not torch.equal(mirrored(values, name), values)
 

@@ -537,7 +537,9 @@ def test_the_teachers_commands_are_corrected_until_the_policy_walks_at_the_given
     for _ in range(60):
         env.command[:], env.episode_step[:] = draw(), 1
         for _ in range(80):
-            env._average[:] = walked(env.command) + rng.normal(0, [0.02, 0.02, 0.1], (200, 3))
+            env._strides.velocity[:] = walked(env.command) + rng.normal(
+                0, [0.02, 0.02, 0.1], (200, 3)
+            )
             teacher.watch()
         teacher.adapt(0.2)
     assert (error() < 0.2 * before).all()
@@ -547,7 +549,7 @@ def test_speeds_count_from_a_second_after_a_new_command_on():
     env = make_env(tiny_run(environments=1, task=Walking()), Ranks())
     teacher = Teacher(env)
     env.command[:], env.episode_step[:] = (0.1, 0.0, 0.0), 1
-    env._average[:] = (0.05, 0.0, 0.0)
+    env._strides.velocity[:] = (0.05, 0.0, 0.0)
     for _ in range(50):
         teacher.watch()
     assert sum(len(e) for e in teacher._errors) == 0

@@ -34,7 +34,7 @@ from pupper_sysid.sim.walking.config import (
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
-from pupper_sysid.sim.walking.rewards import TERMS, Rewards
+from pupper_sysid.sim.walking.rewards import TERMS, Rewards, progress
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from pupper_sysid.sim.walking.step import StepResult
 from support.robot_in_air import error_in_air, lags_in_air
@@ -224,7 +224,7 @@ def test_an_observation_is_sixty_named_numbers_in_the_published_order():
     env = make()
     observation, privileged = env.reset()
     assert observation.shape == (4, 60) and observation.dtype == np.float32
-    assert privileged.shape == (4, 82) and privileged.dtype == np.float32
+    assert privileged.shape == (4, 85) and privileged.dtype == np.float32
 
 
 def test_the_last_action_is_seen_raw_and_the_command_as_given():
@@ -738,11 +738,12 @@ def test_the_curriculum_changes_delay_commands_penalties_guides_and_widths():
     def facts() -> tuple[float, float, float, float]:
         env.reset()
         delay, forward = drawn_field(env, "actuator_delay")[0, 0], env.command[0, 0]
+        env._strides.velocity[:, 0] = 0.02
         found = env.step(still(env) + 0.1)
         speed = found.facts.linear_velocity[0, :2]
         away = np.hypot(forward - speed[0], speed[1])
         width = -away / np.log(found.terms["base_linear_velocity"][0] / SPAN)
-        guide = found.terms["progress"][0] / (SPAN * np.clip(speed[0] / forward, -1, 1))
+        guide = found.terms["progress"][0] / (SPAN * progress(found.facts, rewards)[0])
         assert guide == pytest.approx(0.5 if env.steps == 1 else 2.0)
         return delay, forward, found.terms["action_rate"][0], width
 

@@ -26,6 +26,7 @@ SIZES = {
     "angular_velocity": 3,
     "gravity": 3,
     "stride_velocity": 3,
+    "clock": 3,
     "contact": 4,
     "air_s": 4,
     "contact_s": 4,
@@ -64,14 +65,49 @@ EXPONENTIAL = replace(
 GAUSSIAN = replace(EXPONENTIAL, tracking_shape="gaussian")
 
 
-def test_progress_is_the_share_of_the_commanded_speed_along_the_command():
-    s = step(command=(0.12, -0.16, 0.0), linear_velocity=(0.06, -0.08, 9.0))
-    assert wr.progress(s, P)[0] == pytest.approx(0.5)
-    assert wr.progress(step(command=FORWARD, linear_velocity=(-1.0, 0, 0)), P)[0] == -1.0
-    assert wr.progress(step(linear_velocity=(1.0, 0, 0)), P)[0] == 0.0
-    turning = step(command=(0, 0, -0.4), angular_velocity=(0, 0, -0.1))
-    assert wr.turn_progress(turning, P)[0] == pytest.approx(0.25)
-    assert wr.turn_progress(step(angular_velocity=(0, 0, 1.0)), P)[0] == 0.0
+def test_progress_is_how_much_nearer_to_the_command_than_standing():
+    s = step(command=(0.12, -0.16, 0.0), stride_velocity=(0.06, -0.08, 9.0))
+    assert wr.progress(s, P)[0] == pytest.approx(0.1 / np.hypot(0.2, 0.05))
+    assert wr.progress(step(command=FORWARD, stride_velocity=(-1.0, 0, 0)), P)[0] == -1.0
+    assert wr.progress(step(command=FORWARD), P)[0] == 0.0
+    assert wr.progress(step(stride_velocity=(1.0, 0, 0)), P)[0] == 0.0
+    turning = step(command=(0, 0, -0.4), stride_velocity=(0, 0, -0.1))
+    assert wr.turn_progress(turning, P)[0] == pytest.approx(0.1 / np.hypot(0.4, 0.15))
+    assert wr.turn_progress(step(stride_velocity=(0, 0, 1.0)), P)[0] == 0.0
+
+
+@pytest.mark.parametrize("too_fast", [1.5, 2.0])
+def test_going_too_fast_pays_no_more_than_going_too_slow(too_fast: float):
+    fast = step(command=(0.2, 0, 0.4), stride_velocity=(0.2 * too_fast, 0, 0.4 * too_fast))
+    slow = step(
+        command=(0.2, 0, 0.4), stride_velocity=(0.2 * (2 - too_fast), 0, 0.4 * (2 - too_fast))
+    )
+    for term in (wr.progress, wr.turn_progress):
+        assert term(fast, P)[0] == pytest.approx(term(slow, P)[0])
+
+
+def test_progress_may_pay_only_in_time_with_the_clock():
+    p = replace(P, progress_in_time=True)
+    for in_time, pays in ((0.25, 0.25), (-0.5, 0.0), (1.2, 1.0)):
+        s = step(command=FORWARD, stride_velocity=(0.1, 0, 0), clock=(1.0, 0.0, in_time))
+        assert wr.progress(s, p)[0] == pytest.approx(pays * wr.progress(s, P)[0])
+
+
+def test_the_clock_pays_feet_that_are_up_in_their_half_and_charges_others():
+    p = replace(P, clock_duty=0.5, clock_height=0.01)
+    up = {"command": FORWARD, "foot_height_m": (0.005, 0.0, 0.0, 0.02)}
+    assert wr.clock(step(clock=(0.0, 1.0, 0.0), **up), p)[0] == pytest.approx(1.5)
+    assert wr.clock(step(clock=(0.0, -1.0, 0.0), **up), p)[0] == pytest.approx(-1.5)
+    assert wr.clock(step(clock=(0.0, 1.0, 0.0), foot_height_m=0.02), p)[0] == 0.0
+    assert wr.clock(step(clock=(0.0, 1.0, 0.0), command=FORWARD), p)[0] == 0.0
+    # what pays is the time in which the clock is above the limit
+    turn = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    p = replace(p, clock_duty=0.6)
+    wanted = [
+        wr.clock(step(command=FORWARD, clock=(0, y, 0), foot_height_m=(0.02, 0, 0, 0)), p)[0] > 0
+        for y in np.sin(turn)
+    ]
+    assert np.mean(wanted) == pytest.approx(0.4, abs=0.002)
 
 
 def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
@@ -88,7 +124,7 @@ def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
 
 
 def test_a_curriculum_fades_guides_alone_and_widens_what_tracks():
-    s = step(command=FORWARD, linear_velocity=(0.2, 0, 0), action=1.0)
+    s = step(command=FORWARD, stride_velocity=(0.2, 0, 0), action=1.0)
     p = replace(P, progress=2.0)
     whole, faded = weighted(s, p), weighted(s, p, guides=0.5)
     assert faded["progress"][0] == 0.5 * whole["progress"][0]
