@@ -63,7 +63,7 @@ class Strides:
             "velocity": self.velocity, "phase": self.phase, "in_time": self.in_time,
         }  # fmt: skip
 
-    def clock(self, rows: slice) -> Array:
+    def clock(self, rows: slice | NDArray[np.intp]) -> Array:
         """Cosine and sine of the phase, and `in_time`, of some robots, shape (k, 3)."""
         angle = 2 * np.pi * self.phase[rows]
         return np.column_stack([np.cos(angle), np.sin(angle), self.in_time[rows]])
