@@ -308,8 +308,9 @@ def gait(s: Step, p: Rewards) -> Array:
 
 
 def clock(s: Step, p: Rewards) -> Array:
-    """Sum over feet of their height, as a share of `clock_height`, times how far the clock wants
-    them up (1) or down (-1 and less); 0 for a robot that stands, or is to.
+    """Heights of feet, as shares of `clock_height`, times how far the clock wants them up.
+
+    That is 1 to -1 and less; the sum is 0 for a robot that stands, or is to.
     """
     up = s.clock[:, 1:2] * _TURNS - np.sin(np.pi * (p.clock_duty - 0.5))
     share = np.clip(s.foot_height_m / p.clock_height, 0.0, 1.0)
