@@ -27,7 +27,7 @@ from pupper_sysid.policies.network.hyperparameters import (
 )
 from pupper_sysid.policies.train.ranges import refuse_impossible
 from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
-from pupper_sysid.sim.walking.rewards import Rewards
+from pupper_sysid.sim.walking.rewards.weights import Rewards
 
 Start = Literal["imitation", "scratch"]
 """How a policy comes to its first gait."""

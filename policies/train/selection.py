@@ -80,8 +80,8 @@ class Judge:
             velocity) minus the share of falls. Beside it `score_falls`, the mean absolute errors
             `score_vx_m_s`, `score_vy_m_s` and `score_yaw_rad_s`, and `score_turn`, the turn rate
             over the commanded one where robots are to turn on the spot; of those that are to move,
-            `score_steps_hz`, how often each foot comes down per second, and `score_duty`, the share
-            of the time that it is on the ground.
+            `score_steps_hz`, how often each foot comes down per second, bounces included, and
+            `score_duty`, the share of the time that it is on the ground.
         """
         env = self._env
         env.restore(self._start)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pupper_sysid.policies.walks.handicaps import Handicap
 from pupper_sysid.sim.walking.config import Commands, Curriculum, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.rewards import Step
+from pupper_sysid.sim.walking.step import Step
 
 Array = NDArray[np.float64]
 Kept = TypeVar("Kept", covariant=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sim.walking.rewards import Step
+from pupper_sysid.sim.walking.step import Step
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -15,7 +15,7 @@ from pupper_sysid.sim.robot.mini_pupper import Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
-from pupper_sysid.sim.walking.rewards import DEFAULT, PAPER, RELEASE, Rewards
+from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards
 
 EVALUATION_STEP_S = 0.002
 """Longest time step of the physics in which policies are evaluated."""

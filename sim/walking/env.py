@@ -21,7 +21,6 @@ from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
 from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity
 from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
-from pupper_sysid.sim.walking import rewards as walking_rewards
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
 from pupper_sysid.sim.walking.held_readings import HeldReadings
@@ -35,10 +34,12 @@ from pupper_sysid.sim.walking.observation import (
     observed,
     privileged_of,
 )
+from pupper_sysid.sim.walking.rewards.strides import Strides
+from pupper_sysid.sim.walking.rewards.terms import weighted
+from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
-from pupper_sysid.sim.walking.step import StepResult, Unfinished, empty_facts
-from pupper_sysid.sim.walking.strides import Strides
+from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts
 
 Array = NDArray[np.float64]
 
@@ -236,7 +237,7 @@ class PupperEnv:
             self._restart(over)
             noise = None if now.noise is None else now.noise[over]
             now.observation[over], now.privileged[over] = self._look(over, noise)
-        facts = walking_rewards.Step(**now.facts)
+        facts = Step(**now.facts)
         return StepResult(
             now.observation, now.privileged, reward, done, timed_out, now.terms, terminal, facts
         )
@@ -306,11 +307,9 @@ class PupperEnv:
             self.level = level
             self._rewards = self._rewards_now()
 
-    def _rewards_now(self) -> walking_rewards.Rewards:
+    def _rewards_now(self) -> Rewards:
         level = self.level
-        return walking_rewards.narrowed(
-            self.config.rewards, level.linear_sigma, level.angular_sigma
-        )
+        return narrowed(self.config.rewards, level.linear_sigma, level.angular_sigma)
 
     # ------------------------------------------------------------------------- one step
 
@@ -358,10 +357,8 @@ class PupperEnv:
         facts["velocity"][:] = qvel[:, 6:]
         np.subtract(qvel[:, 6:], now.velocity_before[rows], out=facts["acceleration"])
         facts["acceleration"] /= span
-        step = walking_rewards.Step(**facts)
-        terms = walking_rewards.weighted(
-            step, self._rewards, self.level.penalties, self.level.guides
-        )
+        step = Step(**facts)
+        terms = weighted(step, self._rewards, self.level.penalties, self.level.guides)
         for name, term in terms.items():
             whole = now.terms.setdefault(name, np.empty(self.environments))
             np.multiply(term, span, out=whole[rows])

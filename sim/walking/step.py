@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.sim.robot.robot_batch import FEET
-from pupper_sysid.sim.walking.rewards import Step
 
 Array = NDArray[np.float64]
 
@@ -20,6 +19,65 @@ _COLUMNS = {
     "stride_velocity": 3, "clock": 3,
 }  # fmt: skip
 _FLAGS = ("contact", "landed", "lifted")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happened in one control step, for all environments.
+
+    Attributes
+    ----------
+    command : ndarray, shape (n, 3)
+        Forward and sideways speed [m/s], turn rate [rad/s].
+    linear_velocity, angular_velocity, gravity : ndarray, shape (n, 3)
+        Of the trunk, in its own frame [m/s, rad/s, unit vector].
+    position_relative, velocity, acceleration, torque : ndarray, shape (n, 12)
+        Of the joints, from the default pose [rad, rad/s, rad/s², N·m].
+    action, last_action, earlier_action : ndarray, shape (n, 12)
+        Raw outputs of the policy: this, the one before, and the one before that.
+    contact : ndarray of bool, shape (n, 4)
+    air_s, contact_s : ndarray, shape (n, 4)
+        Time that each foot has been in the air, on the ground; 0 if it is not.
+    last_air_s, last_contact_s : ndarray, shape (n, 4)
+        Duration of the last swing and stance.
+    landed, lifted : ndarray of bool, shape (n, 4)
+        Feet that came down, or left the ground, in this step.
+    stride_velocity : ndarray, shape (n, 3)
+        Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
+    foot_height_m, foot_speed_m_s : ndarray, shape (n, 4)
+        Of the sole above the ground; of the foot along it.
+    clock : ndarray, shape (n, 3)
+        Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1
+        to 1; see `Strides`.
+    """
+
+    command: Array
+    linear_velocity: Array
+    angular_velocity: Array
+    gravity: Array
+    position_relative: Array
+    velocity: Array
+    acceleration: Array
+    torque: Array
+    action: Array
+    last_action: Array
+    earlier_action: Array
+    contact: NDArray[np.bool_]
+    air_s: Array
+    contact_s: Array
+    last_air_s: Array
+    last_contact_s: Array
+    landed: NDArray[np.bool_]
+    lifted: NDArray[np.bool_]
+    foot_height_m: Array
+    foot_speed_m_s: Array
+    stride_velocity: Array
+    clock: Array
+
+    def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
+        """Whether a robot is commanded to move, or moves, shape (n,)."""
+        commanded = np.abs(self.command).max(axis=1) > 0
+        return commanded | (np.linalg.norm(self.linear_velocity[:, :2], axis=1) > threshold_m_s)
 
 
 @dataclass(frozen=True)
@@ -71,7 +129,7 @@ class Unfinished:
 def empty_facts(
     command: Array, action: Array, last_action: Array, earlier_action: Array
 ) -> dict[str, Any]:
-    """Arrays of a `rewards.Step` that are to be filled in; the given ones are copied."""
+    """Arrays of a `Step` that are to be filled in; the given ones are copied."""
     found: dict[str, Any] = {
         "command": command.copy(), "action": action.copy(), "last_action": last_action.copy(),
         "earlier_action": earlier_action.copy(),

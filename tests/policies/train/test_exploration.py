@@ -15,6 +15,7 @@ from pupper_sysid.policies.network.hyperparameters import Exploration, Hyperpara
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.selection import Judge
 from pupper_sysid.policies.train.training import make_learner
+from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import CALIBRATION, tiny_run
@@ -144,6 +145,35 @@ def test_a_policy_is_judged_without_noise_and_always_on_the_same_walks():
     assert judge(learner.actor) != first
 
 
+class TrotActor:
+    """Open-loop trot in place of a policy's network."""
+
+    def __init__(self, judge: Judge, task: Walking):
+        self._trot, self._command, self._task = task.trot, judge._command, task
+        self._phase = 0.0
+
+    def get_hidden_state(self) -> None:
+        return None
+
+    def reset(self, dones: torch.Tensor | None = None, hidden_state: object = None) -> None:
+        pass
+
+    def __call__(self, observations: object) -> torch.Tensor:
+        self._phase += 2 * np.pi * self._trot.frequency_hz * self._task.control_step_s
+        joints = self._trot.joints(np.full(len(self._command), self._phase), self._command)
+        return torch.from_numpy((joints - default_pose()) / self._task.action_scale).float()
+
+
+def test_the_judge_counts_the_steps_of_a_trot():
+    task = Walking()
+    judge = Judge(task, servo_ranges("paper", "ideal"), 0, 1)
+    found = judge(TrotActor(judge, task))  # type: ignore[arg-type]
+    assert found["score_falls"] == 0
+    # feet that bounce come down twice
+    assert task.trot.frequency_hz <= found["score_steps_hz"] < 1.25 * task.trot.frequency_hz
+    assert 0.5 < found["score_duty"] < 0.9
+
+
 def test_a_robot_that_stands_scores_about_nothing_and_one_that_falls_less():
     learner = make_learner(tiny_run(), Ranks())
     judge = Judge(Walking(episode_s=2.0), learner.env.env.servos, 0, 1)
@@ -154,6 +184,7 @@ def test_a_robot_that_stands_scores_about_nothing_and_one_that_falls_less():
     standing = judge(learner.actor)
     assert standing["score"] == pytest.approx(0.0, abs=0.1) and standing["score_falls"] == 0
     assert standing["score_turn"] == pytest.approx(0.0, abs=0.1)
+    assert standing["score_steps_hz"] < 0.1 and standing["score_duty"] > 0.7
     with torch.no_grad():
         last.bias.copy_(torch.tensor([2.0, 2.0, 2.0] * 2 + [-2.0, -2.0, 0.0] * 2))
     fallen = judge(learner.actor)

@@ -34,7 +34,8 @@ from pupper_sysid.sim.walking.config import (
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
-from pupper_sysid.sim.walking.rewards import TERMS, Rewards, progress
+from pupper_sysid.sim.walking.rewards.terms import TERMS, progress
+from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from pupper_sysid.sim.walking.step import StepResult
 from support.robot_in_air import error_in_air, lags_in_air

@@ -8,17 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pupper_sysid.sim.walking import rewards as wr
 from pupper_sysid.sim.walking.config import PRESETS
-from pupper_sysid.sim.walking.rewards import (
-    DEFAULT,
-    PAPER,
-    RELEASE,
-    TERMS,
-    Rewards,
-    Step,
-    weighted,
-)
+from pupper_sysid.sim.walking.rewards import terms as wr
+from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
+from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards, narrowed
+from pupper_sysid.sim.walking.step import Step
 
 SIZES = {
     "command": 3,
@@ -131,7 +125,7 @@ def test_a_curriculum_fades_guides_alone_and_widens_what_tracks():
     assert {k: v[0] for k, v in faded.items() if k not in wr.GUIDES} == {
         k: v[0] for k, v in whole.items() if k not in wr.GUIDES
     }
-    wide = wr.narrowed(p, 2.0, 3.0)
+    wide = narrowed(p, 2.0, 3.0)
     assert (wide.linear_sigma, wide.stride_linear_sigma) == (
         2 * p.linear_sigma, 2 * p.stride_linear_sigma
     )  # fmt: skip

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.sim.walking.rewards import Rewards
+from pupper_sysid.sim.walking.rewards.strides import Strides
+from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.step import empty_facts
-from pupper_sysid.sim.walking.strides import Strides
 
 SPAN = 0.02
 WHOLE = slice(None)

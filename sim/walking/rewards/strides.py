@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.sim.robot.robot_batch import FEET
-from pupper_sysid.sim.walking.rewards import DIAGONALS, Rewards
+from pupper_sysid.sim.walking.rewards.terms import DIAGONALS
+from pupper_sysid.sim.walking.rewards.weights import Rewards
 
 Array = NDArray[np.float64]
 
@@ -97,7 +98,7 @@ class Strides:
         velocity : ndarray, shape (k, 3)
             Forward and sideways speed and turn rate of the trunk [m/s, rad/s].
         facts : dict of str to ndarray
-            Of a `rewards.Step`, for these robots.
+            Of a `Step`, for these robots.
         """
         span, (at, height) = self._span, feet
         np.greater(touch, _TOUCH_N, out=facts["contact"])

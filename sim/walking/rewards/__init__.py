@@ -1,0 +1,1 @@
+"""Rewards of the walking task: weights, terms, and what they know of the last strides."""
