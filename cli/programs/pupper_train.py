@@ -48,8 +48,10 @@ class Options:
     preset: Preset = "fast"
     """`fast`: sizes, task and rewards for a few cores; `paper`, `release`: as published."""
     start: Start = "imitation"
-    """`imitation`: learn to continue a trot, then improve it; `scratch`: find a walk from nothing.
-    The published presets always start from nothing."""
+    """`imitation`: learn to continue a trot, then improve it; `scratch`: find a walk from nothing,
+    with a teacher that sees the true state, then learn to walk like it from what the robot sees;
+    `teacher`: that teacher alone, for `--imitation.teacher runs/NAME`. The published presets always
+    start from nothing."""
     name: str | None = None
     """Name of the run's folder in runs/; by default policy, date and time."""
     resume: Path | None = None
@@ -170,14 +172,14 @@ def _bar() -> Iterator:
 
         def watch(now) -> None:
             if now.phase == "imitation":
-                what = f"difference to the trot {now.row['difference']:.3f}"
+                what = f"difference to the teacher {now.row['difference']:.3f}"
             else:
                 what = (
                     f"score {now.row['score']:.2f}, reward {now.row['reward'] * 50:.2f}/s, "
                     f"std {now.row['std']:.3f}, rate {now.row['learning_rate']:.1e}, "
                     f"KL {now.row['kl']:.3f}, clipped {100 * now.row['clip_fraction']:.0f} %"
                 )
-            label = {"imitation": "first gait", "ppo": "PPO"}[now.phase]
+            label = {"teacher": "teacher", "imitation": "first gait", "ppo": "PPO"}[now.phase]
             left = f"{now.left_s / 60:.0f} min left"
             bar.update(
                 task, description=label, completed=now.done, total=now.total, what=what, left=left

@@ -42,6 +42,8 @@ def build(
     actor_groups = ["policy"]
     if architecture.kind == "mlp-actions":
         actor_groups.append("actions")
+    if architecture.privileged_actor:
+        actor_groups.append("privileged")
     critic_groups = ["policy", "noise"]
     if architecture.privileged_critic:
         critic_groups.append("privileged")

@@ -27,6 +27,9 @@ class Architecture:
     """Units of the layers of the critic."""
     privileged_critic: bool = True
     """Whether the critic has the true state beside the observation."""
+    privileged_actor: bool = False
+    """Whether the policy has it, too, and with it the clock of the reward: a teacher, which no
+    robot can follow, for policies that can (`--start scratch`)."""
 
     def __post_init__(self):
         for name in ("hidden", "critic_hidden"):
@@ -123,12 +126,18 @@ class Hyperparameters:
                 raise InputError(f"learner.{name} is {getattr(self, name)}; it must be at least 1.")
 
 
+TROT, OWN = "trot", "own"
+
+
 @dataclass(frozen=True)
 class Imitation:
     """Settings of the first gait's imitation."""
 
     iterations: int = 12
     """Rounds; 0 to start PPO from random weights."""
+    teacher: str = TROT
+    """`trot`: the open-loop trot; `own`: one that is trained from nothing first, in the run's
+    folder `teacher/`; or the folder of a run of `--start teacher`."""
     rollouts: int = 5
     """Rollouts per round, each of as many steps as one of PPO."""
     epochs: int = 10

@@ -19,6 +19,7 @@ from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import Place
 from pupper_sysid.policies.network.hyperparameters import (
+    OWN,
     Architecture,
     Exploration,
     Hyperparameters,
@@ -29,8 +30,9 @@ from pupper_sysid.policies.train.ranges import refuse_impossible
 from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 
-Start = Literal["imitation", "scratch"]
-"""How a policy comes to its first gait."""
+Start = Literal["imitation", "scratch", "teacher"]
+"""How a policy comes to its first gait: by imitation of a trot, or of a teacher that was trained
+from nothing; or whether it is that teacher."""
 
 Device = Literal["cpu", "cuda", "warp-cpu"]
 LearnerDevice = Literal["as-device", "cpu", "cuda"]
@@ -38,6 +40,7 @@ LearnerDevice = Literal["as-device", "cpu", "cuda"]
 RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 2
 RUN_FILE = "run.yaml"
+_TEACHING = 0.6  # of a run's time: the most that its own teacher may take
 _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
     Hyperparameters: {"initial_std"},
@@ -90,7 +93,10 @@ def preset(
     nothing.
     """
     if name == "fast":
-        return _first_gait_imitated(kind) if start == "imitation" else _from_scratch(kind)
+        if start == "teacher":
+            return _teacher(kind)
+        run = _first_gait_imitated(kind)
+        return run if start == "imitation" else _from_scratch(run)
     wide = (512, 256, 128)
     return Run(
         architecture=Architecture(kind, wide, 128, wide, privileged_critic=False),
@@ -120,15 +126,30 @@ def _first_gait_imitated(kind: Kind) -> Run:
     )  # fmt: skip
 
 
-def _from_scratch(kind: Kind) -> Run:
+def _from_scratch(run: Run) -> Run:
+    return replace(run, imitation=replace(run.imitation, teacher=OWN), minutes=90.0)
+
+
+def _teacher(kind: Kind) -> Run:
     return Run(
-        architecture=Architecture(kind, (128, 64), 64, (128, 64)), task=PRESETS["scratch"],
+        architecture=Architecture(kind, (128, 64), 64, (128, 64), privileged_actor=True),
+        task=PRESETS["scratch"],
         learner=Hyperparameters(
-            steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.015,
-            exploration=Exploration((0.5, 0.04), (1.5, 18.0), 0.08),
+            steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.02,
+            learning_rates=(1e-6, 2e-3),
+            exploration=Exploration((0.15, 0.04), (1.5, 10.0), 0.1),
             mirror=kind in ("mlp", "mlp-actions"),
         ),
-        imitation=Imitation(iterations=0), environments=1024, iterations=2500, minutes=90.0,
+        imitation=Imitation(iterations=0), environments=1024, iterations=1500, minutes=60.0,
+    )  # fmt: skip
+
+
+def teacher_of(run: Run) -> Run:
+    """Settings of the teacher that a run trains for itself: for the same robot."""
+    return replace(
+        _teacher("mlp"), actuator=run.actuator, feedback=run.feedback, threads=run.threads,
+        device=run.device, learner_device=run.learner_device, seed=run.seed,
+        minutes=_TEACHING * run.minutes,
     )  # fmt: skip
 
 

@@ -4,7 +4,8 @@
 `progress.csv` and TensorBoard events (one row per update), `last.pt` and `best.pt` (checkpoints,
 see `policies.train.learner`), and `policy_last/`, `policy_best/` (see
 `policies.network.policy_file`). The best has the highest score so far (`policies.train.selection`),
-imitation alone included.
+imitation alone included. A run that learns from a teacher of its own has that teacher's run in
+`teacher/`, which has no policies: they would see what no robot can.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,18 +25,28 @@ import torch
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.memory import keep_freed_memory
+from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
-from pupper_sysid.policies.train.imitation import Teacher, imitate
+from pupper_sysid.policies.train.imitation import imitate
 from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
-from pupper_sysid.policies.train.run_file import Run, refuse_taken, resume_run, save_run
+from pupper_sysid.policies.train.run_file import (
+    RUN_FILE,
+    Run,
+    refuse_taken,
+    resume_run,
+    save_run,
+    teacher_of,
+)
 from pupper_sysid.policies.train.selection import Judge
+from pupper_sysid.policies.train.teachers import LearnedTeacher, Teacher, TrotTeacher, load_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 
 LAST, BEST = "last.pt", "best.pt"
+_TEACHER = "teacher"
 _SAVE_EVERY = 10
 _JUDGE_EVERY = 25
 _GRACE_S = 0.7
@@ -45,7 +56,7 @@ _GRACE_S = 0.7
 class Progress:
     """Progress of a run, for its watcher."""
 
-    phase: Literal["imitation", "ppo"]
+    phase: Literal["teacher", "imitation", "ppo"]
     done: int
     total: int
     elapsed_s: float
@@ -152,10 +163,7 @@ def train(
             "with the present one, from its networks and poses, not exactly as it would have."
         )
     with _interruptible() as stop_requested:
-        session.learn_first_gait(stop_requested)
-        session.improve(stop_requested)
-        session.save(LAST)
-    session.finish()
+        session.go(stop_requested)
     return session.learner
 
 
@@ -203,10 +211,19 @@ class _Session:
         if self.ranks.rank == 0:
             save_run(self.folder, self.run)
 
+    def go(self, stop_requested: Callable[[], bool]) -> None:
+        """All that remains of the run, until its end or a stop; then everything is saved."""
+        self.learn_first_gait(stop_requested)
+        self.improve(stop_requested)
+        self.save(LAST)
+        self.finish()
+
     def learn_first_gait(self, stop_requested: Callable[[], bool]) -> None:
         """The remaining rounds of imitation."""
         learner, rounds = self.learner, self.run.imitation.iterations
-        teacher = Teacher(learner.env.env, self.counters.get("teacher"))
+        if self.counters["imitated"] >= rounds:
+            return
+        teacher = self.teacher(stop_requested)
         self.phase_began = time.monotonic()
         while self.counters["imitated"] < rounds and not self.ranks.any(stop_requested()):
             before = learner.networks()
@@ -216,6 +233,35 @@ class _Session:
             self.counters["teacher"] = teacher.state
             self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
             self.save(LAST)
+
+    def teacher(self, stop_requested: Callable[[], bool]) -> Teacher:
+        """Who shows the first gait; a teacher of the run's own is trained first, or to its end."""
+        learner, wanted = self.learner, self.run.imitation.teacher
+        state = self.counters.get("teacher")
+        if wanted == TROT:
+            return TrotTeacher(learner.env, state)
+        # a resumed run is to draw what it would have drawn
+        with torch.random.fork_rng(devices=[]):
+            folder = Path(wanted) if wanted != OWN else self._train_teacher(stop_requested)
+            network = load_teacher(folder, BEST, self.run, learner.observations)
+        return LearnedTeacher(learner.env, network, state)
+
+    def _train_teacher(self, stop_requested: Callable[[], bool]) -> Path:
+        folder = self.folder / _TEACHER
+        begun = (folder / RUN_FILE).is_file()
+        own = resume_run(folder, None, None) if begun else teacher_of(self.run)
+        session = _Session(folder, own, begun, self._watch_teacher)
+        session.go(stop_requested)
+        self.ranks.any(False)  # the first has written it
+        # its time is this run's, also where that was killed meanwhile
+        now = time.monotonic()
+        elapsed = max(now - self.started, session.counters["elapsed_s"])
+        self.counters["elapsed_s"], self.started = elapsed, now - elapsed
+        return folder
+
+    def _watch_teacher(self, progress: Progress) -> None:
+        if self.watch:
+            self.watch(replace(progress, phase="teacher"))
 
     def improve(self, stop_requested: Callable[[], bool]) -> None:
         """Updates of PPO, until they are done, time is up or a stop is requested."""
@@ -278,8 +324,8 @@ class _Session:
 
     def write_policy(self, name: str) -> None:
         """Write a policy folder."""
-        if self.ranks.rank != 0:
-            return
+        if self.ranks.rank != 0 or self.run.architecture.privileged_actor:
+            return  # what a robot cannot see is no policy for it
         servos = self.learner.env.env.servos
         about = {
             "iteration": self.learner.iteration, "imitation_rounds": self.counters["imitated"],

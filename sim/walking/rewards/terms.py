@@ -243,6 +243,8 @@ def weighted(
 
 
 def _tracking(error: Array, sigma: float, p: Rewards) -> Array:
+    if p.tracking_shape == "linear":
+        return np.maximum(1.0 - error / sigma, -1.0)
     if p.tracking_shape == "gaussian":
         return np.exp(-((error / sigma) ** 2))
     return np.exp(-error / sigma)

@@ -27,7 +27,8 @@ class Rewards:
     stride_angular_sigma: float = 0.2
     """σ of the mean turn rate's error [rad/s]."""
     tracking_shape: str = "exponential"
-    """`gaussian`: exp(-error²/σ²); `exponential`: exp(-error/σ), as published."""
+    """`gaussian`: exp(-error²/σ²); `exponential`: exp(-error/σ), as published; `linear`:
+    1 - error/σ, and -1 from 2 σ on, which pulls equally at errors of every size up to there."""
     linear_sigma: float = 0.1
     """σ of the speed error [m/s]."""
     angular_sigma: float = 0.3

@@ -15,7 +15,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -26,40 +25,14 @@ from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperpar
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.curves import PROGRESS
-from pupper_sysid.policies.train.imitation import Teacher, imitate
 from pupper_sysid.policies.train.learner import Learner, read_checkpoint
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import RUN_FILE, load_run, preset, save_run
-from pupper_sysid.policies.train.training import LAST, make_env, make_learner, train
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.policies.train.training import LAST, train
+from support.checkpoints import different, stop_after
 from support.tiny_training import ALL_KINDS, CALIBRATION, tiny_run
 
 # ------------------------------------------------------------------------------ resuming
-
-
-def different(a, b, path: str = "") -> list[str]:
-    """Places where two checkpoints differ by as much as a bit; times of day apart."""
-    if path.endswith("elapsed_s"):
-        return []
-    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
-        return [d for k in a for d in different(a[k], b[k], f"{path}.{k}")]
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
-        pairs = enumerate(zip(a, b, strict=True))
-        return [d for i, (x, y) in pairs for d in different(x, y, f"{path}[{i}]")]
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return [] if torch.equal(a, b) else [path]
-    return [] if type(a) is type(b) and a == b else [path]
-
-
-def stop_after(phase: str, done: int):
-    """A watcher that presses Ctrl-C after so many rounds or updates."""
-
-    def watch(now):
-        if (now.phase, now.done) == (phase, done):
-            signal.raise_signal(signal.SIGINT)
-
-    return watch
 
 
 @pytest.fixture(scope="module")
@@ -489,106 +462,6 @@ def test_sizes_that_cannot_be_are_refused(make):
 
 
 # ------------------------------------------------------------------------------ imitation
-
-
-def test_the_teacher_goes_on_from_the_last_action_by_one_step_of_the_trot():
-    """The phase moves on by 2 π f dt."""
-    env = make_env(tiny_run(environments=3), Ranks())
-    trot = env.trot
-    env.command[:] = [[0.15, 0.0, 0.0], [0.0, 0.08, 0.0], [0.1, 0.0, 0.4]]
-    scale, dt = env.config.action_scale, 0.02
-    for phase in np.linspace(-3.0, 3.0, 7):
-        now, step = np.full(3, phase), 2 * np.pi * trot.frequency_hz * dt
-        env.action[:] = (trot.joints(now, env.command) - env.default) / scale
-        env.last_action[:] = (trot.joints(now - step, env.command) - env.default) / scale
-        expected = trot.joints(now + step, env.command)
-        # the phase is read off a grid: 0.03 rad of it move a foot by half a millimetre
-        shown = env.default + scale * Teacher(env).actions()
-        np.testing.assert_allclose(shown, expected, atol=0.02)
-
-
-def test_a_robot_told_to_stand_is_taught_the_default_pose():
-    env = make_env(tiny_run(environments=2), Ranks())
-    env.command[:] = 0.0
-    np.testing.assert_allclose(Teacher(env).actions(), 0.0, atol=1e-12)
-
-
-def test_the_teachers_commands_are_corrected_until_the_policy_walks_at_the_given_ones():
-    """A policy that walks at other speeds than its teacher's feet, by gains of its own."""
-    rng = np.random.default_rng(3)
-    env = make_env(tiny_run(environments=200), Ranks())
-    teacher = Teacher(env)
-
-    def walked(command: np.ndarray) -> np.ndarray:
-        x, y, turn = teacher.corrected(command).T
-        backward = np.where(x < 0, 0.8, 1.1)
-        return np.column_stack(
-            [backward * x, y * (0.9 - 1.5 * np.abs(x)), 1.15 * turn - 0.6 * y]
-        )  # fmt: skip
-
-    def draw() -> np.ndarray:
-        return rng.uniform([-0.2, -0.1, -0.5], [0.2, 0.1, 0.5], (200, 3))
-
-    def error() -> np.ndarray:
-        command = draw()
-        return np.abs(walked(command) - command).mean(axis=0)
-
-    before = error()
-    for _ in range(60):
-        env.command[:], env.episode_step[:] = draw(), 1
-        for _ in range(80):
-            env._strides.velocity[:] = walked(env.command) + rng.normal(
-                0, [0.02, 0.02, 0.1], (200, 3)
-            )
-            teacher.watch()
-        teacher.adapt(0.2)
-    assert (error() < 0.2 * before).all()
-
-
-def test_speeds_count_from_a_second_after_a_new_command_on():
-    env = make_env(tiny_run(environments=1, task=Walking()), Ranks())
-    teacher = Teacher(env)
-    env.command[:], env.episode_step[:] = (0.1, 0.0, 0.0), 1
-    env._strides.velocity[:] = (0.05, 0.0, 0.0)
-    for _ in range(50):
-        teacher.watch()
-    assert sum(len(e) for e in teacher._errors) == 0
-    for _ in range(2):
-        teacher.watch()
-    np.testing.assert_allclose(teacher._errors[-1], [[0.25, 0.0, 0.0]])
-
-
-def test_imitation_brings_the_policy_nearer_to_the_trot():
-    rounds = 6
-    run = tiny_run(
-        environments=8, task=Walking(),
-        learner=Hyperparameters(steps_per_environment=24, minibatches=4),
-        imitation=Imitation(rounds, rollouts=2, epochs=5, minibatches=4),
-        architecture=Architecture("mlp", (64,), 8, (16,)),
-    )  # fmt: skip
-    learner = make_learner(run, Ranks())
-    begun = difference_when_alone(learner, run)
-    teacher = Teacher(learner.env.env)
-    for i in range(rounds):
-        reported = imitate(learner, teacher, run.imitation, i)
-    ended = difference_when_alone(learner, run)
-    # over eight seeds 0.35 to 0.69, and the reported one 0.48 to 0.98 of that when alone
-    assert ended < 0.75 * begun
-    assert 0.2 * ended < reported < 2 * ended
-
-
-def difference_when_alone(learner: Learner, run) -> float:
-    """Root mean square difference to the teacher of a policy that acts for itself, in a twin."""
-    env = WalkingVecEnv(make_env(replace(run, seed=50), Ranks()))
-    squares, teacher = [], Teacher(env.env)
-    seen = env.get_observations()
-    with torch.inference_mode():
-        for _ in range(24):
-            wanted = teacher.actions()
-            action = learner.actor(seen)
-            squares.append(np.mean((action.numpy() - wanted) ** 2))
-            seen = env.step(action)[0]
-    return float(np.sqrt(np.mean(squares)))
 
 
 def test_ppo_begins_with_its_own_learning_rate_and_no_momentum_of_imitation(tmp_path):

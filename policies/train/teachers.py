@@ -1,0 +1,218 @@
+"""Teachers of a first gait: what a policy imitates before PPO begins.
+
+`TrotTeacher` continues an open-loop trot. It needs no clock: it computes the phase of the trot from
+the last two actions and returns the next point. `LearnedTeacher` is a network that was trained from
+nothing and sees the true state of the robot and the clock of its reward (`--start teacher`).
+
+A policy that imitates does not walk at its teacher's speeds: its strokes and its rhythm differ a
+little, and noise of the actions loosens dry friction, so that a robot with it walks at other speeds
+than without. So some robots act without noise, and the teacher corrects the commands that it
+follows by how fast they walk (iterative learning control): after each round the errors of speed are
+fitted as a function of the command, and a share of the fit is added to the correction. Where some
+robots have no differences from the calibrated one, only these count: a low battery and a weak leg
+slow a robot down, and no correction is right for it and for the calibrated one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.policies.network.actor_critic import build
+from pupper_sysid.policies.train.learner import read_checkpoint
+from pupper_sysid.policies.train.run_file import Run, load_run
+from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+
+Array = NDArray[np.float64]
+
+_SETTLED_S = 1.0  # after a new command
+_RANGE = np.array([0.2, 0.1, 0.5])  # of commands [m/s, m/s, rad/s], so that features are of order 1
+_MOST = 0.6  # of a coefficient of the correction
+_RIDGE = 0.02  # in shares of the data
+_FEWEST = 1000  # errors that are fitted
+_QUIET = 4  # every so many robots act without noise
+_COMMAND = OBSERVATION_PARTS["command"]
+
+
+class Teacher:
+    """Shows actions for commands that are corrected by how the policy walks.
+
+    Parameters
+    ----------
+    env : WalkingVecEnv
+        In which the policy acts.
+    state : dict of str to Tensor, optional
+        Of a teacher before, to go on from.
+
+    Attributes
+    ----------
+    quiet : ndarray of bool, shape (n,)
+        Robots that are to act without noise, whose speeds count.
+    correction : ndarray, shape (3, 6)
+        Coefficients of the correction, in shares of the largest commands.
+    """
+
+    def __init__(self, env: WalkingVecEnv, state: dict[str, torch.Tensor] | None = None):
+        self._vec_env, self._env = env, env.env
+        self._command = self._env.command.copy()
+        self.quiet = np.arange(env.num_envs) % _QUIET == 0
+        self.correction, self._since = np.zeros((3, 6)), np.zeros(env.num_envs)
+        if state:
+            self.correction, self._since = (
+                state[name].numpy().copy() for name in ("correction", "since_s")
+            )
+        self._features: list[Array] = []
+        self._errors: list[Array] = []
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """All that a teacher of the same environment goes on with, between two rounds."""
+        found = {"correction": self.correction, "since_s": self._since}
+        return {name: torch.from_numpy(value.copy()) for name, value in found.items()}
+
+    def actions(self, observations: TensorDict) -> torch.Tensor:
+        """Actions to learn in every environment, shape (n, 12), on the learner's device."""
+        raise NotImplementedError
+
+    def corrected(self, command: Array) -> Array:
+        """Commands that the trot follows where these are given, shape (n, 3)."""
+        more = np.einsum("nak,ak->na", _features(command), self.correction)
+        return command + _RANGE * more
+
+    def watch(self) -> None:
+        """Take the speeds of the present step."""
+        env = self._env
+        changed = (env.command != self._command).any(axis=1) | (env.episode_step == 0)
+        self._since = np.where(changed, 0.0, self._since + env.config.control_step_s)
+        self._command = env.command.copy()
+        walks = self.quiet & (self._since > _SETTLED_S) & env.command.any(axis=1)
+        if env.config.differences.as_calibrated:
+            walks &= env.robots.bodies.as_calibrated
+        self._features.append(_features(env.command[walks]))
+        self._errors.append((env.command - env.stride_velocity)[walks] / _RANGE)
+
+    def adapt(self, rate: float) -> None:
+        """Add a share `rate` of the errors since the last time, fitted, to the correction."""
+        features, errors = np.concatenate(self._features), np.concatenate(self._errors)
+        self._features, self._errors = [], []
+        if not rate or len(errors) < _FEWEST:
+            return
+        for axis in range(3):
+            x = features[:, axis]
+            square = x.T @ x / len(x) + _RIDGE * np.eye(x.shape[1])
+            self.correction[axis] += rate * np.linalg.solve(square, x.T @ errors[:, axis] / len(x))
+        np.clip(self.correction, -_MOST, _MOST, out=self.correction)
+
+
+class TrotTeacher(Teacher):
+    """Continues the open-loop trot from whatever the last two actions were."""
+
+    def actions(self, observations: TensorDict) -> torch.Tensor:
+        """Next points of the trot, as actions."""
+        env = self._env
+        trot, scale, span = env.trot, env.config.action_scale, env.config.control_step_s
+        command = self.corrected(env.command)
+        now, before = (env.default + scale * a for a in (env.action, env.last_action))
+        phase = trot.phase_of(now, before, span, command) + 2 * np.pi * trot.frequency_hz * span
+        shown = (trot.joints(phase, command) - env.default) / scale
+        return self._vec_env.tensor(shown.astype(np.float32))
+
+
+class LearnedTeacher(Teacher):
+    """Acts as a network that sees the truth.
+
+    Parameters
+    ----------
+    env : WalkingVecEnv
+    network : MLPModel
+        Of `load_teacher`.
+    state : dict of str to Tensor, optional
+        As for `Teacher`.
+    """
+
+    def __init__(
+        self,
+        env: WalkingVecEnv,
+        network: MLPModel,
+        state: dict[str, torch.Tensor] | None = None,
+    ):
+        super().__init__(env, state)
+        self._network = network.to(env.device)
+
+    def actions(self, observations: TensorDict) -> torch.Tensor:
+        """What the network does where the policy is, without noise."""
+        seen = observations["policy"].clone()
+        command = self.corrected(self._env.command)
+        seen[:, _COMMAND] = self._vec_env.tensor(command.astype(np.float32))
+        return self._network(TensorDict({**observations, "policy": seen}, observations.batch_size))
+
+
+def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> MLPModel:
+    """The network of a run of `--start teacher`.
+
+    Parameters
+    ----------
+    folder : Path
+        Of that run.
+    checkpoint : str
+        Name of its file there.
+    run : Run
+        That is to learn from it.
+    seen : TensorDict
+        Observations of its environment, for their sizes.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no such run, or its actions mean something else.
+    """
+    own = load_run(folder)
+    if not own.architecture.privileged_actor or own.architecture.kind != "mlp":
+        raise InputError(
+            f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
+            "of a run of `pupper-train --start teacher`."
+        )
+    for name in ("action_scale", "control_step_s", "knee"):
+        theirs, ours = getattr(own.task, name), getattr(run.task, name)
+        if theirs != ours:
+            raise InputError(
+                f"The teacher in {folder} was trained with task.{name} {theirs}, this run has "
+                f"{ours}. Give both the same."
+            )
+    content = read_checkpoint(folder / checkpoint)
+    network, _ = build(own.architecture, seen, own.learner, own.task.control_step_s)
+    try:
+        network.load_state_dict(content["actor_state_dict"])
+    except RuntimeError as error:
+        raise InputError(
+            f"The teacher in {folder} does not fit: {str(error).splitlines()[0]}. Train one with "
+            "this version."
+        ) from error
+    network.requires_grad_(False)
+    return network.eval()
+
+
+def _features(command: Array) -> Array:
+    """Of each axis, what its speed may depend on, shape (n, 3, 6).
+
+    Only what is odd under a mirror image where the axis is, and even where it is.
+    """
+    x, y, turn = (command / _RANGE).T
+    alone = Trot.turning_in_place(command)
+    return np.stack(
+        [
+            np.stack([np.maximum(x, 0), np.minimum(x, 0), x * abs(x), x * abs(y), x * abs(turn),
+                      y * turn], axis=-1),
+            np.stack([y, y * abs(y), y * abs(x), y * abs(turn), turn, x * turn], axis=-1),
+            np.stack([turn, turn * abs(turn), alone, turn * abs(x), turn * abs(y), y], axis=-1),
+        ],
+        axis=1,
+    )  # fmt: skip
