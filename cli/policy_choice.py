@@ -67,6 +67,12 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
         if (path / name / CONTRACT).is_file():
             err.print(f"Taking {path / name}.", soft_wrap=True)
             return load_policy(path / name), load_run(path)
+    run = load_run(path)
+    if run.architecture.privileged_actor:
+        raise InputError(
+            f"{path} is a teacher, which sees what no robot can. Train a policy that learns from "
+            f"it: pupper-train --start scratch --imitation.teacher {path}"
+        )
     raise InputError(
         f"{path} has no policy yet. Train on: pupper-train --resume {path} (the first is written "
         "after ten updates of PPO)."

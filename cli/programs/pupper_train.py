@@ -128,16 +128,22 @@ def _run(options: Options, given: list[str]) -> None:
         )
     with _bar() as watch:
         if options.resume:
-            train(folder, None, watch, *_extension(options, given), lambda text: warn([text]))
+            learner = train(
+                folder, None, watch, *_extension(options, given), lambda text: warn([text])
+            )
         else:
-            train(folder, run, watch)
+            learner = train(folder, run, watch)
     if ranks.rank > 0:
         return
-    err.print(
-        f"Saved. Look at it: pupper-play {folder} --video walk.mp4; measure it: "
-        f"pupper-eval {folder}; go on: pupper-train --resume {folder} (longer than it was begun "
-        "for: with --iterations or --minutes)"
+    on = (
+        f"go on: pupper-train --resume {folder} (longer than it was begun for: with --iterations "
+        "or --minutes)"
     )
+    if learner.architecture.privileged_actor:
+        use = f"Learn from it: pupper-train --start scratch --imitation.teacher {folder}"
+    else:
+        use = f"Look at it: pupper-play {folder} --video walk.mp4; measure it: pupper-eval {folder}"
+    err.print(f"Saved. {use}; {on}")
 
 
 def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:

@@ -28,7 +28,7 @@ from pupper_sysid.policies.network.hyperparameters import (
 )
 from pupper_sysid.policies.train.ranges import refuse_impossible
 from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
 
 Start = Literal["imitation", "scratch", "teacher"]
 """How a policy comes to its first gait: by imitation of a trot, or of a teacher that was trained
@@ -45,7 +45,7 @@ _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
     Hyperparameters: {"initial_std"},
     Curriculum: {"on", "stages", "stage_steps", "easiest", "action_scale"},
-    Rewards: {"flight"},
+    Rewards: {"flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
 
@@ -127,7 +127,9 @@ def _first_gait_imitated(kind: Kind) -> Run:
 
 
 def _from_scratch(run: Run) -> Run:
-    return replace(run, imitation=replace(run.imitation, teacher=OWN), minutes=90.0)
+    clock = {name: getattr(PRESETS["scratch"].rewards, name) for name in CLOCK}
+    task = replace(run.task, rewards=replace(run.task.rewards, **clock))
+    return replace(run, task=task, imitation=replace(run.imitation, teacher=OWN), minutes=90.0)
 
 
 def _teacher(kind: Kind) -> Run:
@@ -135,9 +137,9 @@ def _teacher(kind: Kind) -> Run:
         architecture=Architecture(kind, (128, 64), 64, (128, 64), privileged_actor=True),
         task=PRESETS["scratch"],
         learner=Hyperparameters(
-            steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.02,
+            steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.03,
             learning_rates=(1e-6, 2e-3),
-            exploration=Exploration((0.15, 0.04), (1.5, 10.0), 0.1),
+            exploration=Exploration((0.12, 0.015), (1.5, 14.0), 0.15),
             mirror=kind in ("mlp", "mlp-actions"),
         ),
         imitation=Imitation(iterations=0), environments=1024, iterations=1500, minutes=60.0,

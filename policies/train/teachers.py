@@ -30,6 +30,7 @@ from pupper_sysid.policies.train.run_file import Run, load_run
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.rewards.weights import CLOCK
 
 Array = NDArray[np.float64]
 
@@ -180,12 +181,14 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
             f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
             "of a run of `pupper-train --start teacher`."
         )
-    for name in ("action_scale", "control_step_s", "knee"):
-        theirs, ours = getattr(own.task, name), getattr(run.task, name)
+    same = [(f"task.{n}", own.task, run.task) for n in ("action_scale", "control_step_s", "knee")]
+    same += [(f"task.rewards.{name}", own.task.rewards, run.task.rewards) for name in CLOCK]
+    for name, *of in same:
+        theirs, ours = (getattr(part, name.rsplit(".", 1)[1]) for part in of)
         if theirs != ours:
             raise InputError(
-                f"The teacher in {folder} was trained with task.{name} {theirs}, this run has "
-                f"{ours}. Give both the same."
+                f"The teacher in {folder} was trained with {name} {theirs}, this run has {ours}. "
+                "Give both the same."
             )
     content = read_checkpoint(folder / checkpoint)
     network, _ = build(own.architecture, seen, own.learner, own.task.control_step_s)

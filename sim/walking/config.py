@@ -122,8 +122,9 @@ class Curriculum:
     penalties: Ramp = Ramp()
     """On rewards of negative weight."""
     guides: Ramp = Ramp()
-    """On the rewards that lead to a first gait: `progress`, `turn_progress`, `clock` and
-    `gait`."""
+    """On the rewards that lead to steps: `clock` and `gait`."""
+    progress: Ramp = Ramp()
+    """On the rewards that lead to travel: `progress` and `turn_progress`."""
     linear_sigma: Ramp = Ramp()
     """On the widths of the speed's tracking terms."""
     angular_sigma: Ramp = Ramp()
@@ -143,6 +144,7 @@ class Level:
     push: float = 1.0
     penalties: float = 1.0
     guides: float = 1.0
+    progress: float = 1.0
     linear_sigma: float = 1.0
     angular_sigma: float = 1.0
 
@@ -231,25 +233,29 @@ _PUBLISHED = Walking(
 _SCRATCH = Walking(
     physics_step_s=0.004,
     commands=Commands(every_s=4.0, standing=0.1),
-    randomisation=Randomisation(on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5),
+    randomisation=Randomisation(
+        on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5, push_m_s=0.8, push_every_s=(6.0, 12.0)
+    ),
     differences=TYPICAL,
     curriculum=Curriculum(
         commands=Ramp(0.6, 1.0, 1.0, 4.0),
-        push=Ramp(0.0, 1.0, 10.0, 20.0),
-        penalties=Ramp(0.3, 1.0, 1.0, 12.0),
-        guides=Ramp(1.0, 0.3, 6.0, 24.0),
-        linear_sigma=Ramp(2.5, 0.6, 2.0, 24.0),
-        angular_sigma=Ramp(3.0, 0.6, 2.0, 24.0),
+        push=Ramp(0.0, 1.0, 8.0, 14.0),
+        # first steps on the spot, by the clock; then they are to travel, then to do so evenly
+        progress=Ramp(0.0, 1.0, 1.5, 2.5),
+        penalties=Ramp(0.15, 1.0, 2.0, 6.0),
+        guides=Ramp(1.0, 0.3, 10.0, 24.0),
+        linear_sigma=Ramp(1.5, 1.0, 2.0, 3.0),
+        angular_sigma=Ramp(2.0, 1.0, 2.0, 3.0),
     ),
     rewards=Rewards(
-        progress=3.0, turn_progress=1.5, alive=0.1, gait=2.0, gait_sigma=0.03, unsupported=-4.0,
-        short_swing=-4.0, shortest_swing=0.12, short_stance=-4.0, shortest_stance=0.16,
-        tracking_shape="gaussian",
-        base_linear_velocity=1.0, linear_sigma=0.1, base_angular_velocity=2.0, angular_sigma=0.5,
-        stride_linear_velocity=2.0, stride_linear_sigma=0.05,
-        stride_angular_velocity=2.0, stride_angular_sigma=0.2,
-        base_orientation=-2.0, base_motion=-1.0, foot_slip=-1.0, joint_position=-0.2,
-        action_rate=-0.05, action_jerk=-0.02,
+        clock=10.0, clock_pull_hz=0.2, progress=8.0, turn_progress=4.0, alive=0.1, gait=0.0,
+        tracking_shape="linear",
+        base_linear_velocity=3.0, linear_sigma=0.1, base_angular_velocity=6.0, angular_sigma=0.5,
+        stride_linear_velocity=2.0, stride_linear_sigma=0.1,
+        stride_angular_velocity=2.0, stride_angular_sigma=0.4,
+        unsupported=-8.0, short_swing=-4.0, shortest_swing=0.12, short_stance=-8.0,
+        shortest_stance=0.16, base_orientation=-2.0, base_motion=-6.0, foot_slip=-1.0,
+        joint_position=-0.2, action_rate=-0.5, action_jerk=-0.2,
     ),
 )  # fmt: skip
 """Settings with which a walk is found from nothing; see `benchmarks/README.md`."""

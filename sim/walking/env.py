@@ -358,7 +358,8 @@ class PupperEnv:
         np.subtract(qvel[:, 6:], now.velocity_before[rows], out=facts["acceleration"])
         facts["acceleration"] /= span
         step = Step(**facts)
-        terms = weighted(step, self._rewards, self.level.penalties, self.level.guides)
+        level = self.level
+        terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
         for name, term in terms.items():
             whole = now.terms.setdefault(name, np.empty(self.environments))
             np.multiply(term, span, out=whole[rows])

@@ -50,16 +50,12 @@ def stride_angular_velocity(s: Step, p: Rewards) -> Array:
 
 def progress(s: Step, p: Rewards) -> Array:
     """Share of the commanded speed by which the mean over a stride is nearer than 0, -1 to 1."""
-    return _nearer(s.command[:, :2], s.stride_velocity[:, :2], _SLOW[0]) * _stepping(s, p)
+    return _nearer(s.command[:, :2], s.stride_velocity[:, :2], _SLOW[0])
 
 
 def turn_progress(s: Step, p: Rewards) -> Array:
     """The same of the turn rate."""
-    return _nearer(s.command[:, 2:], s.stride_velocity[:, 2:], _SLOW[1]) * _stepping(s, p)
-
-
-def _stepping(s: Step, p: Rewards) -> Array | float:
-    return np.clip(s.clock[:, 2], 0.0, 1.0) if p.progress_in_time else 1.0
+    return _nearer(s.command[:, 2:], s.stride_velocity[:, 2:], _SLOW[1])
 
 
 def _nearer(wanted: Array, velocity: Array, slow: float) -> Array:
@@ -213,12 +209,18 @@ TERMS = {
 """All terms by the name of their weight."""
 
 
-GUIDES = ("progress", "turn_progress", "clock", "gait")
-"""Terms that lead to a first gait; a curriculum may fade them."""
+GUIDES = ("clock", "gait")
+"""Terms that lead to steps; a curriculum may fade them."""
+PROGRESS = ("progress", "turn_progress")
+"""Terms that lead to travel; a curriculum may let them wait until there are steps."""
 
 
 def weighted(
-    step: Step, rewards: Rewards, penalties: float = 1.0, guides: float = 1.0
+    step: Step,
+    rewards: Rewards,
+    penalties: float = 1.0,
+    guides: float = 1.0,
+    progress: float = 1.0,
 ) -> dict[str, Array]:
     """Every term that counts, times its weight.
 
@@ -226,17 +228,18 @@ def weighted(
     ----------
     step : Step
     rewards : Rewards
-    penalties, guides : float
-        Factors on negative weights and on those of `GUIDES`, for a curriculum.
+    penalties, guides, progress : float
+        Factors on negative weights and on those of `GUIDES` and `PROGRESS`, for a curriculum.
 
     Returns
     -------
     dict of str to ndarray, shape (n,)
     """
+    factors = dict.fromkeys(GUIDES, guides) | dict.fromkeys(PROGRESS, progress)
     found = {}
     for name, term in TERMS.items():
         weight = getattr(rewards, name)
-        factor = penalties if weight < 0 else guides if name in GUIDES else 1.0
+        factor = penalties if weight < 0 else factors.get(name, 1.0)
         if weight:
             found[name] = weight * factor * term(step, rewards)
     return found

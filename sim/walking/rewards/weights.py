@@ -42,8 +42,6 @@ class Rewards:
     the first step on."""
     turn_progress: float = 0.0
     """The same of the turn rate."""
-    progress_in_time: bool = False
-    """Whether progress of either kind pays only as far as feet step with the clock."""
     alive: float = 0.5
     """Be upright."""
     unsupported: float = 0.0
@@ -119,6 +117,9 @@ class Rewards:
     joint_velocity: float = -1e-3
     """Norm of the velocities."""
 
+
+CLOCK = ("clock_hz", "clock_pull_hz", "clock_height")
+"""Names of the parameters that decide the phase of the trot's clock."""
 
 DEFAULT = Rewards(
     tracking_shape="gaussian", linear_sigma=0.035, stride_linear_sigma=0.015, angular_sigma=0.16,

@@ -19,6 +19,7 @@ from pupper_sysid.policies.train.teachers import LearnedTeacher, TrotTeacher, lo
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
 from support.checkpoints import different, stop_after
 from support.tiny_training import tiny_run
 
@@ -233,6 +234,8 @@ def test_a_teacher_of_a_runs_own_is_of_its_robot_and_its_seed():
     assert own.architecture.kind == "mlp" and own.architecture.privileged_actor
     for name in ("action_scale", "control_step_s", "knee"):
         assert getattr(own.task, name) == getattr(run.task, name)
+    for name in CLOCK:
+        assert getattr(own.task.rewards, name) == getattr(run.task.rewards, name)
 
 
 def test_a_run_that_is_no_teacher_is_refused_as_one(tmp_path, taught):
@@ -242,8 +245,15 @@ def test_a_run_that_is_no_teacher_is_refused_as_one(tmp_path, taught):
         learned_teacher(tmp_path, env)
 
 
-def test_a_teacher_with_other_actions_is_refused(taught):
-    run = tiny_run(task=Walking(episode_s=0.2, action_scale=0.25))
-    env = WalkingVecEnv(make_env(run, Ranks()))
-    with pytest.raises(InputError, match=r"task\.action_scale 0\.5.*this run has 0\.25"):
-        load_teacher(taught, BEST, run, env.get_observations())
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        (Walking(action_scale=0.25), r"task\.action_scale 0\.5.*this run has 0\.25"),
+        (Walking(rewards=Rewards(clock_hz=3.0)), r"clock_hz 3\.6.*this run has 3\.0"),
+    ],
+)
+def test_a_teacher_with_other_actions_or_another_clock_is_refused(taught, task, words):
+    run = tiny_run(task=task)
+    seen = WalkingVecEnv(make_env(run, Ranks())).get_observations()
+    with pytest.raises(InputError, match=words):
+        load_teacher(taught, BEST, run, seen)

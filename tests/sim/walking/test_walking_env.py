@@ -719,7 +719,7 @@ def test_a_ramp_is_linear_between_its_ends():
     assert Curriculum().at(0) == Curriculum().at(1e9) == Level()
 
 
-def test_the_curriculum_changes_delay_commands_penalties_guides_and_widths():
+def test_the_curriculum_changes_delay_commands_penalties_progress_and_widths():
     rewards = only(
         alive=1.0, action_rate=-1.0, progress=2.0, base_linear_velocity=1.0, linear_sigma=0.1,
         tracking_shape="exponential",
@@ -730,7 +730,7 @@ def test_the_curriculum_changes_delay_commands_penalties_guides_and_widths():
         rewards=rewards,
         commands=Commands((0.2, 0.2), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0),
         curriculum=Curriculum(
-            commands=eased, delay=eased, penalties=eased, guides=eased,
+            commands=eased, delay=eased, penalties=eased, progress=eased,
             linear_sigma=replace(eased, first=2.0),
         ),
     )  # fmt: skip
@@ -744,8 +744,8 @@ def test_the_curriculum_changes_delay_commands_penalties_guides_and_widths():
         speed = found.facts.linear_velocity[0, :2]
         away = np.hypot(forward - speed[0], speed[1])
         width = -away / np.log(found.terms["base_linear_velocity"][0] / SPAN)
-        guide = found.terms["progress"][0] / (SPAN * progress(found.facts, rewards)[0])
-        assert guide == pytest.approx(0.5 if env.steps == 1 else 2.0)
+        factor = found.terms["progress"][0] / (SPAN * progress(found.facts, rewards)[0])
+        assert factor == pytest.approx(0.5 if env.steps == 1 else 2.0)
         return delay, forward, found.terms["action_rate"][0], width
 
     full = -1.0 * 12 * 0.1**2 * SPAN

@@ -80,13 +80,6 @@ def test_going_too_fast_pays_no_more_than_going_too_slow(too_fast: float):
         assert term(fast, P)[0] == pytest.approx(term(slow, P)[0])
 
 
-def test_progress_may_pay_only_in_time_with_the_clock():
-    p = replace(P, progress_in_time=True)
-    for in_time, pays in ((0.25, 0.25), (-0.5, 0.0), (1.2, 1.0)):
-        s = step(command=FORWARD, stride_velocity=(0.1, 0, 0), clock=(1.0, 0.0, in_time))
-        assert wr.progress(s, p)[0] == pytest.approx(pays * wr.progress(s, P)[0])
-
-
 def test_the_clock_pays_feet_that_are_up_in_their_half_and_charges_others():
     p = replace(P, clock_duty=0.5, clock_height=0.01)
     up = {"command": FORWARD, "foot_height_m": (0.005, 0.0, 0.0, 0.02)}
@@ -117,14 +110,18 @@ def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
     assert wr.short_stance(s, p)[0] == pytest.approx(0.75)
 
 
-def test_a_curriculum_fades_guides_alone_and_widens_what_tracks():
-    s = step(command=FORWARD, stride_velocity=(0.2, 0, 0), action=1.0)
-    p = replace(P, progress=2.0)
-    whole, faded = weighted(s, p), weighted(s, p, guides=0.5)
-    assert faded["progress"][0] == 0.5 * whole["progress"][0]
-    assert {k: v[0] for k, v in faded.items() if k not in wr.GUIDES} == {
-        k: v[0] for k, v in whole.items() if k not in wr.GUIDES
-    }
+def test_a_curriculum_fades_guides_and_progress_and_widens_what_tracks():
+    s = step(command=FORWARD, stride_velocity=(0.2, 0, 0), action=1.0, clock=(0.0, 1.0, 0.0))
+    s = replace(s, foot_height_m=np.array([[0.01, 0.0, 0.0, 0.0]]))
+    p = replace(P, progress=2.0, clock=1.0)
+    whole = weighted(s, p)
+    assert whole["clock"][0] and whole["progress"][0]
+    for faded, names in (
+        (weighted(s, p, guides=0.5), wr.GUIDES), (weighted(s, p, progress=0.5), wr.PROGRESS)
+    ):  # fmt: skip
+        assert {k: v[0] for k, v in faded.items()} == {
+            k: (0.5 if k in names else 1.0) * v[0] for k, v in whole.items()
+        }
     wide = narrowed(p, 2.0, 3.0)
     assert (wide.linear_sigma, wide.stride_linear_sigma) == (
         2 * p.linear_sigma, 2 * p.stride_linear_sigma
@@ -139,6 +136,13 @@ def test_speed_is_tracked_by_the_exponential_of_the_horizontal_error():
     far = step(command=FORWARD, linear_velocity=(0.0, 0.0, 0.0))
     assert wr.base_linear_velocity(far, EXPONENTIAL)[0] == pytest.approx(np.exp(-2))
     assert wr.base_linear_velocity(far, GAUSSIAN)[0] == pytest.approx(np.exp(-4))
+
+
+def test_linear_tracking_falls_by_the_error_over_its_width_down_to_minus_one():
+    p = replace(P, tracking_shape="linear", linear_sigma=0.1)
+    for speed, earns in ((0.2, 1.0), (0.15, 0.5), (0.1, 0.0), (0.05, -0.5), (-0.3, -1.0)):
+        s = step(command=FORWARD, linear_velocity=(speed, 0, 0))
+        assert wr.base_linear_velocity(s, p)[0] == pytest.approx(earns)
 
 
 def test_fast_commands_earn_more_by_the_bonus_and_slow_ones_do_not_earn_less():
