@@ -26,8 +26,8 @@ from pupper_sysid.cli.user_errors import parse, user_errors
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
 from pupper_sysid.common.results import plain
-from pupper_sysid.policies.network.hyperparameters import Kind
-from pupper_sysid.policies.train.run_file import Run, Start, preset
+from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
+from pupper_sysid.policies.train.run_file import Run, Start, check_teacher, preset
 from pupper_sysid.sim.walking.servo_ranges import check_actuator
 
 DESCRIPTION = """Train a walking policy in a simulator that moves like the measured robot.
@@ -98,6 +98,8 @@ def _run(options: Options, given: list[str]) -> None:
         refuse_path(options.name, "--name")
     if options.resume is None and not options.benchmark:
         check_actuator(run.actuator)
+        if run.imitation.iterations and run.imitation.teacher not in (TROT, OWN):
+            check_teacher(Path(run.imitation.teacher), run)
     # torch and rsl_rl take seconds to import: only after the settings were checked
     warnings.filterwarnings("ignore", category=UserWarning, module="torch")
     from pupper_sysid.policies.train.ranks import Ranks

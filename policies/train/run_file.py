@@ -155,6 +155,32 @@ def teacher_of(run: Run) -> Run:
     )  # fmt: skip
 
 
+def check_teacher(folder: Path, run: Run) -> Run:
+    """Settings of a teacher's run, which `run` is to learn from.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no such run, or its actions or its clock mean something else.
+    """
+    own = load_run(folder)
+    if not own.architecture.privileged_actor or own.architecture.kind != "mlp":
+        raise InputError(
+            f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
+            "of a run of `pupper-train --start teacher`."
+        )
+    same = [(f"task.{n}", own.task, run.task) for n in ("action_scale", "control_step_s", "knee")]
+    same += [(f"task.rewards.{name}", own.task.rewards, run.task.rewards) for name in CLOCK]
+    for name, *of in same:
+        theirs, ours = (getattr(part, name.rsplit(".", 1)[1]) for part in of)
+        if theirs != ours:
+            raise InputError(
+                f"The teacher in {folder} was trained with {name} {theirs}, this run has {ours}. "
+                "Give both the same."
+            )
+    return own
+
+
 def load_run(folder: Path) -> Run:
     """Settings of the run in `folder`.
 

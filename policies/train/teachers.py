@@ -26,11 +26,10 @@ from tensordict import TensorDict
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.actor_critic import build
 from pupper_sysid.policies.train.learner import read_checkpoint
-from pupper_sysid.policies.train.run_file import Run, load_run
+from pupper_sysid.policies.train.run_file import Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
-from pupper_sysid.sim.walking.rewards.weights import CLOCK
 
 Array = NDArray[np.float64]
 
@@ -175,21 +174,7 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
     InputError
         If the folder holds no such run, or its actions mean something else.
     """
-    own = load_run(folder)
-    if not own.architecture.privileged_actor or own.architecture.kind != "mlp":
-        raise InputError(
-            f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
-            "of a run of `pupper-train --start teacher`."
-        )
-    same = [(f"task.{n}", own.task, run.task) for n in ("action_scale", "control_step_s", "knee")]
-    same += [(f"task.rewards.{name}", own.task.rewards, run.task.rewards) for name in CLOCK]
-    for name, *of in same:
-        theirs, ours = (getattr(part, name.rsplit(".", 1)[1]) for part in of)
-        if theirs != ours:
-            raise InputError(
-                f"The teacher in {folder} was trained with {name} {theirs}, this run has {ours}. "
-                "Give both the same."
-            )
+    own = check_teacher(folder, run)
     content = read_checkpoint(folder / checkpoint)
     network, _ = build(own.architecture, seen, own.learner, own.task.control_step_s)
     try:

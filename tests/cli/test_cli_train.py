@@ -18,7 +18,7 @@ from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.battery import BATTERY
 from pupper_sysid.policies.train.learner import read_checkpoint
-from pupper_sysid.policies.train.run_file import load_run, preset
+from pupper_sysid.policies.train.run_file import load_run, preset, save_run
 from pupper_sysid.policies.walks.film import SIZE
 from pupper_sysid.sim.walking import env
 from support.browser import looks_right
@@ -88,6 +88,22 @@ def test_printed_settings_are_not_wrapped_or_coloured(capsys, monkeypatch):
 def test_a_calibration_that_is_not_there_is_refused_before_anything_is_made(capsys, here):
     said = refused(capsys, pupper_train, "--actuator", "missing.yaml")
     assert "missing.yaml: there is no such file" in said and "pupper-sysid calibrate" in said
+    assert not list(here.iterdir())
+
+
+def test_a_teacher_is_trained_and_then_learned_from(capsys, here):
+    code, _, err = run(capsys, pupper_train, *TINY, "--start", "teacher", "--name", "t")
+    assert code == 0
+    assert "pupper-train --start scratch --imitation.teacher runs/t" in " ".join(err.split())
+    taught = (*TINY, "--start", "scratch", "--imitation.teacher", "runs/t", "--name", "s")
+    code, _, err = run(capsys, pupper_train, *taught)
+    assert code == 0 and "pupper-eval runs/s" in " ".join(err.split())
+    assert (here / "runs/s/policy_best").is_dir()
+
+
+def test_a_teacher_that_is_not_there_is_refused_before_anything_is_made(capsys, here):
+    wanted = (*TINY, "--start", "scratch", "--imitation.teacher", "runs/t")
+    assert "runs/t holds no run" in refused(capsys, pupper_train, *wanted)
     assert not list(here.iterdir())
 
 
@@ -325,8 +341,10 @@ def test_no_episodes_are_refused(capsys, trained):
 @pytest.mark.parametrize("module", [pupper_eval, pupper_play])
 def test_a_folder_without_a_policy_is_refused(capsys, here, module):
     assert "neither a run nor a policy" in refused(capsys, module, here)
-    (here / "run.yaml").write_text("")
-    assert "has no policy yet" in refused(capsys, module, here)
+    save_run(here / "begun", preset("fast", "mlp"))
+    assert "has no policy yet" in refused(capsys, module, here / "begun")
+    save_run(here / "teacher", preset("fast", "mlp", "teacher"))
+    assert "is a teacher, which sees what no robot can" in refused(capsys, module, here / "teacher")
 
 
 @pytest.mark.parametrize("module", [pupper_eval, pupper_play])
