@@ -141,7 +141,7 @@ def _teacher(kind: Kind) -> Run:
             steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.03,
             learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
             # with twice as much the first gait hops, and small noise does not leave it
-            exploration=Exploration((0.075, 0.02), (1.0, 8.0), 0.15),
+            exploration=Exploration((0.075, 0.02), (2.5, 10.0), 0.15),
             mirror=kind in ("mlp", "mlp-actions"),
         ),
         imitation=Imitation(iterations=0), environments=512, iterations=3000, minutes=60.0,

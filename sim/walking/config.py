@@ -248,8 +248,8 @@ _SCRATCH = Walking(
         angular_sigma=Ramp(2.0, 1.0, 2.0, 3.0),
     ),
     rewards=Rewards(
-        clock=10.0, clock_pull_hz=0.2, clock_duty=0.66, progress=8.0, turn_progress=4.0, alive=0.1, gait=0.0,
-        tracking_shape="linear",
+        clock=10.0, clock_pull_hz=0.2, clock_duty=0.66, gait=0.0, alive=0.1,
+        progress=8.0, turn_progress=4.0, tracking_shape="linear",
         base_linear_velocity=3.0, linear_sigma=0.1, base_angular_velocity=6.0, angular_sigma=0.5,
         stride_linear_velocity=2.0, stride_linear_sigma=0.1,
         stride_angular_velocity=2.0, stride_angular_sigma=0.4,
