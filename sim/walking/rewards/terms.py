@@ -160,11 +160,6 @@ def base_motion(s: Step, p: Rewards) -> Array:
     return 0.8 * s.linear_velocity[:, 2] ** 2 + 0.2 * rocking
 
 
-def bounce(s: Step, p: Rewards) -> Array:
-    """Vertical speed of the trunk, up or down [m/s]."""
-    return np.abs(s.linear_velocity[:, 2])
-
-
 def base_orientation(s: Step, p: Rewards) -> Array:
     """Horizontal part of gravity in the trunk's frame: sine of the tilt."""
     return np.linalg.norm(s.gravity[:, :2], axis=1)
@@ -207,7 +202,7 @@ TERMS = {
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
         stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
         short_stance, air_time, clock, gait, foot_clearance, swing_height, action_smoothness,
-        action_rate, action_jerk, air_time_variance, base_motion, bounce, base_orientation,
+        action_rate, action_jerk, air_time_variance, base_motion, base_orientation,
         foot_slip, joint_position, hip_abduction, joint_torques, joint_acceleration,
         joint_velocity,
     )

@@ -98,8 +98,6 @@ class Rewards:
     """Published: feet that swing or stand for different times."""
     base_motion: float = -0.5
     """0.8 v_z² + 0.2 (|ω_x| + |ω_y|)."""
-    bounce: float = 0.0
-    """Vertical speed of the trunk."""
     base_orientation: float = -1.0
     """Tilt."""
     foot_slip: float = -1.0

@@ -97,11 +97,6 @@ def test_the_clock_pays_feet_that_are_up_in_their_half_and_charges_others():
     assert np.mean(wanted) == pytest.approx(0.4, abs=0.002)
 
 
-def test_a_bounce_costs_the_vertical_speed_either_way():
-    for speed in (0.1, -0.1):
-        assert wr.bounce(step(linear_velocity=(0.3, 0.2, speed)), P)[0] == pytest.approx(0.1)
-
-
 def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
     assert wr.unsupported(step(), P)[0] == 1.0
     assert wr.unsupported(step(contact=(False, True, False, False)), P)[0] == 0.5
