@@ -136,7 +136,7 @@ def _from_scratch(run: Run) -> Run:
     learner = replace(run.learner, exploration=Exploration((0.03, 0.02), (0.0, 4.0), 0.15))
     return replace(
         run, task=replace(run.task, rewards=rewards), learner=learner, imitation=imitation,
-        environments=1024, iterations=120, minutes=90.0,
+        environments=1024, iterations=400, minutes=90.0,
     )  # fmt: skip
 
 
