@@ -15,6 +15,7 @@ slow a robot down, and no correction is right for it and for the calibrated one.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ _QUIET = 4  # every so many robots act without noise
 _COMMAND = OBSERVATION_PARTS["command"]
 
 
-class Teacher:
+class Teacher(ABC):
     """Shows actions for commands that are corrected by how the policy walks.
 
     Parameters
@@ -78,9 +79,9 @@ class Teacher:
         found = {"correction": self.correction, "since_s": self._since}
         return {name: torch.from_numpy(value.copy()) for name, value in found.items()}
 
+    @abstractmethod
     def actions(self, observations: TensorDict) -> torch.Tensor:
         """Actions to learn in every environment, shape (n, 12), on the learner's device."""
-        raise NotImplementedError
 
     def corrected(self, command: Array) -> Array:
         """Commands that the trot follows where these are given, shape (n, 3)."""
