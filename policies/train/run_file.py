@@ -40,6 +40,7 @@ LearnerDevice = Literal["as-device", "cpu", "cuda"]
 RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 2
 RUN_FILE = "run.yaml"
+_OF_ACTIONS = ("action_scale", "control_step_s", "knee")  # settings that say what actions mean
 _TEACHING = 0.6  # of a run's time: the most that its own teacher may take
 _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
@@ -156,9 +157,12 @@ def _teacher(kind: Kind) -> Run:
 
 
 def teacher_of(run: Run) -> Run:
-    """Settings of the teacher that a run trains for itself: for the same robot."""
+    """Settings of the teacher that a run trains for itself: for the same robot and actions."""
+    own = _teacher("mlp")
+    rewards = replace(own.task.rewards, **{n: getattr(run.task.rewards, n) for n in CLOCK})
+    task = replace(own.task, rewards=rewards, **{n: getattr(run.task, n) for n in _OF_ACTIONS})
     return replace(
-        _teacher("mlp"), actuator=run.actuator, feedback=run.feedback, threads=run.threads,
+        own, task=task, actuator=run.actuator, feedback=run.feedback, threads=run.threads,
         device=run.device, learner_device=run.learner_device, seed=run.seed,
         minutes=_TEACHING * run.minutes,
     )  # fmt: skip
@@ -178,7 +182,7 @@ def check_teacher(folder: Path, run: Run) -> Run:
             f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
             "of a run of `pupper-train --start teacher`."
         )
-    same = [(f"task.{n}", own.task, run.task) for n in ("action_scale", "control_step_s", "knee")]
+    same = [(f"task.{name}", own.task, run.task) for name in _OF_ACTIONS]
     same += [(f"task.rewards.{name}", own.task.rewards, run.task.rewards) for name in CLOCK]
     for name, *of in same:
         theirs, ours = (getattr(part, name.rsplit(".", 1)[1]) for part in of)

@@ -14,7 +14,13 @@ from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.imitation import imitate
 from pupper_sysid.policies.train.learner import Learner, read_checkpoint
 from pupper_sysid.policies.train.ranks import Ranks
-from pupper_sysid.policies.train.run_file import load_run, preset, teacher_of
+from pupper_sysid.policies.train.run_file import (
+    check_teacher,
+    load_run,
+    preset,
+    save_run,
+    teacher_of,
+)
 from pupper_sysid.policies.train.teachers import LearnedTeacher, TrotTeacher, load_teacher
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
@@ -236,6 +242,15 @@ def test_a_teacher_of_a_runs_own_is_of_its_robot_and_its_seed():
         assert getattr(own.task, name) == getattr(run.task, name)
     for name in CLOCK:
         assert getattr(own.task.rewards, name) == getattr(run.task.rewards, name)
+
+
+def test_a_teacher_of_a_runs_own_has_the_runs_actions_and_clock(tmp_path):
+    run = preset("fast", "lstm", "scratch")
+    rewards = replace(run.task.rewards, clock_hz=3.0)
+    task = replace(run.task, action_scale=0.4, knee="serial", rewards=rewards)
+    run = replace(run, task=task)
+    save_run(tmp_path, teacher_of(run))
+    assert check_teacher(tmp_path, run).task.knee == "serial"
 
 
 def test_a_run_that_is_no_teacher_is_refused_as_one(tmp_path, taught):
