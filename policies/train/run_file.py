@@ -160,7 +160,13 @@ def teacher_of(run: Run) -> Run:
     """Settings of the teacher that a run trains for itself: for the same robot and actions."""
     own = _teacher("mlp")
     rewards = replace(own.task.rewards, **{n: getattr(run.task.rewards, n) for n in CLOCK})
-    task = replace(own.task, rewards=rewards, **{n: getattr(run.task, n) for n in _OF_ACTIONS})
+    steps = run.task.control_step_s / own.task.physics_step_s
+    even = abs(steps - round(steps)) < 1e-6
+    task = replace(
+        own.task, rewards=rewards,
+        physics_step_s=own.task.physics_step_s if even else run.task.physics_step_s,
+        **{name: getattr(run.task, name) for name in _OF_ACTIONS},
+    )  # fmt: skip
     return replace(
         own, task=task, actuator=run.actuator, feedback=run.feedback, threads=run.threads,
         device=run.device, learner_device=run.learner_device, seed=run.seed,

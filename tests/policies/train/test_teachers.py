@@ -251,6 +251,9 @@ def test_a_teacher_of_a_runs_own_has_the_runs_actions_and_clock(tmp_path):
     run = replace(run, task=task)
     save_run(tmp_path, teacher_of(run))
     assert check_teacher(tmp_path, run).task.knee == "serial"
+    # 0.025 s are no whole number of the teacher's steps of 4 ms
+    slower = replace(run, task=replace(task, control_step_s=0.025, physics_step_s=0.0025))
+    assert teacher_of(slower).task.physics_step_s == 0.0025
 
 
 def test_a_run_that_is_no_teacher_is_refused_as_one(tmp_path, taught):
