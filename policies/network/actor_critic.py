@@ -18,6 +18,7 @@ from pupper_sysid.policies.network.exploration import (
     TransformerActor,
 )
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
+from pupper_sysid.policies.network.teacher import TeacherActor
 
 _FIRST_HEAD = 0.01  # factor on a policy's last weights (Andrychowicz et al., 2021)
 
@@ -65,7 +66,8 @@ def build(
     elif architecture.kind == "transformer":
         actor = TransformerActor(observations, groups, "actor", actions, **own)
     else:
-        actor = MLPActor(observations, groups, "actor", actions, **own)
+        network = TeacherActor if architecture.privileged_actor else MLPActor
+        actor = network(observations, groups, "actor", actions, **own)
     # the first policy stands; another wide one would swing through its last action, and fast
     head = [layer for layer in actor.mlp if isinstance(layer, torch.nn.Linear)][-1]
     with torch.no_grad():

@@ -46,7 +46,7 @@ _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
     Hyperparameters: {"initial_std"},
     Curriculum: {"on", "stages", "stage_steps", "easiest", "action_scale"},
-    Rewards: {"flight", "progress_in_time"},
+    Rewards: {"clock", "flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
 
@@ -128,17 +128,9 @@ def _first_gait_imitated(kind: Kind) -> Run:
 
 
 def _from_scratch(run: Run) -> Run:
-    # the teacher's rewards go on, at their end of the curriculum: those of an imitated trot are
-    # too narrow for a gait that is not yet as fast as it is commanded to be
-    taught = PRESETS["scratch"]
-    rewards = replace(taught.rewards, clock=taught.curriculum.guides.last * taught.rewards.clock)
     # a network is learned from more easily than a trot that bends sharply
     imitation = replace(run.imitation, teacher=OWN, rollouts=4, epochs=6)
-    learner = replace(run.learner, exploration=Exploration((0.03, 0.02), (0.0, 4.0), 0.15))
-    return replace(
-        run, task=replace(run.task, rewards=rewards), learner=learner, imitation=imitation,
-        environments=1024, iterations=400, minutes=90.0,
-    )  # fmt: skip
+    return replace(run, imitation=imitation, minutes=90.0)
 
 
 def _teacher(kind: Kind) -> Run:
@@ -146,13 +138,14 @@ def _teacher(kind: Kind) -> Run:
         architecture=Architecture(kind, (128, 64), 64, (128, 64), privileged_actor=True),
         task=PRESETS["scratch"],
         learner=Hyperparameters(
-            steps_per_environment=20, epochs=3, learning_rate=1e-3, desired_kl=0.03,
-            learning_rates=(1e-6, 2e-3),
-            # less at once finds no steps that travel; more later hides how evenly they do
-            exploration=Exploration((0.12, 0.033), (1.5, 9.26), 0.15),
+            # many small updates: how far one may go limits learning, not how sure it is of where
+            steps_per_environment=8, epochs=3, learning_rate=1e-3, desired_kl=0.025,
+            learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
+            # noise that lasts over half a stride would be rewarded for what it does in the other
+            exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
             mirror=kind in ("mlp", "mlp-actions"),
         ),
-        imitation=Imitation(iterations=0), environments=1024, iterations=550, minutes=60.0,
+        imitation=Imitation(iterations=0), environments=512, iterations=2000, minutes=60.0,
     )  # fmt: skip
 
 

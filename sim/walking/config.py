@@ -122,7 +122,7 @@ class Curriculum:
     penalties: Ramp = Ramp()
     """On rewards of negative weight."""
     guides: Ramp = Ramp()
-    """On the rewards that lead to steps: `clock` and `gait`."""
+    """On the rewards that lead to steps: `foot_paths` and `gait`."""
     progress: Ramp = Ramp()
     """On the rewards that lead to travel: `progress` and `turn_progress`."""
     linear_sigma: Ramp = Ramp()
@@ -233,28 +233,25 @@ _PUBLISHED = Walking(
 _SCRATCH = Walking(
     physics_step_s=0.004,
     commands=Commands(every_s=4.0, standing=0.1),
-    randomisation=Randomisation(
-        on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5, push_m_s=0.8, push_every_s=(6.0, 12.0)
-    ),
+    randomisation=Randomisation(on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5, push_m_s=0.0),
     differences=TYPICAL,
     curriculum=Curriculum(
         commands=Ramp(0.6, 1.0, 1.0, 4.0),
-        push=Ramp(0.0, 1.0, 8.0, 14.0),
-        # first steps on the spot, by the clock; then they are to travel, then to do so evenly
-        progress=Ramp(0.0, 1.0, 1.5, 2.5),
-        penalties=Ramp(0.15, 1.0, 2.0, 6.0),
-        guides=Ramp(1.0, 0.3, 10.0, 24.0),
+        # first steps by the clock; then they are to travel, then to do so evenly
+        progress=Ramp(0.0, 1.0, 0.3, 0.6),
+        penalties=Ramp(0.3, 1.0, 0.5, 3.0),
+        guides=Ramp(1.0, 0.4, 3.0, 7.0),
         linear_sigma=Ramp(1.5, 1.0, 2.0, 3.0),
         angular_sigma=Ramp(2.0, 1.0, 2.0, 3.0),
     ),
     rewards=Rewards(
-        clock=10.0, clock_pull_hz=0.2, gait=0.0, alive=0.1, progress=8.0, turn_progress=4.0,
+        foot_paths=15.0, gait=0.0, alive=0.1, progress=8.0, turn_progress=4.0,
         tracking_shape="linear",
-        base_linear_velocity=3.0, linear_sigma=0.1, base_angular_velocity=6.0, angular_sigma=0.5,
+        base_linear_velocity=6.0, linear_sigma=0.1, base_angular_velocity=12.0, angular_sigma=0.5,
         stride_linear_velocity=2.0, stride_linear_sigma=0.1,
         stride_angular_velocity=2.0, stride_angular_sigma=0.4,
         unsupported=-8.0, short_swing=-4.0, shortest_swing=0.12, short_stance=-8.0,
-        shortest_stance=0.16, base_orientation=-2.0, base_motion=-6.0, foot_slip=-1.0,
+        shortest_stance=0.16, base_orientation=-2.0, base_motion=-12.0, foot_slip=-1.0,
         joint_position=-0.2, action_rate=-0.5, action_jerk=-0.2,
     ),
 )  # fmt: skip

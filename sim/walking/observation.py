@@ -6,7 +6,7 @@ that policies can be loaded, exported and deployed without it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,19 @@ OBSERVATION = (
 )
 """Name, size and half width of the published uniform noise of each part of an observation."""
 OBSERVATION_SIZE = sum(size for _, size, _ in OBSERVATION)
-_ENDS = np.cumsum([size for _, size, _ in OBSERVATION])
-OBSERVATION_PARTS = {
-    name: slice(int(end) - size, int(end))
-    for (name, size, _), end in zip(OBSERVATION, _ENDS, strict=True)
-}
+
+
+def _places(parts: Iterable[tuple[str, int]]) -> dict[str, slice]:
+    """Where each of several parts is in a row of them."""
+    names, sizes = zip(*parts, strict=True)
+    ends = np.cumsum(sizes)
+    return {
+        name: slice(int(end) - size, int(end))
+        for name, size, end in zip(names, sizes, ends, strict=True)
+    }
+
+
+OBSERVATION_PARTS = _places((name, size) for name, size, _ in OBSERVATION)
 """Where each part of an observation is."""
 _NOISE = np.concatenate([np.full(size, half, np.float32) for _, size, half in OBSERVATION])
 _NOISE_BLIND = np.where(np.arange(OBSERVATION_SIZE) < 3, np.float32(0), _NOISE)
@@ -87,6 +95,8 @@ PRIVILEGED = (
     ("clock", 3), ("time_left", 1),
 )  # fmt: skip
 """Name and size of each part of what the critic sees."""
+PRIVILEGED_PARTS = _places(PRIVILEGED)
+"""Where each of them is."""
 PRIVILEGED_SIZE = sum(size for _, size in PRIVILEGED)
 
 

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.joints import LEGS
+from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.step import Step
 
@@ -20,7 +22,10 @@ _HIPS = slice(0, 12, 3)
 DIAGONALS = ((0, 3), (1, 2))
 """Feet that a trot moves together, by index."""
 _APART = ((0, 1), (3, 2), (0, 2), (1, 3))
-_TURNS = np.array([1.0, -1.0, -1.0, 1.0])  # of the feet in the first half of the clock's cycle
+_BEHIND = np.array([0.0, 0.5, 0.5, 0.0])  # of the feet, in cycles of the clock
+_POSE = default_pose()
+_FEET_AT = np.array([foot_position(leg, *_POSE[3 * i : 3 * i + 3]) for i, leg in enumerate(LEGS)])
+_SIDES = np.sign(_FEET_AT[:, 1])
 _SLOW = (0.05, 0.15)  # commands [m/s, rad/s] that are not much above the trunk's sway
 
 
@@ -110,14 +115,34 @@ def gait(s: Step, p: Rewards) -> Array:
     return np.where(s.moving(p.gait_threshold), product, 0.0)
 
 
-def clock(s: Step, p: Rewards) -> Array:
-    """Heights of feet, as shares of `clock_height`, times how far the clock wants them up.
+def foot_paths(s: Step, p: Rewards) -> Array:
+    """1 - Σ e²/`foot_paths_sigma`², -2 at least, of the distances e of the feet from where the
+    clock wants them in the trunk's frame; 0 for a robot that is to stand.
 
-    That is 1 to -1 and less; the sum is 0 for a robot that stands, or is to.
+    While the clock wants a foot down, it passes evenly under its place in the default pose at the
+    commanded speed, by the rule of Raibert (1986); meanwhile the others swing back and rise by
+    `clock_height`. Margolis and Agrawal (2022) reward both. The mean place of the feet and how far
+    they are spread are free.
     """
-    up = s.clock[:, 1:2] * _TURNS - np.sin(np.pi * (p.clock_duty - 0.5))
-    share = np.clip(s.foot_height_m / p.clock_height, 0.0, 1.0)
-    return np.where(np.abs(s.command).max(axis=1) > 0, (up * share).sum(axis=1), 0.0)
+    joints = _POSE + s.position_relative
+    feet = np.stack(
+        [foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T) for i, leg in enumerate(LEGS)], axis=1
+    )
+    cycle = np.arctan2(s.clock[:, 1], s.clock[:, 0])[:, None] / (2 * np.pi)
+    # since the middle of a foot's swing, -0.5 to 0.5 cycles
+    own = (cycle + _BEHIND + 0.25) % 1.0 - 0.5
+    half = 0.5 * (1.0 - p.clock_duty)
+    swings = np.abs(own) < half
+    along = np.where(swings, own / half, np.sign(own) * (0.5 - np.abs(own)) / (0.5 - half))
+    x, y, turn = s.command.T[:, :, None]
+    speed = np.stack([x - turn * _FEET_AT[:, 1], y + turn * _FEET_AT[:, 0]], axis=-1)
+    away = feet - _FEET_AT
+    away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
+    away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
+    away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
+    away[..., 1] -= _SIDES * (_SIDES * away[..., 1]).mean(axis=1, keepdims=True)
+    missed = (away**2).sum(axis=(1, 2)) / p.foot_paths_sigma**2
+    return np.where(np.abs(s.command).max(axis=1) > 0, np.maximum(1.0 - missed, -2.0), 0.0)
 
 
 def foot_clearance(s: Step, p: Rewards) -> Array:
@@ -201,16 +226,16 @@ TERMS = {
     for f in (
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
         stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
-        short_stance, air_time, clock, gait, foot_clearance, swing_height, action_smoothness,
-        action_rate, action_jerk, air_time_variance, base_motion, base_orientation,
-        foot_slip, joint_position, hip_abduction, joint_torques, joint_acceleration,
-        joint_velocity,
+        short_stance, air_time, foot_paths, gait, foot_clearance, swing_height,
+        action_smoothness, action_rate, action_jerk, air_time_variance, base_motion,
+        base_orientation, foot_slip, joint_position, hip_abduction, joint_torques,
+        joint_acceleration, joint_velocity,
     )
 }  # fmt: skip
 """All terms by the name of their weight."""
 
 
-GUIDES = ("clock", "gait")
+GUIDES = ("foot_paths", "gait")
 """Terms that lead to steps; a curriculum may fade them."""
 PROGRESS = ("progress", "turn_progress")
 """Terms that lead to travel; a curriculum may let them wait until there are steps."""

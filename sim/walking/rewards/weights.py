@@ -59,17 +59,20 @@ class Rewards:
     """Published: long swings and stances while moving, all feet down while standing."""
     air_time_most: float = 0.25
     """Longest swing that counts for `air_time` [s]."""
-    clock: float = 0.0
-    """Feet that are up when a trot's clock says so, less those that are when it does not, while
-    commanded to move. The policy does not see the clock, which follows the feet."""
+    foot_paths: float = 0.0
+    """Feet pass under the trunk, swing back and rise as a trot's clock and the command say. A
+    policy does not see the clock, which follows the feet; a teacher does."""
+    foot_paths_sigma: float = 0.012
+    """Its width: root of the summed squares of four feet's distances [m]."""
     clock_hz: float = 3.6
     """Steps of each foot per second by that clock."""
-    clock_pull_hz: float = 0.5
+    clock_pull_hz: float = 0.2
     """How far from that rate it follows feet."""
-    clock_duty: float = 0.6
+    clock_duty: float = 0.72
     """Share of the time that a foot is to be down by that clock."""
-    clock_height: float = 0.012
-    """Height of a foot that counts as up [m]; lower ones count in proportion."""
+    clock_height: float = 0.006
+    """How far a foot is to rise by that clock, which so takes it as up [m]; lower ones count in
+    proportion."""
     gait: float = 0.3
     """Diagonal feet together, the two pairs in turn (a trot)."""
     gait_threshold: float = 0.1

@@ -157,9 +157,7 @@ def learned_teacher(folder, env: WalkingVecEnv) -> LearnedTeacher:
     return LearnedTeacher(env, load_teacher(folder, BEST, tiny_run(), env.get_observations()))
 
 
-def test_a_teacher_sees_the_truth_and_the_clock_and_is_no_policy_for_a_robot(taught):
-    weight = read_checkpoint(taught / BEST)["actor_state_dict"]["mlp.0.weight"]
-    assert weight.shape == (16, 60 + 85)
+def test_a_teacher_is_no_policy_for_a_robot(taught):
     assert not list(taught.glob("policy_*"))
 
 

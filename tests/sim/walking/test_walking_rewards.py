@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pupper_sysid.common.joints import LEGS
+from pupper_sysid.sim.robot.mini_pupper import SIDE, default_pose, foot_position, joint_angles
 from pupper_sysid.sim.walking.config import PRESETS
 from pupper_sysid.sim.walking.rewards import terms as wr
 from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
@@ -80,21 +82,59 @@ def test_going_too_fast_pays_no_more_than_going_too_slow(too_fast: float):
         assert term(fast, P)[0] == pytest.approx(term(slow, P)[0])
 
 
-def test_the_clock_pays_feet_that_are_up_in_their_half_and_charges_others():
-    p = replace(P, clock_duty=0.5, clock_height=0.01)
-    up = {"command": FORWARD, "foot_height_m": (0.005, 0.0, 0.0, 0.02)}
-    assert wr.clock(step(clock=(0.0, 1.0, 0.0), **up), p)[0] == pytest.approx(1.5)
-    assert wr.clock(step(clock=(0.0, -1.0, 0.0), **up), p)[0] == pytest.approx(-1.5)
-    assert wr.clock(step(clock=(0.0, 1.0, 0.0), foot_height_m=0.02), p)[0] == 0.0
-    assert wr.clock(step(clock=(0.0, 1.0, 0.0), command=FORWARD), p)[0] == 0.0
-    # what pays is the time in which the clock is above the limit
-    turn = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
-    p = replace(p, clock_duty=0.6)
-    wanted = [
-        wr.clock(step(command=FORWARD, clock=(0, y, 0), foot_height_m=(0.02, 0, 0, 0)), p)[0] > 0
-        for y in np.sin(turn)
-    ]
-    assert np.mean(wanted) == pytest.approx(0.4, abs=0.002)
+def on_paths(command, turns: float, **moved):
+    """A step at so many turns of the clock, with some feet moved from the default pose [m]."""
+    angle, pose, away = 2 * np.pi * turns, default_pose(), np.zeros(12)
+    for i, leg in enumerate(LEGS):
+        own = slice(3 * i, 3 * i + 3)
+        foot = foot_position(leg, *pose[own]) + np.array(moved.get(leg, (0.0, 0.0, 0.0)))
+        away[own] = joint_angles(leg, foot) - pose[own]
+    clock = (np.cos(angle), np.sin(angle), 0.0)
+    return step(command=command, clock=clock, position_relative=away)
+
+
+LF, RF, LB, RB = LEGS
+
+
+def test_feet_are_paid_to_rise_in_their_half_of_the_clock():
+    p = replace(P, clock_duty=0.6, clock_height=0.006, foot_paths_sigma=0.024)
+    up = (0.0, 0.0, 0.006)
+    in_time = {"command": FORWARD, "turns": 0.25, LF: up, RB: up}
+    assert wr.foot_paths(on_paths(**in_time), p)[0] == pytest.approx(1.0)
+    # all four 6 mm off
+    late = wr.foot_paths(on_paths(**in_time | {"turns": 0.75}), p)[0]
+    assert late == pytest.approx(1.0 - 4 * 0.006**2 / 0.024**2)
+    assert late < wr.foot_paths(on_paths(FORWARD, 0.25), p)[0] < 1.0
+    assert wr.foot_paths(on_paths((0, 0, 0), 0.25), p)[0] == 0.0
+    assert wr.foot_paths(on_paths(FORWARD, 0.25, LF=(0.0, 0.0, 1.0)), p)[0] == -2.0
+
+
+@pytest.mark.parametrize(
+    ("command", "stroke"),
+    [((0.2, 0, 0), (1, 0, 0)), ((-0.2, 0, 0), (-1, 0, 0)), ((0, 0.2, 0), (0, 1, 0))],
+)
+def test_feet_are_paid_to_touch_down_ahead_by_half_of_what_they_pass(command, stroke):
+    # with the feet down for half of the time, the first pair touches down at half a turn
+    p = replace(P, clock_duty=0.5, clock_hz=4.0)
+    ahead = 0.2 * 0.5 / (2 * 4.0) * np.array(stroke)
+    moved = {LF: ahead, RB: ahead, RF: -ahead, LB: -ahead}
+    assert wr.foot_paths(on_paths(command, 0.5, **moved), p)[0] == pytest.approx(1.0)
+    assert wr.foot_paths(on_paths(command, 0.0, **moved), p)[0] < -1.0
+    # where all are, and how far to their sides, is free
+    wide = {leg: at + np.array([0.01, 0.005 * SIDE[leg], -0.01]) for leg, at in moved.items()}
+    assert wr.foot_paths(on_paths(command, 0.5, **wide), p)[0] == pytest.approx(1.0)
+
+
+def test_in_a_turn_feet_are_paid_to_go_around():
+    p = replace(P, clock_duty=0.5, clock_hz=4.0)
+    moved = {}
+    for sign, legs in ((1, (LF, RB)), (-1, (RF, LB))):
+        for leg in legs:
+            own = slice(3 * LEGS.index(leg), 3 * LEGS.index(leg) + 3)
+            x, y, _ = foot_position(leg, *default_pose()[own])
+            moved[leg] = sign * 0.5 * 0.5 / 8.0 * np.array([-y, x, 0.0])
+    assert wr.foot_paths(on_paths((0, 0, 0.5), 0.5, **moved), p)[0] == pytest.approx(1.0)
+    assert wr.foot_paths(on_paths((0, 0, -0.5), 0.5, **moved), p)[0] < 1.0
 
 
 def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
@@ -113,9 +153,9 @@ def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
 def test_a_curriculum_fades_guides_and_progress_and_widens_what_tracks():
     s = step(command=FORWARD, stride_velocity=(0.2, 0, 0), action=1.0, clock=(0.0, 1.0, 0.0))
     s = replace(s, foot_height_m=np.array([[0.01, 0.0, 0.0, 0.0]]))
-    p = replace(P, progress=2.0, clock=1.0)
+    p = replace(P, progress=2.0, foot_paths=1.0)
     whole = weighted(s, p)
-    assert whole["clock"][0] and whole["progress"][0]
+    assert whole["foot_paths"][0] and whole["progress"][0]
     for faded, names in (
         (weighted(s, p, guides=0.5), wr.GUIDES), (weighted(s, p, progress=0.5), wr.PROGRESS)
     ):  # fmt: skip
