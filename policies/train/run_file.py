@@ -129,8 +129,16 @@ def _first_gait_imitated(kind: Kind) -> Run:
 
 def _from_scratch(run: Run) -> Run:
     # a network is learned from more easily than a trot that bends sharply
-    imitation = replace(run.imitation, teacher=OWN, rollouts=4, epochs=6)
-    return replace(run, imitation=imitation, minutes=90.0)
+    imitation = replace(run.imitation, teacher=OWN, iterations=8, rollouts=4, epochs=6)
+    learner = replace(
+        run.learner, steps_per_environment=16, learning_rate=1e-5,
+        exploration=Exploration((0.02, 0.012), (0.0, 6.0), persistence_s=0.0),
+    )  # fmt: skip
+    task = replace(run.task, physics_step_s=PRESETS["scratch"].physics_step_s)
+    return replace(
+        run, task=task, learner=learner, imitation=imitation, environments=512, iterations=800,
+        minutes=90.0,
+    )  # fmt: skip
 
 
 def _teacher(kind: Kind) -> Run:
@@ -145,7 +153,7 @@ def _teacher(kind: Kind) -> Run:
             exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
             mirror=kind in ("mlp", "mlp-actions"),
         ),
-        imitation=Imitation(iterations=0), environments=512, iterations=2000, minutes=60.0,
+        imitation=Imitation(iterations=0), environments=512, iterations=1200, minutes=60.0,
     )  # fmt: skip
 
 
