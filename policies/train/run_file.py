@@ -128,13 +128,18 @@ def _first_gait_imitated(kind: Kind) -> Run:
 
 
 def _from_scratch(run: Run) -> Run:
+    # the teacher's rewards go on, at their end of the curriculum: those of an imitated trot are
+    # too narrow for a gait that is not yet as fast as it is commanded to be
+    taught = PRESETS["scratch"]
+    guides = taught.curriculum.guides.last
+    rewards = replace(taught.rewards, foot_paths=guides * taught.rewards.foot_paths)
+    task = replace(run.task, physics_step_s=taught.physics_step_s, rewards=rewards)
     # a network is learned from more easily than a trot that bends sharply
     imitation = replace(run.imitation, teacher=OWN, iterations=8, rollouts=4, epochs=6)
     learner = replace(
         run.learner, steps_per_environment=16, learning_rate=1e-5,
         exploration=Exploration((0.02, 0.012), (0.0, 6.0), persistence_s=0.0),
     )  # fmt: skip
-    task = replace(run.task, physics_step_s=PRESETS["scratch"].physics_step_s)
     return replace(
         run, task=task, learner=learner, imitation=imitation, environments=512, iterations=800,
         minutes=90.0,

@@ -30,7 +30,7 @@ from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS, PRIVILEGED_PARTS
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,8 @@ _RIDGE = 0.02  # in shares of the data
 _FEWEST = 1000  # errors that are fitted
 _QUIET = 4  # every so many robots act without noise
 _COMMAND = OBSERVATION_PARTS["command"]
+_CLOCK = slice(PRIVILEGED_PARTS["clock"].start, PRIVILEGED_PARTS["clock"].start + 2)
+_PER_STEP = 4  # phases of a learned gait that are compared, per control step
 
 
 class Teacher(ABC):
@@ -128,7 +130,11 @@ class TrotTeacher(Teacher):
 
 
 class LearnedTeacher(Teacher):
-    """Acts as a network that sees the truth.
+    """Continues the gait of a network from whatever the last two actions were.
+
+    The network acts by a clock that no policy sees. So the clock is set, as for the trot, to the
+    phase at which the network would have acted most nearly as the robot just did: a policy without
+    a memory can follow, and a robot that stands and is to walk begins to.
 
     Parameters
     ----------
@@ -147,13 +153,43 @@ class LearnedTeacher(Teacher):
     ):
         super().__init__(env, state)
         self._network = network.to(env.device)
+        config = self._env.config
+        cycles = config.rewards.clock_hz * config.control_step_s
+        self._step, count = 2 * np.pi * cycles, _PER_STEP * round(1 / cycles)
+        self._grid = torch.arange(count, device=env.device) * (2 * np.pi / count)
 
     def actions(self, observations: TensorDict) -> torch.Tensor:
-        """What the network does where the policy is, without noise."""
-        seen = observations["policy"].clone()
+        """What the network does next where the policy is, without noise."""
+        n, count = len(observations), len(self._grid)
+        policy = observations["policy"].clone()
         command = self.corrected(self._env.command)
-        seen[:, _COMMAND] = self._vec_env.tensor(command.astype(np.float32))
-        return self._network(TensorDict({**observations, "policy": seen}, observations.batch_size))
+        policy[:, _COMMAND] = self._vec_env.tensor(command.astype(np.float32))
+        seen = TensorDict({"policy": policy, "privileged": observations["privileged"]}, [n])
+        wide = seen.repeat_interleave(count, 0)
+        shown = self._at(wide, self._grid.repeat(n)).view(n, count, -1)
+        last, earlier = (
+            self._vec_env.tensor(a.astype(np.float32))[:, None]
+            for a in (self._env.action, self._env.last_action)
+        )
+        away = (shown - last).square().sum(-1)
+        away += (shown.roll(_PER_STEP, 1) - earlier).square().sum(-1)
+        return self._at(seen, lowest(away) + self._step)
+
+    def _at(self, seen: TensorDict, phase: torch.Tensor) -> torch.Tensor:
+        """Actions at phases of the clock, shape (k, 12)."""
+        privileged = seen["privileged"].clone()
+        privileged[:, _CLOCK] = torch.stack([torch.cos(phase), torch.sin(phase)], dim=-1)
+        return self._network(TensorDict({**seen, "privileged": privileged}, seen.batch_size))
+
+
+def lowest(values: torch.Tensor) -> torch.Tensor:
+    """Phase [rad] of the lowest of values at equal distances of a cycle, shapes (n,) and (n, k):
+    the bottom of the parabola through it and its neighbours.
+    """
+    at, rows, count = values.argmin(1), torch.arange(len(values)), values.shape[1]
+    before, here, after = (values[rows, (at + k) % count] for k in (-1, 0, 1))
+    bend = (before - 2 * here + after).clamp(min=1e-12)
+    return (at + (0.5 * (before - after) / bend).clamp(-0.5, 0.5)) * (2 * np.pi / count)
 
 
 def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> MLPModel:

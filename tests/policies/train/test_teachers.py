@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
@@ -21,10 +22,16 @@ from pupper_sysid.policies.train.run_file import (
     save_run,
     teacher_of,
 )
-from pupper_sysid.policies.train.teachers import LearnedTeacher, TrotTeacher, load_teacher
+from pupper_sysid.policies.train.teachers import (
+    LearnedTeacher,
+    TrotTeacher,
+    load_teacher,
+    lowest,
+)
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.observation import PRIVILEGED_PARTS
 from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
 from support.checkpoints import different, stop_after
 from support.tiny_training import tiny_run
@@ -161,29 +168,53 @@ def test_a_teacher_is_no_policy_for_a_robot(taught):
     assert not list(taught.glob("policy_*"))
 
 
-def test_a_learned_teacher_acts_as_its_network_does_on_the_policys_robot(taught):
-    env = WalkingVecEnv(make_env(tiny_run(environments=3), Ranks()))
-    seen = env.get_observations()
-    teacher = learned_teacher(taught, env)
-    own = load_teacher(taught, BEST, tiny_run(), seen)
-    torch.testing.assert_close(teacher.actions(seen), own(seen))
+class Circle(torch.nn.Module):
+    """A gait: joints follow the clock, each later than the one before, as far as commanded."""
+
+    def forward(self, seen: TensorDict) -> torch.Tensor:
+        cos, sin = seen["privileged"][:, PRIVILEGED_PARTS["clock"]][:, :2].T
+        return self.at(torch.atan2(sin, cos), seen["policy"][:, 9:10])
+
+    @staticmethod
+    def at(phase: torch.Tensor, forward: torch.Tensor) -> torch.Tensor:
+        """Actions at phases [rad] and commanded speeds, shape (n, 12)."""
+        return (0.2 + forward) * torch.cos(phase[:, None] + 0.3 * torch.arange(12))
 
 
-def test_a_learned_teacher_follows_the_corrected_command(taught):
-    env = WalkingVecEnv(make_env(tiny_run(environments=3), Ranks()))
+def test_a_learned_teacher_continues_its_gait_from_the_last_two_actions():
+    env = WalkingVecEnv(make_env(tiny_run(environments=5), Ranks()))
     env.env.command[:] = (0.1, 0.0, 0.0)
     seen = env.get_observations()
-    teacher = learned_teacher(taught, env)
-    before = seen["policy"].clone()
-    uncorrected = teacher.actions(seen)
+    step = 2 * np.pi * env.env.config.rewards.clock_hz * 0.02
+    phase = torch.tensor([0.0, 1.0, 2.5, -2.0, -0.3])
+    forward = torch.full((5, 1), 0.1)
+    rng = np.random.default_rng(0)
+    for ago, name in ((0, "action"), (1, "last_action")):
+        acted = Circle.at(phase - ago * step, forward).numpy() + 0.005 * rng.normal(size=(5, 12))
+        setattr(env.env, name, acted)
+    before = seen.clone()
+    found = LearnedTeacher(env, Circle()).actions(seen)  # pyright: ignore[reportArgumentType]
+    torch.testing.assert_close(found, Circle.at(phase + step, forward), atol=0.01, rtol=0)
+    assert all(torch.equal(seen[k], before[k]) for k in seen.keys())
+
+
+def test_the_lowest_of_a_cycle_lies_between_its_points():
+    phase = torch.tensor([0.02, 1.0, 6.2])
+    grid = torch.arange(56) * (2 * np.pi / 56)
+    found = lowest(-torch.cos(grid - phase[:, None]))
+    torch.testing.assert_close(torch.cos(found - phase), torch.ones(3), atol=1e-6, rtol=0)
+
+
+def test_a_learned_teacher_follows_the_corrected_command():
+    env = WalkingVecEnv(make_env(tiny_run(environments=3), Ranks()))
+    env.env.command[:] = (0.1, 0.0, 0.0)
+    teacher = LearnedTeacher(env, Circle())  # pyright: ignore[reportArgumentType]
+    seen = env.get_observations()
+    slower = teacher.actions(seen).abs().amax(1)
     teacher.correction[0, 0] = 0.2
-    faster = seen.clone()
     # 20 % of the range of 0.2 m/s for a command of half of it
-    faster["policy"][:, 9] += 0.2 * 0.2 * 0.5
-    own = load_teacher(taught, BEST, tiny_run(), seen)
-    torch.testing.assert_close(teacher.actions(seen), own(faster))
-    assert not torch.equal(teacher.actions(seen), uncorrected)
-    assert torch.equal(seen["policy"], before), "the policy's own observation stays"
+    ratio = teacher.actions(seen).abs().amax(1) / slower
+    torch.testing.assert_close(ratio, torch.full((3,), 0.32 / 0.3), atol=0.02, rtol=0)
 
 
 def test_a_policy_learns_to_act_as_a_teacher_whose_state_it_cannot_see(taught):
