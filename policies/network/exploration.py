@@ -10,6 +10,12 @@ output m, correlation c from step to step and standard deviation s,
 so that, given the state and `e_before`, the action is Gaussian about m + c · e_before with standard
 deviation √(1 − c²) · s. `e_before` is the observation group `noise`; it is known to the likelihood
 and to the critic, and never enters the policy's network.
+
+Where steps are to be found, white noise is better. The likelihood takes e from the step before as
+it was, so a change of m counts as if it lasted as the noise does: filtered by 1 / (1 − c·z⁻¹). At
+the 3.6 Hz of a trot, with a time constant of 0.15 s, the gradient of what a joint does within a
+stride is then turned by 61 degrees of the stride and is a third as large, beside that of where the
+joint is on average.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ class Architecture:
     privileged_critic: bool = True
     """Whether the critic has the true state beside the observation."""
     privileged_actor: bool = False
-    """Whether the policy has it, too, and with it the clock of the reward: a teacher, which no
-    robot can follow, for policies that can (`--start scratch`)."""
+    """Whether the policy acts by the clock of the reward and sees, besides, its command, the IMU
+    and the trunk's true speed alone: a teacher, which no robot can follow, for policies that can
+    (`--start scratch`)."""
 
     def __post_init__(self):
         for name in ("hidden", "critic_hidden"):
@@ -50,7 +51,8 @@ class Exploration:
     """Millions of samples between which it falls, by equal factors."""
     persistence_s: float = 0.3
     """Time constant of the noise's correlation; 0 for white noise. Noise that lasts moves joints
-    out of the dead band of their friction."""
+    out of the dead band of their friction. What lasts over half a stride is credited with what it
+    did in the other half, and steps are learned more slowly."""
     by_dead_band: bool = True
     """Whether joints of larger dead band (friction over stiffness) get more noise in proportion."""
     learned: bool = False

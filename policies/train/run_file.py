@@ -135,13 +135,13 @@ def _from_scratch(run: Run) -> Run:
     rewards = replace(taught.rewards, foot_paths=guides * taught.rewards.foot_paths)
     task = replace(run.task, physics_step_s=taught.physics_step_s, rewards=rewards)
     # a network is learned from more easily than a trot that bends sharply
-    imitation = replace(run.imitation, teacher=OWN, iterations=8, rollouts=4, epochs=6)
+    imitation = replace(run.imitation, teacher=OWN, iterations=16, rollouts=4, epochs=6)
     learner = replace(
-        run.learner, steps_per_environment=16, learning_rate=1e-5,
-        exploration=Exploration((0.02, 0.012), (0.0, 6.0), persistence_s=0.0),
+        run.learner, steps_per_environment=16, learning_rate=1e-5, desired_kl=0.01,
+        exploration=Exploration((0.015, 0.01), (0.0, 2.5), persistence_s=0.0),
     )  # fmt: skip
     return replace(
-        run, task=task, learner=learner, imitation=imitation, environments=512, iterations=800,
+        run, task=task, learner=learner, imitation=imitation, environments=512, iterations=300,
         minutes=90.0,
     )  # fmt: skip
 
@@ -158,7 +158,7 @@ def _teacher(kind: Kind) -> Run:
             exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
             mirror=kind in ("mlp", "mlp-actions"),
         ),
-        imitation=Imitation(iterations=0), environments=512, iterations=1200, minutes=60.0,
+        imitation=Imitation(iterations=0), environments=512, iterations=1700, minutes=60.0,
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """Teachers of a first gait: what a policy imitates before PPO begins.
 
-`TrotTeacher` continues an open-loop trot. It needs no clock: it computes the phase of the trot from
-the last two actions and returns the next point. `LearnedTeacher` is a network that was trained from
-nothing and sees the true state of the robot and the clock of its reward (`--start teacher`).
+`TrotTeacher` continues an open-loop trot, `LearnedTeacher` the gait of a network that was trained
+from nothing (`--start teacher`). Both need no clock: they compute the phase of the gait from the
+last two actions and return the next point. So a policy without a memory can learn to do the same.
 
 A policy that imitates does not walk at its teacher's speeds: its strokes and its rhythm differ a
 little, and noise of the actions loosens dry friction, so that a robot with it walks at other speeds
