@@ -49,7 +49,7 @@ class Options:
     """`fast`: sizes, task and rewards for a few cores; `paper`, `release`: as published."""
     start: Start = "imitation"
     """`imitation`: learn to continue a trot, then improve it; `scratch`: find a walk from nothing,
-    with a teacher that sees the true state, then learn to walk like it from what the robot sees;
+    with a teacher that acts by a clock, then learn to walk like it from what the robot sees;
     `teacher`: that teacher alone, for `--imitation.teacher runs/NAME`. The published presets always
     start from nothing."""
     name: str | None = None

@@ -44,7 +44,7 @@ def build(
     if architecture.kind == "mlp-actions":
         actor_groups.append("actions")
     if architecture.privileged_actor:
-        actor_groups.append("privileged")
+        actor_groups = ["policy", "privileged"]
     critic_groups = ["policy", "noise"]
     if architecture.privileged_critic:
         critic_groups.append("privileged")

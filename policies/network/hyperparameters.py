@@ -38,6 +38,11 @@ class Architecture:
                 raise InputError(f"architecture.{name} is empty; give the units of each layer.")
         if min(*self.hidden, *self.critic_hidden, self.memory) < 1:
             raise InputError("A layer of the architecture has no units; each needs at least 1.")
+        if self.privileged_actor and self.kind != "mlp":
+            raise InputError(
+                f"A teacher is an MLP, not a policy of kind {self.kind}. Leave `--policy` out; what "
+                "learns from it can be of any kind."
+            )
 
 
 @dataclass(frozen=True)

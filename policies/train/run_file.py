@@ -156,7 +156,7 @@ def _teacher(kind: Kind) -> Run:
             learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
             # noise that lasts over half a stride would be rewarded for what it does in the other
             exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
-            mirror=kind in ("mlp", "mlp-actions"),
+            mirror=True,
         ),
         imitation=Imitation(iterations=0), environments=512, iterations=1700, minutes=60.0,
     )  # fmt: skip
@@ -189,7 +189,7 @@ def check_teacher(folder: Path, run: Run) -> Run:
         If the folder holds no such run, or its actions or its clock mean something else.
     """
     own = load_run(folder)
-    if not own.architecture.privileged_actor or own.architecture.kind != "mlp":
+    if not own.architecture.privileged_actor:
         raise InputError(
             f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
             "of a run of `pupper-train --start teacher`."

@@ -107,6 +107,12 @@ def test_a_teacher_that_is_not_there_is_refused_before_anything_is_made(capsys, 
     assert not list(here.iterdir())
 
 
+def test_a_teacher_of_another_kind_is_refused(capsys, here):
+    said = refused(capsys, pupper_train, *TINY, "--start", "teacher", "--policy", "lstm")
+    assert "A teacher is an MLP, not a policy of kind lstm. Leave `--policy` out" in said
+    assert not list(here.iterdir())
+
+
 def test_a_calibration_with_an_unknown_joint_is_refused_by_name(capsys, here):
     text = Path(CALIBRATION).read_text().replace("LF_hip:", "LF_wing:")
     (here / "wing.yaml").write_text(text)
