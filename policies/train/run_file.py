@@ -191,7 +191,7 @@ def check_teacher(folder: Path, run: Run) -> Run:
     own = load_run(folder)
     if not own.architecture.privileged_actor:
         raise InputError(
-            f"{folder} is not a teacher: its policy does not see the true state. Give the folder "
+            f"{folder} is not a teacher: its policy acts by no clock. Give the folder "
             "of a run of `pupper-train --start teacher`."
         )
     same = [(f"task.{name}", own.task, run.task) for name in _OF_ACTIONS]
