@@ -133,7 +133,6 @@ def _from_scratch(run: Run) -> Run:
     taught = PRESETS["scratch"]
     guides = taught.curriculum.guides.last
     rewards = replace(taught.rewards, foot_paths=guides * taught.rewards.foot_paths)
-    task = replace(run.task, physics_step_s=taught.physics_step_s, rewards=rewards)
     # a network is learned from more easily than a trot that bends sharply
     imitation = replace(run.imitation, teacher=OWN, iterations=16, rollouts=4, epochs=6)
     learner = replace(
@@ -141,8 +140,8 @@ def _from_scratch(run: Run) -> Run:
         exploration=Exploration((0.015, 0.01), (0.0, 2.5), persistence_s=0.0),
     )  # fmt: skip
     return replace(
-        run, task=task, learner=learner, imitation=imitation, environments=512, iterations=300,
-        minutes=90.0,
+        run, task=replace(run.task, rewards=rewards), learner=learner, imitation=imitation,
+        environments=512, iterations=25, minutes=90.0,
     )  # fmt: skip
 
 
