@@ -20,6 +20,7 @@ from pupper_sysid.common.reading.budget import refuse_more
 
 MAX_DEPTH = 20
 MOST_NODES = 100_000
+_DEEPEST = 1000  # libyaml's own limit of nesting, since PyYAML 6.0.4
 
 Place = tuple[str | int, ...]
 """Where a value stands in a file: keys and list indices from the top."""
@@ -159,6 +160,9 @@ def load(text: str, name: str = "the text") -> tuple[Any, dict[Place, int]]:
             raise InputError(
                 f"{name} holds several YAML documents ('---'). Keep one per file."
             ) from error
+        if "nesting depth" in what:
+            refuse_more(name, _DEEPEST, MAX_DEPTH, "levels of nesting", exact=False)
+            raise InputError(f"{name} is nested too deeply. Check the file.") from error
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         at = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         raise InputError(f"{name} is not valid YAML: {at}{what}.") from error

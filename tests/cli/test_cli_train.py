@@ -109,7 +109,7 @@ def test_a_teacher_that_is_not_there_is_refused_before_anything_is_made(capsys, 
 
 def test_a_teacher_of_another_kind_is_refused(capsys, here):
     said = refused(capsys, pupper_train, *TINY, "--start", "teacher", "--policy", "lstm")
-    assert "A teacher is an MLP, not a policy of kind lstm. Leave `--policy` out" in said
+    assert "A teacher is an MLP, not a policy of kind lstm. What learns from it" in said
     assert not list(here.iterdir())
 
 

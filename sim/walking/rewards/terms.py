@@ -116,8 +116,9 @@ def gait(s: Step, p: Rewards) -> Array:
 
 
 def foot_paths(s: Step, p: Rewards) -> Array:
-    """1 - Σ e²/`foot_paths_sigma`², -2 at least, of the distances e of the feet from where the
-    clock wants them in the trunk's frame; 0 for a robot that is to stand.
+    """Nearness of the feet to where the clock wants them in the trunk's frame, -2 to 1.
+
+    It is 1 - Σ e² / σ² of the four distances e, -2 at least; 0 for a robot that is to stand.
 
     While the clock wants a foot down, it passes evenly under its place in the default pose at the
     commanded speed, by the rule of Raibert (1986); meanwhile the others swing back and rise by
