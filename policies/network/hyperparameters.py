@@ -40,8 +40,8 @@ class Architecture:
             raise InputError("A layer of the architecture has no units; each needs at least 1.")
         if self.privileged_actor and self.kind != "mlp":
             raise InputError(
-                f"A teacher is an MLP, not a policy of kind {self.kind}. What learns from it can be of "
-                "any kind."
+                f"A teacher is an MLP, not a policy of kind {self.kind}. What learns from it "
+                "can be of any kind."
             )
 
 

@@ -23,7 +23,9 @@ _HARMONICS = (2, 3)
 
 
 class TeacherActor(MLPActor):
-    """Sees rates and gravity as the IMU reads them, the command, the trunk's true speed, and the
+    """Network of a teacher.
+
+    It sees rates and gravity as the IMU reads them, the command, the trunk's true speed, and the
     clock of its reward with two harmonics; nothing of the joints.
     """
 

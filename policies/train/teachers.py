@@ -183,8 +183,13 @@ class LearnedTeacher(Teacher):
 
 
 def lowest(values: torch.Tensor) -> torch.Tensor:
-    """Phase [rad] of the lowest of values at equal distances of a cycle, shapes (n,) and (n, k):
-    the bottom of the parabola through it and its neighbours.
+    """Phase [rad] of the lowest of values at equal distances of a cycle, shape (n,).
+
+    It is the bottom of the parabola through the lowest and its neighbours.
+
+    Parameters
+    ----------
+    values : Tensor, shape (n, k)
     """
     at, rows, count = values.argmin(1), torch.arange(len(values)), values.shape[1]
     before, here, after = (values[rows, (at + k) % count] for k in (-1, 0, 1))
