@@ -3,7 +3,8 @@
 A teacher learns from nothing, by PPO. Adam moves every weight about as far whether its gradient is
 signal or noise, and PPO limits how far all of them together move the actions. So inputs that say
 nothing about a gait cost most of what an update may change: with the 145 numbers that a critic sees
-steps took 20 times as many samples as with these 19 (`benchmarks/README.md`).
+a teacher travelled after 1.4 million samples, with these 19 after half a million ("What it took" in
+`benchmarks/README.md`).
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class Teacher(ABC):
         """Actions to learn in every environment, shape (n, 12), on the learner's device."""
 
     def corrected(self, command: Array) -> Array:
-        """Commands that the trot follows where these are given, shape (n, 3)."""
+        """Commands that the teacher follows where these are given, shape (n, 3)."""
         more = np.einsum("nak,ak->na", _features(command), self.correction)
         return command + _RANGE * more
 

@@ -134,7 +134,7 @@ class Trot:
         """Middle of each foot's stroke in the trunk's frame [m], shape (4, 3)."""
         side = np.array([SIDE[leg] for leg in LEGS])
         moved = [np.zeros(4), self.spread_m * side, np.full(4, self.crouch_m)]
-        return _NEUTRAL + np.column_stack(moved)
+        return FEET_AT + np.column_stack(moved)
 
     def _strokes(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
@@ -161,6 +161,7 @@ class Trot:
 _BREAKS_LOOSE_M_S = 0.025  # speed sideways from which steps move the hips in any case
 _SOFT = 0.05  # rad/s over which the dead band is added
 
-_NEUTRAL = np.array(
+FEET_AT = np.array(
     [foot_position(leg, *default_pose()[3 * i : 3 * i + 3]) for i, leg in enumerate(LEGS)]
 )
+"""Where the feet are in the default pose, in the trunk's frame [m], shape (4, 3)."""

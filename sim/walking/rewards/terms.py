@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.joints import LEGS
 from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position
+from pupper_sysid.sim.robot.trot import FEET_AT
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.step import Step
 
@@ -24,8 +25,7 @@ DIAGONALS = ((0, 3), (1, 2))
 _APART = ((0, 1), (3, 2), (0, 2), (1, 3))
 _BEHIND = np.array([0.0, 0.5, 0.5, 0.0])  # of the feet, in cycles of the clock
 _POSE = default_pose()
-_FEET_AT = np.array([foot_position(leg, *_POSE[3 * i : 3 * i + 3]) for i, leg in enumerate(LEGS)])
-_SIDES = np.sign(_FEET_AT[:, 1])
+_SIDES = np.sign(FEET_AT[:, 1])
 _SLOW = (0.05, 0.15)  # commands [m/s, rad/s] that are not much above the trunk's sway
 
 
@@ -136,8 +136,8 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     swings = np.abs(own) < half
     along = np.where(swings, own / half, np.sign(own) * (0.5 - np.abs(own)) / (0.5 - half))
     x, y, turn = s.command.T[:, :, None]
-    speed = np.stack([x - turn * _FEET_AT[:, 1], y + turn * _FEET_AT[:, 0]], axis=-1)
-    away = feet - _FEET_AT
+    speed = np.stack([x - turn * FEET_AT[:, 1], y + turn * FEET_AT[:, 0]], axis=-1)
+    away = feet - FEET_AT
     away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
     away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
     away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
