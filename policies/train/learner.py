@@ -38,7 +38,7 @@ from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
-CHECKPOINT_VERSION = 3
+CHECKPOINT_VERSION = 4
 _ANOTHER = "Resume from another checkpoint of the run."
 _PARTS = (
     "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
@@ -51,7 +51,13 @@ _LOST, _MUCH = 10.0, 3.0  # beyond so many times the desired KL a policy is take
 
 
 class TerminalPPO(PPO):
-    """PPO that bootstraps time-outs with the value of the state that was reached."""
+    """PPO that takes the values of the states that were reached, whatever chance did then.
+
+    At a time-out it adds the value of the state that was reached. Where a robot is then given a new
+    command or a push, the step before is credited with the value of the state without them: no
+    action can bring them about, and what they cost was most of the variance of the advantages
+    ("What it took" in `benchmarks/README.md`).
+    """
 
     def process_env_step(
         self,
@@ -66,6 +72,12 @@ class TerminalPPO(PPO):
             reached = self.critic(extras["terminal_observations"]).detach()
             rewards = rewards.clone()
             rewards[late] += self.gamma * reached[:, 0]
+        ids = extras["unforeseen_ids"]
+        if len(ids):
+            both = extras["unforeseen_observations"], obs[ids]
+            values = [self.critic(o).detach() for o in both]
+            rewards = rewards.clone()
+            rewards[ids] += self.gamma * (values[0] - values[1])[:, 0]
         super().process_env_step(obs, rewards, dones, {})
 
 
@@ -398,7 +410,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is damaged and cannot be read. {_ANOTHER}") from error
     if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
         raise InputError(f"{path} is not a checkpoint of pupper-train.")
-    if content.get("schema_version") in (1, 2):
+    if content.get("schema_version") in (1, 2, 3):
         raise InputError(
             f"{path} is of an older version of pupper-train, whose critic has other inputs, and "
             "cannot be resumed. Its policies can be played and evaluated; start a new run."

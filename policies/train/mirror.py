@@ -32,7 +32,8 @@ _IMAGES: dict[str, tuple[list[int], list[float]]] = {
     "joint_effort": _ANGLES, "last_action": _ANGLES, "air_s": _FEET, "contact_s": _FEET,
     "dead_time_s": _JOINT_SIZES, "centre_of_mass": _POLAR, "leg_strength": _FEET,
     "joint_zero": _ANGLES, "imu_mounting": _AXIAL, "gyro_bias": _AXIAL,
-    "clock": ([0, 1, 2], [-1.0, -1.0, 1.0]),
+    "true_angular_velocity": _AXIAL, "true_gravity": _POLAR, "stride_velocity": _COMMAND,
+    "earlier_action": _ANGLES, "clock": ([0, 1, 2], [-1.0, -1.0, 1.0]),
 }  # fmt: skip
 """Image of a quantity: whose value each element has, and its sign; others stay as they are."""
 

@@ -68,7 +68,8 @@ class WalkingVecEnv:
         -------
         observations, rewards, dones, extras
             `extras` has `terminal_ids` and `terminal_observations` of the environments whose time
-            was up, `terms`, the reward terms, and `facts`, what happened.
+            was up, `unforeseen_ids` and `unforeseen_observations` (see `StepResult.unforeseen`),
+            `terms`, the reward terms, and `facts`, what happened.
         """
         found = self.env.step(actions.detach().cpu().numpy())
         ended = self._past
@@ -79,14 +80,20 @@ class WalkingVecEnv:
             self._past[found.done] = self.env.action[found.done][:, None]
         late, noise = found.terminal["ids"], self.noise
         self.noise = noise * self.tensor(~found.done)[:, None]
-        ids = self.tensor(late)
+        ids, surprised = self.tensor(late), found.unforeseen["ids"]
         extras: dict[str, Any] = {
             "terms": found.terms, "facts": found.facts, "terminal_ids": ids,
+            "unforeseen_ids": self.tensor(surprised),
         }  # fmt: skip
         if len(late):
             extras["terminal_observations"] = self._groups(
                 found.terminal["observation"], found.terminal["privileged"], ended[late],
                 noise[ids],
+            )  # fmt: skip
+        if len(surprised):
+            extras["unforeseen_observations"] = self._groups(
+                found.unforeseen["observation"], found.unforeseen["privileged"],
+                self._past[surprised], self.noise[extras["unforeseen_ids"]],
             )  # fmt: skip
         return (
             self._groups(found.observation, found.privileged, self._past, self.noise),

@@ -39,7 +39,7 @@ from pupper_sysid.sim.walking.rewards.terms import weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
-from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts
+from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, without_chance
 
 Array = NDArray[np.float64]
 
@@ -232,6 +232,7 @@ class PupperEnv:
         terminal: dict[str, NDArray] = {"ids": late}
         if len(late):
             terminal |= {"observation": now.observation[late], "privileged": now.privileged[late]}
+        unforeseen = without_chance(now, self.command, done, config.observation.base_velocity)
         over = np.flatnonzero(done)
         if len(over):
             self._restart(over)
@@ -239,8 +240,9 @@ class PupperEnv:
             now.observation[over], now.privileged[over] = self._look(over, noise)
         facts = Step(**now.facts)
         return StepResult(
-            now.observation, now.privileged, reward, done, timed_out, now.terms, terminal, facts
-        )
+            now.observation, now.privileged, reward, done, timed_out, now.terms, terminal,
+            unforeseen, facts,
+        )  # fmt: skip
 
     def set_points(self, action: Array) -> Array:
         """Joint set-points [rad] of actions, shape (n, 12), within the joint limits."""
@@ -444,6 +446,7 @@ class PupperEnv:
                 velocity, qpos[:, 7:] - self.default, qvel[:, 6:], height[:, None],
                 strides.air_s[rows], strides.stance_s[rows], self.robots.friction[rows, None],
                 self.robots.drawn["dead_time_s"][rows], *self._differing(rows),
+                qvel[:, 3:6], gravity, strides.velocity[rows], self.last_action[rows],
                 strides.clock(rows), left[:, None],
             ],
             privileged,

@@ -92,7 +92,8 @@ PRIVILEGED = (
     ("height", 1), ("air_s", 4), ("contact_s", 4), ("friction", 1), ("dead_time_s", 12),
     ("added_mass", 1), ("centre_of_mass", 3), ("leg_strength", 4), ("battery", 1),
     ("joint_zero", 12), ("imu_mounting", 3), ("gyro_bias", 3), ("imu_age", 2), ("readings", 3),
-    ("clock", 3), ("time_left", 1),
+    ("true_angular_velocity", 3), ("true_gravity", 3), ("stride_velocity", 3),
+    ("earlier_action", 12), ("clock", 3), ("time_left", 1),
 )  # fmt: skip
 """Name and size of each part of what the critic sees."""
 PRIVILEGED_PARTS = _places(PRIVILEGED)
@@ -103,7 +104,7 @@ PRIVILEGED_SIZE = sum(size for _, size in PRIVILEGED)
 def privileged_of(
     parts: Sequence[NDArray[np.floating]], out: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """What a critic in the simulator may know of n robots, shape (n, 85).
+    """What a critic in the simulator may know of n robots, shape (n, 106).
 
     Parameters
     ----------
@@ -114,16 +115,17 @@ def privileged_of(
         strength of the legs and of the battery relative to the model, errors of the joints' zeros
         [rad], rotation of the IMU [rad], errors of its rates [rad/s], its latency and period [s],
         factors on the readings' periods and on the commands' jitter with whether efforts are read,
-        clock of a trot (see `Strides`), share of the episode that is left: the parts of
-        `PRIVILEGED`.
-    out : ndarray of float32, shape (n, 85), optional
+        rates [rad/s] and direction of gravity as they are, speeds over about a stride [m/s, rad/s],
+        the action before the last, clock of a trot (see `Strides`), share of the episode that is
+        left: the parts of `PRIVILEGED`.
+    out : ndarray of float32, shape (n, 106), optional
         Where to write it.
     """
     velocity, angle, speed, height, air, stance, friction, dead_time, *differs = parts
-    mass, centre, legs, battery, zero, turn, bias, age, factors, clock, left = differs
+    mass, centre, legs, battery, zero, turn, bias, age, factors, *more = differs
     if out is None:
         out = np.empty((len(velocity), PRIVILEGED_SIZE), np.float32)
     scaled = [velocity, angle, 0.1 * speed, 10 * height, air, stance.clip(0, 1), friction]
     scaled += [10 * dead_time, 10 * mass, 100 * centre, legs, battery, 20 * zero, 20 * turn]
-    scaled += [20 * bias, 50 * age, factors, clock, left]
+    scaled += [20 * bias, 50 * age, factors, *more]
     return np.concatenate(scaled, axis=1, out=out)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.sim.robot.robot_batch import FEET
+from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS, PRIVILEGED_PARTS
 
 Array = NDArray[np.float64]
 
@@ -96,6 +97,9 @@ class StepResult:
         Each reward term, weighted and times the control period.
     terminal : dict of str to ndarray
         `ids` of environments whose time was up, and their last `observation` and `privileged`.
+    unforeseen : dict of str to ndarray
+        `ids` of other environments that were given a new command or a push after this step, and
+        `observation` and `privileged` as they would be without.
     facts : Step
         What happened, before any new episode.
     """
@@ -107,6 +111,7 @@ class StepResult:
     timed_out: NDArray[np.bool_]
     terms: dict[str, Array]
     terminal: dict[str, NDArray]
+    unforeseen: dict[str, NDArray]
     facts: Step
 
 
@@ -136,3 +141,35 @@ def empty_facts(
     }  # fmt: skip
     found |= {name: np.empty((len(command), size)) for name, size in _COLUMNS.items()}
     return found | {name: np.empty((len(command), FEET), bool) for name in _FLAGS}
+
+
+def without_chance(
+    now: Unfinished, command: Array, done: NDArray[np.bool_], base_velocity: str
+) -> dict[str, NDArray]:
+    """`StepResult.unforeseen` of a step.
+
+    Parameters
+    ----------
+    now : Unfinished
+        The step, with everything filled in.
+    command : ndarray, shape (n, 3)
+        After the step.
+    done : ndarray of bool, shape (n,)
+        Episodes that are over.
+    base_velocity : str
+        As in `Observation`.
+    """
+    before, velocity = now.facts["command"], now.facts["linear_velocity"]
+    changed = (before != command).any(axis=1)
+    changed[now.pushed] = True
+    ids = np.flatnonzero(changed & ~done)
+    if not len(ids):
+        return {"ids": ids}
+    observation, privileged = now.observation[ids], now.privileged[ids]
+    place = PRIVILEGED_PARTS["base_linear_velocity"]
+    if base_velocity == "true":
+        seen = OBSERVATION_PARTS["base_linear_velocity"]
+        observation[:, seen] += velocity[ids] - privileged[:, place]
+    observation[:, OBSERVATION_PARTS["command"]] = before[ids]
+    privileged[:, place] = velocity[ids]
+    return {"ids": ids, "observation": observation, "privileged": privileged}

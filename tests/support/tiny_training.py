@@ -73,7 +73,8 @@ def ppo(kind: str, robots: int, steps: int) -> TerminalPPO:
 
 def roll(learner: TerminalPPO, dones: torch.Tensor, generator: torch.Generator) -> None:
     """One rollout of made-up observations with these `dones`, shape (steps, robots)."""
-    nothing = {"terminal_ids": torch.zeros(0, dtype=torch.long)}
+    none = torch.zeros(0, dtype=torch.long)
+    nothing = {"terminal_ids": none, "unforeseen_ids": none}
     robots = dones.shape[1]
     seen = observations(robots, generator)
     with torch.inference_mode():

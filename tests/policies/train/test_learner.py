@@ -18,7 +18,7 @@ from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, read_checkpo
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import Commands, Randomisation, Walking
 from support.tiny_training import observations, ppo, tiny_run
 
 GAMMA = 0.99
@@ -111,7 +111,10 @@ def test_a_time_out_is_worth_the_value_of_the_state_reached_and_a_fall_nothing()
     before, reached, after = (observations(3, generator) for _ in range(3))
     with torch.inference_mode():
         learner.act(before)
-        extras = {"terminal_ids": torch.tensor([2]), "terminal_observations": reached[2:]}
+        extras = {
+            "terminal_ids": torch.tensor([2]), "terminal_observations": reached[2:],
+            "unforeseen_ids": torch.zeros(0, dtype=torch.long),
+        }  # fmt: skip
         rewards = torch.tensor([10.0, 20.0, 30.0])
         learner.process_env_step(after, rewards, torch.tensor([False, True, True]), extras)
         learner.compute_returns(after)
@@ -128,9 +131,29 @@ def test_a_time_out_is_worth_the_value_of_the_state_reached_and_a_fall_nothing()
     assert returns.tolist() == pytest.approx([goes_on, 20.0, bootstrapped], abs=1e-5)
 
 
+def test_what_chance_does_after_a_step_is_not_credited_to_it():
+    """Robot 1 is pushed: its advantage is that of the state without the push."""
+    learner = ppo("mlp", robots=2, steps=1)
+    generator = torch.Generator().manual_seed(1)
+    before, after, without = (observations(2, generator) for _ in range(3))
+    with torch.inference_mode():
+        learner.act(before)
+        extras = {
+            "terminal_ids": torch.zeros(0, dtype=torch.long),
+            "unforeseen_ids": torch.tensor([1]), "unforeseen_observations": without[1:],
+        }  # fmt: skip
+        learner.process_env_step(after, torch.tensor([1.0, 2.0]), torch.zeros(2).bool(), extras)
+        learner.compute_returns(after)
+        reached = learner.critic(torch.cat([after[:1], without[1:]]))[:, 0]
+        assert (learner.critic(without)[1] - learner.critic(after)[1]).abs() > 0.05
+    expected = torch.tensor([1.0, 2.0]) + learner.gamma * reached
+    torch.testing.assert_close(learner.storage.returns[0, :, 0], expected)
+
+
 def test_in_a_rollout_every_time_out_is_worth_the_value_of_its_own_terminal_observation():
-    run = tiny_run(task=Walking(episode_s=0.06))
-    learner = make_learner(run, Ranks())
+    calm = Randomisation(push_m_s=0.0)
+    task = Walking(episode_s=0.06, commands=Commands(every_s=1e6), randomisation=calm)
+    learner = make_learner(tiny_run(task=task), Ranks())
     seen = []
     learner.rollout(lambda rewards, dones, extras: seen.append((rewards.clone(), extras)))
     late = [len(extras["terminal_ids"]) for _, extras in seen]
@@ -142,6 +165,7 @@ def test_in_a_rollout_every_time_out_is_worth_the_value_of_its_own_terminal_obse
             with torch.inference_mode():
                 value = learner.ppo.critic(extras["terminal_observations"])[:, 0]
             expected[extras["terminal_ids"]] += learner.hyper.discount * value
+        assert not len(extras["unforeseen_ids"]), "or more would have been added"
         torch.testing.assert_close(learner.ppo.storage.rewards[step, :, 0], expected)
 
 

@@ -17,6 +17,7 @@ from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.mini_pupper import foot_position
 from pupper_sysid.sim.walking.config import Observation, Randomisation, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.observation import PRIVILEGED_SIZE
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import HISTORY, observations, tiny_run
 
@@ -58,9 +59,9 @@ def test_a_robot_with_mirrored_commands_and_actions_sees_the_mirror_image():
 
 def test_the_image_of_an_image_is_the_original():
     seen = observations(5, torch.Generator().manual_seed(0))
-    privileged = torch.randn(5, 85)
+    privileged = torch.randn(5, PRIVILEGED_SIZE)
     for name, values in (*seen.items(), ("privileged", privileged)):
-        if values.shape[1] in (60, 85, 12, 12 * HISTORY):
+        if values.shape[1] in (60, PRIVILEGED_SIZE, 12, 12 * HISTORY):
             assert torch.equal(mirrored(mirrored(values, name), name), values)
             assert not torch.equal(mirrored(values, name), values)
 

@@ -32,7 +32,7 @@ from pupper_sysid.sim.walking.config import (
     Walking,
 )
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
+from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE, PRIVILEGED_SIZE
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.rewards.terms import TERMS, progress
 from pupper_sysid.sim.walking.rewards.weights import Rewards
@@ -225,7 +225,7 @@ def test_an_observation_is_sixty_named_numbers_in_the_published_order():
     env = make()
     observation, privileged = env.reset()
     assert observation.shape == (4, 60) and observation.dtype == np.float32
-    assert privileged.shape == (4, 85) and privileged.dtype == np.float32
+    assert privileged.shape == (4, PRIVILEGED_SIZE) and privileged.dtype == np.float32
 
 
 def test_the_last_action_is_seen_raw_and_the_command_as_given():
@@ -565,6 +565,28 @@ def test_only_those_whose_time_is_up_hand_over_a_last_observation():
     np.testing.assert_array_equal(result.timed_out, [False, False, True, False])
     np.testing.assert_array_equal(result.terminal["ids"], [2])
     assert len(result.terminal["observation"]) == 1
+
+
+@pytest.mark.parametrize("true", [False, True])
+def test_what_chance_did_after_a_step_is_handed_over_undone(true):
+    """Robot 0 gets a new command, 1 a push, 2 both and falls, 3 neither."""
+    seen = Observation(noise=False, base_velocity="true" if true else "zero")
+    task = replace(QUIET, observation=seen, randomisation=Randomisation(push_m_s=1.0))
+    env, twin = make(MEASURED, task), make(MEASURED, task)
+    for e in (env, twin):
+        e._until_command[:], e._until_push[:] = np.inf, np.inf
+        throw(e, [2])
+    env._until_command[[0, 2]] = env._until_push[[1, 2]] = 0.0
+    found, undone = env.step(still(env)), twin.step(still(twin))
+    assert (env.command[0] != twin.command[0]).any() and found.done.tolist()[2]
+    assert found.unforeseen["ids"].tolist() == [0, 1]
+    assert (found.observation[0] != undone.observation[0]).any()
+    assert (found.privileged[1] != undone.privileged[1]).any()
+    for name in ("observation", "privileged"):
+        np.testing.assert_allclose(
+            found.unforeseen[name], getattr(undone, name)[:2], rtol=0, atol=1e-6
+        )
+    assert undone.unforeseen["ids"].tolist() == []
 
 
 def test_facts_are_of_the_old_episode_also_where_it_ended():
