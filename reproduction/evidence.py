@@ -26,9 +26,10 @@ from pupper_sysid.policies.analysis.robustness import (
     terrain,
 )
 from pupper_sysid.policies.analysis.trial import Outcome, Trial, outcome
+from pupper_sysid.policies.network.hyperparameters import TROT
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import PROGRESS
-from pupper_sysid.policies.train.run_file import RUN_FILE, load_run
+from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.walking.config import Curriculum
 from reproduction.claims import NotTestable
@@ -61,6 +62,8 @@ class PolicyEvidence:
     """Whether it was trained with a curriculum; None if not known."""
     ground: str | None
     """Kind of ground it was trained on; None if not known."""
+    first_gait: str | None
+    """What it imitated before PPO; None if nothing, or not known."""
     walk: Rollout
     gait: GaitReport | None
     """None if no robot walked long enough."""
@@ -103,11 +106,12 @@ def gather(
         gait = describe(walk, rng)
     except InputError:
         gait = None
-    task = load_run(run_folder).task if run_folder and (run_folder / RUN_FILE).is_file() else None
+    run = load_run(run_folder) if run_folder and (run_folder / RUN_FILE).is_file() else None
+    task = run.task if run else None
     return PolicyEvidence(
         name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s),
         task.curriculum != Curriculum() if task else None,
-        task.terrain if task else None, walk, gait,
+        task.terrain if task else None, _imitated(run) if run else None, walk, gait,
         step("orbits", lambda: orbits(policy, trial)),
         step("delay", lambda: delay_curve(policy, trial, _EXTRA_DELAYS_MS)),
         step("ablation", lambda: ablation(policy, trial, ("all joints",))),
@@ -116,6 +120,12 @@ def gather(
         step("terrain", lambda: terrain(policy, trial)),
         step("directions", lambda: compliance(policy, trial)),
     )  # fmt: skip
+
+
+def _imitated(run: Run) -> str | None:
+    if not run.imitation.iterations:
+        return None
+    return "a trot" if run.imitation.teacher == TROT else "a teacher that learned from nothing"
 
 
 def scales(policy: Policy, trial: Trial) -> list[ScalePoint]:

@@ -52,9 +52,10 @@ def curriculum(policies: Policies) -> Finding:
     if not any(p.kind == "mlp" for p in without):
         raise NotTestable("Give a run, with its run.yaml, of an MLP without a curriculum.")
     found = of_kinds(without, lambda e: float(e.walk.alive[-1].mean()), "mlp")
+    first = " or ".join(sorted({p.first_gait for p in without if p.first_gait}))
     return Finding(
         several(found, 2), bounds(found), holds(found["mlp"].value < 0.9),
-        "Imitation of a trot came first, for all alike.",
+        f"Imitation of {first} came first." if first else "",
     )  # fmt: skip
 
 

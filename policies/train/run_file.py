@@ -133,6 +133,10 @@ def _from_scratch(run: Run) -> Run:
     taught = PRESETS["scratch"]
     guides = taught.curriculum.guides.last
     rewards = replace(taught.rewards, foot_paths=guides * taught.rewards.foot_paths)
+    pushes = {n: getattr(taught.randomisation, n) for n in ("push_m_s", "push_every_s")}
+    task = replace(
+        run.task, rewards=rewards, randomisation=replace(run.task.randomisation, **pushes)
+    )
     # a network is learned from more easily than a trot that bends sharply
     imitation = replace(run.imitation, teacher=OWN, iterations=16, rollouts=4, epochs=6)
     learner = replace(
@@ -140,24 +144,24 @@ def _from_scratch(run: Run) -> Run:
         exploration=Exploration((0.015, 0.01), (0.0, 2.5), persistence_s=0.0),
     )  # fmt: skip
     return replace(
-        run, task=replace(run.task, rewards=rewards), learner=learner, imitation=imitation,
+        run, task=task, learner=learner, imitation=imitation,
         environments=512, iterations=25, minutes=90.0,
     )  # fmt: skip
 
 
 def _teacher(kind: Kind) -> Run:
     return Run(
-        architecture=Architecture(kind, (128, 64), 64, (128, 64), privileged_actor=True),
+        architecture=Architecture(kind, (128, 64), 64, (256, 128, 64), privileged_actor=True),
         task=PRESETS["scratch"],
         learner=Hyperparameters(
             # many small updates: how far one may go limits learning, not how sure it is of where
             steps_per_environment=8, epochs=3, learning_rate=1e-3, desired_kl=0.025,
             learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
             # noise that lasts over half a stride would be rewarded for what it does in the other
-            exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
+            exploration=Exploration((0.06, 0.012), (0.5, 4.5), persistence_s=0.0),
             mirror=True,
         ),
-        imitation=Imitation(iterations=0), environments=512, iterations=1700, minutes=60.0,
+        imitation=Imitation(iterations=0), environments=512, iterations=1200, minutes=60.0,
     )  # fmt: skip
 
 

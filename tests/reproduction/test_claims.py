@@ -80,7 +80,7 @@ def evidence(kind: str, name: str | None = None) -> PolicyEvidence:
     directions = ("forward", "backward", "left", "right", "turn left", "turn right")
     return PolicyEvidence(
         name or kind, kind, {"reward": 7.0, "std": 0.01, "updates": 60.0, "steps_per_s": 1000.0},
-        False, "flat", walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
+        False, "flat", "a trot", walked((0.15, 0.0, 0.0), 0.15, 0.0, 0.0), None,
         {"actions": orbit, "hidden": orbit},
         [
             DelayPoint(extra_delay_ms=d, mode=m, **gait)
