@@ -123,7 +123,7 @@ def foot_paths(s: Step, p: Rewards) -> Array:
 
     While the clock wants a foot down, it passes evenly under its place in the default pose at the
     commanded speed, by the rule of Raibert (1986); meanwhile the others swing back and rise by
-    `clock_height`. Margolis and Agrawal (2022) reward all three. Where the feet are on average along
+    `clock_height`. Margolis and Agrawal (2022) reward all three. The mean place of the feet along
     the trunk is free.
     """
     joints = _POSE + s.position_relative
