@@ -4,7 +4,7 @@ A teacher learns from nothing, by PPO. Adam moves every weight about as far whet
 signal or noise, and PPO limits how far all of them together move the actions. So inputs that say
 nothing about a gait cost most of what an update may change: with the 145 numbers that a critic sees
 a teacher travelled after 1.4 million samples, with 19 of these after 0.5, and with the products of
-speeds and clock after 0.3 ("What it took" in `benchmarks/README.md`).
+command and clock after 0.3 ("What it took" in `benchmarks/README.md`).
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ class TeacherActor(MLPActor):
     """Network of a teacher.
 
     It sees rates and gravity as the IMU reads them, the command, the trunk's true speed, the clock
-    of its reward with two harmonics, and these times each part of the command and the trunk's
-    planar speed; nothing of the joints.
+    of its reward with two harmonics, and these times each part of the command; nothing of the
+    joints.
     """
 
     def get_latent(
         self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None
     ) -> torch.Tensor:
-        """Its inputs, normalised, shape (…, 49)."""
+        """Its inputs, normalised, shape (…, 37)."""
         return self.obs_normalizer(inputs(obs))
 
     def update_normalization(self, obs: TensorDict) -> None:
@@ -46,14 +46,13 @@ class TeacherActor(MLPActor):
 
 
 def inputs(obs: TensorDict) -> torch.Tensor:
-    """What a teacher sees of the groups `policy` and `privileged`, shape (…, 49)."""
+    """What a teacher sees of the groups `policy` and `privileged`, shape (…, 37)."""
     policy, privileged = obs["policy"], obs["privileged"]
     seen = [policy[..., OBSERVATION_PARTS[name]] for name in _SEEN]
     velocity = privileged[..., PRIVILEGED_PARTS["base_linear_velocity"]]
     cos, sin, in_time = privileged[..., PRIVILEGED_PARTS["clock"]].split(1, -1)
     angles = torch.atan2(sin, cos) * _HARMONICS.to(sin.device)
     waves = torch.cat([torch.cos(angles), torch.sin(angles)], dim=-1)
-    # Raibert's rule: where a foot goes is a speed, commanded or true, times a function of the clock
-    speeds = torch.cat([seen[-1], velocity[..., :2]], dim=-1)
-    strokes = (speeds[..., None] * waves[..., None, :]).flatten(-2)
+    # a foot's stroke is its speed times a function of the clock: Raibert's rule
+    strokes = (seen[-1][..., None] * waves[..., None, :]).flatten(-2)
     return torch.cat([*seen, velocity, in_time, waves, strokes], dim=-1)

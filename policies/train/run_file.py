@@ -145,7 +145,7 @@ def _from_scratch(run: Run) -> Run:
     )  # fmt: skip
     return replace(
         run, task=task, learner=learner, imitation=imitation,
-        environments=512, iterations=25, minutes=90.0,
+        environments=512, iterations=100, minutes=90.0,
     )  # fmt: skip
 
 
@@ -158,10 +158,10 @@ def _teacher(kind: Kind) -> Run:
             steps_per_environment=8, epochs=3, learning_rate=1e-3, desired_kl=0.025,
             learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
             # noise that lasts over half a stride would be rewarded for what it does in the other
-            exploration=Exploration((0.06, 0.012), (0.5, 4.5), persistence_s=0.0),
+            exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
             mirror=True,
         ),
-        imitation=Imitation(iterations=0), environments=512, iterations=1200, minutes=60.0,
+        imitation=Imitation(iterations=0), environments=512, iterations=1700, minutes=60.0,
     )  # fmt: skip
 
 

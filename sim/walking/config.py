@@ -234,19 +234,18 @@ _SCRATCH = Walking(
     physics_step_s=0.004,
     commands=Commands(every_s=4.0, standing=0.1),
     randomisation=Randomisation(
-        on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5, push_m_s=1.2, push_every_s=(2.5, 6.0)
+        on_the_move=0.0, joint_rad=0.1, joint_rad_s=0.5, push_m_s=1.2, push_every_s=(3.0, 8.0)
     ),
     differences=TYPICAL,
     curriculum=Curriculum(
-        commands=Ramp(0.6, 1.0, 0.5, 2.0),
+        commands=Ramp(0.6, 1.0, 1.0, 4.0),
         # first steps by the clock; then they are to travel, then to do so evenly
-        progress=Ramp(0.0, 1.0, 0.2, 0.5),
-        penalties=Ramp(0.3, 1.0, 0.4, 2.0),
-        # while the noise is still large enough to find steps that catch a fall
-        push=Ramp(0.0, 1.0, 0.5, 2.0),
-        guides=Ramp(1.0, 0.4, 2.0, 4.5),
-        linear_sigma=Ramp(1.5, 1.0, 1.0, 2.0),
-        angular_sigma=Ramp(2.0, 1.0, 1.0, 2.0),
+        progress=Ramp(0.0, 1.0, 0.3, 0.6),
+        penalties=Ramp(0.3, 1.0, 0.5, 3.0),
+        push=Ramp(0.0, 1.0, 1.5, 5.0),
+        guides=Ramp(1.0, 0.4, 3.0, 7.0),
+        linear_sigma=Ramp(1.5, 1.0, 2.0, 3.0),
+        angular_sigma=Ramp(2.0, 1.0, 2.0, 3.0),
     ),
     rewards=Rewards(
         foot_paths=15.0, gait=0.0, alive=0.1, progress=8.0, turn_progress=4.0,

@@ -118,13 +118,12 @@ def gait(s: Step, p: Rewards) -> Array:
 def foot_paths(s: Step, p: Rewards) -> Array:
     """Nearness of the feet to where the clock wants them in the trunk's frame, -2 to 1.
 
-    It is 1 - Σ e² / σ² of the four distances e, -2 at least; 0 for a robot that is to stand. How
-    far all feet together are from a crouch and a spread counts as one more.
+    It is 1 - Σ e² / σ² of the four distances e, -2 at least; 0 for a robot that is to stand.
 
     While the clock wants a foot down, it passes evenly under its place in the default pose at the
     commanded speed, by the rule of Raibert (1986); meanwhile the others swing back and rise by
-    `clock_height`. Margolis and Agrawal (2022) reward all three. The mean place of the feet along
-    the trunk is free.
+    `clock_height`. Margolis and Agrawal (2022) reward both. The mean place of the feet and how far
+    they are spread are free.
     """
     joints = _POSE + s.position_relative
     feet = np.stack(
@@ -141,11 +140,9 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     away = feet - FEET_AT
     away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
     away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
-    lower, wider = away[..., 2].mean(axis=1), (_SIDES * away[..., 1]).mean(axis=1)
     away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
-    away[..., 1] -= _SIDES * wider[:, None]
-    missed = (away**2).sum(axis=(1, 2)) + (lower - p.crouch) ** 2 + (wider - p.spread) ** 2
-    missed /= p.foot_paths_sigma**2
+    away[..., 1] -= _SIDES * (_SIDES * away[..., 1]).mean(axis=1, keepdims=True)
+    missed = (away**2).sum(axis=(1, 2)) / p.foot_paths_sigma**2
     return np.where(np.abs(s.command).max(axis=1) > 0, np.maximum(1.0 - missed, -2.0), 0.0)
 
 

@@ -64,10 +64,6 @@ class Rewards:
     policy does not see the clock, which follows the feet; a teacher does."""
     foot_paths_sigma: float = 0.012
     """Its width: root of the summed squares of four feet's distances [m]."""
-    crouch: float = 0.01
-    """How much lower than in the default pose the trunk is to be, for `foot_paths` [m]."""
-    spread: float = 0.007
-    """How much farther to their sides than in the default pose feet are to be, likewise [m]."""
     clock_hz: float = 3.6
     """Steps of each foot per second by that clock."""
     clock_pull_hz: float = 0.2

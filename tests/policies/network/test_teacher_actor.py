@@ -36,15 +36,14 @@ def seen() -> TensorDict:
 
 def test_a_teacher_sees_command_imu_speed_and_the_clock_with_its_harmonics(seen):
     found = inputs(seen)
-    assert found.shape == (5, 49)
+    assert found.shape == (5, 37)
     torch.testing.assert_close(found[:, :9], seen["policy"][:, 3:12])
     velocity = seen["privileged"][:, PRIVILEGED_PARTS["base_linear_velocity"]]
     torch.testing.assert_close(found[:, 9:12], velocity)
     angles = 2 * np.pi * TURNS * np.array([1, 2, 3])
     cos, sin = np.cos(angles), np.sin(angles)
     np.testing.assert_allclose(found[0, 12:19], [0.3, *cos, *sin], atol=1e-6)
-    speeds = [*seen["policy"][0, 9:12], *velocity[0, :2]]
-    strokes = np.multiply.outer(speeds, [*cos, *sin])
+    strokes = np.multiply.outer(seen["policy"][0, 9:12], [*cos, *sin])
     np.testing.assert_allclose(found[0, 19:], strokes.flatten(), atol=1e-6)
 
 

@@ -83,12 +83,11 @@ def test_going_too_fast_pays_no_more_than_going_too_slow(too_fast: float):
 
 
 def on_paths(command, turns: float, **moved):
-    """A step at so many turns of the clock, with some feet moved from the wanted crouch [m]."""
+    """A step at so many turns of the clock, with some feet moved from the default pose [m]."""
     angle, pose, away = 2 * np.pi * turns, default_pose(), np.zeros(12)
     for i, leg in enumerate(LEGS):
         own = slice(3 * i, 3 * i + 3)
         foot = foot_position(leg, *pose[own]) + np.array(moved.get(leg, (0.0, 0.0, 0.0)))
-        foot += np.array([0.0, P.spread * SIDE[leg], P.crouch])
         away[own] = joint_angles(leg, foot) - pose[own]
     clock = (np.cos(angle), np.sin(angle), 0.0)
     return step(command=command, clock=clock, position_relative=away)
@@ -121,11 +120,9 @@ def test_feet_are_paid_to_touch_down_ahead_by_half_of_what_they_pass(command, st
     moved = {LF: ahead, RB: ahead, RF: -ahead, LB: -ahead}
     assert wr.foot_paths(on_paths(command, 0.5, **moved), p)[0] == pytest.approx(1.0)
     assert wr.foot_paths(on_paths(command, 0.0, **moved), p)[0] < -1.0
-    # where all are along the trunk is free; how high and wide it stands counts once
-    for more, cost in (((0.01, 0.0, 0.0), 0.0), ((0.0, 0.004, 0.003), 0.005**2)):
-        other = {leg: at + more * np.array([1, SIDE[leg], 1]) for leg, at in moved.items()}
-        found = wr.foot_paths(on_paths(command, 0.5, **other), p)[0]
-        assert found == pytest.approx(1.0 - cost / p.foot_paths_sigma**2)
+    # where all are, and how far to their sides, is free
+    wide = {leg: at + np.array([0.01, 0.005 * SIDE[leg], -0.01]) for leg, at in moved.items()}
+    assert wr.foot_paths(on_paths(command, 0.5, **wide), p)[0] == pytest.approx(1.0)
 
 
 def test_in_a_turn_feet_are_paid_to_go_around():
