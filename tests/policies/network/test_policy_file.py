@@ -312,7 +312,7 @@ def test_a_list_of_a_million_tensors_is_refused_at_once(tmp_path):
     assert time.process_time() - started < 2
 
 
-@pytest.mark.parametrize("kind", ["mlp", "lstm", "lstm_from_nothing"])
+@pytest.mark.parametrize("kind", ["mlp", "lstm", "lstm_from_nothing", "mlp_from_nothing"])
 def test_the_shipped_policies_find_their_servos_wherever_the_samples_are_copied(
     tmp_path, monkeypatch, kind
 ):
