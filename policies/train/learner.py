@@ -4,7 +4,8 @@
 - After each update the KL divergence and the share of clipped ratios are measured at the first step
   of its data; the policy's learning rate follows the former, and a policy that went much too far is
   taken back. The critic has a rate of its own.
-- At a time-out the value of the state reached is added, not that of the state before it.
+- At a time-out the value of the state reached is added, not that of the state before it; where a
+  new command or a push follows a step, the value of the state without them counts.
 - A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
   rate, random numbers, recurrent state, environments with their delay lines, the last observation
   and the counters. It is written atomically and read with `weights_only`.
@@ -55,8 +56,9 @@ class TerminalPPO(PPO):
 
     At a time-out it adds the value of the state that was reached. Where a robot is then given a new
     command or a push, the step before is credited with the value of the state without them: no
-    action can bring them about, and what they cost was most of the variance of the advantages
-    ("What it took" in `benchmarks/README.md`).
+    action can bring them about, and what they cost was nine tenths of the variance of the advantages
+    ("What it took" in `benchmarks/README.md`). So a policy learns to recover from a push, but is
+    not paid for standing in a way that makes pushes matter less.
     """
 
     def process_env_step(
