@@ -111,7 +111,7 @@ def gather(
     return PolicyEvidence(
         name, policy.contract.kind, _trained(run_folder, trial.task.control_step_s),
         task.curriculum != Curriculum() if task else None,
-        task.terrain if task else None, _imitated(run) if run else None, walk, gait,
+        task.terrain if task else None, imitated(run) if run else None, walk, gait,
         step("orbits", lambda: orbits(policy, trial)),
         step("delay", lambda: delay_curve(policy, trial, _EXTRA_DELAYS_MS)),
         step("ablation", lambda: ablation(policy, trial, ("all joints",))),
@@ -122,7 +122,8 @@ def gather(
     )  # fmt: skip
 
 
-def _imitated(run: Run) -> str | None:
+def imitated(run: Run) -> str | None:
+    """What a run's policy imitated before PPO; None if nothing."""
     if not run.imitation.iterations:
         return None
     return "a trot" if run.imitation.teacher == TROT else "a teacher that learned from nothing"

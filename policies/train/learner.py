@@ -415,7 +415,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if content.get("schema_version") in (1, 2, 3):
         raise InputError(
             f"{path} is of an older version of pupper-train, whose critic has other inputs, and "
-            "cannot be resumed. Its policies can be played and evaluated; start a new run."
+            "cannot be resumed or imitated. Its policies can be played and evaluated; start a new "
+            "run."
         )
     refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)
     missing = [part for part in _PARTS if part not in content]

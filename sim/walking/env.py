@@ -39,7 +39,7 @@ from pupper_sysid.sim.walking.rewards.terms import weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
-from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, without_chance
+from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
 
 Array = NDArray[np.float64]
 
@@ -232,7 +232,7 @@ class PupperEnv:
         terminal: dict[str, NDArray] = {"ids": late}
         if len(late):
             terminal |= {"observation": now.observation[late], "privileged": now.privileged[late]}
-        unforeseen = without_chance(now, self.command, done, config.observation.base_velocity)
+        unforeseen = unforeseen_of(now, self.command, done, config.observation.base_velocity)
         over = np.flatnonzero(done)
         if len(over):
             self._restart(over)

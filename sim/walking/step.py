@@ -143,7 +143,7 @@ def empty_facts(
     return found | {name: np.empty((len(command), FEET), bool) for name in _FLAGS}
 
 
-def without_chance(
+def unforeseen_of(
     now: Unfinished, command: Array, done: NDArray[np.bool_], base_velocity: str
 ) -> dict[str, NDArray]:
     """`StepResult.unforeseen` of a step.

@@ -31,11 +31,13 @@ from pupper_sysid.policies.analysis.autonomy import (
 )
 from pupper_sysid.policies.analysis.paths import DirectionWalk
 from pupper_sysid.policies.analysis.robustness import AblationPoint, DelayPoint, GroundPoint
+from pupper_sysid.policies.network.hyperparameters import Imitation
+from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.sysid.compare.four_way import FITTED, PUBLISHED, four_way
 from pupper_sysid.sysid.recordings.files import load
 from reproduction import servos as servo_claims
 from reproduction.claims import Claim
-from reproduction.evidence import PolicyEvidence, ScalePoint
+from reproduction.evidence import PolicyEvidence, ScalePoint, imitated
 from reproduction.policies import judge
 from support.browser import looks_right
 from support.command_line import refused, run_program
@@ -238,6 +240,27 @@ def test_how_a_policy_was_trained_is_looked_at_not_taken_for_granted(id_, traine
     mlp, lstm = BOTH
     assert verdicts(mlp, lstm)[id_] != "not testable here"
     assert verdicts(replace(mlp, **trained), lstm)[id_] == "not testable here"
+
+
+def test_the_page_says_what_a_policy_imitated_first():
+    mlp, lstm = BOTH
+    assert "Imitation of a trot came first." in claims(mlp, lstm)["T3"].how
+    taught = replace(mlp, first_gait="a teacher that learned from nothing")
+    assert "a teacher that learned from nothing or a trot" in claims(taught, lstm)["T3"].how
+    alone = [replace(policy, first_gait=None) for policy in BOTH]
+    assert "Imitation" not in claims(*alone)["T3"].how
+
+
+@pytest.mark.parametrize(
+    ("run", "first"),
+    [
+        (Run(), "a trot"), (Run(imitation=Imitation(iterations=0)), None),
+        (Run(imitation=Imitation(teacher="own")), "a teacher that learned from nothing"),
+        (Run(imitation=Imitation(teacher="runs/T")), "a teacher that learned from nothing"),
+    ],
+)  # fmt: skip
+def test_what_was_imitated_first_is_read_from_the_settings(run, first):
+    assert imitated(run) == first
 
 
 @pytest.mark.parametrize(

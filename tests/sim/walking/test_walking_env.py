@@ -32,7 +32,7 @@ from pupper_sysid.sim.walking.config import (
     Walking,
 )
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE, PRIVILEGED_SIZE
+from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.rewards.terms import TERMS, progress
 from pupper_sysid.sim.walking.rewards.weights import Rewards
@@ -225,7 +225,7 @@ def test_an_observation_is_sixty_named_numbers_in_the_published_order():
     env = make()
     observation, privileged = env.reset()
     assert observation.shape == (4, 60) and observation.dtype == np.float32
-    assert privileged.shape == (4, PRIVILEGED_SIZE) and privileged.dtype == np.float32
+    assert privileged.shape == (4, 106) and privileged.dtype == np.float32
 
 
 def test_the_last_action_is_seen_raw_and_the_command_as_given():
