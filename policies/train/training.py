@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from rsl_rl.models import MLPModel
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.memory import keep_freed_memory
@@ -203,6 +204,9 @@ class _Session:
 
     def _begin(self) -> None:
         """Write a first checkpoint, then the settings: from then on the run can be resumed."""
+        if self.run.imitation.iterations and self.run.imitation.teacher not in (TROT, OWN):
+            # one that cannot be read is refused while the folder's name is still free
+            self._network_of(Path(self.run.imitation.teacher))
         if self.ranks.rank == 0:
             refuse_taken(self.folder)
         self.ranks.any(False)  # no process writes before that
@@ -243,8 +247,11 @@ class _Session:
         # a resumed run is to draw what it would have drawn
         with torch.random.fork_rng(devices=[]):
             folder = Path(wanted) if wanted != OWN else self._train_teacher(stop_requested)
-            network = load_teacher(folder, BEST, self.run, learner.observations)
-        return LearnedTeacher(learner.env, network, state)
+        return LearnedTeacher(learner.env, self._network_of(folder), state)
+
+    def _network_of(self, teacher: Path) -> MLPModel:
+        with torch.random.fork_rng(devices=[]):
+            return load_teacher(teacher, BEST, self.run, self.learner.observations)
 
     def _train_teacher(self, stop_requested: Callable[[], bool]) -> Path:
         folder = self.folder / _TEACHER

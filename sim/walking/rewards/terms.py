@@ -123,12 +123,8 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     While the clock wants a foot down, it passes evenly under its place in the default pose at the
     commanded speed, by the rule of Raibert (1986); meanwhile the others swing back and rise by
     `clock_height`. Margolis and Agrawal (2022) reward both. The mean place of the feet and how far
-    they are spread are free.
+    they are spread are free (see `stance`).
     """
-    joints = _POSE + s.position_relative
-    feet = np.stack(
-        [foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T) for i, leg in enumerate(LEGS)], axis=1
-    )
     cycle = np.arctan2(s.clock[:, 1], s.clock[:, 0])[:, None] / (2 * np.pi)
     # since the middle of a foot's swing, -0.5 to 0.5 cycles
     own = (cycle + _BEHIND + 0.25) % 1.0 - 0.5
@@ -137,13 +133,28 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     along = np.where(swings, own / half, np.sign(own) * (0.5 - np.abs(own)) / (0.5 - half))
     x, y, turn = s.command.T[:, :, None]
     speed = np.stack([x - turn * FEET_AT[:, 1], y + turn * FEET_AT[:, 0]], axis=-1)
-    away = feet - FEET_AT
+    away = _feet_away(s)
     away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
     away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
     away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
     away[..., 1] -= _SIDES * (_SIDES * away[..., 1]).mean(axis=1, keepdims=True)
     missed = (away**2).sum(axis=(1, 2)) / p.foot_paths_sigma**2
     return np.where(np.abs(s.command).max(axis=1) > 0, np.maximum(1.0 - missed, -2.0), 0.0)
+
+
+def stance(s: Step, p: Rewards) -> Array:
+    """Distance of the feet, all together, from `crouch` and `spread` [m]; 0 while standing."""
+    away = _feet_away(s)
+    lower, wider = away[..., 2].mean(axis=1), (_SIDES * away[..., 1]).mean(axis=1)
+    missed = np.abs(lower - p.crouch) + np.abs(wider - p.spread)
+    return np.where(np.abs(s.command).max(axis=1) > 0, missed, 0.0)
+
+
+def _feet_away(s: Step) -> Array:
+    """Feet in the trunk's frame less where they are in the default pose [m], shape (n, 4, 3)."""
+    joints = (_POSE + s.position_relative).reshape(-1, len(LEGS), 3)
+    feet = [foot_position(leg, *joints[:, i].T) for i, leg in enumerate(LEGS)]
+    return np.stack(feet, axis=1) - FEET_AT
 
 
 def foot_clearance(s: Step, p: Rewards) -> Array:
@@ -184,6 +195,11 @@ def base_motion(s: Step, p: Rewards) -> Array:
     """Bouncing and rocking of the trunk."""
     rocking = np.abs(s.angular_velocity[:, :2]).sum(axis=1)
     return 0.8 * s.linear_velocity[:, 2] ** 2 + 0.2 * rocking
+
+
+def bounce(s: Step, p: Rewards) -> Array:
+    """Speed at which the trunk rises or falls [m/s]."""
+    return np.abs(s.linear_velocity[:, 2])
 
 
 def base_orientation(s: Step, p: Rewards) -> Array:
@@ -227,8 +243,8 @@ TERMS = {
     for f in (
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
         stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
-        short_stance, air_time, foot_paths, gait, foot_clearance, swing_height,
-        action_smoothness, action_rate, action_jerk, air_time_variance, base_motion,
+        short_stance, air_time, foot_paths, stance, gait, foot_clearance, swing_height,
+        action_smoothness, action_rate, action_jerk, air_time_variance, base_motion, bounce,
         base_orientation, foot_slip, joint_position, hip_abduction, joint_torques,
         joint_acceleration, joint_velocity,
     )

@@ -64,6 +64,12 @@ class Rewards:
     policy does not see the clock, which follows the feet; a teacher does."""
     foot_paths_sigma: float = 0.012
     """Its width: root of the summed squares of four feet's distances [m]."""
+    stance: float = 0.0
+    """Distance of the feet, all together, from `crouch` and `spread`."""
+    crouch: float = 0.02
+    """How much lower than in the default pose the trunk is to be carried, for `stance` [m]."""
+    spread: float = 0.007
+    """How much farther to their sides than in the default pose feet are to be, likewise [m]."""
     clock_hz: float = 3.6
     """Steps of each foot per second by that clock."""
     clock_pull_hz: float = 0.2
@@ -101,6 +107,8 @@ class Rewards:
     """Published: feet that swing or stand for different times."""
     base_motion: float = -0.5
     """0.8 v_z² + 0.2 (|ω_x| + |ω_y|)."""
+    bounce: float = 0.0
+    """Speed at which the trunk rises or falls."""
     base_orientation: float = -1.0
     """Tilt."""
     foot_slip: float = -1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -290,6 +291,16 @@ def test_a_run_that_is_no_teacher_is_refused_as_one(tmp_path, taught):
     env = WalkingVecEnv(make_env(tiny_run(), Ranks()))
     with pytest.raises(InputError, match=r"is not a teacher.*--start teacher"):
         learned_teacher(tmp_path, env)
+
+
+def test_a_run_that_is_refused_for_its_teacher_leaves_its_name_free(tmp_path, taught):
+    broken = tmp_path / "teacher"
+    shutil.copytree(taught, broken)
+    (broken / BEST).write_bytes(b"not a checkpoint")
+    run = tiny_run(imitation=Imitation(iterations=1, rollouts=1, teacher=str(broken)))
+    with pytest.raises(InputError, match="damaged"):
+        train(tmp_path / "run", run)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
