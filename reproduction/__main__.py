@@ -42,6 +42,9 @@ class Options:
     """Calibration, `paper`, `release` or `ideal` instead of what it was trained with."""
     feedback: str | None = None
     """`held`, `ideal` or a calibration instead of what it was trained with."""
+    beside: Path | None = None
+    """`tables/claims.csv` of another page, such as one on policies that began otherwise; claims
+    that it judges otherwise are listed."""
     out: Path = Path("analysis/claims")
     """Folder for pages, figures and tables."""
     seed: int = 0

@@ -32,7 +32,8 @@ PICTURES = (
     "compliance", "servos",
 )  # fmt: skip
 """All that may be drawn; which are depends on the evidence."""
-TABLES = ("claims", "table_one", "inputs")
+TABLES = ("claims", "beside", "table_one", "inputs")
+"""As `PICTURES`."""
 _STACK_ROUNDS, _STACK_SECONDS = 6, 10.0
 _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 
@@ -42,6 +43,7 @@ def write_claims(options: Options, tries: Tries) -> None:
     from pupper_sysid.common.page import write_page
     from reproduction import servos as servo_claims
     from reproduction import walks as walk_claims
+    from reproduction.beside import differences
     from reproduction.evidence import KINDS, gather
     from reproduction.policies import judge
 
@@ -50,6 +52,8 @@ def write_claims(options: Options, tries: Tries) -> None:
     tables = [f"tables/{name}.csv" for name in TABLES]
     for name in (PAGE, REPORT, *figures, *tables):  # before hours of work
         refuse_overwrite(options.out / name, options.force)
+    if options.beside is not None:
+        differences([], options.beside)
     for name, (policy, _) in tries.items():
         if policy.contract.kind not in KINDS:
             raise InputError(
@@ -68,12 +72,13 @@ def write_claims(options: Options, tries: Tries) -> None:
         *judge(evidence, _played(robot), stacks),
         *walk_claims.judge(walks),
     ]
+    other = differences(found, options.beside) if options.beside is not None else None
     pictures = _draw(evidence, robot)
     inputs = _inputs(options, tries)
-    text = _page(found, evidence, pictures, inputs, options)
+    text = _page(found, other, evidence, pictures, inputs, options)
     write_text(page, text, options.force)
     write_page(
-        report, _TITLE, _tally(found), _sections(found, evidence, pictures, inputs, options),
+        report, _TITLE, _tally(found), _sections(found, other, evidence, pictures, inputs, options),
         options.force,
     )  # fmt: skip
     if options.json:
@@ -204,8 +209,8 @@ def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
 
 
 def _page(
-    found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
-    inputs: dict[str, str], options: Options,
+    found: list[Claim], other: list[dict[str, str]] | None, evidence: list[PolicyEvidence],
+    pictures: list[Picture], inputs: dict[str, str], options: Options,
 ) -> str:  # fmt: skip
     """The report as Markdown."""
     lines = [
@@ -218,6 +223,11 @@ def _page(
             f"| {c.id} | {c.claim} | {c.paper} | {c.ours} | {_bounds(c)} | **{c.verdict}** | "
             f"{c.how} |"
         )
+    if other is not None:
+        lines += ["", f"## {_BESIDE}", "", _other(other), ""]
+        if other:
+            lines += ["| " + " | ".join(h for h, _ in _OTHER) + " |", "|---" * len(_OTHER) + "|"]
+        lines += ["| " + " | ".join(row[key] for _, key in _OTHER) + " |" for row in other]
     kinds, rows = _table_one(evidence)
     lines += ["", f"## {_TABLE_ONE}", "", "| | " + " | ".join(kinds) + " |"]
     lines += ["|---|" + "---|" * len(kinds)]
@@ -231,8 +241,8 @@ def _page(
 
 
 def _sections(
-    found: list[Claim], evidence: list[PolicyEvidence], pictures: list[Picture],
-    inputs: dict[str, str], options: Options,
+    found: list[Claim], other: list[dict[str, str]] | None, evidence: list[PolicyEvidence],
+    pictures: list[Picture], inputs: dict[str, str], options: Options,
 ) -> list[Section]:  # fmt: skip
     """The report as a page in the style of the others."""
     from pupper_sysid.common.page import Column, Section, Table
@@ -254,12 +264,21 @@ def _sections(
     kinds, rows = _table_one(evidence)
     one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
     first = Column("", lambda row: row[""], "words")
+    compared = []
+    if other is not None:
+        shown = tuple(
+            Column(heading, lambda row, key=key: row[key], "prose" if heading else "key")
+            for heading, key in _OTHER
+        )
+        tables = [Table("beside", "Judged otherwise", shown, tuple(other))] if other else []
+        compared = [Section("beside", _BESIDE, [_other(other)], tables=tables)]
     return [
         Section(
             "claims", "Claims", [_ABOUT],
             tables=[Table("claims", "What the paper says, and what is found here",
                           columns, claims)],
         ),
+        *compared,
         Section(
             "table", _TABLE_ONE,
             tables=[Table("table_one", "Architectures, means and 90 % intervals",
@@ -280,13 +299,24 @@ def _sections(
 
 
 _TITLE, _TABLE_ONE = "The published claims, one by one", "Table I, regenerated"
-_MADE = "Where this comes from"
+_MADE, _BESIDE = "Where this comes from", "Beside the other page"
+_OTHER = (
+    ("", "id"), ("claim", "claim"), ("here", "here"), ("verdict here", "verdict"),
+    ("there", "there"), ("verdict there", "verdict_there"),
+)  # fmt: skip
+"""Headings and keys of what another page judges otherwise."""
 _MORE = ("torch", "pandas")  # packages that shape these numbers beside the usual ones
 _ABOUT = (
     "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
     "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
     "claims about the physical one are judged by its recordings and the logs of its IMU."
 )
+
+
+def _other(rows: list[dict[str, str]]) -> str:
+    if not rows:
+        return "Every claim that both pages have is judged alike."
+    return "Claims that the page given with `--beside` judges otherwise."
 
 
 def _tally(found: list[Claim]) -> str:
@@ -307,6 +337,8 @@ def _command(options: Options) -> str:
     for flag in ("actuator", "feedback"):
         if getattr(options, flag):
             parts += [f"--{flag}", str(getattr(options, flag))]
+    if options.beside:
+        parts += ["--beside", str(options.beside)]
     parts += ["--command", *(f"{c:g}" for c in options.command)]
     for flag in ("robots", "seconds", "seed"):
         parts += [f"--{flag}", f"{getattr(options, flag):g}"]
@@ -333,6 +365,7 @@ def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     if options.servo:
         servos.add(options.servo)
     files = [p / WEIGHTS if p.is_dir() else p for p in sorted(servos)]
+    files += [options.beside] if options.beside else []
     files += [*options.recordings, *(Path(name) for _, name in _logs(options))]
     return found | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
 

@@ -28,6 +28,7 @@ def build(
     observations: TensorDict,
     hyper: Hyperparameters,
     control_step_s: float,
+    first_action: torch.Tensor | None = None,
 ) -> tuple[MLPModel, MLPModel]:
     """Actor and critic.
 
@@ -39,6 +40,8 @@ def build(
     hyper : Hyperparameters
     control_step_s : float
         Time between two actions, over which the noise of exploration decays.
+    first_action : Tensor, shape (12,), optional
+        What the policy does at first, whatever it sees; by default 0, the default pose.
     """
     actor_groups = ["policy"]
     if architecture.kind == "mlp-actions":
@@ -72,7 +75,7 @@ def build(
     head = [layer for layer in actor.mlp if isinstance(layer, torch.nn.Linear)][-1]
     with torch.no_grad():
         head.weight.mul_(_FIRST_HEAD)
-        head.bias.zero_()
+        head.bias.copy_(torch.zeros(actions) if first_action is None else first_action)
     critic = MLPModel(
         observations, groups, "critic", 1, hidden_dims=list(architecture.critic_hidden), **common
     )

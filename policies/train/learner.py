@@ -37,6 +37,7 @@ from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperpar
 from pupper_sysid.policies.train.mirror import MirrorImages, mirrored
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.robot.trot import stance
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
 CHECKPOINT_VERSION = 4
@@ -152,7 +153,11 @@ class Learner:
         env.episode_length_buf = torch.randint(0, env.max_episode_length, (env.num_envs,))
         self.observations = env.get_observations()
         task = env.env.config
-        actor, critic = build(architecture, self.observations, hyper, task.control_step_s)
+        first = None
+        if task.rewards.stance:
+            wanted = stance(task.rewards.crouch, task.rewards.spread) - env.env.default
+            first = torch.from_numpy(wanted / task.action_scale)
+        actor, critic = build(architecture, self.observations, hyper, task.control_step_s, first)
         # a recurrent policy's minibatches are whole environments
         if actor.is_recurrent and env.num_envs < hyper.minibatches:
             raise InputError(

@@ -132,9 +132,7 @@ class Trot:
     @cached_property
     def _centre(self) -> NDArray[np.float64]:
         """Middle of each foot's stroke in the trunk's frame [m], shape (4, 3)."""
-        side = np.array([SIDE[leg] for leg in LEGS])
-        moved = [np.zeros(4), self.spread_m * side, np.full(4, self.crouch_m)]
-        return FEET_AT + np.column_stack(moved)
+        return feet_at(self.crouch_m, self.spread_m)
 
     def _strokes(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
@@ -165,3 +163,15 @@ FEET_AT = np.array(
     [foot_position(leg, *default_pose()[3 * i : 3 * i + 3]) for i, leg in enumerate(LEGS)]
 )
 """Where the feet are in the default pose, in the trunk's frame [m], shape (4, 3)."""
+
+
+def feet_at(crouch_m: float, spread_m: float) -> NDArray[np.float64]:
+    """Feet in the trunk's frame [m], shape (4, 3), of a trunk that is lower, and farther apart."""
+    side = np.array([SIDE[leg] for leg in LEGS])
+    return FEET_AT + np.column_stack([np.zeros(4), spread_m * side, np.full(4, crouch_m)])
+
+
+def stance(crouch_m: float, spread_m: float) -> NDArray[np.float64]:
+    """Joint angles [rad], shape (12,), of a robot that stands so low and wide."""
+    feet = feet_at(crouch_m, spread_m)
+    return np.concatenate([joint_angles(leg, foot) for leg, foot in zip(LEGS, feet, strict=True)])

@@ -248,13 +248,14 @@ _SCRATCH = Walking(
         angular_sigma=Ramp(2.0, 0.5, 2.0, 5.0),
     ),
     rewards=Rewards(
-        foot_paths=15.0, gait=0.0, stance=-100.0, alive=0.1, progress=8.0, turn_progress=4.0,
+        foot_paths=15.0, gait=0.0, stance=-200.0, alive=0.1, progress=8.0, turn_progress=4.0,
         tracking_shape="linear",
         base_linear_velocity=6.0, linear_sigma=0.1, base_angular_velocity=12.0, angular_sigma=0.5,
         stride_linear_velocity=2.0, stride_linear_sigma=0.1,
         stride_angular_velocity=2.0, stride_angular_sigma=0.4,
         unsupported=-8.0, short_swing=-4.0, short_stance=-8.0, shortest_stance=0.16,
-        swing_height=-1400.0, clearance_height=0.008, base_orientation=-2.0, base_motion=-12.0, bounce=-40.0,
+        swing_height=-1400.0, clearance_height=0.008, base_orientation=-2.0, base_motion=-18.0,
+        bounce=-60.0,
         foot_slip=-1.0, joint_position=-0.2, action_rate=-0.5, action_jerk=-0.2,
     ),
 )  # fmt: skip

@@ -364,7 +364,7 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     assert {Path(p).stem for p in found["pictures"]} <= set(reproduction.page.PICTURES)
     beside = {p.relative_to("analysis/claims") for p in Path("analysis/claims").rglob("*.*")}
     drawn = {Path(p).with_suffix(ending) for p in found["pictures"] for ending in (".png", ".svg")}
-    tables = {Path(f"tables/{name}.csv") for name in reproduction.page.TABLES}
+    tables = {Path(f"tables/{name}.csv") for name in reproduction.page.TABLES if name != "beside"}
     assert beside == drawn | tables | {Path("claims.md"), Path("claims.html")}
     rows = list(csv.DictReader((Path("analysis/claims") / "tables/claims.csv").open()))
     assert [row["verdict"] for row in rows] == [claim["verdict"] for claim in found["claims"]]
@@ -382,6 +382,58 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     Path("c/figures/ablation.png").touch()
     taken = refused(capsys, program, *arguments, "--out", "c")
     assert "ablation.png exists already" in taken
+
+
+def test_claims_that_another_page_judges_otherwise_are_listed_beside(
+    capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "reproduction.evidence.gather",
+        lambda name, policy, *rest: evidence(policy.contract.kind, name),
+    )
+    policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
+    arguments = (*policies, "--actuator", SAMPLES / "calibrated.yaml")
+    code, out, err = run_program(capsys, program, *arguments, "--json", "--out", "a")
+    assert code == 0, err
+    first = {c["id"]: c for c in json.loads(out)["claims"]}
+    assert first["C1"]["verdict"] == "holds"
+    table = Path("a/tables/claims.csv")
+    code, _, err = run_program(capsys, program, *arguments, "--beside", table, "--out", "b")
+    assert code == 0, err
+    alike = Path("b/claims.md").read_text()
+    assert "Every claim that both pages have is judged alike." in alike
+    assert not Path("b/tables/beside.csv").exists()
+    rows = list(csv.DictReader(table.open()))
+    next(row for row in rows if row["id"] == "C1")["verdict"] = "does not hold here"
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    code, _, err = run_program(capsys, program, *arguments, "--beside", table, "--out", "c")
+    assert code == 0, err
+    (row,) = csv.DictReader(Path("c/tables/beside.csv").open())
+    assert (row["id"], row["verdict"], row["verdict_there"]) == (
+        "C1", "holds", "does not hold here"
+    )  # fmt: skip
+    line = f"| C1 | {row['claim']} | {row['here']} | holds | {row['there']} | does not hold here |"
+    assert line in Path("c/claims.md").read_text()
+    assert sha256(table) in Path("c/claims.md").read_text()
+    assert "Judged otherwise" in Path("c/claims.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("id,claim\nA1,x\n", "has no column `ours`"),
+        ("id,ours,verdict\nA1,x,perhaps\n", "verdict of A1 is 'perhaps'"),
+    ],
+)
+def test_what_is_no_table_of_claims_is_refused_before_any_walk(capsys, tmp_path, text, words):
+    table = tmp_path / "table.csv"
+    table.write_text(text)
+    policy = SAMPLES / "policies/lstm"
+    assert words in refused(capsys, program, policy, "--beside", table, "--out", tmp_path / "out")
 
 
 def test_a_kind_of_policy_about_which_nothing_was_published_is_refused(capsys, tmp_path):

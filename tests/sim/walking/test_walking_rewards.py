@@ -137,6 +137,24 @@ def test_in_a_turn_feet_are_paid_to_go_around():
     assert wr.foot_paths(on_paths((0, 0, -0.5), 0.5, **moved), p)[0] < 1.0
 
 
+def test_a_stance_costs_as_far_as_it_is_from_a_crouch_and_a_spread():
+    p = replace(P, crouch=0.02, spread=0.007)
+    assert wr.stance(on_paths(FORWARD, 0.25), p)[0] == pytest.approx(0.027)
+    low = {leg: np.array([0.03, 0.01 * SIDE[leg], 0.015]) for leg in LEGS}
+    assert wr.stance(on_paths(FORWARD, 0.25, **low), p)[0] == pytest.approx(0.005 + 0.003)
+    # the mean counts: one foot may rise, and all may lean to one side
+    asked = {leg: np.array([0.0, 0.007 * SIDE[leg] + 0.004, 0.02]) for leg in LEGS}
+    asked[LF] += [0.0, 0.0, 0.004]
+    asked[RB] -= [0.0, 0.0, 0.004]
+    assert wr.stance(on_paths(FORWARD, 0.25, **asked), p)[0] == pytest.approx(0.0, abs=1e-9)
+    assert wr.stance(on_paths((0, 0, 0), 0.25), p)[0] == 0.0
+
+
+def test_a_trunk_that_rises_or_falls_costs_its_speed():
+    assert wr.bounce(step(linear_velocity=(0.3, 0.2, -0.05)), P)[0] == pytest.approx(0.05)
+    assert wr.bounce(step(linear_velocity=(0.3, 0.2, 0.05)), P)[0] == pytest.approx(0.05)
+
+
 def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
     assert wr.unsupported(step(), P)[0] == 1.0
     assert wr.unsupported(step(contact=(False, True, False, False)), P)[0] == 0.5
