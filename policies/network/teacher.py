@@ -25,15 +25,15 @@ _HARMONICS = torch.tensor([1.0, 2.0, 3.0])
 class TeacherActor(MLPActor):
     """Network of a teacher.
 
-    It sees rates and gravity as the IMU reads them, the command, the trunk's true speed, the clock
-    of its reward with two harmonics, and these times each part of the command; nothing of the
-    joints.
+    It sees rates and gravity as the IMU reads them, the command, the clock of its reward with two
+    harmonics, and these times each part of the command; nothing of the joints. But for the clock
+    it sees nothing that a policy does not: what it answers to can be imitated.
     """
 
     def get_latent(
         self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None
     ) -> torch.Tensor:
-        """Its inputs, normalised, shape (…, 37)."""
+        """Its inputs, normalised, shape (…, 34)."""
         return self.obs_normalizer(inputs(obs))
 
     def update_normalization(self, obs: TensorDict) -> None:
@@ -46,13 +46,12 @@ class TeacherActor(MLPActor):
 
 
 def inputs(obs: TensorDict) -> torch.Tensor:
-    """What a teacher sees of the groups `policy` and `privileged`, shape (…, 37)."""
+    """What a teacher sees of the groups `policy` and `privileged`, shape (…, 34)."""
     policy, privileged = obs["policy"], obs["privileged"]
     seen = [policy[..., OBSERVATION_PARTS[name]] for name in _SEEN]
-    velocity = privileged[..., PRIVILEGED_PARTS["base_linear_velocity"]]
     cos, sin, in_time = privileged[..., PRIVILEGED_PARTS["clock"]].split(1, -1)
     angles = torch.atan2(sin, cos) * _HARMONICS.to(sin.device)
     waves = torch.cat([torch.cos(angles), torch.sin(angles)], dim=-1)
     # a foot's stroke is its speed times a function of the clock: Raibert's rule
     strokes = (seen[-1][..., None] * waves[..., None, :]).flatten(-2)
-    return torch.cat([*seen, velocity, in_time, waves, strokes], dim=-1)
+    return torch.cat([*seen, in_time, waves, strokes], dim=-1)

@@ -376,8 +376,9 @@ class Learner:
             self.take_back(content)
         except (RuntimeError, KeyError, ValueError) as error:
             raise InputError(
-                f"{path} does not fit this run's networks ({str(error).splitlines()[0]}). "
-                "Resume with the settings of the run."
+                f"{path} does not fit this run's networks: it was trained with other settings, or "
+                "by a version of pupper-train whose networks differ. Resume with the settings of "
+                "the run, or start a new one."
             ) from error
         state = {
             k: v.numpy() if isinstance(v, torch.Tensor) else v

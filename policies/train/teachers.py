@@ -223,8 +223,8 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
         network.load_state_dict(content["actor_state_dict"])
     except RuntimeError as error:
         raise InputError(
-            f"The teacher in {folder} does not fit: {str(error).splitlines()[0]}. Train one with "
-            "this version."
+            f"The teacher in {folder} is of a version of pupper-train whose teachers see something "
+            "else. Train one with this version: pupper-train --start teacher."
         ) from error
     network.requires_grad_(False)
     return network.eval()

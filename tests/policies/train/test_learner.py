@@ -14,11 +14,15 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import LEGS
 from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, read_checkpoint
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.robot.mini_pupper import SIDE, foot_position
+from pupper_sysid.sim.robot.trot import FEET_AT
 from pupper_sysid.sim.walking.config import Commands, Randomisation, Walking
+from pupper_sysid.sim.walking.rewards.weights import Rewards
 from support.tiny_training import observations, ppo, tiny_run
 
 GAMMA = 0.99
@@ -98,6 +102,22 @@ def test_the_learner_sees_the_rewards_and_ends_that_the_environment_gave():
         assert dones.tolist() == found.done.tolist()
         assert sum(extras["terms"].values()) == pytest.approx(found.reward)
         assert env.episode_length_buf.tolist() == twin.env.episode_step.tolist()
+
+
+def test_a_first_policy_stands_as_low_and_wide_as_its_rewards_want():
+    rewards = Rewards(stance=-200.0, crouch=0.015, spread=0.005)
+    learner = make_learner(tiny_run(task=Walking(rewards=rewards)), Ranks())
+    env = learner.env.env
+    with torch.no_grad():
+        action = learner.actor(learner.observations).numpy()
+    joints = env.default + env.config.action_scale * action
+    for i, leg in enumerate(LEGS):
+        away = foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T) - FEET_AT[i]
+        # the rest of the network is small, not 0
+        wanted = np.broadcast_to([0.0, 0.005 * SIDE[leg], 0.015], away.shape)
+        np.testing.assert_allclose(away, wanted, atol=1.5e-3)
+    free = make_learner(tiny_run(), Ranks())
+    assert free.actor(free.observations).abs().max() < 0.1
 
 
 # ------------------------------------------------------------------------------ time-outs

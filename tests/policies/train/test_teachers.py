@@ -303,6 +303,18 @@ def test_a_run_that_is_refused_for_its_teacher_leaves_its_name_free(tmp_path, ta
     assert not (tmp_path / "run").exists()
 
 
+def test_a_teacher_that_sees_something_else_is_refused(tmp_path, taught):
+    other = tmp_path / "teacher"
+    shutil.copytree(taught, other)
+    content = torch.load(other / BEST, weights_only=True)
+    first = content["actor_state_dict"]["mlp.0.weight"]
+    content["actor_state_dict"]["mlp.0.weight"] = torch.cat([first, first[:, :3]], dim=1)
+    torch.save(content, other / BEST)
+    run = tiny_run(imitation=Imitation(iterations=1, rollouts=1, teacher=str(other)))
+    with pytest.raises(InputError, match="see something else. Train one with this version"):
+        train(tmp_path / "run", run)
+
+
 @pytest.mark.parametrize(
     ("task", "words"),
     [
