@@ -145,7 +145,7 @@ def _from_scratch(run: Run) -> Run:
     )  # fmt: skip
     return replace(
         run, task=task, learner=learner, imitation=imitation,
-        environments=512, iterations=100, minutes=90.0,
+        environments=512, iterations=40, minutes=90.0,
     )  # fmt: skip
 
 
