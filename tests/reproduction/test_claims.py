@@ -384,9 +384,7 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     assert "ablation.png exists already" in taken
 
 
-def test_claims_that_another_page_judges_otherwise_are_listed_beside(
-    capsys, tmp_path, monkeypatch
-):
+def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "reproduction.evidence.gather",
