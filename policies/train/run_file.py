@@ -113,17 +113,21 @@ def preset(
 
 
 def _first_gait_imitated(kind: Kind) -> Run:
+    alone = kind in ("mlp", "mlp-actions")
     # without a memory, reading the gait's phase off one action takes a wide network
-    hidden = (512, 256, 128) if kind in ("mlp", "mlp-actions") else (128, 64)
+    hidden = (512, 256, 128) if alone else (128, 64)
+    steps = 8 if alone else 16
     return Run(
         architecture=Architecture(kind, hidden, 64, (256, 128, 64)), task=PRESETS["fast"],
         learner=Hyperparameters(
-            epochs=3, desired_kl=0.02, critic_warmup=20, freeze_normaliser=True,
-            learning_rate=1e-6,
-            # more noise loosens dry friction, and the policy walks at other speeds without it
-            exploration=Exploration((0.02, 0.015), (0.0, 20.0), 0.3),
+            # many small updates with little white noise: noise that lasts is credited with what it
+            # does in the other half of a stride, and more of it loosens dry friction
+            steps_per_environment=steps, epochs=3, desired_kl=0.01, critic_warmup=40,
+            freeze_normaliser=True, learning_rate=1e-5, discount=0.97, gae_lambda=0.9,
+            exploration=Exploration((0.02, 0.01), (0.0, 2.5), persistence_s=0.0), mirror=alone,
         ),
-        environments=2048,
+        imitation=Imitation(rollouts=240 // steps, minibatches=4 if alone else 16),
+        environments=512, iterations=8000 // steps,
     )  # fmt: skip
 
 
@@ -138,15 +142,10 @@ def _from_scratch(run: Run) -> Run:
         run.task, rewards=rewards, randomisation=replace(run.task.randomisation, **pushes)
     )
     # a network is learned from more easily than a trot that bends sharply
-    imitation = replace(run.imitation, teacher=OWN, iterations=16, rollouts=4, epochs=6)
-    learner = replace(
-        run.learner, steps_per_environment=16, learning_rate=1e-5, desired_kl=0.01,
-        exploration=Exploration((0.015, 0.01), (0.0, 2.5), persistence_s=0.0),
+    imitation = replace(
+        run.imitation, teacher=OWN, iterations=16, rollouts=64 // run.learner.steps_per_environment, epochs=6,
     )  # fmt: skip
-    return replace(
-        run, task=task, learner=learner, imitation=imitation,
-        environments=512, iterations=40, minutes=90.0,
-    )  # fmt: skip
+    return replace(run, task=task, imitation=imitation, minutes=90.0)
 
 
 def _teacher(kind: Kind) -> Run:
