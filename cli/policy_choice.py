@@ -36,7 +36,7 @@ def is_policy(folder: Path) -> bool:
 
 
 def run_folder(path: Path) -> Path:
-    """The run that a policy is in (`policy_best`, `policy_last`), else the folder itself."""
+    """The run that a policy is in (`policy_best`, …), else the folder itself."""
     path = resolved(path)
     return path.parent if path.name.startswith("policy_") else path
 

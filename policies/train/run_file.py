@@ -142,9 +142,8 @@ def _from_scratch(run: Run) -> Run:
         run.task, rewards=rewards, randomisation=replace(run.task.randomisation, **pushes)
     )
     # a network is learned from more easily than a trot that bends sharply
-    imitation = replace(
-        run.imitation, teacher=OWN, iterations=16, rollouts=64 // run.learner.steps_per_environment, epochs=6,
-    )  # fmt: skip
+    rollouts = 64 // run.learner.steps_per_environment
+    imitation = replace(run.imitation, teacher=OWN, iterations=16, rollouts=rollouts, epochs=6)
     return replace(run, task=task, imitation=imitation, minutes=90.0)
 
 

@@ -4,8 +4,9 @@
 `progress.csv` and TensorBoard events (one row per update), `last.pt` and `best.pt` (checkpoints,
 see `policies.train.learner`), and `policy_last/`, `policy_best/` (see
 `policies.network.policy_file`). The best has the highest score so far (`policies.train.selection`),
-imitation alone included. A run that learns from a teacher of its own has that teacher's run in
-`teacher/`, which has no policies: they would see what no robot can.
+imitation alone included; that is also kept as `policy_imitated/`, so that PPO's share can be
+measured. A run that learns from a teacher of its own has that teacher's run in `teacher/`, which
+has no policies: they would see what no robot can.
 """
 
 from __future__ import annotations
@@ -278,6 +279,8 @@ class _Session:
         if not self.counters["scores"]:
             self.counters["scores"] = self.judge(learner.actor)
             self.keep_best()  # of imitation alone, so that PPO must be better
+            if self.run.imitation.iterations:
+                self.write_policy("policy_imitated")
         self.phase_began = time.monotonic()
         while learner.iteration < self.run.iterations and not self.ranks.any(
             stop_requested() or time.monotonic() - self.started >= 60 * self.run.minutes

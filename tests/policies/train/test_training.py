@@ -168,6 +168,19 @@ def test_resuming_a_finished_run_changes_nothing(tmp_path):
     assert len(rows(tmp_path / PROGRESS)) == 3
 
 
+def test_a_run_keeps_the_policy_of_imitation_alone_beside_what_ppo_made_of_it(tmp_path):
+    """Without imitation there is none to keep."""
+    hyper = replace(tiny_run().learner, learning_rate=1e-3, desired_kl=1e9)
+    train(tmp_path / "run", tiny_run(learner=hyper, iterations=1))
+    imitated, last = (load_policy(tmp_path / "run" / f"policy_{n}") for n in ("imitated", "last"))
+    assert imitated.contract.training["iteration"] == 0
+    assert last.contract.training["iteration"] == 1
+    before, after = (policy.network.mlp.state_dict() for policy in (imitated, last))
+    assert all((before[name] != after[name]).any() for name in before)
+    train(tmp_path / "alone", tiny_run(imitation=Imitation(iterations=0), iterations=1))
+    assert not (tmp_path / "alone" / "policy_imitated").exists()
+
+
 def test_a_termination_signal_saves_too_and_handlers_are_put_back(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
 
