@@ -132,15 +132,15 @@ def _first_gait_imitated(kind: Kind) -> Run:
 
 
 def _from_scratch(run: Run) -> Run:
-    # the teacher's rewards go on, at their end of the curriculum: those of an imitated trot are
-    # too narrow for a gait that is not yet as fast as it is commanded to be
     taught = PRESETS["scratch"]
-    guides = taught.curriculum.guides.last
-    rewards = replace(taught.rewards, foot_paths=guides * taught.rewards.foot_paths)
     pushes = {n: getattr(taught.randomisation, n) for n in ("push_m_s", "push_every_s")}
+    # of the teacher's rewards only that of its stance goes on: the others hold a policy to the gait
+    # that led the teacher to steps
+    kept = {name: getattr(taught.rewards, name) for name in ("crouch", "spread", *CLOCK)}
     task = replace(
-        run.task, rewards=rewards, randomisation=replace(run.task.randomisation, **pushes)
-    )
+        run.task, rewards=replace(run.task.rewards, stance=0.5 * taught.rewards.stance, **kept),
+        randomisation=replace(run.task.randomisation, **pushes),
+    )  # fmt: skip
     # a network is learned from more easily than a trot that bends sharply
     rollouts = 64 // run.learner.steps_per_environment
     imitation = replace(run.imitation, teacher=OWN, iterations=16, rollouts=rollouts, epochs=6)
