@@ -113,10 +113,10 @@ def preset(
 
 
 def _first_gait_imitated(kind: Kind) -> Run:
-    alone = kind in ("mlp", "mlp-actions")
+    without_memory = kind in ("mlp", "mlp-actions")
     # without a memory, reading the gait's phase off one action takes a wide network
-    hidden = (512, 256, 128) if alone else (128, 64)
-    steps = 8 if alone else 16
+    hidden = (512, 256, 128) if without_memory else (128, 64)
+    steps = 8 if without_memory else 16
     return Run(
         architecture=Architecture(kind, hidden, 64, (256, 128, 64)), task=PRESETS["fast"],
         learner=Hyperparameters(
@@ -124,9 +124,10 @@ def _first_gait_imitated(kind: Kind) -> Run:
             # does in the other half of a stride, and more of it loosens dry friction
             steps_per_environment=steps, epochs=3, desired_kl=0.01, critic_warmup=40,
             freeze_normaliser=True, learning_rate=1e-5, discount=0.97, gae_lambda=0.9,
-            exploration=Exploration((0.02, 0.01), (0.0, 2.5), persistence_s=0.0), mirror=alone,
+            exploration=Exploration((0.02, 0.01), (0.0, 2.5), persistence_s=0.0),
+            mirror=without_memory,
         ),
-        imitation=Imitation(rollouts=240 // steps, minibatches=4 if alone else 16),
+        imitation=Imitation(rollouts=240 // steps, minibatches=4 if without_memory else 16),
         environments=512, iterations=8000 // steps,
     )  # fmt: skip
 
