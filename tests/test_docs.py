@@ -188,7 +188,11 @@ def test_options_that_do_not_exist_would_be_found():
 
 # ----- references
 
+WRITTEN_BY_USERS = {  # `/runs/` and the like, which following the README makes
+    line.strip("/") for line in (ROOT / ".gitignore").read_text().split() if line[0] == "/"
+}
 FOLDERS = {path.name for path in ROOT.iterdir() if path.is_dir() and path.name[0] != "."}
+FOLDERS -= WRITTEN_BY_USERS
 PATH = re.compile(r"`([\w.-]+/[\w./*<>-]*)`")
 DOTTED = re.compile(rf"`(?:pupper_sysid\.)?((?:{'|'.join(ROOMS)})(?:\.\w+)+)(?:\(\))?`")
 
