@@ -126,9 +126,13 @@ class Hyperparameters:
     mixed_precision: bool = False
     """Whether updates are computed in bfloat16; worth it where the processor has it (avx512_bf16,
     amx)."""
+    averaging: int = 1
+    """Updates over which the weights of the policy that is judged and saved are averaged
+    (exponentially); 1 for the last ones. Each update moves a policy about as far by chance as by
+    what was learned."""
 
     def __post_init__(self):
-        for name in ("steps_per_environment", "epochs", "minibatches"):
+        for name in ("steps_per_environment", "epochs", "minibatches", "averaging"):
             if getattr(self, name) < 1:
                 raise InputError(f"learner.{name} is {getattr(self, name)}; it must be at least 1.")
 
@@ -140,7 +144,7 @@ TROT, OWN = "trot", "own"
 class Imitation:
     """Settings of the first gait's imitation."""
 
-    iterations: int = 12
+    iterations: int = 6
     """Rounds; 0 to start PPO from random weights."""
     teacher: str = TROT
     """`trot`: the open-loop trot; `own`: one that is trained from nothing first, in the run's
@@ -153,7 +157,7 @@ class Imitation:
     """Parts of each rollout per pass."""
     learning_rate: float = 1e-2
     """Of Muon (matrices) and Adam (biases) at the start; it falls to 0 with the last step."""
-    correction_rate: float = 0.3
+    correction_rate: float = 0.6
     """Share of the policy's errors of speed by which the teacher's commands change per round, in
     the second half of the rounds."""
 

@@ -4,6 +4,7 @@
 - After each update the KL divergence and the share of clipped ratios are measured at the first step
   of its data; the policy's learning rate follows the former, and a policy that went much too far is
   taken back. The critic has a rate of its own.
+- The policy that is judged and saved has the mean of the last updates' weights.
 - At a time-out the value of the state reached is added, not that of the state before it; where a
   new command or a push follows a step, the value of the state without them counts.
 - A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
@@ -26,6 +27,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from pupper_sysid.common.border import read_bytes, refuse_other_version
 from pupper_sysid.common.errors import InputError
@@ -48,6 +50,7 @@ _PARTS = (
 )  # fmt: skip
 
 
+_AVERAGED = "module."  # before the names of weights in `AveragedModel`
 _TOO_FAR, _TOO_NEAR, _FACTOR = 2.0, 0.5, 1.3
 _LOST, _MUCH = 10.0, 3.0  # beyond so many times the desired KL a policy is taken back
 
@@ -201,11 +204,19 @@ class Learner:
         if group:
             self.ppo.broadcast_parameters()
             torch.manual_seed(seed + 1000 * self.ranks.rank)
+        keep = get_ema_multi_avg_fn(1.0 - 1.0 / hyper.averaging)
+        self._average = AveragedModel(actor, multi_avg_fn=keep)
 
     @property
     def actor(self) -> MLPModel:
         """The policy's network."""
         return self.ppo.actor
+
+    @property
+    def averaged(self) -> MLPModel:
+        """The policy to judge and to save: its weights are means over the last updates."""
+        # until PPO has changed the policy there is nothing to average
+        return self._average.module if self._average.n_averaged else self.actor
 
     @property
     def samples(self) -> int:
@@ -288,6 +299,7 @@ class Learner:
                 with torch.no_grad():
                     for parameter, value in zip(ppo.actor.parameters(), before, strict=True):
                         parameter.copy_(value)
+            self._average.update_parameters(ppo.actor)
         return losses | found
 
     @property
@@ -308,13 +320,15 @@ class Learner:
 
     def networks(self) -> dict[str, Any]:
         """A copy of networks, optimiser and learning rate, for `take_back`."""
-        return copy.deepcopy(self.ppo.save()) | {
+        return copy.deepcopy(self.ppo.save() | {"average": self._average.state_dict()}) | {
             "learning_rate": self.ppo.learning_rate, "iteration": self.iteration,
         }  # fmt: skip
 
     def take_back(self, networks: dict[str, Any]) -> None:
         """Return to `networks`; the environments stay as they are."""
         self.ppo.load(networks, None, True)
+        if "average" in networks:  # a checkpoint of an older version has none
+            self._average.load_state_dict(networks["average"])
         self.ppo.learning_rate = networks["learning_rate"]
         self.iteration = networks["iteration"]
 
@@ -343,6 +357,7 @@ class Learner:
             "schema_version": CHECKPOINT_VERSION,
             "architecture": self.architecture.kind,
             **self.ppo.save(),
+            "average": self._average.state_dict(),
             "learning_rate": self.ppo.learning_rate,
             "iteration": self.iteration,
             "torch_rng": torch.get_rng_state(),
@@ -398,6 +413,15 @@ class Learner:
         self.observations = found.to(device)
         torch.set_rng_state(content["torch_rng"])
         return content["more"]
+
+
+def judged_weights(content: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """Of the policy that was judged when a checkpoint was written: `Learner.averaged`."""
+    average = content.get("average")
+    if average is None or not average["n_averaged"]:
+        return content["actor_state_dict"]
+    whole = {name: value for name, value in average.items() if name.startswith(_AVERAGED)}
+    return {name.removeprefix(_AVERAGED): value for name, value in whole.items()}
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

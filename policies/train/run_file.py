@@ -125,7 +125,7 @@ def _first_gait_imitated(kind: Kind) -> Run:
             steps_per_environment=steps, epochs=3, desired_kl=0.01, critic_warmup=40,
             freeze_normaliser=True, learning_rate=1e-5, discount=0.97, gae_lambda=0.9,
             exploration=Exploration((0.02, 0.01), (0.0, 2.5), persistence_s=0.0),
-            mirror=without_memory,
+            mirror=without_memory, averaging=50,
         ),
         imitation=Imitation(rollouts=240 // steps, minibatches=4 if without_memory else 16),
         environments=512, iterations=8000 // steps,

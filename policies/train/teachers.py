@@ -26,7 +26,7 @@ from tensordict import TensorDict
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.train.learner import read_checkpoint
+from pupper_sysid.policies.train.learner import judged_weights, read_checkpoint
 from pupper_sysid.policies.train.run_file import Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.trot import Trot
@@ -220,7 +220,7 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
     content = read_checkpoint(folder / checkpoint)
     network, _ = build(own.architecture, seen, own.learner, own.task.control_step_s)
     try:
-        network.load_state_dict(content["actor_state_dict"])
+        network.load_state_dict(judged_weights(content))
     except RuntimeError as error:
         raise InputError(
             f"The teacher in {folder} is of a version of pupper-train whose teachers see something "

@@ -277,7 +277,7 @@ class _Session:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
         if not self.counters["scores"]:
-            self.counters["scores"] = self.judge(learner.actor)
+            self.counters["scores"] = self.judge(learner.averaged)
             self.keep_best()  # of imitation alone, so that PPO must be better
             if self.run.imitation.iterations:
                 self.write_policy("policy_imitated")
@@ -305,7 +305,7 @@ class _Session:
             }
             judged = learner.iteration % _JUDGE_EVERY == 0
             if judged:
-                self.counters["scores"] = self.judge(learner.actor)
+                self.counters["scores"] = self.judge(learner.averaged)
             self.report(
                 "ppo", learner.iteration, self.run.iterations, row | self.counters["scores"]
             )
@@ -343,7 +343,7 @@ class _Session:
             "elapsed_s": self.counters["elapsed_s"],
         }  # fmt: skip
         write_policy(
-            self.folder / name, self.learner.actor.state_dict(), self.run, servos,
+            self.folder / name, self.learner.averaged.state_dict(), self.run, servos,
             action_history(self.run, servos), about,
         )  # fmt: skip
 

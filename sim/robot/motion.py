@@ -56,3 +56,15 @@ def own_velocity(qpos: Array, qvel: Array) -> Array:
     found[:, 1] = b + w * u + v * x - t * z
     found[:, 2] = c + w * v + t * y - u * x
     return found
+
+
+def planar(velocity: Array, qvel: Array) -> Array:
+    """Forward and sideways speed [m/s] and turn rate [rad/s], shape (n, 3).
+
+    Parameters
+    ----------
+    velocity : ndarray, shape (n, 3)
+        `own_velocity`.
+    qvel : ndarray, shape (n, 18)
+    """
+    return np.column_stack([velocity[:, :2], qvel[:, 5]])

@@ -3,7 +3,7 @@
 One call steps all physics in C++ (`Batch.rollout`, ten steps of 2 ms). Servo delay, gains, limits
 and friction are MuJoCo's own, per environment and joint, drawn per episode from the calibration.
 The joint angles that a policy sees have passed through the measured feedback
-(`sim.walking.held_readings`). Arrays are (environments, …) NumPy.
+(`sim.walking.senses`). Arrays are (environments, …) NumPy.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.joint_arrays import JointArrays
 from pupper_sysid.sim.robot.falls import touches_ground
 from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
-from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity
+from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity, planar
 from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
-from pupper_sysid.sim.walking.held_readings import HeldReadings
-from pupper_sysid.sim.walking.imu import Imu
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
     OBSERVATION_SIZE,
     PRIVILEGED_SIZE,
-    VELOCITY_STEPS,
     noise_of,
     observed,
     privileged_of,
@@ -37,6 +34,7 @@ from pupper_sysid.sim.walking.observation import (
 from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.terms import weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
+from pupper_sysid.sim.walking.senses import Rows, Senses
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
@@ -46,7 +44,7 @@ Array = NDArray[np.float64]
 _EDGE_M = 0.5
 _ARRAYS = (
     "command", "episode_step", "action", "last_action", "earlier_action", "_until_command",
-    "_until_push", "_seen",
+    "_until_push",
 )  # fmt: skip
 
 
@@ -150,17 +148,12 @@ class PupperEnv:
         self.default, (self._low, self._high) = default_pose(), limits()
         self.trot = config.trot
         n = environments
-        self._readings = HeldReadings(
-            servos.feedback, n, config.physics_step_s, generator([seed, 2], twins),
-            self.robots.linked, config.differences.poll_period[0],
-        )  # fmt: skip
-        self._imu = Imu(config.differences, n, config.control_step_s)
+        self._senses = Senses(config, servos, self.robots, n, generator([seed, 2], twins))
         self._strides = Strides(n, config.control_step_s, config.rewards)
-        self._parts = {"readings": self._readings, "imu": self._imu, "strides": self._strides}
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
         self.level = config.curriculum.at(0)
-        self._rewards = self._rewards_now()
+        self._rewards = self._narrowed()
 
         def zeros(*shape: int) -> Array:
             return np.zeros((n, *shape))
@@ -169,8 +162,6 @@ class PupperEnv:
         self.episode_step = np.zeros(n, int)
         self.action, self.last_action, self.earlier_action = zeros(12), zeros(12), zeros(12)
         self._until_command, self._until_push = zeros(), zeros()
-        # readings in turn, the newest where `steps` says
-        self._seen = np.zeros((VELOCITY_STEPS + 1, n, 12))
         self.reset()
 
     # ------------------------------------------------------------------------- public
@@ -186,11 +177,7 @@ class PupperEnv:
         Draws noise, but does not let time pass.
         """
         n = self.environments
-        observation = np.empty((n, OBSERVATION_SIZE), np.float32)
-        privileged = np.empty((n, PRIVILEGED_SIZE), np.float32)
-        noise = noise_of(self.config.observation, n, self.rng)
-        self._look(slice(None), noise, observation, privileged)
-        return observation, privileged
+        return self._look(slice(None), noise_of(self.config.observation, n, self.rng))
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Let every robot act for one control step.
@@ -258,7 +245,7 @@ class PupperEnv:
     @property
     def readings(self) -> Array:
         """Joint angles as the bus reports them now [rad], shape (n, 12)."""
-        return self._read(slice(None))
+        return self._senses.angles(slice(None))
 
     @property
     def stride_velocity(self) -> Array:
@@ -268,13 +255,9 @@ class PupperEnv:
     @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, as arrays and strings; `restore` takes it back exactly."""
-        found = self.robots.state
-        for part, holder in self._parts.items():
-            found |= {f"{part}.{k}": v.copy() for k, v in holder.state.items()}
-        found |= {name: getattr(self, name).copy() for name in _ARRAYS}
+        found = self.robots.state | {name: value.copy() for name, value in self._live.items()}
         found["counters"] = np.array([self.nan_resets, self.steps])
-        rngs = (self.rng, self._readings.rng)
-        found["rng"] = json.dumps([rng.bit_generator.state for rng in rngs])
+        found["rng"] = json.dumps([rng.bit_generator.state for rng in self._rngs])
         return found
 
     def restore(self, state: dict[str, Any]) -> bool:
@@ -291,34 +274,42 @@ class PupperEnv:
         if differ := sorted(state.keys() ^ self.state.keys()):
             raise InputError(f"they differ in {differ[0]}. Resume with the settings of the run.")
         exact = self.robots.restore(state)
-        for part, holder in self._parts.items():
-            for k, v in holder.state.items():
-                v[:] = state[f"{part}.{k}"]
-        for name in _ARRAYS:
-            getattr(self, name)[:] = state[name]
+        for name, value in self._live.items():
+            value[:] = state[name]
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
-        for rng, own in zip((self.rng, self._readings.rng), json.loads(state["rng"]), strict=True):
+        for rng, own in zip(self._rngs, json.loads(state["rng"]), strict=True):
             rng.bit_generator.state = own
         self._grow()
         return exact
+
+    @property
+    def _live(self) -> dict[str, NDArray]:
+        """All arrays that change, but for those of the physics."""
+        senses = self._senses
+        parts = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
+        found = {f"{part}.{k}": v for part, its in parts.items() for k, v in its.state.items()}
+        return found | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.kept}
+
+    @property
+    def _rngs(self) -> tuple[np.random.Generator, ...]:
+        return self.rng, self._senses.readings.rng
 
     def _grow(self) -> None:
         """Go on to the present level of the curriculum."""
         level = self.config.curriculum.at(self.steps * self.environments * self.processes)
         if level != self.level:
             self.level = level
-            self._rewards = self._rewards_now()
+            self._rewards = self._narrowed()
 
-    def _rewards_now(self) -> Rewards:
-        level = self.level
-        return narrowed(self.config.rewards, level.linear_sigma, level.angular_sigma)
+    def _narrowed(self) -> Rewards:
+        return narrowed(self.config.rewards, self.level.linear_sigma, self.level.angular_sigma)
 
     # ------------------------------------------------------------------------- one step
 
     def _begin(self, velocity_before: Array) -> Unfinished:
         """All of a step that its physics does not decide."""
         n, config, span = self.environments, self.config, self.config.control_step_s
-        chances = self._readings.chances(config.substeps)
+        chances = self._senses.readings.chances(config.substeps)
         actions = (self.action, self.last_action, self.earlier_action)
         facts = empty_facts(self.command, *actions)
         self.episode_step += 1
@@ -345,14 +336,13 @@ class PupperEnv:
         """What follows from the physics, for the robots that have moved."""
         robots, rows, span = self.robots, moved.rows, self.config.control_step_s
         qpos, qvel = robots.qpos[rows].copy(), robots.qvel[rows].copy()
-        self._readings.advance(moved.start, moved.qpos, moved.load, now.chances, rows)
-        self._seen[self.steps % len(self._seen), rows] = self._read(rows)
+        self._senses.advance(moved, now.chances, self.steps)
         gravity, velocity = gravity_direction(qpos), own_velocity(qpos, qvel)
         fallen = gravity[:, 2] > -FALLEN_TILT
         fallen |= touches_ground(qpos, gravity, self.ground)
         now.fallen[rows] = fallen
         facts = {name: value[rows] for name, value in now.facts.items()}
-        self._strides.advance(rows, moved.touch, robots.feet(rows), _planar(velocity, qvel), facts)
+        self._strides.advance(rows, moved.touch, robots.feet(rows), planar(velocity, qvel), facts)
         facts["linear_velocity"][:], facts["gravity"][:] = velocity, gravity
         facts["angular_velocity"][:], facts["torque"][:] = qvel[:, 3:6], moved.load[:, -1]
         np.subtract(qpos[:, 7:], self.default, out=facts["position_relative"])
@@ -371,15 +361,12 @@ class PupperEnv:
             robots.push(ids, now.push[first:last])
             qvel = robots.qvel[rows]
             velocity = own_velocity(qpos, qvel)
-        self._imu.advance(rows, qvel[:, 3:6], gravity)
+        self._senses.imu.advance(rows, qvel[:, 3:6], gravity)
         noise = None if now.noise is None else now.noise[rows]
         self._look(
-            rows,
-            noise,
-            now.observation[rows],
-            now.privileged[rows],
+            rows, noise, now.observation[rows], now.privileged[rows],
             (qpos, qvel, gravity, velocity),
-        )
+        )  # fmt: skip
 
     # ------------------------------------------------------------------------- a new episode
 
@@ -388,16 +375,14 @@ class PupperEnv:
         self._draw_commands(ids)
         start, speed = draw_pose(self.config.randomisation, self.trot, self.command[ids], self.rng)
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
-        bodies = self.robots.bodies
-        self._readings.reset(ids, self.robots.to_servo(start), bodies.poll[ids])
-        self._seen[:, ids] = self._read(ids)
+        angles = self.robots.to_servo(start)
         qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
-        self._imu.reset(ids, qvel[:, 3:6], gravity_direction(qpos), self.rng)
-        velocity = _planar(own_velocity(qpos, qvel), qvel)
+        self._senses.reset(ids, angles, qvel[:, 3:6], gravity_direction(qpos), self.rng)
+        velocity = planar(own_velocity(qpos, qvel), qvel)
         self._strides.reset(ids, self.robots.feet(ids)[0], velocity)
         self._until_push[ids] = self.rng.uniform(*self.config.randomisation.push_every_s, len(ids))
         self.episode_step[ids] = 0
-        command = self.robots.from_servo(self.robots.to_servo(start) - bodies.zero_rad[ids])
+        command = self.robots.from_servo(angles - self.robots.bodies.zero_rad[ids])
         relative = (command - self.default) / self.config.action_scale
         for action in (self.action, self.last_action, self.earlier_action):
             action[ids] = relative
@@ -411,7 +396,7 @@ class PupperEnv:
 
     def _look(
         self,
-        rows: slice | NDArray[np.intp],
+        rows: Rows,
         noise: NDArray[np.float32] | None,
         observation: NDArray[np.float32] | None = None,
         privileged: NDArray[np.float32] | None = None,
@@ -425,13 +410,9 @@ class PupperEnv:
             qpos, qvel = self.robots.qpos[rows], self.robots.qvel[rows]
             state = qpos, qvel, gravity_direction(qpos), own_velocity(qpos, qvel)
         qpos, qvel, gravity, velocity = state
-        true, newest = self.config.observation.base_velocity == "true", self.steps % len(self._seen)
-        angle = self._seen[newest, rows]
-        moved = angle - self._seen[(newest + 1) % len(self._seen), rows]
-        moved /= VELOCITY_STEPS * self.config.control_step_s
-        bodies, strides = self.robots.bodies, self._strides
-        rate, down = self._imu.read(rows, qvel[:, 3:6], gravity)
-        effort = self._readings.load[rows] * bodies.effort[rows, None]
+        true, strides = self.config.observation.base_velocity == "true", self._strides
+        angle, moved, effort = self._senses.joints(rows, self.steps)
+        rate, down = self._senses.imu.read(rows, qvel[:, 3:6], gravity)
         observation = observed(
             [
                 velocity if true else np.zeros((len(qpos), 3)), rate, down,
@@ -453,9 +434,9 @@ class PupperEnv:
         )  # fmt: skip
         return observation, privileged
 
-    def _differing(self, rows: slice | NDArray[np.intp]) -> list[Array]:
+    def _differing(self, rows: Rows) -> list[Array]:
         """What was drawn for robots, as the critic sees it."""
-        robots, imu, bodies = self.robots, self._imu, self.robots.bodies
+        robots, imu, bodies = self.robots, self._senses.imu, self.robots.bodies
         stiffness = robots.drawn["stiffness"][rows] / self.servos.value["stiffness"]
         speed = robots.drawn["velocity_limit"][rows] / self.servos.value["velocity_limit"]
         return [
@@ -466,13 +447,3 @@ class PupperEnv:
             np.stack([imu.latency_s[rows], imu.period_s[rows]], axis=1),
             np.stack([bodies.poll[rows], bodies.jitter[rows], bodies.effort[rows]], axis=1),
         ]  # fmt: skip
-
-    def _read(self, rows: slice | NDArray[np.intp]) -> Array:
-        """Joint angles as the controller reads them."""
-        position = self._readings.position[rows] - self.robots.bodies.zero_rad[rows]
-        return self.robots.from_servo(position)
-
-
-def _planar(velocity: Array, qvel: Array) -> Array:
-    """Forward and sideways speed and turn rate, shape (k, 3)."""
-    return np.column_stack([velocity[:, :2], qvel[:, 5]])

@@ -15,7 +15,7 @@ import torch
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import LEGS
-from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, read_checkpoint
+from pupper_sysid.policies.train.learner import CHECKPOINT_VERSION, judged_weights, read_checkpoint
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
@@ -201,6 +201,10 @@ def saved(tmp_path, kind: str = "mlp"):
     return learner, path
 
 
+def weights_of(learner):
+    return *learner.actor.state_dict().values(), *learner.averaged.state_dict().values()
+
+
 @pytest.mark.parametrize("kind", ["mlp-actions", "gru"])
 def test_a_loaded_learner_goes_on_exactly_as_the_one_that_was_saved(tmp_path, kind):
     first, path = saved(tmp_path, kind)
@@ -213,11 +217,47 @@ def test_a_loaded_learner_goes_on_exactly_as_the_one_that_was_saved(tmp_path, ki
         learner.update()
     assert not torch.equal(rng, torch.get_rng_state())
     for a, b in zip(
-        (*first.actor.state_dict().values(), *first.observations.values()),
-        (*second.actor.state_dict().values(), *second.observations.values()),
+        (*weights_of(first), *first.observations.values()),
+        (*weights_of(second), *second.observations.values()),
         strict=True,
     ):
         assert torch.equal(a, b)
+
+
+def updating(averaging: int, updates: int, tmp_path):
+    """Weights after each update, those that would be saved, and the last checkpoint."""
+    hyper = replace(
+        tiny_run().learner, averaging=averaging, critic_warmup=1, learning_rate=1e-2,
+        learning_rates=(1e-2, 1e-2), desired_kl=1e9,
+    )  # fmt: skip
+    learner = make_learner(tiny_run(learner=hyper), Ranks())
+    after = []
+    for _ in range(updates):
+        learner.rollout()
+        learner.update()
+        after.append(learner.actor.mlp[0].weight.detach().clone())
+    learner.save(tmp_path / "last.pt", {})
+    return after, learner.averaged.mlp[0].weight.detach(), read_checkpoint(tmp_path / "last.pt")
+
+
+def test_the_policy_that_is_saved_has_the_mean_of_the_last_updates_weights(tmp_path):
+    """The critic's first update changes no policy and does not count."""
+    after, averaged, checkpoint = updating(2, 4, tmp_path)
+    assert (after[1] != after[0]).any() and (after[3] != after[2]).any()
+    wanted = 0.5 * after[3] + 0.25 * after[2] + 0.25 * after[1]
+    torch.testing.assert_close(averaged, wanted)
+    assert torch.equal(judged_weights(checkpoint)["mlp.0.weight"], averaged)
+
+
+def test_without_averaging_the_policy_that_is_saved_is_the_last(tmp_path):
+    after, averaged, checkpoint = updating(1, 3, tmp_path)
+    assert torch.equal(averaged, after[2])
+    checkpoint.pop("average")  # as of an older version
+    assert torch.equal(judged_weights(checkpoint)["mlp.0.weight"], after[2])
+    torch.save(checkpoint, tmp_path / "old.pt")
+    learner = make_learner(tiny_run(), Ranks())
+    learner.load(tmp_path / "old.pt")
+    assert torch.equal(learner.averaged.mlp[0].weight, after[2])
 
 
 def test_it_learns_on_the_processor_though_the_machine_has_a_gpu(monkeypatch):

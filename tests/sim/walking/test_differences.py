@@ -122,7 +122,9 @@ def test_the_observation_has_the_imu_s_readings():
     seen = stand(env, 30)
     tilt = seen[:, PARTS["projected_gravity"]][:, :2]
     level = stand(make(), 30)[:, PARTS["projected_gravity"]][:, :2]
-    np.testing.assert_allclose(tilt[:, 0] - level[:, 0], env._imu.mounting_rad[:, 1], atol=0.01)
+    np.testing.assert_allclose(
+        tilt[:, 0] - level[:, 0], env._senses.imu.mounting_rad[:, 1], atol=0.01
+    )
     assert np.abs(tilt).max() > 0.05
 
 
@@ -218,7 +220,7 @@ def test_commands_within_the_dead_band_mean_stand():
 def test_the_critic_sees_what_was_drawn():
     env = make(MEASURED, **{f.name: getattr(TYPICAL, f.name) for f in fields(Differences)})
     seen = env.observe()[1]
-    bodies, imu = env.robots.bodies, env._imu
+    bodies, imu = env.robots.bodies, env._senses.imu
     sight = {tuple(np.round(column, 5)) for column in seen.T}
     for truth in (
         20 * bodies.zero_rad, 100 * bodies.centre_m, 20 * imu.mounting_rad, 20 * imu.bias_rad_s,
