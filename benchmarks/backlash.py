@@ -1,6 +1,6 @@
 """Coverage of `sysid.backlash` on emulated servos: play 0 to 2°, dead zones of 0 to 5 counts.
 
-Each servo is drawn (`sim.emulator.pendulum_bench.BenchSpec`), swings 0.1 kg at 0.1 m, and is
+Each servo is drawn (`sim.emulator.servos.pendulum_bench.BenchSpec`), swings 0.1 kg at 0.1 m, and is
 stroked slowly at P 8 and P 32. Printed are how often the 90 % intervals hold the truth, and the
 errors.
 

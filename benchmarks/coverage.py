@@ -36,7 +36,7 @@ from random_robots import sweep_random_robot
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.compare.truth import truth_table
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
 from pupper_sysid.sysid.identify.posterior import posterior
 from pupper_sysid.sysid.identify.preparation import prepare_joint
 from pupper_sysid.sysid.identify.search import SIMULATED

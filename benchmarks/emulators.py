@@ -22,7 +22,7 @@ from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.walking.robot import WalkingRobot
 
 KINDS = ("feetech", "esp32")

@@ -30,7 +30,7 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 SERVOS = range(1, 13)
 MEMORY = 80

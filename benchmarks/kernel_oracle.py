@@ -2,10 +2,10 @@
 
     .venv/bin/python benchmarks/kernel_oracle.py
 
-The three functions of `sysid.identify.simulation` that run the compiled kernel are replaced by the
-definition of the models (`CandidateModel.simulate`, NumPy), and a joint of a short emulated sweep
-is calibrated both ways. Printed: the largest difference of a number in units of its interval's
-width, and of a score relative to itself; processor time of both.
+The three functions of `sysid.identify.candidates.simulation` that run the compiled kernel are
+replaced by the definition of the models (`CandidateModel.simulate`, NumPy), and a joint of a short
+emulated sweep is calibrated both ways. Printed: the largest difference of a number in units of its
+interval's width, and of a score relative to itself; processor time of both.
 """
 
 from __future__ import annotations
@@ -27,8 +27,12 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.identify import output_error, posterior, search
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.identify.models import CandidateModel
-from pupper_sysid.sysid.identify.simulation import LONGEST_DEAD_TIME_S, TrialData, look_up
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.simulation import (
+    LONGEST_DEAD_TIME_S,
+    TrialData,
+    look_up,
+)
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
 from pupper_sysid.sysid.sweep.recorder import record

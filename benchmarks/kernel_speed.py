@@ -25,8 +25,8 @@ import numpy as np
 
 from pupper_sysid.servo_models.delay_line import fractional_shift
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, TIME_STEP_S
-from pupper_sysid.sysid.identify.models import candidate_model
-from pupper_sysid.sysid.identify.simulation import TrialData, look_up, residuals
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, look_up, residuals
 
 STEPS, READINGS, CANDIDATES, SLICES = 1500, 160, 2048, 15
 PAD = 64

@@ -20,7 +20,7 @@ import numpy as np
 from emulators import KINDS, in_process, served
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording

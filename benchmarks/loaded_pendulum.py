@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pupper_sysid.sim.emulator.pendulum_servo import PendulumServo, PendulumServoParameters
+from pupper_sysid.sim.emulator.servos.pendulum import PendulumServo, PendulumServoParameters
 from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, fit_loaded_joint
 from pupper_sysid.sysid.recordings.recording import Recording
 

@@ -37,8 +37,8 @@ from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, draw_robot
+from pupper_sysid.sim.emulator.servos.free_air import PHYSICS_STEP_S
 from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
 from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_fits
 from pupper_sysid.sysid.recordings.files import load

@@ -28,7 +28,7 @@ from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.step_size import delay_at_step
-from pupper_sysid.sim.emulator.free_air_servo import PHYSICS_STEP_S, FreeAirServo
+from pupper_sysid.sim.emulator.servos.free_air import PHYSICS_STEP_S, FreeAirServo
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.lag.phase_slope import tone_lags, tone_weights

@@ -44,9 +44,9 @@ from pupper_sysid.sysid.compare.readings import (
     with_ages,
 )
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import free_run
 from pupper_sysid.sysid.identify.results import CandidateFit
-from pupper_sysid.sysid.identify.simulation import free_run
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data

@@ -45,7 +45,7 @@ def parse_registers(text: str) -> dict[str, int]:
     InputError
         If it names one that does not act on the motion, or a value that it cannot have.
     """
-    from pupper_sysid.sim.emulator.pendulum_servo import REGISTERS
+    from pupper_sysid.sim.emulator.servos.pendulum import REGISTERS
 
     found = {}
     for part in filter(None, text.split(",")):

@@ -34,10 +34,10 @@ from random_robots import SweptRobot, sweep_random_robot
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.scores import rms, score
 from pupper_sysid.sysid.identify.search import leave_one_out_folds
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording

@@ -27,8 +27,8 @@ from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.sim.emulator.clocks import RealClock, VirtualClock
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
-from pupper_sysid.sim.emulator.servo_bench import SUPPLY_V
-from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
+from pupper_sysid.sim.emulator.servos.bench import SUPPLY_V
+from pupper_sysid.sim.emulator.servos.plant import FreeAirServos, ServoPlant
 
 NOMINAL_SPEED_LIMIT_RAD_S = 7.5
 """Speed limit of the Mini Pupper's servos [rad/s], and of others whose data sheet has none."""

@@ -20,7 +20,7 @@ from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.imu import to_chip
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 TICK_S = 0.002
 """Period of the firmware's servo task [s], which writes goal positions."""

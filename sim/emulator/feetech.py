@@ -27,7 +27,7 @@ from pupper_sysid.hardware.feetech.registers import (
     Series,
 )
 from pupper_sysid.sim.emulator.faults import BusFaults, with_wrong_length
-from pupper_sysid.sim.emulator.servo_bench import AMBIENT_C, ServoBench
+from pupper_sysid.sim.emulator.servos.bench import AMBIENT_C, ServoBench
 
 MEMORY_BYTES = 80
 _OVERLOAD = 32  # of `hardware.feetech.registers.ERROR_BITS`

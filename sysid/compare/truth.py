@@ -30,7 +30,7 @@ from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult
-from pupper_sysid.sysid.identify.simulation import whole_counts
+from pupper_sysid.sysid.identify.candidates.simulation import whole_counts
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
 from pupper_sysid.sysid.lag.phase_slope import tone_lags, tone_weights
 from pupper_sysid.sysid.lag.tone import tone_response

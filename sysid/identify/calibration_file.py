@@ -38,7 +38,7 @@ from pupper_sysid.servo_models.calibration.parts import (
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
 from pupper_sysid.sysid.identify.results import UNTOLD, CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording

@@ -1,6 +1,6 @@
 """Fit the candidate models to one joint, choose one, and find what the data do not identify.
 
-The candidates of `sysid.identify.models` are fitted to fresh readings by output error, from seeded
+The models of `sysid.identify.candidates` are fitted to fresh readings by output error, from seeded
 global starts, and scored by leaving one frequency out. Simulators run DelayedPD with one of two
 limits on its speed, the set-point's slew or the motor's back-EMF; of these the one with the smaller
 error on unseen frequencies is carried. The intervals of its numbers are quantiles of their
@@ -19,12 +19,13 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.models import (
+from pupper_sysid.sysid.identify.candidates.models import (
     CANDIDATE_MODELS,
     CandidateModel,
     Parameter,
     candidate_model,
 )
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run
 from pupper_sysid.sysid.identify.noise import command_jitter
 from pupper_sysid.sysid.identify.output_error import Fit
 from pupper_sysid.sysid.identify.posterior import Posterior, posterior
@@ -45,7 +46,6 @@ from pupper_sysid.sysid.identify.search import (
     integrated_autocorrelation_time,
     leave_one_out_folds,
 )
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 

@@ -15,8 +15,13 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.sysid.identify.models import CandidateModel
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up, with_late_commands
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.simulation import (
+    TrialData,
+    free_run,
+    look_up,
+    with_late_commands,
+)
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _OUTLIER_MAD = 4.0

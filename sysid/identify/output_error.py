@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.identify.models import CandidateModel
-from pupper_sysid.sysid.identify.simulation import TrialData, moments_if_later, residuals
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, moments_if_later, residuals
 
 DIFFERENCE = 0.01  # relative step of the Jacobian; smaller ones drown in friction's stick-slip
 _WIDE_DIFFERENCE = 0.03  # for the covariance: the slope over a likely error, not of one kink

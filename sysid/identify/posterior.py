@@ -29,10 +29,10 @@ from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import delay_at_step
-from pupper_sysid.sysid.identify.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData
 from pupper_sysid.sysid.identify.output_error import Fit, Problem, costs
 from pupper_sysid.sysid.identify.search import fresh_residuals
-from pupper_sysid.sysid.identify.simulation import TrialData
 
 HARMONICS = (1, 2, 3)
 STEPPING_SD_S = 0.5 * TIME_STEP_S

@@ -23,11 +23,11 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.slips import Motion
 from pupper_sysid.sysid.feedback.upsets import Upset, find_upsets
-from pupper_sysid.sysid.identify.models import CandidateModel, candidate_model
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel, candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.identify.noise import noise_by_trial
 from pupper_sysid.sysid.identify.output_error import Fit, Problem, fit
 from pupper_sysid.sysid.identify.search import SIMULATED, fit_problems, fresh_residuals
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.joints import joint_rng
 from pupper_sysid.sysid.recordings.recording import Trial

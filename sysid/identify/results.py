@@ -9,8 +9,8 @@ from typing import Any
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived, flat, internal
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData
 from pupper_sysid.sysid.identify.scores import Scores
-from pupper_sysid.sysid.identify.simulation import TrialData
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 
 UNTOLD = "the data do not tell a set-point of limited rate from back-EMF"
@@ -25,7 +25,7 @@ class CandidateFit(Result):
     Attributes
     ----------
     model : str
-        Its name in `sysid.identify.models`.
+        Its name in `sysid.identify.candidates.models`.
     parameters : dict of str to Interval
         By name, which ends in the unit.
     undecided : dict of str to str

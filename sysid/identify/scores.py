@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import Result
-from pupper_sysid.sysid.identify.simulation import TrialData, look_up
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, look_up
 
 
 @dataclass(frozen=True, kw_only=True)

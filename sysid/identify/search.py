@@ -18,7 +18,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sysid.identify.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.output_error import (
     DIFFERENCE,
     Fit,
@@ -27,7 +28,6 @@ from pupper_sysid.sysid.identify.output_error import (
     fit,
     global_starts,
 )
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 
 PREFERRED = "delayed_pd"
 """DelayedPD with a set-point of limited rate: what a simulator runs unless the data say more."""

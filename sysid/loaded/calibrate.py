@@ -31,9 +31,9 @@ from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
 from pupper_sysid.sysid.feedback.poll_lattice import quantum, readings
+from pupper_sysid.sysid.identify.candidates.simulation import prepare
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.scores import Scores as FitScores
-from pupper_sysid.sysid.identify.simulation import prepare
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, fit_loaded_joint
 from pupper_sysid.sysid.recordings.joints import joint_rng, map_joints

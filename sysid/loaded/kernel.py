@@ -1,8 +1,8 @@
 """Compiled simulation of `servo_models.loaded_servo`: the inner loop of every fit (numba).
 
-`LANES` candidates are stepped abreast through one run; see `sysid.identify.kernel`. The arithmetic
-is that of `LoadedServo`, which is its definition and the reference of its tests. Compiled once per
-machine, on first use, and cached.
+`LANES` candidates are stepped abreast through one run, as in `sysid.identify.candidates.kernel`.
+The arithmetic is that of `LoadedServo`, which is its definition and the reference of its tests.
+Compiled once per machine, on first use, and cached.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
-from pupper_sysid.sysid.identify.kernel import LANES, SAFE, clip, fill_lanes
+from pupper_sysid.sysid.identify.candidates.kernel import LANES, SAFE, clip, fill_lanes
 
 OFFSET, WIDTH = 19, 20
 """Column of the offset, and number of columns: `loaded_servo.COLUMNS`, then the gravity [N·m] and

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, readings
-from pupper_sysid.sysid.identify.simulation import whole_counts
+from pupper_sysid.sysid.identify.candidates.simulation import whole_counts
 from pupper_sysid.sysid.loaded import kernel
 from pupper_sysid.sysid.loaded.structures import LONGEST_DEAD_TIME_S, Structure
 from pupper_sysid.sysid.recordings.recording import Trial

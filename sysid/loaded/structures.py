@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.loaded_servo import COLUMNS, LoadedServoParameters
-from pupper_sysid.sysid.identify.models import Parameter
+from pupper_sysid.sysid.identify.candidates.models import Parameter
 from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
 
 LONGEST_DEAD_TIME_S = 0.4

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.identify.simulation import TrialData, prepare
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, prepare
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.sweep.excitation import (
     HIGHEST_HZ,

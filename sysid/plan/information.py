@@ -20,8 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sysid.identify.models import CandidateModel
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up, residuals
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates.simulation import (
+    TrialData,
+    free_run,
+    look_up,
+    residuals,
+)
 
 SHIFT_SD_S = 0.0003
 """Standard deviation of the time shift common to a tone's readings [s], about that of the phase of

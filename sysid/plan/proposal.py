@@ -223,7 +223,7 @@ def plan_first_sweep(
     """Plan a first sweep of servos of which nothing is known.
 
     The trials are the best on average over servos drawn from the prior of
-    `sysid.identify.models`.
+    `sysid.identify.candidates.models`.
 
     Parameters
     ----------

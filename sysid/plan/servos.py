@@ -12,10 +12,10 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel, Parameter, candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.search import SIMULATED
-from pupper_sysid.sysid.identify.simulation import TrialData
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.plan.candidates import Setup
 from pupper_sysid.sysid.plan.information import (

@@ -16,9 +16,9 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
 LONGEST_RUN = 12

@@ -16,13 +16,13 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import CandidateModel, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.identify.calibration_file import preset_parameters
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import free_run
 from pupper_sysid.sysid.identify.joint_fit import score_preset
-from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.scores import Scores, score
 from pupper_sysid.sysid.identify.search import SIMULATED
-from pupper_sysid.sysid.identify.simulation import free_run
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.joints import Recordings, usable_trials
 from pupper_sysid.sysid.recordings.recording import Trial

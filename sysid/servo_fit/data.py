@@ -33,7 +33,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     fresh_rows,
     readings,
 )
-from pupper_sysid.sysid.identify.simulation import TrialData, prepare, whole_counts
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, prepare, whole_counts
 from pupper_sysid.sysid.recordings.joints import joint_rng, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
-from pupper_sysid.sysid.identify.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData
 from pupper_sysid.sysid.identify.output_error import Problem
 from pupper_sysid.sysid.identify.search import PREFERRED, fit_problems
-from pupper_sysid.sysid.identify.simulation import TrialData
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen
 

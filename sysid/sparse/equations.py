@@ -33,7 +33,8 @@ from pupper_sysid.servo_models.sparse_equation import (
     explain,
     integrate,
 )
-from pupper_sysid.sysid.identify.models import CandidateModel, Parameter, candidate_model
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel, Parameter, candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run
 from pupper_sysid.sysid.identify.output_error import Fit, Problem
 from pupper_sysid.sysid.identify.preparation import prepare_joint
 from pupper_sysid.sysid.identify.scores import Scores, score
@@ -44,7 +45,6 @@ from pupper_sysid.sysid.identify.search import (
     held_out_residuals,
     leave_one_out_folds,
 )
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,

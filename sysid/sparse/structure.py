@@ -22,7 +22,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
-from pupper_sysid.sysid.identify.simulation import TrialData
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData
 
 Support = tuple[str, ...]
 """Names of the coefficients of one structure, in the order of `COEFFICIENTS`."""

@@ -12,8 +12,13 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.hardware.feetech.registers import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum_bench import BENCH_MAP, Pendulum, PendulumBench, draw_bench
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+    BENCH_MAP,
+    Pendulum,
+    PendulumBench,
+    draw_bench,
+)
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run
 from support.servo_servers import on_a_port

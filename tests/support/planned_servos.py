@@ -9,10 +9,10 @@ import numpy as np
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.joint_fit import fit_joint
-from pupper_sysid.sysid.identify.models import candidate_model
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.plan.candidates import Setup, recorded
 from pupper_sysid.sysid.plan.information import (
     Hypothesis,

@@ -20,7 +20,7 @@ from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy": "mini_pupper_2"}
 

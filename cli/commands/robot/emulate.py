@@ -29,7 +29,9 @@ from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.servos.pendulum_bench import (
     BENCH_MAP,
     BenchSpec,
     Pendulum,
@@ -37,8 +39,6 @@ from pupper_sysid.sim.emulator.pendulum_bench import (
     draw_bench,
     has_registers,
 )
-from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from pupper_sysid.sysid.sweep.bench import parse_load
 
 _MOST_BACKLASH_DEG = 20.0

@@ -19,7 +19,7 @@ from pupper_sysid.hardware.feetech.opening import open_line
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
 from pupper_sysid.hardware.feetech.settings import memory_of
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from support.servo_servers import (
     Scripted,
     StillBench,

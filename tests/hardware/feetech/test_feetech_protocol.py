@@ -13,7 +13,7 @@ from scservo_sdk import scservo_def
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.line import FeetechLine
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series, series_of_model_bytes
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from support.servo_servers import (
     Listening,
     bench_of,

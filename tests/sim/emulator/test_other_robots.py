@@ -18,7 +18,7 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.robot_map import joint_map_of
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges

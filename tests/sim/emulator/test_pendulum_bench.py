@@ -14,15 +14,15 @@ from pupper_sysid.hardware.feetech.registers import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.servos.pendulum import PendulumServo, PendulumServoParameters
+from pupper_sysid.sim.emulator.servos.pendulum_bench import (
     BENCH_MAP,
     BenchSpec,
     Pendulum,
     PendulumBench,
     draw_bench,
 )
-from pupper_sysid.sim.emulator.pendulum_servo import PendulumServo, PendulumServoParameters
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
 from support.servo_servers import on_a_port
 
 COUNT = 2 * np.pi / 4096

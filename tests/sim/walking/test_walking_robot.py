@@ -24,7 +24,7 @@ from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import ServoBench
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.bus import WalkingBus

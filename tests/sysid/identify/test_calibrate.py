@@ -9,11 +9,11 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, Delayed
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.identify.calibrate import calibrate, side_by_side
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
+from pupper_sysid.sysid.identify.candidates.models import CANDIDATE_MODELS, candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.identify.joint_fit import fit_joint, joint_lag
-from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
 from pupper_sysid.sysid.identify.output_error import Problem, fit, global_starts
 from pupper_sysid.sysid.identify.results import plausible
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, prepare
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Truncation
 from support.synthetic import LOOP_S, tone_trials

@@ -8,8 +8,8 @@ import pytest
 from pupper_sysid.servo_models.delay_line import fractional_shift
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
-from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS
-from pupper_sysid.sysid.identify.simulation import (
+from pupper_sysid.sysid.identify.candidates.models import CANDIDATE_MODELS
+from pupper_sysid.sysid.identify.candidates.simulation import (
     TrialData,
     free_run,
     look_up,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.sysid.identify.models import candidate_model
-from pupper_sysid.sysid.identify.simulation import free_run, look_up
+from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import free_run, look_up
 from pupper_sysid.sysid.plan.information import (
     SHIFT_SD_S,
     Hypothesis,

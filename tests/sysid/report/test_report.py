@@ -21,10 +21,10 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.examination import Examination, JointExamination
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
-from pupper_sysid.sysid.identify.models import CANDIDATE_MODELS, candidate_model
+from pupper_sysid.sysid.identify.candidates.models import CANDIDATE_MODELS, candidate_model
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.scores import Scores
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run, look_up
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction

@@ -15,7 +15,7 @@ from pupper_sysid.servo_models.sparse_equation import (
     equation,
     explain,
 )
-from pupper_sysid.sysid.identify.simulation import TrialData, free_run
+from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sparse.equations import (
     equation_model,

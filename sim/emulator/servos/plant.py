@@ -47,7 +47,7 @@ class FreeAirServos:
     """A `ServoPlant` on a stand: level and at rest, legs in free air."""
 
     def __init__(self, robot: EmulatedRobot):
-        from pupper_sysid.sim.emulator.free_air_servo import FreeAirServo  # imports MuJoCo
+        from pupper_sysid.sim.emulator.servos.free_air import FreeAirServo  # imports MuJoCo
 
         pose = robot.joint_map.rest_pose().tolist()
         self._servos = [

@@ -20,14 +20,14 @@ import numpy as np
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.pendulum_servo import (
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
+from pupper_sysid.sim.emulator.servos.bench import AMBIENT_C, SUPPLY_V
+from pupper_sysid.sim.emulator.servos.pendulum import (
     PHYSICS_STEP_S,
     REGISTERS,
     PendulumServo,
     PendulumServoParameters,
 )
-from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
-from pupper_sysid.sim.emulator.servo_bench import AMBIENT_C, SUPPLY_V
 
 BENCH_MAP = "bench_sts3215"
 """Joint map of one STS3215 on a bench: joint `bench`, id 1, 0 rad at its centre count."""

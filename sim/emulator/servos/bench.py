@@ -1,7 +1,7 @@
 """Emulated servos as registers and datagrams show them: commands and positions in counts.
 
 The emulators of both protocols use the same servos as `EmulatedBus`, with the same truth, in free
-air or in a robot that walks (`sim.emulator.servo_plant`). A bench adds the encoder's counts, the
+air or in a robot that walks (`sim.emulator.servos.plant`). A bench adds the encoder's counts, the
 duty, the supply, and a hand that moves limp joints (`move_by_hand`), so that a calibration of the
 joints can be rehearsed without a robot.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from pupper_sysid.hardware.imu import ImuSample
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.sim.emulator.robot import EmulatedRobot
-from pupper_sysid.sim.emulator.servo_plant import FreeAirServos, ServoPlant
+from pupper_sysid.sim.emulator.servos.plant import FreeAirServos, ServoPlant
 
 AMBIENT_C, SUPPLY_V = 27.0, 7.4
 

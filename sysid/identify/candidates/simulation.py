@@ -2,7 +2,7 @@
 
 `prepare` gives a trial the form that a simulation needs. The functions below simulate any number of
 candidates, which are parameter vectors of one model, from rest under the commands as the servo
-received them; `sysid.identify.kernel` does the arithmetic.
+received them; `sysid.identify.candidates.kernel` does the arithmetic.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.identify import kernel
-from pupper_sysid.sysid.identify.models import CandidateModel
+from pupper_sysid.sysid.identify.candidates import kernel
+from pupper_sysid.sysid.identify.candidates.models import CandidateModel
 from pupper_sysid.sysid.recordings.recording import Trial
 
 LONGEST_DEAD_TIME_S = 0.4

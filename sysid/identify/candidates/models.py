@@ -65,12 +65,12 @@ class CandidateModel:
         `(values, track) -> None`: `values` (parameters, simulations) without delay and offset;
         `track` (steps, simulations) holds delayed commands relative to rest and is overwritten
         with positions [rad], each step lasting `TIME_STEP_S`. The reference of
-        `sysid.identify.kernel`, which fits run.
+        `sysid.identify.candidates.kernel`, which fits run.
     columns : callable or None
         From values (candidates, parameters) without dead time and offset to the kernel's; None
         where they are the same.
     kernel : str or None
-        Name in `sysid.identify.kernel.KINDS`; None where it is the model's.
+        Name in `sysid.identify.candidates.kernel.KINDS`; None where it is the model's.
     """
 
     name: str

@@ -1,0 +1,1 @@
+"""Candidate servo models of calibration, and their compiled simulation."""
