@@ -5,7 +5,8 @@ at rest is not stepped until a command moves it. Commands come at any instant, n
 steps: each actuator gets the mean of its held command over the step before
 (`sim.robot.servo_mjcf.for_commands_between_steps`). The last two seconds are kept, because servos
 are polled one after the other, each a little before the latest evaluated instant. `trunk` gives the
-true motion, for scoring. """
+true motion, for scoring.
+"""
 
 from __future__ import annotations
 
