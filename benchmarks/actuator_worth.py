@@ -18,15 +18,19 @@ import torch
 
 from pupper_sysid.cli.policy_choice import policy_at
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.policies.evaluation.battery import BATTERY
 from pupper_sysid.policies.evaluation.evaluate import evaluate, table
+from pupper_sysid.policies.evaluation.figures import share_interval
 from pupper_sysid.policies.walks.conditions import Walker
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 CALIBRATED = "data/samples/calibrated.yaml"
+_PUSHED = next(case for case in BATTERY if case.name == "pushes of 1.2 m/s")
 _HEAD = (
     "trained with", "policy", "fell %", "instant: forward mm/s", "sideways mm/s", "turn mrad/s",
     "stride: forward", "sideways", "turn", "forward, % of commanded", "turn left, right, %",
+    "pushed by 1.2 m/s: fell %",
 )  # fmt: skip
 
 
@@ -47,22 +51,23 @@ def main() -> None:
 
         def robots(case, walker: Walker, first: bool = trot is None) -> int:
             if walker == "policy" or (walker == "trot" and first):
-                return options.episodes if case.group == "random" else 16
+                return options.episodes if case.group in ("random", "push") else 16
             return 1
 
         found = evaluate(
-            policy, Walking(knee=policy.contract.knee), servos, table((), ()), robots, 0,
-            options.threads,
+            policy, Walking(knee=policy.contract.knee), servos, (*table((), ()), _PUSHED),
+            robots, 0, options.threads,
         )  # fmt: skip
         rows = {row.name: row for row in found.conditions}
         trained = Path(policy.contract.actuator).name
-        print(_line(trained, f"{path.name}", {k: v.policy for k, v in rows.items()}), flush=True)
+        walked = {k: v.policy for k, v in rows.items()}
+        print(_line(trained, f"{path.name}", walked, options.episodes), flush=True)
         trot = trot or {k: v.trot for k, v in rows.items()}
     if trot:
-        print(_line("none", "open-loop trot with a clock", trot))
+        print(_line("none", "open-loop trot with a clock", trot, options.episodes))
 
 
-def _line(trained: str, name: str, rows: dict) -> str:
+def _line(trained: str, name: str, rows: dict, episodes: int) -> str:
     figures = next(iter(rows.values()))
     intervals = figures.intervals
     cells = [trained, name, f"{100 * figures.fall_rate:.0f}"]
@@ -71,6 +76,8 @@ def _line(trained: str, name: str, rows: dict) -> str:
             cells.append(_shown(getattr(intervals, f"{kind}_{axis}")))
     share = {way: 100 * rows[way].speed_share for way in ("forward", "turn left", "turn right")}
     cells += [f"{share['forward']:.0f}", f"{share['turn left']:.0f}, {share['turn right']:.0f}"]
+    pushed = share_interval(round(rows[_PUSHED.name].fall_rate * episodes), episodes)
+    cells.append(f"{100 * pushed.value:.0f} ({100 * pushed.low:.0f}–{100 * pushed.high:.0f})")
     return f"| {' | '.join(cells)} |"
 
 

@@ -144,7 +144,7 @@ TROT, OWN = "trot", "own"
 class Imitation:
     """Settings of the first gait's imitation."""
 
-    iterations: int = 6
+    iterations: int = 12
     """Rounds; 0 to start PPO from random weights."""
     teacher: str = TROT
     """`trot`: the open-loop trot; `own`: one that is trained from nothing first, in the run's
@@ -157,7 +157,7 @@ class Imitation:
     """Parts of each rollout per pass."""
     learning_rate: float = 1e-2
     """Of Muon (matrices) and Adam (biases) at the start; it falls to 0 with the last step."""
-    correction_rate: float = 0.6
+    correction_rate: float = 0.3
     """Share of the policy's errors of speed by which the teacher's commands change per round, in
     the second half of the rounds."""
 

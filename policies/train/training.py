@@ -50,7 +50,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 LAST, BEST = "last.pt", "best.pt"
 _TEACHER = "teacher"
 _SAVE_EVERY = 10
-_JUDGE_EVERY = 25
+_JUDGE_EVERY = 50
 _GRACE_S = 0.7
 
 

@@ -263,7 +263,6 @@ _SCRATCH = Walking(
 
 PRESETS = {
     "fast": Walking(
-        physics_step_s=0.004,
         # half of the robots are as the calibration says: their speeds are to be right
         differences=replace(TYPICAL, as_calibrated=0.5),
         # 5 mm lower than the most exact trot: pushed robots fall a quarter as often, and PPO makes

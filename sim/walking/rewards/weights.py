@@ -134,8 +134,8 @@ CLOCK = ("clock_hz", "clock_pull_hz", "clock_height")
 """Names of the parameters that decide the phase of the trot's clock."""
 
 DEFAULT = Rewards(
-    tracking_shape="gaussian", linear_sigma=0.035, stride_linear_sigma=0.015, angular_sigma=0.16,
-    stride_angular_sigma=0.06,
+    base_linear_velocity=3.0, tracking_shape="gaussian", linear_sigma=0.035,
+    stride_linear_sigma=0.015, angular_sigma=0.16, stride_angular_sigma=0.06,
 )  # fmt: skip
 """With widths of about an imitated trot's errors, where the slope of a Gaussian is largest."""
 
