@@ -122,8 +122,9 @@ def _first_gait_imitated(kind: Kind) -> Run:
         learner=Hyperparameters(
             # many small updates with little white noise: noise that lasts is credited with what it
             # does in the other half of a stride, and more of it loosens dry friction
-            steps_per_environment=steps, epochs=3, desired_kl=0.01, critic_warmup=40,
-            freeze_normaliser=True, learning_rate=1e-5, discount=0.97, gae_lambda=0.9,
+            steps_per_environment=steps, epochs=3, critic_warmup=40, freeze_normaliser=True,
+            desired_kl=0.02 if without_memory else 0.01, learning_rate=1e-5, discount=0.97,
+            gae_lambda=0.9,
             exploration=Exploration((0.02, 0.01), (0.0, 2.5), persistence_s=0.0),
             mirror=without_memory, averaging=50,
         ),
