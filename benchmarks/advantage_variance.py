@@ -20,7 +20,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from pupper_sysid.policies.train.learner import Learner, read_checkpoint
+from pupper_sysid.policies.train.checkpoint import read_checkpoint
+from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import Run, load_run
 from pupper_sysid.policies.train.training import make_learner

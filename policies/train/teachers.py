@@ -26,7 +26,7 @@ from tensordict import TensorDict
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.train.learner import judged_weights, read_checkpoint
+from pupper_sysid.policies.train.checkpoint import judged_weights, read_checkpoint
 from pupper_sysid.policies.train.run_file import Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.trot import Trot

@@ -13,8 +13,9 @@ from tensordict import TensorDict
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train import training
+from pupper_sysid.policies.train.checkpoint import read_checkpoint
 from pupper_sysid.policies.train.imitation import imitate
-from pupper_sysid.policies.train.learner import Learner, read_checkpoint
+from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import (
     check_teacher,

@@ -24,8 +24,9 @@ from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
+from pupper_sysid.policies.train.checkpoint import read_checkpoint
 from pupper_sysid.policies.train.curves import PROGRESS
-from pupper_sysid.policies.train.learner import Learner, read_checkpoint
+from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import RUN_FILE, load_run, preset, save_run
 from pupper_sysid.policies.train.training import LAST, train
