@@ -209,7 +209,9 @@ class Learner:
     def averaged(self) -> MLPModel:
         """The policy to judge and to save: its weights are means over the last updates."""
         # until PPO has changed the policy there is nothing to average
-        return self._average.module if self._average.n_averaged else self.actor
+        average = self._average.module if self._average.n_averaged else self.actor
+        assert isinstance(average, MLPModel)
+        return average
 
     @property
     def samples(self) -> int:

@@ -278,7 +278,9 @@ def weighted(
     -------
     dict of str to ndarray, shape (n,)
     """
-    factors = dict.fromkeys(GUIDES, guides) | dict.fromkeys(PROGRESS, progress)
+    factors: dict[str, float] = {
+        **dict.fromkeys(GUIDES, guides), **dict.fromkeys(PROGRESS, progress),
+    }  # fmt: skip
     found = {}
     for name, term in TERMS.items():
         weight = getattr(rewards, name)
