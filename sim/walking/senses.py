@@ -30,6 +30,8 @@ class Senses:
     servos : ServoRanges
     robots : RobotBatch
         Whose joints and trunks are measured.
+    environments : int
+        How many robots, n.
     rng : numpy.random.Generator
         Of the readings.
 
