@@ -200,7 +200,7 @@ def test_a_simulated_walk_is_written_with_its_trunk_moving_as_it_walked(
     words = (str(policy), "--seconds", "2", "--rerun", "w.rrd", "--mcap", "w.mcap")
     code, out, err = run_program(capsys, pupper_play, *words)
     assert code == 0 and "Wrote w.rrd" in err and "Wrote w.mcap" in err
-    away = float(out.split("; ")[-1].split(" m ")[0])
+    away = float(" ".join(out.split()).split("; ")[-1].split(" m ")[0])
     _, values = next(
         v for k, v in entities_of(tmp_path / "w.rrd").items()
         if k.startswith("/robot/") and k.endswith("translation") and np.ptp(v[1], axis=0).max() > 0
