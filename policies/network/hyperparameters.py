@@ -128,8 +128,7 @@ class Hyperparameters:
     amx)."""
     averaging: int = 1
     """Updates over which the weights of the policy that is judged and saved are averaged
-    (exponentially); 1 for the last ones. Each update moves a policy about as far by chance as by
-    what was learned."""
+    (exponentially), which smooths out the noise of single updates; 1 for the last ones."""
 
     def __post_init__(self):
         for name in ("steps_per_environment", "epochs", "minibatches", "averaging"):

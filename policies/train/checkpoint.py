@@ -62,4 +62,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     missing = [part for part in _PARTS if part not in content]
     if missing:
         raise InputError(f"{path} has no {missing[0]}. {_ANOTHER}")
+    average = content.get("average", {"n_averaged": 0})  # older files have none
+    if not isinstance(average, dict) or "n_averaged" not in average:
+        raise InputError(f"The average in {path} is no set of weights. {_ANOTHER}")
     return content

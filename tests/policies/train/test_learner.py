@@ -409,6 +409,9 @@ def test_what_is_no_checkpoint_or_of_another_version_or_incomplete_is_refused(tm
     for part in ("hidden", "environment", "learning_rate"):
         torch.save({k: v for k, v in good.items() if k != part}, path)
         assert f"has no {part}" in refusal(path)
+    for damaged in (5, {}, [1, 2]):
+        torch.save(good | {"average": damaged}, path)
+        assert "no set of weights" in refusal(path)
     good["environment"].pop("command")
     torch.save(good, path)
     assert "command" in refusal(path)
