@@ -35,6 +35,7 @@ _CURVES = {
     "falls_per_1000_steps": "falls / 1,000 steps",
     "std": "action noise",
 }
+_SCORE = {"score": "score without noise"}  # by which the best policy is chosen; not in old curves
 
 
 def walking_sections(
@@ -207,13 +208,14 @@ def _curves(path: Path) -> dict[str, np.ndarray] | None:
     lacking = [name for name in ("samples", *_CURVES) if name not in found]
     if lacking:
         raise InputError(f"{path} has no numbers called {lacking[0]}. {remedy}")
-    return {name: found[name] for name in ("samples", *_CURVES)}
+    return {name: found[name] for name in ("samples", *_SCORE, *_CURVES) if name in found}
 
 
 @styled
 def _training_figure(curves: Mapping[str, np.ndarray]) -> Figure:
-    figure, axes = axes_column(len(_CURVES), 1.7 * len(_CURVES))
-    for (key, title), one in zip(_CURVES.items(), axes, strict=True):
+    shown = {key: title for key, title in (_SCORE | _CURVES).items() if key in curves}
+    figure, axes = axes_column(len(shown), 1.7 * len(shown))
+    for (key, title), one in zip(shown.items(), axes, strict=True):
         one.plot(curves["samples"] / 1e6, curves[key], color=BLUE, lw=1.2)
         one.set_ylabel(title)
         if key == "falls_per_1000_steps":
