@@ -12,8 +12,13 @@ from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
 from types import GenericAlias
-from typing import get_args
+from typing import ClassVar, get_args
 from unittest.mock import patch
+
+from jinja2 import Template
+from jinja2.sandbox import SandboxedEnvironment
+from numpydoc import docscrape_sphinx
+from sphinx.addnodes import pending_xref
 
 from pupper_sysid.cli.dispatch import words
 
@@ -154,6 +159,24 @@ def _skip_aliases(app, what, name, item, skip, options) -> bool | None:
     return True if isinstance(item, GenericAlias) or get_args(item) else None
 
 
+def _link_whole_names(app, doctree) -> None:
+    """Types in signatures are whole names, so that none has to be looked for in every room."""
+    for reference in doctree.findall(pending_xref):
+        reference.attributes.pop("refspecific", None)
+
+
+class _CompiledOnce(SandboxedEnvironment):
+    """Keeps the templates; numpydoc compiles its only one anew for every docstring."""
+
+    kept: ClassVar[dict[str, Template]] = {}
+
+    def get_template(self, name, *more, **named) -> Template:
+        """The template of that name."""
+        if name not in self.kept:
+            self.kept[name] = super().get_template(name, *more, **named)
+        return self.kept[name]
+
+
 def setup(app) -> None:
     """Write the generated pages before any page is read."""
     (HERE / "commands.md").write_text(reference())
@@ -165,3 +188,5 @@ def setup(app) -> None:
         (GALLERY / f"{script.stem}.md").write_text(page)
     app.connect("autodoc-process-docstring", _as_rst, priority=100)  # before numpydoc
     app.connect("autodoc-skip-member", _skip_aliases)
+    app.connect("doctree-read", _link_whole_names)
+    docscrape_sphinx.SandboxedEnvironment = _CompiledOnce
