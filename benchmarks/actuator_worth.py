@@ -39,8 +39,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policies", type=Path, nargs="+")
     parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--pushed", type=int, help="episodes with pushes; by default as many")
     parser.add_argument("--threads", type=int, default=0)
     options = parser.parse_args()
+    pushed = options.pushed or options.episodes
     torch.set_num_threads(1)
     print("|", " | ".join(_HEAD), "|")
     print("|---" * len(_HEAD) + "|")
@@ -51,7 +53,8 @@ def main() -> None:
 
         def robots(case, walker: Walker, first: bool = trot is None) -> int:
             if walker == "policy" or (walker == "trot" and first):
-                return options.episodes if case.group in ("random", "push") else 16
+                of_group = {"random": options.episodes, "push": pushed}
+                return of_group.get(case.group, 16)
             return 1
 
         found = evaluate(
@@ -61,10 +64,10 @@ def main() -> None:
         rows = {row.name: row for row in found.conditions}
         trained = Path(policy.contract.actuator).name
         walked = {k: v.policy for k, v in rows.items()}
-        print(_line(trained, f"{path.name}", walked, options.episodes), flush=True)
+        print(_line(trained, f"{path.name}", walked, pushed), flush=True)
         trot = trot or {k: v.trot for k, v in rows.items()}
     if trot:
-        print(_line("none", "open-loop trot with a clock", trot, options.episodes))
+        print(_line("none", "open-loop trot with a clock", trot, pushed))
 
 
 def _line(trained: str, name: str, rows: dict, episodes: int) -> str:
