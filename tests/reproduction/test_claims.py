@@ -390,7 +390,7 @@ def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, tmp
         "reproduction.evidence.gather",
         lambda name, policy, *rest: evidence(policy.contract.kind, name),
     )
-    monkeypatch.setattr("reproduction.page._draw", lambda *evidence: [])  # the test above draws them
+    monkeypatch.setattr("reproduction.page._draw", lambda *evidence: [])  # drawn above
     policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
     arguments = (*policies, "--actuator", SAMPLES / "calibrated.yaml")
     code, out, err = run_program(capsys, program, *arguments, "--json", "--out", "a")
