@@ -1,12 +1,12 @@
 # The two set-up commands: `make demo` shows what the tool does, `make test` proves that it works.
-# Both keep everything in .venv and install it on first use.
+# Both keep everything in .venv and install it on first use, with PYTHON (make demo PYTHON=python3.12).
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test check docs links setup clean
+.PHONY: demo test test-all check docs links setup interpreter clean
 
 demo: setup
 	$(BIN)/pupper-sysid sweep --freqs 1-10 --joints LF --seed 1 --out $(DEMO)/sweep.csv --truth --force
@@ -14,7 +14,12 @@ demo: setup
 	$(BIN)/pupper-sysid calibrate $(DEMO)/sweep.csv --out $(DEMO)/calibrated.yaml --force
 	$(BIN)/pupper-sysid report $(DEMO)/sweep.csv --calibration $(DEMO)/calibrated.yaml --out $(DEMO)/report --force
 
+# 4 minutes on two cores
 test: setup
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+# 10 minutes on two cores: every page of the documentation and long campaigns besides
+test-all: setup
 	$(BIN)/python -m pytest -n 2
 
 check: setup links
@@ -36,11 +41,32 @@ links: setup
 setup: $(VENV)/.installed
 
 # torch first, pinned: whatever asks for it later finds it and does not fetch CUDA
-$(VENV)/.installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+$(VENV)/.installed: pyproject.toml constraints.txt | interpreter
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip >/dev/null 2>&1 \
+		|| $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV); echo "$(NO_VENV)" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
+
+ANOTHER = make $(or $(MAKECMDGOALS),demo) PYTHON=python3.12
+NEEDED = pupper-sysid needs Python 3.11 or newer; to name one: $(ANOTHER)
+NO_VENV = $(PYTHON) could not create $(VENV). On Debian and Ubuntu, install python3-venv \
+(python3.12-venv for python3.12). To name another Python: $(ANOTHER)
+VERSION := -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null
+
+# before pip runs: a Python that is new enough, and a .venv of the Python that was named
+interpreter:
+	@stop() { echo "$$1" >&2; exit 1; }; \
+	named=$$($(PYTHON) $(VERSION)); present=$$($(BIN)/python $(VERSION)); \
+	test -n "$$present" || test ! -e $(VENV)/.installed \
+		|| stop "The Python of $(VENV) does not run any more. Run make clean, then make again."; \
+	test -n "$$present$$named" || stop "$(PYTHON) does not run. $(NEEDED)"; \
+	case "$$present" in 2.*|3.?|3.10) \
+		stop "$(VENV) is of Python $$present. Run make clean first. $(NEEDED)";; esac; \
+	case "$${present:-$$named}" in 2.*|3.?|3.10) \
+		stop "$(PYTHON) is Python $$named. $(NEEDED)";; esac; \
+	test -z "$$present" || test "$$present" = "$$named" || test "$(origin PYTHON)" = file \
+		|| stop "$(VENV) is of Python $$present, $(PYTHON) is Python $${named:-?}. To change: make clean."
 
 clean:
 	rm -rf $(VENV) $(DEMO) build *.egg-info
