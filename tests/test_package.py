@@ -109,7 +109,7 @@ def wheel(tmp_path_factory) -> Path:
     no_caches = shutil.ignore_patterns("__pycache__")
     for folder in (*FOLDERS.values(), "reproduction", "tests"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=no_caches)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "NOTICE"):
         shutil.copy(ROOT / name, copy)
     done = subprocess.run(
         [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist", copy],
