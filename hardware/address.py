@@ -68,6 +68,6 @@ def parse_address(text: str) -> BusAddress:
             "feetech:/dev/ttyUSB0."
         )
     device, at, baud = where.partition("@")
-    if at and not (baud.isascii() and baud.isdecimal() and len(baud) < 10):
+    if at and not (baud.isascii() and baud.isdecimal() and len(baud) < 10 and int(baud) > 0):
         raise InputError(f"bus {text}: '{baud}' is no baud rate; write for example @500000.")
     return BusAddress(kind, device, int(baud) if at else None)

@@ -140,11 +140,12 @@ def _run(options: Deploy) -> None:
     if options.playback:
         Sweep(
             playback=options.playback, loops=PLAYBACK_LOOPS, joint_map=options.joint_map,
-            bus=options.bus, seed=options.seed,
-            rate=options.rate or PLAYBACK_HZ, json=options.json, force=options.force,
+            bus=options.bus, seed=options.seed, json=options.json, force=options.force,
+            rate=PLAYBACK_HZ if options.rate is None else options.rate,
             live=options.live, rerun=options.rerun, mcap=options.mcap,
         ).run()  # fmt: skip
         return
+    Stack(**_changes(options))  # refuses what is out of range, before a policy is loaded
     if options.name is not None:
         refuse_path(options.name, "--name")
     if options.live and options.keyboard:
@@ -200,13 +201,7 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     """The stack, with the user's changes."""
     name = suited(contract) if options.stack == "auto" else options.stack
     stack = STACKS[name]
-    if options.observer:
-        stack = replace(stack, observer=options.observer)
-    if options.lowpass_hz is not None:
-        stack = replace(stack, lowpass_hz=options.lowpass_hz or None)
-    if options.fade_in_s is not None:
-        stack = replace(stack, fade_in_s=options.fade_in_s)
-    stack = replace(stack, scale_rad=options.scale_rad, rate_hz=options.rate)
+    stack = replace(stack, **_changes(options))
     own = 1 / contract.control_step_s
     if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
         warn(
@@ -216,6 +211,17 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
             ]
         )
     return name, stack
+
+
+def _changes(options: Deploy) -> dict[str, Any]:
+    """Settings that the user gives instead of the stack's."""
+    lowpass_hz = options.lowpass_hz
+    changes = {
+        "observer": options.observer, "lowpass_hz": lowpass_hz, "fade_in_s": options.fade_in_s,
+        "scale_rad": options.scale_rad, "rate_hz": options.rate,
+    }  # fmt: skip
+    without = {"lowpass_hz": None} if lowpass_hz == 0 else {}
+    return {name: value for name, value in changes.items() if value is not None} | without
 
 
 def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:

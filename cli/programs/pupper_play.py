@@ -25,6 +25,7 @@ from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress,
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.policies.deploy.commands import checked_command
 from pupper_sysid.sim.robot.terrain import Terrain
 
 DESCRIPTION = """Watch a policy walk in the simulator it was trained in.
@@ -70,6 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: Play) -> None:
     need_positive("--seconds", options.seconds)
+    command = checked_command(options.command)
     if options.video:
         if options.video.suffix.lower() != ".mp4":
             raise InputError(f"--video {options.video}: give a name that ends in .mp4.")
@@ -90,7 +92,7 @@ def _run(options: Play) -> None:
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)
-    env.set_command(np.array(options.command))
+    env.set_command(command)
     screen, track = _Screen(env, options), _Track(env)
     observation, _ = env.observe()
     policy.reset(env.action)

@@ -32,7 +32,7 @@ def open_line(
     BusError
         If the port cannot be opened, or no servo answers.
     """
-    for rate in (baud,) if baud else AUTO_BAUDS:
+    for rate in AUTO_BAUDS if baud is None else (baud,):
         line = FeetechLine(device, rate, exclusive)
         line.detect_echo()
         found = line.find(ids)
@@ -48,7 +48,7 @@ def open_line(
 
 def rates_in_words(baud: int | None) -> str:
     """Baud rates that are tried, for a message."""
-    return str(baud) if baud else ", ".join(map(str, AUTO_BAUDS))
+    return ", ".join(map(str, AUTO_BAUDS)) if baud is None else str(baud)
 
 
 def known_series(found: dict[int, int | Series], device: str) -> dict[int, Series]:

@@ -43,7 +43,7 @@ def scan_line(
     BusError
         If the port cannot be opened or no servo answers.
     """
-    for rate in (baud,) if baud else AUTO_BAUDS:
+    for rate in AUTO_BAUDS if baud is None else (baud,):
         advance(f"at {rate} baud")
         line = FeetechLine(device, rate)
         try:

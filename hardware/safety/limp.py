@@ -50,7 +50,7 @@ def switch_off(
         known = chosen or load_joint_map("sts3215").per_servo()
         known = known.select(joints) if joints else known
         chosen = known if chosen else None
-        for rate in (address.baud,) if address.baud else AUTO_BAUDS:
+        for rate in AUTO_BAUDS if address.baud is None else (address.baud,):
             line = FeetechLine(address.where, rate, exclusive=False)
             line.torque_off(known.ids)
             line.close()

@@ -278,12 +278,12 @@ def _verdict(found: ServoDemand) -> str:
         about = f"its dead time of {1e3 * found.dead_time_s:.0f} ms is " + (
             f"{'more than' if late else 'within'} the {bound}"
         )
-    if found.survival_on_it is None:
+    if found.survival_on_it is None or found.speed_on_it_m_s is None:
         walk = "it is too stiff to be simulated in the task's physics steps"
     else:
         walk = (
             f"in the simulator {100 * found.survival_on_it:.0f} % of the robots stay up on it and "
-            f"walk at {found.speed_on_it_m_s or 0.0:.2f} m/s, against "
+            f"walk at {found.speed_on_it_m_s:.2f} m/s, against "
             f"{100 * found.survival:.0f} % and {found.speed_m_s:.2f} on "
             f"{found.walked_on.rpartition('/')[2]}"
         )

@@ -74,7 +74,7 @@ def assemble(
         If a part is missing, damaged, or for another rate.
     """
     contract = policy.contract
-    period = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
+    period = stack.period_s(contract)
     servos = servo_ranges(actuator)
     parameters = DelayedPDParameters(**servos.value)
     limits = joint_map.per_servo().position_limits()

@@ -28,13 +28,25 @@ def constant(command: tuple[float, float, float]) -> Commands:
     InputError
         If it is out of range.
     """
+    value = checked_command(command)
+    return lambda elapsed_s: value
+
+
+def checked_command(command: tuple[float, float, float]) -> NDArray[np.float64]:
+    """The command as an array, shape (3,).
+
+    Raises
+    ------
+    InputError
+        If it is out of range.
+    """
     value = np.array(command, float)
     if not np.isfinite(value).all() or np.abs(value).max() > _LARGEST:
         raise InputError(
             f"`command` is {' '.join(map(str, command))}; each must be within ±{_LARGEST:g} "
             "(m/s, m/s, rad/s)."
         )
-    return lambda elapsed_s: value
+    return value
 
 
 def script(path: Path) -> Commands:

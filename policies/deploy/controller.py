@@ -94,15 +94,15 @@ class Controller:
             raise InputError("A policy needs a bus of all twelve joints, in joint coordinates.")
         self.policy, self.stack, self.observer = policy.for_one(), stack, observer
         self.stall_torque_nm = stall_torque_nm
-        self.period_s = 1 / stack.rate_hz if stack.rate_hz else contract.control_step_s
+        self.period_s = stack.period_s(contract)
         self._to_servo = _affine(joint_map, joint_map.per_servo())
         self._to_joint = _affine(joint_map.per_servo(), joint_map)
         self._limits = joint_map.position_limits()
         self.default = np.array([contract.default_pose_rad[name] for name in JOINT_NAMES])
-        self._scale = stack.scale_rad or contract.action_scale_rad
+        self._scale = contract.action_scale_rad if stack.scale_rad is None else stack.scale_rad
         self._smooth = (
             LowPass(stack.lowpass_hz, 1 / self.period_s, len(JOINT_NAMES))
-            if stack.lowpass_hz
+            if stack.lowpass_hz is not None
             else None
         )
         self._attitude = ComplementaryFilter()

@@ -8,6 +8,7 @@ The two others are the published ones, which use a prediction: `lstm-servo` of l
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -42,9 +43,19 @@ class Stack:
         for name in ("lowpass_hz", "scale_rad", "rate_hz"):
             value = getattr(self, name)
             if value is not None and not 0 < value < 1e4:
-                raise InputError(f"`{name}` is {value}; it must be a positive number.")
+                raise InputError(f"`{name}` is {value:g}; it must be a positive number.")
+        if self.scale_rad is not None and self.scale_rad > math.pi:
+            raise InputError(
+                f"`scale_rad` is {self.scale_rad:g} rad per unit of action, and no joint turns by "
+                f"more than half a turn. Write radians: {self.scale_rad:g} degrees are "
+                f"{math.radians(self.scale_rad):.2g}."
+            )
         if not 0 <= self.fade_in_s < 1e3:
-            raise InputError(f"`fade_in_s` is {self.fade_in_s}; it must be 0 or more.")
+            raise InputError(f"`fade_in_s` is {self.fade_in_s:g}; it must be 0 or more.")
+
+    def period_s(self, contract: Contract) -> float:
+        """Time between two actions [s]."""
+        return contract.control_step_s if self.rate_hz is None else 1 / self.rate_hz
 
 
 STACKS: dict[StackName, Stack] = {

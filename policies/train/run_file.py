@@ -244,7 +244,11 @@ def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> R
             f"{run.actuator} is no longer the file with which {folder} was begun. Put that back, "
             "or start a new run with this one."
         )
-    longer = replace(run, iterations=iterations or run.iterations, minutes=minutes or run.minutes)
+    longer = replace(
+        run,
+        iterations=run.iterations if iterations is None else iterations,
+        minutes=run.minutes if minutes is None else minutes,
+    )
     if longer != run:
         _write(path, longer)
     return longer

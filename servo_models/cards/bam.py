@@ -166,9 +166,12 @@ def from_bam(
     p = parameters
     if p.R == 0 or p.kt == 0:
         raise InputError(f"{name}: kt and R must be above 0. Fit it again.")
+    if p.error_gain_ratio == 0:
+        raise InputError(f"{name}: error_gain_ratio is 0; it must be above 0. Fit it again.")
+    ratio = 1.0 if p.error_gain_ratio is None else p.error_gain_ratio
     both = p.load_friction_base, p.load_friction_stribeck
     ours = {
-        "duty_per_rad": kind.error_gain * (p.error_gain_ratio or 1.0),
+        "duty_per_rad": kind.error_gain * ratio,
         "duty_limit": kind.duty_limit,
         "stall_torque_nm": p.kt / p.R * kind.supply_v,
         "back_emf_nm_s_per_rad": p.kt**2 / p.R,

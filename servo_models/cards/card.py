@@ -67,7 +67,7 @@ _HEADER = """\
 class Gains(Part):
     """Gains of the firmware's position loop, as registers hold them."""
 
-    p: NotNegative | None = None
+    p: Annotated[Number, Field(gt=0)] | None = None
     """P gain, or null where the source does not state it."""
     i: NotNegative | None = None
     """I gain, or null."""
@@ -207,7 +207,8 @@ class ServoCard(Part):
         numbers = self.specimens.get(joint or self.default, self.numbers)
         gain = self.gains.p
         if isinstance(numbers, TorquePD):
-            return numbers.loaded(gain or 1.0), gain or 1.0
+            stated_at = 1.0 if gain is None else gain
+            return numbers.loaded(stated_at), stated_at
         assert gain is not None
         return numbers.loaded(), gain
 

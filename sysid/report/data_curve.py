@@ -40,7 +40,7 @@ def data_curve_figure(curve: pd.DataFrame, own_samples: int | None = None) -> Fi
     for model, errors in curve.items():
         title, colour, marker, line = MODELS[str(model)]
         axes.loglog(curve.index, 1e3 * errors, marker=marker, color=colour, ls=line, label=title)
-    if own_samples:
+    if own_samples is not None:
         axes.axvline(own_samples, color=FAINT, lw=1.5, zorder=0)
         axes.text(
             own_samples, 0.98, " this recording", transform=axes.get_xaxis_transform(), va="top",

@@ -22,7 +22,13 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
-from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, TrialPlan, plan
+from pupper_sysid.sysid.sweep.excitation import (
+    LEAD_IN_S,
+    Plan,
+    TrialPlan,
+    check_amplitude,
+    plan,
+)
 from pupper_sysid.sysid.sweep.waveforms import FASTEST_OF_MINIMUM_JERK, after, lift, strokes
 
 BENCH, DROP, REVERSAL = "bench", "drop", "reversal"
@@ -88,6 +94,12 @@ def parse_load(text: str) -> PendulumLoad | None:
             if not value.endswith(unit):
                 raise ValueError
             values[name] = decimal(value.removesuffix(unit))
+        hanging_rad = values.get("hanging_rad", 0.0)
+        if abs(hanging_rad) > np.pi:
+            raise InputError(
+                f"`load`: hanging={hanging_rad:g}rad is more than half a turn from 0. Write "
+                f"radians: {hanging_rad:g} degrees are {np.radians(hanging_rad):.2g}."
+            )
         load = PendulumLoad(mass_kg=decimal(found[1]), length_m=decimal(found[2]), **values)
         if not load.gravity_nm > 0:
             raise ValueError
@@ -159,6 +171,8 @@ def bench_plan(
     InputError
         If the load is too heavy, or a value is out of range.
     """
+    if amplitude_rad is not None:
+        check_amplitude(amplitude_rad)
     warnings = _weigh(load, gains)
     reach = min(margin_rad, REACH_RAD)
     kinds = [kind] if kind != BENCH else ["sine", "chirp", "prbs", "steps", *([DROP] * bool(load))]
@@ -167,17 +181,17 @@ def bench_plan(
     one_gain: list[TrialPlan] = []
     for each in kinds:
         if each == DROP:
-            height = min(amplitude_rad or LIFT_RAD, LIFT_RAD) if kind == DROP else LIFT_RAD
-            one_gain += [_drop(joint, side * min(height, reach)) for side in (1, -1)]
+            height = LIFT_RAD if amplitude_rad is None or kind != DROP else amplitude_rad
+            one_gain += [_drop(joint, side * min(height, LIFT_RAD, reach)) for side in (1, -1)]
         elif each == REVERSAL:
-            size = min(amplitude_rad or STROKE_RAD, reach)
+            size = min(STROKE_RAD if amplitude_rad is None else amplitude_rad, reach)
             offset, time = strokes(size, STROKE_SPEEDS_RAD_S, STROKES)
             one_gain.append(TrialPlan((joint,), np.nan, LEAD_IN_S + time, after(LEAD_IN_S, offset)))
         else:
             some = plan(
                 each, [joint], CHIRP_HZ if each == "chirp" and kind == BENCH else frequencies_hz,
-                amplitude_rad or AMPLITUDE_RAD, duration_s, loop_period_s, SPEED_LIMIT_RAD_S, 0.0,
-                {joint: reach}, {joint: start_rad},
+                AMPLITUDE_RAD if amplitude_rad is None else amplitude_rad, duration_s,
+                loop_period_s, SPEED_LIMIT_RAD_S, 0.0, {joint: reach}, {joint: start_rad},
             )  # fmt: skip
             one_gain += some.trials
             warnings += some.warnings

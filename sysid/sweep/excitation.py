@@ -55,6 +55,9 @@ RATES_HZ = (1.0, 1000.0)
 TRIAL_S = (0.1, 86_400.0)
 """Shortest and longest trial [s]."""
 
+LARGEST_AMPLITUDE_RAD = np.pi
+"""Largest excursion from a start pose: half a turn to either side. More was meant in degrees."""
+
 MOST_LOOPS = 1000
 """Largest number of loops of a file of commands, and of times to play it."""
 
@@ -181,10 +184,10 @@ def plan(
     """
     if kind not in KINDS:
         raise InputError(f"excitation '{kind}' is unknown; choose from {', '.join(KINDS)}.")
+    check_amplitude(amplitude_rad)
     if not joints:
         raise InputError("excitation: no joint was chosen; name at least one.")
     for name, value in (
-        ("amplitude_rad", amplitude_rad),
         ("loop_period_s", loop_period_s),
         ("speed_limit_rad_s", speed_limit_rad_s),
         ("duration_s", 1.0 if duration_s is None else duration_s),
@@ -200,10 +203,11 @@ def plan(
     warnings: list[str] = []
     amplitude_rad = _within(amplitude_rad, joints, margin_rad or {}, warnings)
     top_speed = SPEED_MARGIN * speed_limit_rad_s
+    span = 20.0 if duration_s is None else duration_s
     if kind in ("sine", "square"):
         shapes = []
         for wanted in frequencies:
-            time = duration_s or max(5.0, 5.0 / wanted)
+            time = max(5.0, 5.0 / wanted) if duration_s is None else duration_s
             f = off_harmonics(wanted, (1 / loop_period_s, poll_rate_hz), time)
             if f != wanted:
                 warnings.append(
@@ -216,19 +220,19 @@ def plan(
             else:
                 shapes.append((np.nan, time, square(f, amplitude_rad)))
     elif kind == "chirp":
-        low, high, time = min(frequencies), max(frequencies), duration_s or 20.0
+        low, high = min(frequencies), max(frequencies)
         _bounded(amplitude_rad, 2 * np.pi * high, top_speed, f"chirp at {high:g} Hz", warnings)
-        shapes = [(np.nan, time, chirp(low, high, time, amplitude_rad, top_speed))]
+        shapes = [(np.nan, span, chirp(low, high, span, amplitude_rad, top_speed))]
     elif kind == "multisine":
         shape = multisine(frequencies)
         peak, speed = peaks(shape, min(frequencies))
         amplitude = _bounded(amplitude_rad, speed / peak, top_speed, "multisine", warnings)
-        shapes = [(np.nan, duration_s or 20.0, scaled(shape, amplitude / peak))]
+        shapes = [(np.nan, span, scaled(shape, amplitude / peak))]
     elif kind == "prbs":
-        shapes = [(np.nan, duration_s or 20.0, prbs(amplitude_rad))]
+        shapes = [(np.nan, span, prbs(amplitude_rad))]
     else:
         offset, one_pass = steps(amplitude_rad)
-        shapes = [(np.nan, duration_s or one_pass, offset)]
+        shapes = [(np.nan, one_pass if duration_s is None else duration_s, offset)]
     trials = tuple(
         TrialPlan((joint,), float(f), LEAD_IN_S + time, after(LEAD_IN_S, offset))
         for joint in joints
@@ -244,6 +248,25 @@ def plan(
     }
     pose = dict(DEFAULT_POSE if start_pose_rad is None else start_pose_rad)
     return Plan(trials, pose, description, tuple(dict.fromkeys(warnings)))
+
+
+def check_amplitude(amplitude_rad: float) -> None:
+    """Refuse an amplitude that is no excursion, or was meant in degrees.
+
+    Raises
+    ------
+    InputError
+        If it is not above 0, or above half a turn.
+    """
+    allowed = f"it must be above 0 and at most {LARGEST_AMPLITUDE_RAD:.3g} rad"
+    if not amplitude_rad > 0:
+        raise InputError(f"`amplitude_rad` is {amplitude_rad:g} rad; {allowed}.")
+    if amplitude_rad > LARGEST_AMPLITUDE_RAD:
+        raise InputError(
+            f"`amplitude_rad` is {amplitude_rad:g} rad, {amplitude_rad / (2 * np.pi):.2g} turns; "
+            f"{allowed}, half a turn. Amplitudes are radians: {amplitude_rad:g} degrees are "
+            f"{np.radians(amplitude_rad):.2g}."
+        )
 
 
 def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:

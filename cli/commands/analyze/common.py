@@ -186,10 +186,12 @@ def tries_of(
     """
     from pupper_sysid.cli.policy_choice import policy_at, run_folder, simulator, warn_of_fallbacks
     from pupper_sysid.policies.analysis.trial import Trial
+    from pupper_sysid.policies.deploy.commands import checked_command
 
     if robots < 1:
         raise InputError(f"--robots is {robots}; it must be at least 1.")
     need_positive("--seconds", seconds)
+    checked_command(command)
     names = [run_folder(path).name for path in options.policies]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:

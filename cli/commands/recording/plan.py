@@ -54,14 +54,14 @@ class Plan:
 
     def run(self) -> None:
         """Plan, print, write."""
-        from pupper_sysid.sysid.plan.plan_file import save_plan
-
         if self.out is not None:
             refuse_overwrite(self.out, self.force)  # before the work, not after it
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
         if self.rate is not None:
             terminal.need_within("--rate", self.rate, *RATES_HZ, "Hz")
+        from pupper_sysid.sysid.plan.plan_file import save_plan
+
         made = self._made()
         if self.out is not None:
             save_plan(made, self.out, self.force)
@@ -96,12 +96,12 @@ class Plan:
         # the Mini Pupper's proxy polls; a serial line answers each read itself
         polled = joint_map.frame == "proxy"
         setup = Setup(
-            loop_period_s=1 / self.rate if self.rate else LOOP_PERIOD_S,
+            loop_period_s=LOOP_PERIOD_S if self.rate is None else 1 / self.rate,
             quantum_rad=float(1 / joint_map.counts_per_rad().min()),
             **({} if polled else {"poll_period_s": 0.0, "loss": 0.0}),
         )
         return plan_first_sweep(
-            joints, setup=setup, seconds=self.seconds or SECONDS,
+            joints, setup=setup, seconds=SECONDS if self.seconds is None else self.seconds,
             margins=margins(joint_map), seed=self.seed,
         )  # fmt: skip
 
@@ -114,8 +114,8 @@ class Plan:
         joints = select_joints(self.joints, calibration.joint_names)
         return plan_from_calibration(
             calibration, Source(name=path.name, sha256=sha256(path)), joints,
-            seconds=self.seconds or SECONDS,
-            loop_period_s=1 / self.rate if self.rate else LOOP_PERIOD_S,
+            seconds=SECONDS if self.seconds is None else self.seconds,
+            loop_period_s=LOOP_PERIOD_S if self.rate is None else 1 / self.rate,
             margins=_some_margins(self._map(None), joints), seed=self.seed,
         )  # fmt: skip
 

@@ -40,6 +40,7 @@ from pupper_sysid.sysid.sweep.excitation import (
     RATES_HZ,
     TRIAL_S,
     Plan,
+    check_amplitude,
     parse_frequencies,
 )
 
@@ -251,7 +252,7 @@ class Sweep:
             "kind": self.kind or ("sine" if self.load is None else BENCH),
             "joints": joints,
             "frequencies_hz": self._frequencies(),
-            "amplitude_rad": self.amplitude or (None if self.load else 0.3),
+            "amplitude_rad": self._amplitude(),
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
             "loops": self.loops,
@@ -261,6 +262,13 @@ class Sweep:
             "until": self._series(joints) if self.until is not None else None,
             "registers": self._registers(bus),
         }
+
+    def _amplitude(self) -> float | None:
+        """Excursion of the request; None leaves it to a bench's kinds of motion."""
+        if self.amplitude is None:
+            return None if self.load else 0.3
+        check_amplitude(self.amplitude)
+        return self.amplitude
 
     def _frequencies(self) -> list[float]:
         if self.freqs is None and self.load is not None:

@@ -80,7 +80,7 @@ class Monitor:
         try:
             watched = Watched(bus)
             if self.once or self.json:
-                self._watch(watched, self.seconds or _ONCE_S)
+                self._watch(watched, _ONCE_S if self.seconds is None else self.seconds)
                 if self.json:
                     terminal.print_json(watched.as_data(bus_name(self.bus)))
                 else:
@@ -101,12 +101,12 @@ class Monitor:
                 views.tick(0, *watched.tick())
             here()
 
+        until = np.inf if self.seconds is None else self.seconds
         if terminal.err.is_terminal:
             from pupper_sysid.cli.oscilloscope import Oscilloscope
 
             title = f"{bus_name(self.bus)}, only read"
             with Oscilloscope(title, watched.bus.joint_names, lag=False) as scope:
-                until = self.seconds or np.inf
                 self._watch(watched, until, lambda: show(lambda: watched.draw(scope)))
             return
         shown_s = -np.inf
@@ -117,7 +117,7 @@ class Monitor:
                 shown_s = watched.now_s
                 terminal.out.print(watched.table(bus_name(self.bus)))
 
-        self._watch(watched, self.seconds or np.inf, lambda: show(table))
+        self._watch(watched, until, lambda: show(table))
 
     def _watch(self, watched: Watched, seconds: float, show=lambda: None) -> None:
         bus = watched.bus
