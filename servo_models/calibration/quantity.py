@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from pupper_sysid.common import border
+from pupper_sysid.common.interval import Interval
 
 UNIT_OF_NAME = {
     "loss": "1",
@@ -59,6 +60,9 @@ class Part(BaseModel):
         allow_inf_nan=False,
         use_attribute_docstrings=True,
     )
+
+
+_Part = TypeVar("_Part", bound=Part)
 
 
 class Quantity(Part):
@@ -121,6 +125,22 @@ class PlausibleRange:
                     raise ValueError(problem)
         return quantity
 
+    def cut(self, quantity: Quantity) -> Quantity:
+        """`quantity` within the range; not identified if its value was outside."""
+        value, low, high = (
+            None if number is None else min(max(number, self.low), self.high)
+            for number in (quantity.value, quantity.low, quantity.high)
+        )
+        assert value is not None
+        identified, why = quantity.identified, quantity.why
+        if value != quantity.value:
+            identified = "no"
+            why = (
+                f"its estimate, {quantity.value:.3g}, is outside the possible {self.low:g} to "
+                f"{self.high:g}"
+            )
+        return Quantity(value=value, low=low, high=high, identified=identified, why=why)
+
     def problem(self, number: float) -> str:
         """Fault of `number` in words; empty if it is in the range."""
         if self.low <= number <= self.high:
@@ -132,11 +152,68 @@ class PlausibleRange:
         return text
 
 
+def quantity_of(
+    interval: Interval, known: Literal["yes", "ratio only"] = "yes", why: str | None = None
+) -> Quantity:
+    """A measured interval as a quantity; its ends are never inside of its value.
+
+    A value that is not finite becomes 0 and is not identified; an end that is not finite is left
+    out.
+
+    Parameters
+    ----------
+    interval : Interval
+    known : {"yes", "ratio only"}
+        What the data identified, unless there is a reason why not.
+    why : str, optional
+        That reason; with "ratio only" one is given if there is none.
+
+    Examples
+    --------
+    >>> quantity_of(Interval(0.02, 0.01, float("inf"))).high is None
+    True
+    >>> quantity_of(Interval(float("nan"), 0.01, 0.03)).identified
+    'no'
+    """
+    if not np.isfinite(interval.value):
+        why, interval = "its estimate is not finite", Interval(0.0, np.nan, np.nan)
+    low, high = (float(end) if np.isfinite(end) else None for end in (interval.low, interval.high))
+    value = float(interval.value)
+    return Quantity(
+        value=value,
+        low=None if low is None else min(low, value),
+        high=None if high is None else max(high, value),
+        identified="no" if why else known,
+        why=why or (None if known == "yes" else "scale from the torque anchor"),
+    )
+
+
+def measured(kind: type[_Part], **entries: Any) -> _Part:
+    """A part of a calibration with numbers of a fit, each cut to its plausible range.
+
+    A file with other numbers is refused; a fit that ends there is a finding: the quantity is not
+    identified, and says so.
+
+    Parameters
+    ----------
+    kind : type
+    entries : Quantity or other values
+        The part's fields.
+    """
+    for name, entry in entries.items():
+        if not isinstance(entry, Quantity):
+            continue
+        for check in kind.model_fields[name].metadata:
+            if isinstance(span := getattr(check, "func", None), PlausibleRange):
+                entries[name] = span.cut(entry)
+    return kind(**entries)
+
+
 TIME = AfterValidator(PlausibleRange(0, 1, "milliseconds", 1e-3))
 
 AGE = AfterValidator(PlausibleRange(0, 10, "milliseconds", 1e-3))
 
-LAG = AfterValidator(PlausibleRange(-1, 1, "milliseconds", 1e-3))
+LAG = AfterValidator(PlausibleRange(-2, 2, "milliseconds", 1e-3))
 
 TORQUE = AfterValidator(PlausibleRange(0, 100, "N·mm", 1e-3))
 

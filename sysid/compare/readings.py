@@ -116,7 +116,7 @@ def _rule(
     if lattice.kind == "every read":
         return ReadingRule(rule="live", source=source, poll_period_s=0.0, loss=0.0, mean_age_s=0.0)
     if lattice.kind == "lattice":
-        known = HeldFeedback(lattice.poll_period_s, lattice.loss)
+        known = HeldFeedback(lattice.poll_period_s, lattice.assumed_loss)
         return _polled("own dates", source, known)
     for name, calibration in calibrations.items():
         if joint in calibration.joint_names:

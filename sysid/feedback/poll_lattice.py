@@ -56,6 +56,13 @@ from pupper_sysid.sysid.feedback.slips import (
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
 
+NO_LOSS = (
+    "between two polls the joint moves by less than a few steps of its reading, so failed polls "
+    "do not show"
+)
+"""Why the loss of a lattice is NaN."""
+
+_UNKNOWN_LOSS = 0.5
 _Z = float(ndtri((1 + LEVEL) / 2))
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
@@ -122,10 +129,13 @@ class PollLattice(Result):
 
     @derived
     def mean_age_s(self) -> float:
-        """Mean age of a reading implied by period and loss [s]; inf where every poll failed."""
-        if self.loss >= 1:
-            return math.inf
+        """Mean age of a reading implied by period and loss [s]; NaN where the loss is unknown."""
         return self.poll_period_s * (0.5 + self.loss / (1 - self.loss))
+
+    @property
+    def assumed_loss(self) -> float:
+        """The loss, or where none could be counted the mean of its prior (Jeffreys)."""
+        return self.loss if math.isfinite(self.loss) else _UNKNOWN_LOSS
 
     @property
     def poll_period_interval(self) -> Interval:
@@ -136,9 +146,14 @@ class PollLattice(Result):
 
     @property
     def loss_interval(self) -> Interval:
-        """Loss with its 90 % interval, over all periods that explain the readings."""
+        """Loss with its 90 % interval, over all periods that explain the readings.
+
+        Where none could be counted, that of the prior: nearly 0 to nearly 1.
+        """
         ends = [self._loss_at(period) for period in (self.poll_period_s, *self.rivals_s)]
-        return Interval(self.loss, min(low for low, _ in ends), max(high for _, high in ends))
+        return Interval(
+            self.assumed_loss, min(low for low, _ in ends), max(high for _, high in ends)
+        )
 
     @property
     def mean_age_interval(self) -> Interval:
@@ -148,11 +163,12 @@ class PollLattice(Result):
             for period in (self.poll_period_s, *self.rivals_s)
             for p in (min(end, 0.999) for end in self._loss_at(period))
         ]
-        return Interval(self.mean_age_s, min(ends), max(ends))
+        loss = self.assumed_loss
+        return Interval(self.poll_period_s * (0.5 + loss / (1 - loss)), min(ends), max(ends))
 
     def _loss_at(self, period_s: float) -> tuple[float, float]:
         """Jeffreys' interval of the loss if polls come each `period_s`: as many succeed."""
-        loss = max(1 - (1 - self.loss) * period_s / self.poll_period_s, 0.0)
+        loss = max(1 - (1 - self.assumed_loss) * period_s / self.poll_period_s, 0.0)
         polls = self.polls * self.poll_period_s / period_s
         failed, tail = loss * polls, (1 - LEVEL) / 2
         low, high = (

@@ -36,8 +36,9 @@ from pupper_sysid.servo_models.calibration.parts import (
     Scores,
     Selection,
 )
-from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.sysid.feedback.poll_lattice import NO_LOSS
 from pupper_sysid.sysid.identify.candidates.models import candidate_model
 from pupper_sysid.sysid.identify.results import UNTOLD, CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
@@ -126,7 +127,8 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
     }
     ratios = {ours: _ratio(pd, fitted, 1.0) for ours, fitted in names.items()}
     torque = {ours: _ratio(pd, fitted, armature, "ratio only") for ours, fitted in names.items()}
-    actuator = Actuator(
+    actuator = measured(
+        Actuator,
         model="delayed_pd",
         stiffness_nm_per_rad=torque["stiffness"],
         damping_nm_s_per_rad=torque["damping"],
@@ -137,22 +139,23 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         ),
         velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
         back_emf_nm_s_per_rad=torque["back_emf"],
-        dead_time_s=_known(result.dead_time_s, pd.undecided.get("dead_time_s")),
+        dead_time_s=quantity_of(result.dead_time_s, why=pd.undecided.get("dead_time_s")),
         command_jitter_s=_jitter(result),
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
-        ratios_to_armature=RatiosToArmature(**ratios),
+        ratios_to_armature=measured(RatiosToArmature, **ratios),
         scale=Scale(anchor="stall torque", value_nm=stall, source=source),
     )
     s = pd.scores
     return JointCalibration(
         actuator=actuator,
         feedback=_feedback(lag, pd.parameters["offset_rad"]),
-        lag=Lag(
-            lag_s=_quantity(lag.lag_s),
-            raw_lag_s=_quantity(lag.raw_lag_s),
-            fresh_lag_s=_quantity(lag.fresh_lag_s),
+        lag=measured(
+            Lag,
+            lag_s=quantity_of(lag.lag_s),
+            raw_lag_s=quantity_of(lag.raw_lag_s),
+            fresh_lag_s=quantity_of(lag.fresh_lag_s),
         ),
         selection=Selection(
             model=result.model,
@@ -211,25 +214,15 @@ def _ratio(
     pd: CandidateFit, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
 ) -> Quantity:
     """A fitted number times `factor`, with its interval and whether the data settled it."""
-    interval, why = pd.parameters[name], pd.undecided.get(name)
-    return Quantity(
-        value=interval.value * factor,
-        low=interval.low * factor,
-        high=interval.high * factor,
-        identified="no" if why else known,
-        why=why or ("scale from the torque anchor" if known == "ratio only" else None),
-    )
+    own = pd.parameters[name]
+    scaled = Interval(own.value * factor, own.low * factor, own.high * factor)
+    return quantity_of(scaled, known, pd.undecided.get(name))
 
 
 def _anchored(pd: CandidateFit, stall: float) -> Quantity:
     effort, why = pd.parameters["effort_rad_s2"], pd.undecided.get("effort_rad_s2")
-    return Quantity(
-        value=stall / effort.value,
-        low=stall / effort.high,
-        high=stall / effort.low,
-        identified="no" if why else "ratio only",
-        why=why or "scale from the torque anchor",
-    )
+    armature = Interval(stall / effort.value, stall / effort.high, stall / effort.low)
+    return quantity_of(armature, "ratio only", why)
 
 
 def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
@@ -238,12 +231,10 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
     if step == 0:
         quantum = Quantity(value=0.0, identified="no", why="readings show no common step")
     if lattice.kind == "lattice":
-        period, loss, age = (
-            _quantity(interval)
-            for interval in (
-                lattice.poll_period_interval, lattice.loss_interval, lattice.mean_age_interval
-            )
-        )  # fmt: skip
+        why = None if np.isfinite(lattice.loss) else NO_LOSS
+        period = quantity_of(lattice.poll_period_interval)
+        loss = quantity_of(lattice.loss_interval, why=why)
+        age = quantity_of(lattice.mean_age_interval, why=why)
     else:
         why = (
             "readings are live: no poll slower than the loop"
@@ -253,15 +244,10 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
         period = loss = Quantity(value=0.0, identified="no", why=why)
         live = lattice.kind == "every read"
         age = Quantity(value=0.0 if live else lattice.time_doubt_s, identified="no", why=why)
-    return Feedback(
-        poll_period_s=period, loss=loss, quantum_rad=quantum, offset_rad=_quantity(offset_rad),
-        mean_age_s=age,
+    return measured(
+        Feedback, poll_period_s=period, loss=loss, quantum_rad=quantum,
+        offset_rad=quantity_of(offset_rad), mean_age_s=age,
     )  # fmt: skip
-
-
-def _quantity(interval: Interval) -> Quantity:
-    """An interval as an identified quantity, its ends never inside of its value."""
-    return _known(interval, None)
 
 
 def _jitter(result: JointCalibrationResult) -> Quantity:
@@ -273,18 +259,7 @@ def _jitter(result: JointCalibrationResult) -> Quantity:
         why = "it cannot be told from none"
     if result.lag.feedback.kind == "unresolved":
         why = "readings are dated to half a loop only"
-    return _known(found, why)
-
-
-def _known(interval: Interval, why: str | None) -> Quantity:
-    """An interval as a quantity that is identified unless there is a reason why not."""
-    return Quantity(
-        value=interval.value,
-        low=min(interval.low, interval.value),
-        high=max(interval.high, interval.value),
-        identified="no" if why else "yes",
-        why=why,
-    )
+    return quantity_of(found, why=why)
 
 
 def _finite(number: float) -> float | None:

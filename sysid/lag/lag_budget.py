@@ -30,6 +30,7 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, derived, flat
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import (
+    NO_LOSS,
     PollLattice,
     Readings,
     find_poll_lattice,
@@ -229,6 +230,10 @@ def lag_budget(
             f"{joint}: readings are held, but their poll period could not be found; fresh readings "
             "are dated to the middle between two reads, which may bias all lags by half a loop "
             f"({1e3 * lattice.time_doubt_s:.0f} ms). A longer sweep would settle it."
+        )
+    if lattice.kind == "lattice" and not math.isfinite(lattice.loss):
+        warnings.append(
+            f"{joint}: the share of lost polls is not identified: {NO_LOSS}. Record a faster motion."
         )
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
     by_frequency = tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency)

@@ -27,7 +27,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     Scores,
     Selection,
 )
-from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
 from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
 from pupper_sysid.sysid.feedback.poll_lattice import quantum, readings
@@ -261,7 +261,8 @@ def _joint(
     }  # fmt: skip
     dead_time = found.numbers["dead_time_s"]
     low, high = whole_steps(dead_time.low, dead_time.high, TIME_STEP_S)
-    actuator = Actuator(
+    actuator = measured(
+        Actuator,
         model="delayed_pd",
         stiffness_nm_per_rad=number("stiffness", "stiffness_nm_per_rad"),
         damping_nm_s_per_rad=number("damping", "duty_s_per_rad"),
@@ -276,7 +277,7 @@ def _joint(
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
-        ratios_to_armature=RatiosToArmature(**ratio),
+        ratios_to_armature=measured(RatiosToArmature, **ratio),
         scale=scale,
     )
     errors = found.errors
@@ -284,8 +285,9 @@ def _joint(
     return JointCalibration(
         actuator=actuator,
         under_load=_block(found, torque),
-        feedback=feedback.model_copy(
-            update={"offset_rad": _quantity(found.numbers["offset_rad"], None, True)}
+        feedback=measured(
+            Feedback,
+            **dict(feedback) | {"offset_rad": _quantity(found.numbers["offset_rad"], None, True)},
         ),
         lag=Lag(),
         selection=Selection(
@@ -294,7 +296,7 @@ def _joint(
                 CandidateModel(
                     model=s.name,
                     parameter_count=len(s.parameters),
-                    rmse_fresh_rad=s.rmse_rad,
+                    rmse_fresh_rad=s.rmse_rad if np.isfinite(s.rmse_rad) else None,
                     mae_unseen_runs_rad=(
                         s.mae_unseen_rad if np.isfinite(s.mae_unseen_rad) else None
                     ),
@@ -334,7 +336,8 @@ def _block(found: LoadedFit, torque: float) -> UnderLoad:
         own["armature_kg_m2"] = Quantity(
             value=torque, identified="ratio only", why="scale from the anchor; holds the load's"
         )
-    return UnderLoad(
+    return measured(
+        UnderLoad,
         structure=found.structure,
         known_load=known,
         p_gain=found.p_gain,
@@ -346,7 +349,7 @@ def _block(found: LoadedFit, torque: float) -> UnderLoad:
         reference_voltage_v=(
             found.reference_voltage_v if np.isfinite(found.reference_voltage_v) else None
         ),
-        **own,  # pyright: ignore[reportArgumentType]
+        **own,
         gravity_nm=number("gravity_nm"),
         hanging_rad=number("hanging_rad"),
     )
@@ -363,13 +366,7 @@ def _scaled(found: LoadedFit, source: str, value: float, factor: float) -> Inter
 
 
 def _quantity(interval: Interval, why: str | None, absolute: bool) -> Quantity:
-    return Quantity(
-        value=interval.value,
-        low=min(interval.low, interval.value),
-        high=max(interval.high, interval.value),
-        identified="no" if why else "yes" if absolute else "ratio only",
-        why=why or (None if absolute else "scale from the torque anchor"),
-    )
+    return quantity_of(interval, "yes" if absolute else "ratio only", why)
 
 
 def _torque(found: LoadedFit) -> float:

@@ -161,7 +161,7 @@ def feedback_setup(lag: LagBudget, setup: Setup) -> Setup:
     lattice = lag.feedback
     known = replace(setup, quantum_rad=lag.quantum_rad)
     if lattice.kind == "lattice":
-        return replace(known, poll_period_s=lattice.poll_period_s, loss=lattice.loss)
+        return replace(known, poll_period_s=lattice.poll_period_s, loss=lattice.assumed_loss)
     fresh = 1.0 if lattice.kind == "every read" else lattice.fresh_fraction
     return replace(known, poll_period_s=0.0, loss=min(max(1 - fresh, 0.0), 0.95))
 

@@ -172,7 +172,7 @@ def hold_runs(
     for histogram in histograms:
         length = np.clip(np.arange(len(histogram)), 0, LONGEST_RUN - 1)
         np.add.at(count, length, np.array(histogram, dtype=np.int64))
-    if lattice.kind != "lattice" or not count.any():
+    if lattice.kind != "lattice" or not count.any() or not np.isfinite(lattice.loss):
         return HoldRuns(lattice, count, None)
     rows = lattice.poll_period_s / float(np.median(loop_periods_s))
     return HoldRuns(lattice, count, count.sum() * _expected(rows, lattice.loss))

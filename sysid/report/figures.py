@@ -163,6 +163,7 @@ _SINGLE = 3
 _LATTICE_WORDS = {
     "every read": "live: each read shows the present position",
     "unresolved": "held, but no poll period found",
+    "lattice": "polled, and how many polls were lost is not known",
 }
 
 

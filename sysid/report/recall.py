@@ -6,6 +6,7 @@ readings are dated with the calibrated motion, so free runs and scores come out 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 
@@ -108,7 +109,8 @@ def _lag(measured: LagBudget, known: JointCalibration) -> LagBudget:
     lattice = measured.feedback
     if lattice.kind == "lattice":
         poll = known.feedback
-        lattice = replace(lattice, poll_period_s=poll.poll_period_s.value, loss=poll.loss.value)
+        loss = math.nan if poll.loss.identified == "no" else poll.loss.value
+        lattice = replace(lattice, poll_period_s=poll.poll_period_s.value, loss=loss)
     stated = {getattr(measured, name).value: lag.value for name, lag in lags.items()}
     budget = replace(
         measured,
