@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import allowed, refuse_more
+from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.strict_yaml import printable
 
@@ -186,8 +187,7 @@ def _opening(path: Path | str, text: str) -> tuple[CsvTable, int, int]:
     line = text[at:stop]
     refuse_more(path, line.count(",") + 1, MOST_COLUMNS, "columns", _SPLIT)
     names = [name.strip() for name in _cells(path, n, line)]
-    if len(set(names)) != len(names):
-        raise InputError(f"{path}, line {n}: a column name stands twice. Rename one.")
+    distinct(f"{path}, line {n}", names)
     return CsvTable(names, comments=comments), n + 1, min(stop + 1, len(text))
 
 

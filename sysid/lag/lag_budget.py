@@ -233,7 +233,8 @@ def lag_budget(
         )
     if lattice.kind == "lattice" and not math.isfinite(lattice.loss):
         warnings.append(
-            f"{joint}: the share of lost polls is not identified: {NO_LOSS}. Record a faster motion."
+            f"{joint}: the share of lost polls is not identified: {NO_LOSS}. Record a faster "
+            "motion."
         )
     fresh, lag = fresh.widened(doubt), lag.widened(doubt)
     by_frequency = tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency)

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
+from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
@@ -209,10 +210,12 @@ class Recording:
         --------
         from_frame : The same from a table.
         """
+        distinct(name, map(str, command_rad), "joints")
         if set(command_rad) != set(position_rad) or not command_rad:
+            commanded, read = (", ".join(map(str, own)) for own in (command_rad, position_rad))
             raise InputError(
-                f"{name}: command_rad has joints {', '.join(command_rad)}, position_rad has "
-                f"{', '.join(position_rad)}; they must be the same, at least one."
+                f"{name}: command_rad has joints {commanded}, position_rad has {read}; they must "
+                "be the same, at least one."
             )
         time_s = np.asarray(send_time_s, float)
         shared: dict[str, Any] = {"trial": trial, "frequency_hz": frequency_hz}
@@ -264,7 +267,9 @@ class Recording:
         """
         given = {"imported_from": "a table in memory"} | dict(metadata or {})
         check_metadata(name, given)
+        distinct(name, map(str, table.columns))
         table = table.copy()
+        table.columns = [str(column) for column in table.columns]
         if "send_time_s" in table:
             if "read_time_s" not in table:
                 table["read_time_s"] = table["send_time_s"] + READ_AFTER_SEND_S

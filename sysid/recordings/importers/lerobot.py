@@ -23,6 +23,7 @@ from pupper_sysid.common.border import parse_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS
+from pupper_sysid.common.reading.names import distinct, one_each
 from pupper_sysid.sysid.recordings.importers.parquet import read_columns
 from pupper_sysid.sysid.recordings.importers.shared.log import (
     Log,
@@ -79,7 +80,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     refuse_more(folder, values, MOST_CELLS, "values", "Give a part of it.")
     columns = {key: _joined(folder, key, [part[key] for part in parts]) for key in parts[0]}
     commands, positions = (
-        _chosen(folder, columns[key], names[key], names["joints"]) for key in (_ACTION, _STATE)
+        _chosen(folder, key, columns[key], names[key], names["joints"]) for key in (_ACTION, _STATE)
     )
     joints = joint_names(info_path, names["joints"])
     for key in ("episode_index", "frame_index"):
@@ -150,6 +151,7 @@ def _names(path: Path, info: Any) -> dict[str, list[str]]:
             count = shape[0] if isinstance(shape, list) and shape else 0
             names = [f"joint_{k}" for k in range(count if isinstance(count, int) else 0)][:1000]
         found[key] = [str(name) for name in names]
+        distinct(f"{path}, {key}", found[key], "joints")
     both = [name for name in found[_STATE] if name in found[_ACTION]]
     positions = [name for name in both if name.endswith(".pos")]
     if not both:
@@ -167,14 +169,11 @@ def _joined(folder: Path, key: str, parts: list[NDArray[np.float64]]) -> NDArray
 
 
 def _chosen(
-    folder: Path, values: NDArray[np.float64], names: list[str], wanted: list[str]
+    folder: Path, key: str, values: NDArray[np.float64], names: list[str], wanted: list[str]
 ) -> NDArray[np.float64]:
     """The wanted joints' columns."""
     values = values.reshape(len(values), -1)
-    if values.shape[1] != len(names):
-        raise InputError(
-            f"{folder}: meta/info.json names {len(names)} joints, the data have {values.shape[1]}."
-        )
+    one_each(folder, {key: values.shape[1], "its list of names in meta/info.json": len(names)})
     return values[:, [names.index(name) for name in wanted]]
 
 

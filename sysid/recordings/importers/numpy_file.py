@@ -16,9 +16,10 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_COLUMNS
-from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, Log
+from pupper_sysid.common.reading.names import distinct
+from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, MOST_JOINTS, Log
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
+from pupper_sysid.sysid.recordings.importers.wide import expanded, read_table
 
 LAYOUT = "NumPy archive"
 MAGIC = b"PK\x03\x04"
@@ -41,6 +42,7 @@ def read_npz(path: Path, data: bytes, options: LogOptions) -> Log:
         refuse_more(f"{path}, unpacked,", len(inside), MOST_COLUMNS, "arrays", "Split it.")
         refuse_more(f"{path}, unpacked,", size, LARGEST_BYTES, "bytes", "Split it.")
         with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
+            distinct(path, loaded.files, "arrays")
             found = {name: loaded[name] for name in loaded.files}
             arrays = {k: v for k, v in found.items() if isinstance(v, np.ndarray)}
     except InputError:
@@ -52,13 +54,12 @@ def read_npz(path: Path, data: bytes, options: LogOptions) -> Log:
             if pickled
             else f"{path} is no NumPy archive, or is damaged. Save it again with numpy.savez."
         ) from error
-    names = next(
-        ([str(n) for n in arrays[key].ravel()[:1000]] for key in _NAMES
-         if key in arrays and arrays[key].dtype.kind in "US"),
-        list(options.joints),
-    )  # fmt: skip
-    numeric = {k: v for k, v in arrays.items() if v.dtype.kind in "biuf" and v.ndim in (1, 2)}
-    lengths = [len(v) for v in numeric.values()]
-    rows = max(set(lengths), key=lengths.count) if lengths else 0
-    columns = {k: v.astype(float) for k, v in numeric.items() if len(v) == rows}
-    return read_table(path, Table(expanded(columns, names)), options, LAYOUT)
+    named = next((k for k in _NAMES if k in arrays and arrays[k].dtype.kind in "US"), None)
+    names = list(options.joints)
+    if named is not None:
+        refuse_more(f"{path}, array {named}", arrays[named].size, MOST_JOINTS, "joints")
+        names = [str(n) for n in arrays[named].ravel().astype(str)]
+    numeric = {
+        k: v.astype(float) for k, v in arrays.items() if v.dtype.kind in "biuf" and v.ndim in (1, 2)
+    }
+    return read_table(path, expanded(path, numeric, names, named), options, LAYOUT)

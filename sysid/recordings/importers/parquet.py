@@ -6,6 +6,7 @@ A file alone (pandas, polars, one file of a LeRobot dataset) is read as a table.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from pupper_sysid.common.reading.csv_table import (
     MOST_COLUMNS,
     MOST_ROWS,
 )
+from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.shared.log import (
     LARGEST_BYTES,
@@ -27,7 +29,7 @@ from pupper_sysid.sysid.recordings.importers.shared.log import (
     Log,
 )
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.wide import Table, expanded, read_table
+from pupper_sysid.sysid.recordings.importers.wide import expanded, read_table
 
 LAYOUT = "parquet table"
 MAGIC = b"PAR1"
@@ -43,8 +45,8 @@ def read_parquet(path: Path, data: bytes, options: LogOptions) -> Log:
     """
     columns = columns_of(path, data)
     arrays = read_columns(path, data, [name for name, numeric in columns.items() if numeric])
-    texts = _texts(path, data)
-    return read_table(path, Table(expanded(arrays, list(options.joints)), texts), options, LAYOUT)
+    table = replace(expanded(path, arrays, list(options.joints)), texts=_texts(path, data))
+    return read_table(path, table, options, LAYOUT)
 
 
 def _library(path: Path) -> Any:
@@ -68,6 +70,7 @@ def columns_of(path: Path, data: bytes) -> dict[str, bool]:
     pa = _library(path)
     schema = _open(path, data).schema_arrow
     refuse_more(path, len(schema), MOST_COLUMNS, "columns", "Split the log.")
+    distinct(path, schema.names)
 
     def numeric(kind: Any) -> bool:
         if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):

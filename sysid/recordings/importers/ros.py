@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS
+from pupper_sysid.common.reading.names import distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.ros_files import (
     Raw,
@@ -135,14 +136,20 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
     state_s, state_by = _times(state, one_clock)
     start = state_s[0]
     state_s = (state_s - start) * 1e-9
-    positions = _by_joint(state, ())
+    positions = _by_joint(f"{path}, topic {printable(state_name)[:80]}", state, ())
     order = tuple(dict.fromkeys(joint for m in state.messages for joint in m.names))
     found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], str]] = {}
     clocks = {f"{state_name}: {state_by}"}
     several = 0
     for name, topic in commanded.items():
         own = tuple(options.joints) or order
-        if topic.kind == MULTI_ARRAY and len(own) == len(topic.messages[0].positions):
+        if topic.kind == MULTI_ARRAY:
+            lengths = {len(m.positions) for m in topic.messages}
+            if lengths != {len(own)} and len(commanded) > 1:
+                warnings.append(
+                    f"{name} has {min(lengths)} values for {len(own)} joints and was left out."
+                )
+                continue
             warnings.append(
                 f"{name} does not name its joints; they were taken in the order "
                 f"{', '.join(map(printable, own))[:200]}. Give `joints` if it is another."
@@ -150,7 +157,8 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
         times, by = _times(topic, one_clock)
         clocks.add(f"{name}: {by}")
         several = max(several, max(m.points for m in topic.messages))
-        for joint, values in _by_joint(topic, own).items():
+        place = f"{path}, topic {printable(name)[:80]}"
+        for joint, values in _by_joint(place, topic, own).items():
             if joint in positions and joint not in found:
                 found[joint] = (times - start) * 1e-9, values, by
     if not found:
@@ -293,13 +301,18 @@ def _times(topic: _Topic, one_clock: bool) -> tuple[NDArray[np.int64], str]:
     return (header, "header") if one_clock or same else (log, "log")
 
 
-def _by_joint(topic: _Topic, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def _by_joint(place: str, topic: _Topic, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Positions over the messages by joint; `names` where the messages have none."""
     found: dict[str, NDArray[np.float64]] = {}
     every = {joint for message in topic.messages for joint in message.names}
     refuse_more("A topic of the log", len(every), MOST_JOINTS, "joints")
+    for own, count in {(m.names or tuple(names), len(m.positions)) for m in topic.messages}:
+        distinct(place, own, "joints")
+        one_each(
+            place, {"a message": count, "its list of joints": len(own)}, "Name them with `joints`."
+        )
     for k, message in enumerate(topic.messages):
-        for joint, value in zip(message.names or names, message.positions, strict=False):
+        for joint, value in zip(message.names or names, message.positions, strict=True):
             if joint not in found:
                 found[joint] = np.full(len(topic.messages), np.nan)
             found[joint][k] = value

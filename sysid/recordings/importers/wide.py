@@ -12,7 +12,7 @@ that names most joints is taken. An ending (`_rad`, `_deg`, `_counts`, `_ms` …
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
+from pupper_sysid.common.reading.names import distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.shared.log import (
     MOST_JOINTS,
@@ -77,30 +78,79 @@ class Table:
         Columns that hold text.
     faults : mapping of str to str
         Why a column is no numbers, as a sentence.
+    widths : mapping of str to int
+        Arrays with a column per joint, and how many; their columns are `<array>.<joint>`.
+    joint_names : (str, int), optional
+        What names those joints, and how many.
     """
 
     columns: Mapping[str, NDArray[np.float64]]
     texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
     faults: Mapping[str, str] = field(default_factory=dict)
+    widths: Mapping[str, int] = field(default_factory=dict)
+    joint_names: tuple[str, int] | None = None
 
     @property
     def names(self) -> list[str]:
         """Names of all columns."""
         return list(dict.fromkeys([*self.columns, *self.texts, *self.faults]))
 
+    def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
+        """Refuse arrays, of which these are columns, with other numbers of joints than names.
+
+        Raises
+        ------
+        InputError
+            If arrays and names are not equally many.
+        """
+        used = {key: n for key, n in self.widths.items()
+                if any(column.startswith(f"{key}.") for column in columns)}  # fmt: skip
+        if used:
+            counts = used | dict([self.joint_names] if self.joint_names else [])
+            one_each(path, counts, "Mend the log, or name the joints to read with `joints`.")
+
 
 def expanded(
-    arrays: Mapping[str, NDArray[np.float64]], names: Sequence[str]
-) -> dict[str, NDArray[np.float64]]:
-    """Columns of arrays of which some have a number per joint: `action` becomes `action.<name>`."""
-    found = {}
+    path: Path | str,
+    arrays: Mapping[str, NDArray[np.float64]],
+    names: Sequence[str],
+    named: str | None = None,
+) -> Table:
+    """Table of arrays of which some have a number per joint: `action` becomes `action.<name>`.
+
+    Parameters
+    ----------
+    path : Path or str
+        For messages.
+    arrays : mapping of str to ndarray, shape (rows,) or (rows, joints)
+    names : sequence of str
+        Of the joints; arrays of another width get `joint_0`, `joint_1`, …
+    named : str, optional
+        What in the log holds these names; None if it does not name its joints.
+
+    Raises
+    ------
+    InputError
+        If a name stands twice.
+    """
+    distinct(path if named is None else f"{path}, {named}", names, "joints")
+    lengths = [len(values) for values in arrays.values()]
+    rows = max(set(lengths), key=lengths.count, default=0)
+    columns, faults, widths = {}, {}, {}
     for key, values in arrays.items():
-        if values.ndim == 1:
-            found[key] = values
-            continue
-        own = names if len(names) == values.shape[1] else [f"joint_{k}" for k in range(10_000)]
-        found |= {f"{key}.{own[k]}": values[:, k] for k in range(min(values.shape[1], 10_000))}
-    return found
+        parts = {key: values}
+        if values.ndim == 2:
+            width = min(values.shape[1], 10_000)
+            own = names if len(names) == width else [f"joint_{k}" for k in range(width)]
+            parts = {f"{key}.{own[k]}": values[:, k] for k in range(width)}
+            widths[key] = width
+        if len(values) == rows:
+            columns |= parts
+        else:
+            text = f"{path}: {key} has {len(values)} rows where others have {rows}. Mend the log."
+            faults |= dict.fromkeys(parts, text)
+    distinct(path, [*columns, *faults])
+    return Table(columns, {}, faults, widths, None if named is None else (named, len(names)))
 
 
 def read_table(path: Path | str, table: Table, options: LogOptions, layout: str = LAYOUT) -> Log:
@@ -152,23 +202,30 @@ def _pairs(path: Path | str, table: Table, options: LogOptions) -> dict[str, _Pa
         patterns = [(_template(options.command), _template(options.position))]
     else:
         patterns = list(product(_patterns(COMMANDS), _patterns(POSITIONS)))
-    matched: dict[re.Pattern[str], dict[str, tuple[str, str]]] = {}
+    matched: dict[re.Pattern[str], dict[str, list[tuple[str, str]]]] = {}
     best: dict[str, _Pair] = {}
+    chosen: tuple[re.Pattern[str], ...] = ()
     for pair in patterns:
         for pattern in pair:
             if pattern not in matched:
                 matched[pattern] = _matches(pattern, table.names)
         commands, positions = (matched[pattern] for pattern in pair)
         both = {
-            joint: _Pair(commands[joint][0], positions[joint][0], commands[joint][1],
-                         positions[joint][1])
-            for joint in commands
-            if joint in positions and commands[joint][0] != positions[joint][0]
-        }  # fmt: skip
+            joint: _Pair(command[0], position[0], command[1], position[1])
+            for joint, (command, *_) in commands.items()
+            for position in positions.get(joint, [])[:1]
+            if command[0] != position[0]
+        }
         if len(both) > len(best):
-            best = both
+            best, chosen = both, pair
     if not best:
+        table.check_joints(path, _angles(table.names))
         raise InputError(_no_pair(path, table, options))
+    for pattern in chosen:  # one column in two units is no second joint
+        named = [(j, ending) for j in best for _, ending in matched[pattern][j]]
+        distinct(path, [f"{j} ({ending})" if ending else j for j, ending in named], "joints")
+    if not options.joints:
+        table.check_joints(path, [c for own in best.values() for c in (own.command, own.position)])
     if options.joints and not (len(best) == 1 and _SOLE in best):
         lacking = [j for j in options.joints if j not in best]
         if lacking:
@@ -202,16 +259,23 @@ def _template(text: str) -> re.Pattern[str]:
     return re.compile(f"{re.escape(before)}{middle}{re.escape(after)}")
 
 
-def _matches(pattern: re.Pattern[str], names: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Column and unit by joint, of the names that fit a pattern as a whole."""
-    found = {}
+def _angles(names: Sequence[str]) -> list[str]:
+    """Columns that are a joint's command or position, whichever joint's."""
+    patterns = _patterns((*COMMANDS, *POSITIONS))
+    return [name for name in names if any(p.fullmatch(name) for p in patterns)]
+
+
+def _matches(pattern: re.Pattern[str], names: Sequence[str]) -> dict[str, list[tuple[str, str]]]:
+    """Columns and their units by joint, of the names that fit a pattern as a whole."""
+    found: dict[str, list[tuple[str, str]]] = {}
     for name in names:
         match = pattern.fullmatch(name[:200])
         if match:
             groups = match.groupdict()
             others = [g for g in match.groups() if g and g != groups.get("joint")]
             joint = bare_name(groups.get("joint") or _SOLE)
-            found.setdefault(joint, (name, others[-1].lower() if others else ""))
+            unit_word = others[-1].lower() if others else ""
+            found.setdefault(joint, []).append((name, unit_word))
     return found
 
 
@@ -261,8 +325,8 @@ def _no_pair(path: Path | str, table: Table, options: LogOptions) -> str:
 def missing(names: Sequence[str]) -> str:
     """What a table lacks to be a servo's log; empty if a joint has a command and a position."""
     commands, positions = (
-        {(joint, column) for p in _patterns(words) for joint, (column, _) in
-         _matches(p, names).items()}
+        {(joint, column) for p in _patterns(words) for joint, own in
+         _matches(p, names).items() for column, _ in own}
         for words in (COMMANDS, POSITIONS)
     )  # fmt: skip
     if any(j == k and a != b for j, a in commands for k, b in positions):

@@ -122,7 +122,7 @@ BAD = {
     "semicolons": (
         [r.replace(",", ";") for r in rows()], HEADER.replace(",", ";"), "separated by semicolons"),
     "tones in a trial": (changed(30, "frequency_hz", "2.0"), HEADER, "its own trial number"),
-    "column twice": (rows(), HEADER.replace("read_time_s", "send_time_s"), "stands twice"),
+    "column twice": (rows(), HEADER.replace("read_time_s", "send_time_s"), "two columns"),
 }
 # fmt: on
 

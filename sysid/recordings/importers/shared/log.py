@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.common.strict_yaml import printable
 
 LARGEST_BYTES = 500e6
@@ -89,9 +90,7 @@ def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
     for name in given:
         text = re.sub(r"[^A-Za-z0-9]+", "_", bare_name(str(name))).strip("_")
         found.append((text if text[:1].isalpha() else f"joint_{text}".rstrip("_"))[:64])
-    twice = [n for n in found if found.count(n) > 1]
-    if twice:
-        raise InputError(f"{path}: two joints would be called {twice[0]}. Rename one of them.")
+    distinct(path, found, "joints")
     return found
 
 

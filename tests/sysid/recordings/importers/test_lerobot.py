@@ -100,7 +100,7 @@ def test_a_given_unit_overrides_the_scale(tmp_path):
         ({"fps": 0}, "fps is 0"),
         ({"features": {}}, "action is missing"),
         ({"features": None}, "features is missing"),
-        ({"names": ["a.pos"]}, "names 1 joints, the data have 2"),
+        ({"names": ["a.pos"]}, "action has 2 values and its list of names in meta/info.json has 1"),
     ],
 )
 def test_a_dataset_that_is_not_as_described_is_refused(tmp_path, changes, said):
