@@ -21,7 +21,7 @@ from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-_OTHER_NAMES = {"frequencies": "freqs", "address": "bus", "workers": "jobs"}
+_OTHER_NAMES = {"frequencies": "freqs", "address": "bus", "workers": "jobs", "p_gain": "gain"}
 _OF_EVERY_PROGRAM = {"read_limit": "--read-limit"}
 """Options with a name of their own, by the library's argument (without its unit)."""
 

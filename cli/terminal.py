@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
+JOBS = (1, 1024)
+"""Smallest and largest number of robots of a fleet that are computed at the same time."""
+
 _COMMAND = re.compile(r"(^|\s)(pupper-[a-z]+|rerun|python|systemctl) ")
 _LINE_S = 10.0  # between lines of progress where there is no terminal
 _CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
@@ -241,12 +244,6 @@ def need_positive(name: str, value: float) -> None:
     """Refuse an option that is not a positive number."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}; it must be a positive number.")
-
-
-def need_within(name: str, value: float, low: float, high: float, unit: str) -> None:
-    """Refuse an option that is no number between two others, which are included."""
-    if not low <= value <= high:
-        raise InputError(f"{name} is {value:g} {unit}; it must be from {low:g} to {high:g} {unit}.")
 
 
 @contextmanager

@@ -35,6 +35,8 @@ _COMPLETIONS = {
     "zsh": ".zfunc/_{}",
 }
 _READ_LIMIT = "--read-limit"
+LARGEST_SEED = 2**63 - 1
+"""The largest that every generator takes: torch's are seeded with 64 bits."""
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 _OF_THE_SYSTEM = (
@@ -74,8 +76,11 @@ def parse(
     parsed = tyro.cli(options, args=arguments, prog=program, **given)
     remember(parsed)
     seed = getattr(parsed, "seed", 0)
-    if seed < 0:
-        raise InputError(f"--seed is {seed}; it must be a whole number from 0 on.")
+    if not 0 <= seed <= LARGEST_SEED:
+        raise InputError(
+            f"--seed is {str(seed)[:24]}; it must be a whole number from 0 on, at most "
+            f"{LARGEST_SEED}."
+        )
     for field in fields(parsed):
         if getattr(parsed, field.name) == "" != field.default:
             raise InputError(f"`{field.name}` is empty. Write a value, or leave it out.")

@@ -33,3 +33,31 @@ class MissingDevice(BusError):
 
 class SafetyStop(BusError):
     """The robot was stopped to prevent harm."""
+
+
+def refuse_outside(name: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Refuse a number that is not between two others, which are included; NaN is not.
+
+    Parameters
+    ----------
+    name : str
+        Of the option, or of the argument in back-quotes.
+    value, low, high : float
+    unit : str
+        Of all three; empty for none.
+
+    Raises
+    ------
+    InputError
+        With what is allowed.
+
+    Examples
+    --------
+    >>> refuse_outside("`seconds`", 1e9, 0.1, 600, "s")
+    Traceback (most recent call last):
+    ...
+    pupper_sysid.common.errors.InputError: `seconds` is 1e+09 s; it must be from 0.1 to 600 s.
+    """
+    if not low <= value <= high:
+        unit = f" {unit}" if unit else ""
+        raise InputError(f"{name} is {value:g}{unit}; it must be from {low:g} to {high:g}{unit}.")

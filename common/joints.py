@@ -22,6 +22,8 @@ DEFAULT_POSE: dict[str, float] = {
 }
 
 STALL_TORQUE_NM = 0.35
+STALL_TORQUES_NM = (1e-3, 100.0)
+"""Smallest and largest stall torque that a servo can have [N·m]: what calibration files hold."""
 STALL_TORQUE_SOURCE = (
     "data sheet of the Mini Pupper servo, 3.5 kg·cm; another data sheet of this servo class says "
     "0.23 N·m at 6 V, so take torques as good to a factor of 1.5 at best"

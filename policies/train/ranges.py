@@ -59,8 +59,8 @@ def refuse_impossible(run: Any) -> None:
         if name != "seed" and not low <= value <= high:  # NaN is in no range
             shown = str(value)[:20]
             raise InputError(f"{name} is {shown}; it must be from {low:g} to {high:g}.")
-    if run.seed < 0:
-        raise InputError(f"seed is {run.seed}; it must be 0 or more.")
+    if not 0 <= run.seed < 2**63:  # what torch's generators take
+        raise InputError(f"seed is {str(run.seed)[:24]}; it must be 0 or more, below 2^63.")
     for name in ("hidden", "critic_hidden"):
         layers = len(getattr(run.architecture, name))
         if layers > _MOST_LAYERS:

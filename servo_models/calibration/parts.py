@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.quantity import (
     AGE,
     LAG,
@@ -32,6 +32,8 @@ from pupper_sysid.servo_models.calibration.quantity import (
 from pupper_sysid.servo_models.calibration.under_load import UnderLoad
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 
+P_GAINS = (1e-3, 1e5)
+"""Smallest and largest P gain of a position loop, whatever the unit of its register."""
 NO_SPEED_LIMIT_RAD_S = 1000.0
 """Speed limit of a set-point that is not limited."""
 _NO_BACK_EMF = Quantity(value=0.0, identified="no", why="the model has no back-EMF")
@@ -257,15 +259,14 @@ class JointCalibration(Part):
         ------
         InputError
             If the calibration is of one gain (the file has no `under_load`), or the gain is not
-            positive.
+            that of a position loop.
         """
         if self.under_load is None:
             raise InputError(
                 "This calibration holds at the P gain that it was recorded with. Record several "
                 "gains, or a known load, to predict others."
             )
-        if not p_gain > 0:
-            raise InputError(f"A P gain of {p_gain:g} is none: give a positive number.")
+        refuse_outside("`p_gain`", p_gain, *P_GAINS)
         share = p_gain / self.under_load.p_gain
         own = self.actuator
         ratio = own.ratios_to_armature.stiffness.scaled(share)

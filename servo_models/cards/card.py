@@ -19,12 +19,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pupper_sysid.common.data_sheet import counts_of
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
 from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
+    P_GAINS,
     Actuator,
     Feedback,
     JointCalibration,
@@ -175,12 +176,13 @@ class ServoCard(Part):
         Raises
         ------
         InputError
-            If another gain is wanted of numbers that are torques already.
+            If another gain is wanted of numbers that are torques already, or it is no gain.
         """
         numbers = self.specimens.get(joint or self.default, self.numbers)
         if not isinstance(numbers, TorquePD):
             own = self.gains.p if p_gain is None else p_gain
             assert own is not None
+            refuse_outside("`p_gain`", own, *P_GAINS)
             return numbers.as_pd(own)
         if p_gain is not None and p_gain != self.gains.p:
             raise InputError(

@@ -30,8 +30,9 @@ import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed, parallel_config
 
-from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.errors import InputError, PupperError, refuse_outside
 from pupper_sysid.common.files import sha256, write_text
+from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.reading.budget import read_limit, reading_up_to
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
@@ -69,6 +70,10 @@ class Settings:
 
     seed: int = 0
     stall_torque_nm: float | None = None
+
+    def __post_init__(self):
+        if self.stall_torque_nm is not None:
+            refuse_outside("`stall_torque_nm`", self.stall_torque_nm, *STALL_TORQUES_NM, "N·m")
 
 
 @dataclass

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pupper_sysid.common.errors import refuse_outside
+from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibration_file import (
@@ -116,8 +118,10 @@ def calibrate(
     Raises
     ------
     InputError
-        If a joint has too little motion.
+        If a joint has too little motion, or `stall_torque_nm` is no servo's.
     """
+    if stall_torque_nm is not None:  # before the work, not after it
+        refuse_outside("`stall_torque_nm`", stall_torque_nm, *STALL_TORQUES_NM, "N·m")
     every, presets = usable_trials(recordings, joints), preset_parameters()
     loaded = {joint: every[joint] for joint in loaded_joints(every)}
     trials = {joint: own for joint, own in every.items() if joint not in loaded}

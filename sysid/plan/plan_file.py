@@ -24,8 +24,8 @@ from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import utc_now
 from pupper_sysid.servo_models.calibration.quantity import Number, Part, Whole
 from pupper_sysid.sysid.plan.planner import PlannedTrial, Prediction
-from pupper_sysid.sysid.plan.proposal import LONGEST_S, Source, SweepPlan
-from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, Plan, plan
+from pupper_sysid.sysid.plan.proposal import Source, SweepPlan
+from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, PLANS_S, Plan, plan
 
 SCHEMA = "pupper-sysid plan"
 SCHEMA_VERSION = 1
@@ -59,7 +59,7 @@ class TrialEntry(Part):
     """Frequency [Hz]."""
     amplitude_rad: Annotated[Number, Field(gt=0, le=float(np.pi))]
     """Largest excursion from the start pose [rad]."""
-    duration_s: Annotated[Number, Field(gt=0, le=LONGEST_S)]
+    duration_s: Annotated[Number, Field(gt=0, le=PLANS_S[1])]
     """Duration without the lead-in [s]."""
     purpose: str = ""
     """What it is for."""

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.joint_fit import fit_joint
@@ -28,13 +28,10 @@ from pupper_sysid.sysid.plan.servos import (
 )
 from pupper_sysid.sysid.recordings.joints import each_joint, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
-from pupper_sysid.sysid.sweep.excitation import LEAST_MARGIN_RAD, LOOP_PERIOD_S
+from pupper_sysid.sysid.sweep.excitation import LEAST_MARGIN_RAD, LOOP_PERIOD_S, PLANS_S
 
 SECONDS = 20.0
 """Recorded seconds per joint of a plan without a recording to go by."""
-
-LONGEST_S = 600.0
-"""Most recorded seconds per joint of a plan."""
 
 _SPEED_LIMIT_RAD_S = 7.5
 
@@ -121,6 +118,8 @@ def plan_from_recordings(
     InputError
         If a joint has too little motion, or `seconds` is out of range.
     """
+    if seconds is not None:
+        _checked(seconds)  # before the work, not after it
     work = partial(fit_joint, seed=seed)
     fits = each_joint(work, recordings, list(joints), workers, progress)
     return plan_from_fits(recordings, fits, seconds=seconds, margins=margins, seed=seed)
@@ -160,7 +159,7 @@ def plan_from_fits(
     for joint, fit in fits.items():
         trials = joint_trials(recordings, joint)
         setup = feedback_setup(fit.lag, _within(base, joint, margins, _excursion(trials)))
-        length = min(recorded_s(trials), LONGEST_S) if seconds is None else _checked(seconds)
+        length = min(recorded_s(trials), PLANS_S[1]) if seconds is None else _checked(seconds)
         plans.append(propose(joint, [fitted_servo(fit)], setup, length))
         polls.append(setup.poll_rate_hz)
     sources = tuple(
@@ -285,10 +284,7 @@ def _within(setup: Setup, joint: str, margins: Margins | None, usual_rad: float)
 
 
 def _checked(seconds: float) -> float:
-    if not (np.isfinite(seconds) and 0 < seconds <= LONGEST_S):
-        raise InputError(
-            f"`seconds` is {seconds:g}; a plan may record 0 to {LONGEST_S:g} s per joint."
-        )
+    refuse_outside("`seconds`", seconds, *PLANS_S, "s")
     return seconds
 
 

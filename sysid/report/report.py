@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.page import WrittenPage, write_page
-from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.calibration import Calibration, is_shipped
 from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.recordings.joints import (
@@ -99,6 +99,10 @@ def write_report(
         if progress:
             progress(what, done / steps)
 
+    for given in models:  # before the work, not after it
+        named = isinstance(given, str | Path) and not is_shipped(given)
+        if named and not Path(given).exists():
+            raise InputError(f"`servo` is {given}: there is no such servo model, file or folder.")
     results: dict[str, JointCalibrationResult] = {}
     if calibration is not None:
         known = [name for name in names if can_recall(calibration.joint(name))]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import ARCHITECTURES, physical_model
@@ -27,6 +27,7 @@ from pupper_sysid.sysid.recordings.joints import (
     chosen_joints,
     usable_trials,
 )
+from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
@@ -74,8 +75,11 @@ class Split:
         Raises
         ------
         InputError
-            If a trial is in both.
+            If a trial is in both, or a number is none that a trial can have.
         """
+        for name, numbers in (("train_loops", train_loops), ("test_loops", test_loops)):
+            for number in numbers:
+                refuse_outside(f"`{name}`", number, -LARGEST_COUNT, LARGEST_COUNT)
         if both := set(train_loops) & set(test_loops):
             raise InputError(
                 f"Loop {min(both)} is in `train_loops` and in `test_loops`; a model would be "
@@ -102,7 +106,7 @@ class Split:
         InputError
             If training does not end after 0 s and before testing begins.
         """
-        if not 0 < train_before_s <= test_after_s:
+        if not 0 < train_before_s <= test_after_s < np.inf:
             raise InputError(
                 f"`train_before_s` is {train_before_s:g} and `test_after_s` {test_after_s:g}; "
                 "training must end after 0 s and before testing begins."

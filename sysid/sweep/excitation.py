@@ -55,6 +55,9 @@ RATES_HZ = (1.0, 1000.0)
 TRIAL_S = (0.1, 86_400.0)
 """Shortest and longest trial [s]."""
 
+PLANS_S = (0.1, 600.0)
+"""Fewest and most recorded seconds per joint of a plan."""
+
 LARGEST_AMPLITUDE_RAD = np.pi
 """Largest excursion from a start pose: half a turn to either side. More was meant in degrees."""
 

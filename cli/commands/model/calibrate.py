@@ -10,9 +10,14 @@ from typing import TYPE_CHECKING
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved
-from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
+from pupper_sysid.common.joints import (
+    JOINT_NAMES,
+    STALL_TORQUE_NM,
+    STALL_TORQUE_SOURCE,
+    STALL_TORQUES_NM,
+)
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.quantity import Quantity
@@ -61,12 +66,13 @@ class Calibrate:
 
     def run(self) -> None:
         """Calibrate, print, write."""
+        if self.stall_torque is not None:
+            refuse_outside("--stall-torque", self.stall_torque, *STALL_TORQUES_NM, "N·m")
+        refuse_outside("--jobs", self.jobs, *terminal.JOBS)
         from pupper_sysid.sysid.identify.calibrate import STAGES, calibrate
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
 
         started = time.perf_counter()
-        if self.stall_torque is not None:
-            terminal.need_positive("--stall-torque", self.stall_torque)
         if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
             self._fleet(self.recordings[0], started)
             return

@@ -11,8 +11,9 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved
+from pupper_sysid.sysid.sweep.excitation import TRIAL_S
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
@@ -84,6 +85,7 @@ class FitServo:
 
     def run(self) -> None:
         """Fit, score, save, print."""
+        self._check_numbers()
         from pupper_sysid.servo_models.servo_file import CONTRACT
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
         from pupper_sysid.sysid.servo_fit.fit import fit_servo
@@ -134,6 +136,15 @@ class FitServo:
         terminal.print_fleet(
             fleet, out, time.perf_counter() - started, self.json, "a servo model", _SHOWN
         )
+
+    def _check_numbers(self) -> None:
+        """Refuse numbers out of range, before anything is imported or read."""
+        refuse_outside("--jobs", self.jobs, *terminal.JOBS)
+        for option, value in (
+            ("--train-before", self.train_before), ("--test-after", self.test_after),
+        ):  # fmt: skip
+            if value is not None:
+                refuse_outside(option, value, 0, TRIAL_S[1], "s")
 
     def _split(self) -> Split:
         from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split

@@ -11,11 +11,11 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.sysid.sweep.excitation import RATES_HZ
+from pupper_sysid.sysid.sweep.excitation import PLANS_S, RATES_HZ
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.plan.proposal import SweepPlan
@@ -57,9 +57,9 @@ class Plan:
         if self.out is not None:
             refuse_overwrite(self.out, self.force)  # before the work, not after it
         if self.seconds is not None:
-            terminal.need_positive("--seconds", self.seconds)
+            refuse_outside("--seconds", self.seconds, *PLANS_S, "s")
         if self.rate is not None:
-            terminal.need_within("--rate", self.rate, *RATES_HZ, "Hz")
+            refuse_outside("--rate", self.rate, *RATES_HZ, "Hz")
         from pupper_sysid.sysid.plan.plan_file import save_plan
 
         made = self._made()

@@ -21,7 +21,7 @@ from pupper_sysid.cli.commands.recording.sweeping import (
     shown,
 )
 from pupper_sysid.cli.live_views import Wanted
-from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
@@ -217,10 +217,10 @@ class Sweep:
         rate = self.rate
         if rate is None:
             rate = BENCH_RATE_HZ if self.load else round(1 / LOOP_PERIOD_S, 2)
-        terminal.need_within("--rate", rate, *RATES_HZ, "Hz")
-        terminal.need_within("--most-seconds", self.most_seconds, *TRIAL_S, "s")
+        refuse_outside("--rate", rate, *RATES_HZ, "Hz")
+        refuse_outside("--most-seconds", self.most_seconds, *TRIAL_S, "s")
         if self.duration is not None:
-            terminal.need_within("--duration", self.duration, *TRIAL_S, "s")
+            refuse_outside("--duration", self.duration, *TRIAL_S, "s")
         bus = bus_name(self.bus)
         if not 1 <= self.loops <= MOST_LOOPS:
             raise InputError(f"--loops is {self.loops}; it must be from 1 to {MOST_LOOPS}.")

@@ -17,7 +17,7 @@ import yaml
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import parse_registers
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.numbers import whole
 from pupper_sysid.hardware.address import SOCKET
@@ -143,7 +143,7 @@ class Feetech(Common):
         baud = self.baud
         if baud is None:
             baud = 1_000_000 if series is STS3215 else 500_000
-        terminal.need_within("--backlash", self.backlash, 0, _MOST_BACKLASH_DEG, "degrees")
+        refuse_outside("--backlash", self.backlash, 0, _MOST_BACKLASH_DEG, "degrees")
         if baud not in BAUD_RATES:
             raise InputError(f"--baud {baud}: choose {', '.join(map(str, BAUD_RATES))}.")
         load = None

@@ -16,7 +16,7 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.live_views import LiveViews, Wanted, live_views
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.connect import open_bus
@@ -66,7 +66,7 @@ class Monitor:
 
     def run(self) -> None:
         """Read and show until the end."""
-        terminal.need_within("--rate", self.rate, *_RATES_HZ, "Hz")
+        refuse_outside("--rate", self.rate, *_RATES_HZ, "Hz")
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
         wanted = Wanted(self.rerun, self.mcap, self.force)

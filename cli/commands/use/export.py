@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import resolved, write_text
+from pupper_sysid.servo_models.calibration.parts import P_GAINS
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import Calibration
@@ -59,6 +60,10 @@ class Export:
 
     def run(self) -> None:
         """Convert and write."""
+        if self.physics_step is not None:
+            refuse_outside("--physics-step", self.physics_step, *_STEPS_S, "s")
+        if self.gain is not None:
+            refuse_outside("--gain", self.gain, *P_GAINS)
         from pupper_sysid.cli.policy_choice import is_policy
         from pupper_sysid.servo_models.calibration.calibration import is_shipped
 
@@ -186,7 +191,6 @@ class Export:
         step = self.physics_step
         if step is None:
             step = _MJCF_STEP_S if self.to == "mjcf" else _TRAINING_STEP_S
-        terminal.need_within("--physics-step", step, *_STEPS_S, "s")
         if self.to == "newton":
             target = self.out or Path(f"{path.stem}_newton")
             export_newton(calibration, step, target, self.force)

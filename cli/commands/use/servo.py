@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
+from pupper_sysid.servo_models.calibration.parts import P_GAINS
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import InputFile
@@ -83,7 +84,7 @@ class Show:
 
         card = load_card(self.card)
         if self.gain is not None:
-            terminal.need_positive("--gain", self.gain)
+            refuse_outside("--gain", self.gain, *P_GAINS)
         if self.yaml:
             print(card.to_yaml(), end="")
             return
@@ -122,7 +123,7 @@ class Diff:
         from pupper_sysid.servo_models.cards.compare import differences, servo_of
 
         if self.gain is not None:
-            terminal.need_positive("--gain", self.gain)
+            refuse_outside("--gain", self.gain, *P_GAINS)
         one, other = (servo_of(n, self.joint, self.gain) for n in (self.first, self.second))
         found = differences(one, other)
         if self.json:
