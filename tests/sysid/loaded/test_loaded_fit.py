@@ -199,5 +199,5 @@ def test_the_file_keeps_the_servo_under_load(tmp_path: Path):
     assert at_32.under_load is not None and at_32.under_load.p_gain == 32.0
     low, high = read.actuator.stiffness_nm_per_rad.low, at_32.actuator.stiffness_nm_per_rad.low
     assert high / low == pytest.approx(32.0 / read.under_load.p_gain)
-    with pytest.raises(InputError, match="positive"):
+    with pytest.raises(InputError, match="p_gain"):
         read.at_p_gain(0.0)
