@@ -26,7 +26,7 @@ from pupper_sysid.cli.flags import forget, remember, spell
 from pupper_sysid.cli.numerals import NUMERALS
 from pupper_sysid.cli.terminal import err, out
 from pupper_sysid.common.errors import InputError, PupperError
-from pupper_sysid.common.files import versions
+from pupper_sysid.common.files import holding_outputs, versions
 from pupper_sysid.common.reading.budget import reading_up_to
 from pupper_sysid.common.reading.numbers import decimal
 
@@ -138,7 +138,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
             if "--install-completion" in arguments:
                 arguments = _completion(program)
             times, rest = _read_limit([a for a in arguments if a != "--debug"])
-            with reading_up_to(times):
+            with reading_up_to(times), holding_outputs():
                 yield rest
         finally:  # also what help printed, which ends the program by itself
             sys.stdout.flush()

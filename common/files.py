@@ -1,14 +1,20 @@
-"""How this project writes files: never over something else, never half, always with provenance."""
+"""How this project writes files: never over something else, never half, always with provenance.
+
+A program holds each of its outputs from the check before the work (`refuse_overwrite`) until it
+ends (`holding_outputs`); another program that would write the same one is refused, `force` or not.
+"""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import stat
 import tempfile
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -30,10 +36,20 @@ def resolved(path: Path) -> Path:
 
 
 def refuse_overwrite(path: Path, force: bool = False) -> None:
-    """Raise unless `path` is free, or a file and `force` was given.
+    """Raise unless `path` is free, or a file and `force` was given; then hold it (`hold_output`).
 
     Devices, pipes and sockets are never replaced.
+
+    Raises
+    ------
+    InputError
+        Also if another program writes it at present.
     """
+    _refuse_existing(path, force)
+    hold_output(path)
+
+
+def _refuse_existing(path: Path, force: bool) -> None:
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -81,7 +97,8 @@ def write_text(path: Path, text: str, force: bool = False) -> None:
 
 def write_bytes(path: Path, data: bytes, force: bool = False) -> None:
     """Write `data` to `path` in one atomic step, so that no reader ever sees half of it."""
-    refuse_overwrite(path, force)
+    _refuse_existing(path, force)
+    _refuse_held(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -124,6 +141,8 @@ class SyncedText:
         self.path, self._advice = path, advice
         if append_at is None:
             refuse_overwrite(path, force)
+        else:
+            hold_output(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             mode = "w" if append_at is None else "r+"
@@ -180,6 +199,150 @@ class SyncedText:
         while not self._closing.wait(_SYNC_S):
             with suppress(OSError):  # the next write will say so
                 os.fsync(self._file.fileno())
+
+
+_held: ContextVar[dict[Path, _Lock] | None] = ContextVar("held_outputs", default=None)
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of a file system without them
+
+
+@contextmanager
+def holding_outputs() -> Iterator[None]:
+    """Within the block, hold the outputs that `refuse_overwrite` and `hold_output` name.
+
+    A lock file beside each output, `.NAME.lock`, holds the process id. It is locked by the system
+    for as long as the process lives, and removed at the end of the block. One that a killed process
+    has left behind is not locked, and does not count.
+    """
+    if _held.get() is not None:  # a program within a program holds for both
+        yield
+        return
+    locks: dict[Path, _Lock] = {}
+    before = _held.set(locks)
+    try:
+        yield
+    finally:
+        _held.reset(before)
+        for lock in locks.values():
+            lock.release()
+
+
+def hold_output(path: Path) -> None:
+    """Hold a file or folder against other programs; does nothing outside `holding_outputs`.
+
+    Raises
+    ------
+    InputError
+        If another process holds it, or its folder cannot be written.
+    """
+    locks, output = _held.get(), resolved(path)
+    if locks is None:
+        _refuse_held(path)
+    elif output not in locks:
+        locks[output] = _Lock(path, output)
+
+
+def _refuse_held(path: Path) -> None:
+    """Refuse a path that another process holds."""
+    output = resolved(path)
+    if output in (_held.get() or {}):
+        return
+    try:
+        descriptor = os.open(_lock_file(output), os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except (OSError, ValueError):  # there is none
+        return
+    try:
+        _lock_or_refuse(descriptor, path)
+    finally:
+        os.close(descriptor)
+
+
+def _lock_file(output: Path) -> Path:
+    return output.with_name(f".{output.name}.lock")
+
+
+def _lock_or_refuse(descriptor: int, path: Path) -> None:
+    """Lock an open lock file without waiting.
+
+    The lock is the process's: a child does not inherit it, and cannot keep it.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return
+        holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
+        raise InputError(
+            f"{path} is being written by another process{f' ({holder})' if holder else ''}. Wait "
+            "until it has ended, or choose another name."
+        ) from None
+
+
+class _Lock:
+    """Lock of one output of this process."""
+
+    def __init__(self, path: Path, output: Path):
+        self._file, self._process = _lock_file(output), os.getpid()
+        self._descriptor: int | None = None
+        self._made: list[Path] = []
+        try:
+            while self._descriptor is None:
+                self._descriptor = self._open(path)
+        except (OSError, ValueError) as error:
+            self._remove_folders()
+            if not output.is_dir():  # a folder can be written where its neighbours cannot
+                raise InputError(
+                    f"{path} cannot be written: {getattr(error, 'strerror', None) or error}."
+                ) from error
+        except InputError:
+            self._remove_folders()
+            raise
+
+    def _open(self, path: Path) -> int | None:
+        """Descriptor of the locked file; None if its last holder has just removed it."""
+        folder = self._file.parent
+        missing = [p for p in (folder, *folder.parents) if not p.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        self._made = missing or self._made
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        try:
+            descriptor = os.open(self._file, flags, 0o666)
+        except FileNotFoundError:
+            if folder.is_dir():
+                raise
+            return None  # the last holder has removed its empty folders
+        try:
+            _lock_or_refuse(descriptor, path)
+            if not os.path.exists(self._file) or not os.path.samestat(
+                os.fstat(descriptor), os.stat(self._file)
+            ):
+                os.close(descriptor)
+                return None
+            with suppress(OSError):  # so that another user's is no obstacle once it is left behind
+                os.fchmod(descriptor, 0o666)
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{self._process}\n".encode(), 0)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return descriptor
+
+    def release(self) -> None:
+        """Remove the lock file, and the folders made for it that are still empty."""
+        if self._descriptor is None or os.getpid() != self._process:
+            return
+        with suppress(OSError):
+            os.unlink(self._file)
+        os.close(self._descriptor)
+        self._remove_folders()
+
+    def _remove_folders(self) -> None:
+        with suppress(OSError):  # not empty: the output is there
+            for folder in self._made:
+                folder.rmdir()
 
 
 def sha256(path: Path) -> str:

@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pupper_sysid.cli.terminal import err, out, print_json, warn
 from pupper_sysid.cli.user_errors import parse, user_errors
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_path
+from pupper_sysid.common.files import hold_output, refuse_path
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
 from pupper_sysid.policies.train.run_file import Run, Start, check_teacher, preset
@@ -125,6 +125,7 @@ def _run(options: Options, given: list[str]) -> None:
     if options.resume is not None and not options.resume.is_dir():
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
     if ranks.rank == 0:
+        hold_output(folder)
         err.print(
             f"{'Going on with' if options.resume else 'Training into'} {folder}.", soft_wrap=True
         )

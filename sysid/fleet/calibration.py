@@ -31,7 +31,7 @@ import pandas as pd
 from joblib import Parallel, delayed, parallel_config
 
 from pupper_sysid.common.errors import InputError, PupperError, refuse_outside
-from pupper_sysid.common.files import sha256, write_text
+from pupper_sysid.common.files import hold_output, sha256, write_text
 from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.reading.budget import read_limit, reading_up_to
 from pupper_sysid.common.strict_yaml import printable
@@ -230,6 +230,7 @@ def run_fleet(
         raise InputError(f"`jobs` is {jobs}; it must be at least 1.")
     if cluster is not None:
         trust(cluster)
+    hold_output(out / TABLE)
     fleet, todo = Fleet(), []
     for path, target in targets.items():
         if target.exists() and _same(is_of, target, path):
