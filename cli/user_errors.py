@@ -13,10 +13,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, TypeVar
 
 import tyro
@@ -41,9 +42,24 @@ CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 _OF_THE_SYSTEM = (
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG,
-    errno.EISDIR, errno.ENOTDIR,
+    errno.EISDIR, errno.ENOTDIR, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
 )  # fmt: skip
-"""Errors of files that are the user's to mend, not defects."""
+"""Refusals of the system that are the user's to mend, not defects."""
+
+_MAKE_ROOM = "Make room, or choose another file or folder."
+_CURES = {
+    errno.ENOSPC: "Make room there.",
+    errno.EDQUOT: "Make room there.",
+    errno.EROFS: "Make it writable.",
+    errno.EACCES: "Give this user the permission.",
+    errno.EPERM: "Give this user the permission.",
+    errno.EMFILE: "Raise the limit of open files (`ulimit -n`).",
+    errno.ENFILE: "Close other programs.",
+    errno.ENOMEM: "Free memory.",
+}
+"""What helps where the system names no file."""
+_SHARED, _POOLS = "multiprocessing.synchronize", ("concurrent.futures", "multiprocessing.pool")
+_OUTPUT, _ERRORS = "standard output", "standard error"
 
 Options = TypeVar("Options")
 
@@ -131,6 +147,8 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     """Yield the arguments without those of every program; an exception becomes a sentence."""
     debug = "--debug" in arguments
     _open_closed()
+    streams = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _Stream(sys.stdout, _OUTPUT), _Stream(sys.stderr, _ERRORS)
     try:
         try:
             if "--version" in arguments:
@@ -152,10 +170,12 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     except KeyboardInterrupt:
         err.print("Stopped.")
         sys.exit(_signalled() or 1)
-    except BrokenPipeError:  # `| head` closed its end: no error
-        _silence(sys.stdout)
-        sys.exit(0)
     except Exception as error:
+        stream = error.filename if isinstance(error, OSError) else None
+        if stream in (_OUTPUT, _ERRORS):  # its buffer would fail once more at the exit
+            _silence(sys.stdout if stream == _OUTPUT else sys.stderr)
+            if isinstance(error, BrokenPipeError):  # `| head` closed its end: no error
+                sys.exit(0)
         if debug:
             raise
         if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
@@ -167,6 +187,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         )
         sys.exit(1)
     finally:
+        sys.stdout, sys.stderr = streams
         _stop_no_more()
         forget()
 
@@ -189,12 +210,54 @@ def _read_limit(arguments: Sequence[str]) -> tuple[float, list[str]]:
 
 
 def _of_the_system(error: OSError) -> str:
-    """Sentence for a file or stream that the system refuses."""
-    where = error.filename
-    if where is None:
-        where = "standard output"
-        _silence(sys.stdout)
-    return f"{where}: {error.strerror}. Make room, or choose another file or folder."
+    """Sentence for what the system refuses: the file or stream, else the call that was refused."""
+    name = error.filename
+    if name is not None:
+        name = os.fsdecode(name) if isinstance(name, bytes) else name
+        return f"{name}: {error.strerror}. {_MAKE_ROOM}"
+    frames = [(f.f_globals.get("__name__", "?"), f.f_code) for f, _ in walk_tb(error.__traceback__)]
+    module, code = frames[-1]
+    what = f"the system refused {module}.{code.co_qualname}"
+    if _SHARED in dict(frames):  # semaphores are files there, which the error does not name
+        what = "/dev/shm: the system refused a semaphore, which processes share"
+    elif module.startswith(_POOLS):  # raised there again
+        what = "the system refused what a worker process asked for"
+    ours = [(n, c) for n, c in frames[:-1] if n.startswith("pupper_sysid.") and n != __name__]
+    where = f" (in {ours[-1][0]}.{ours[-1][1].co_qualname})" if ours else ""
+    return f"{what}{where}: {error.strerror}. {_CURES.get(error.errno or 0, _MAKE_ROOM)}"
+
+
+class _Stream:
+    """A standard stream whose errors carry its name, as those of files do."""
+
+    def __init__(self, stream: Any, name: str):
+        self._stream, self._name = stream, name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(self._stream, attribute)
+
+    def write(self, text: str) -> int:
+        """As the stream's."""
+        with self._named():
+            return self._stream.write(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """As the stream's."""
+        with self._named():
+            self._stream.writelines(lines)
+
+    def flush(self) -> None:
+        """As the stream's."""
+        with self._named():
+            self._stream.flush()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            error.filename = self._name
+            raise
 
 
 def _open_closed() -> None:

@@ -5,13 +5,14 @@
         ...
 
 Tick `k` is due `k` periods after the start; a tick that cannot start in time is left out and
-counted. `real_time_priority` asks the system to run this process first.
+counted. `TimeSpent` accounts for the time of each tick, so that a loop that must stop names what
+made it late. `real_time_priority` asks the system to run this process first.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -23,6 +24,83 @@ from pupper_sysid.common.errors import InputError, SafetyStop
 
 MOST_MISSES_IN_A_ROW = 10
 """So many missed deadlines in a row mean that the robot is out of control."""
+
+
+BUS, IMU, POLICY, LOG, VIEWS, GUARD = "bus", "imu", "policy", "log", "views", "guard"
+"""What the time of a tick is spent on; the rest is the host's."""
+
+_HOST = ""
+_BUSY = "this host is too slow or too busy. Stop other programs, or use a lower rate."
+_LATE = {
+    BUS: (
+        "waiting for the bus",
+        "the bus answers late. Check its cable, its baud rate and power, and that no other program "
+        "uses it; or use a lower rate.",
+    ),
+    IMU: (
+        "waiting for the IMU",
+        "the IMU answers late. Check its cable, and that no other program uses it; or use a lower "
+        "rate.",
+    ),
+    POLICY: (
+        "the policy",
+        "the policy takes too long on this host. Use a smaller network, stop other programs, or "
+        "use a lower rate.",
+    ),
+    LOG: (
+        "writing the log",
+        "the disk takes the log too slowly. Write to another disk, or stop the programs that "
+        "write to this one.",
+    ),
+    VIEWS: (
+        "views and checks of the tick",
+        "what is shown takes too long. Leave the live views out, or stop other programs.",
+    ),
+    GUARD: ("the guard", _BUSY),
+    _HOST: ("the rest of the loop", _BUSY),
+}
+"""What a late loop was busy with, and the cause with its cure."""
+_WORTH_NAMING = 0.05  # share of the time from which a part is named beside the largest
+
+
+class TimeSpent:
+    """Time of a loop's ticks, by what it was spent on.
+
+    Parameters
+    ----------
+    now : callable
+        Clock [s].
+
+    Attributes
+    ----------
+    total_s : dict of str to float
+        So far; time within an inner block counts for that one only.
+
+    Examples
+    --------
+    >>> clock = iter([0.0, 1.0, 4.0, 5.0])
+    >>> spent = TimeSpent(lambda: next(clock))
+    >>> with spent.on(GUARD), spent.on(BUS):
+    ...     pass
+    >>> spent.total_s
+    {'bus': 3.0, 'guard': 2.0}
+    """
+
+    def __init__(self, now: Callable[[], float]):
+        self._now, self._inner_s = now, 0.0
+        self.total_s: dict[str, float] = {}
+
+    @contextmanager
+    def on(self, what: str) -> Iterator[None]:
+        """Count the block's time for `what`."""
+        begun, outer_s = self._now(), self._inner_s
+        self._inner_s = 0.0
+        try:
+            yield
+        finally:
+            took = self._now() - begun
+            self.total_s[what] = self.total_s.get(what, 0.0) + took - self._inner_s
+            self._inner_s = outer_s + took
 
 
 class Timed(Protocol):
@@ -44,6 +122,7 @@ class FixedRateLoop:
     Attributes
     ----------
     timed : Timed
+        Its `spent`, a `TimeSpent`, is used if it has one, as a `GuardedBus` has.
     period_s : float
     most_misses : int
         Missed deadlines in a row after which the loop stops.
@@ -65,6 +144,7 @@ class FixedRateLoop:
     def __post_init__(self):
         if not (np.isfinite(self.period_s) and self.period_s > 0):
             raise InputError(f"loop_period_s is {self.period_s}; it must be a positive number.")
+        self.spent: TimeSpent = getattr(self.timed, "spent", None) or TimeSpent(self.timed.now)
 
     def ticks(self, duration_s: float) -> Iterator[float]:
         """Seconds since the first tick, at every tick for `duration_s`.
@@ -72,10 +152,10 @@ class FixedRateLoop:
         Raises
         ------
         SafetyStop
-            If the loop has missed `most_misses` deadlines in a row.
+            If the loop has missed `most_misses` deadlines in a row; names what took the time.
         """
         timed, start, tick, late = self.timed, self.timed.now(), 0, 0
-        before = None
+        before, in_time_s, spent_s = None, start, {}
         while tick * self.period_s < duration_s:
             timed.sleep_until(start + tick * self.period_s)
             began = timed.now()
@@ -83,6 +163,8 @@ class FixedRateLoop:
                 self.periods.add(began - before)
                 self.jitter.add(abs(began - before - self.period_s))
             before = began
+            if not late:
+                in_time_s, spent_s = began, dict(self.spent.total_s)
             yield began - start
             self.ticks_done += 1
             due = int((timed.now() - start) / self.period_s)
@@ -92,9 +174,21 @@ class FixedRateLoop:
             if late >= self.most_misses:
                 raise SafetyStop(
                     f"the loop missed {late} deadlines of {1e3 * self.period_s:.1f} ms in a row: "
-                    "this host is too slow or too busy. Stop other programs, or use a lower rate."
+                    + self._culprit(timed.now() - in_time_s, spent_s)
                 )
             tick = max(tick + 1, due)
+
+    def _culprit(self, late_s: float, before_s: dict[str, float]) -> str:
+        """What took most of the last `late_s`, with the cure; `before_s` was spent before them."""
+        parts = {k: v - before_s.get(k, 0.0) for k, v in self.spent.total_s.items()}
+        parts[_HOST] = late_s - sum(parts.values())
+        largest = max(parts, key=lambda k: parts[k])
+        shares = [
+            f"{1e3 * parts[k]:.0f} ms {_LATE[k][0]}"
+            for k in sorted(parts, key=lambda k: -parts[k])
+            if k == largest or parts[k] > _WORTH_NAMING * late_s
+        ]
+        return f"{_LATE[largest][1][:-1]} ({1e3 * late_s:.0f} ms went by: {', '.join(shares)})."
 
     def summary(self) -> dict[str, float]:
         """Statistics for the recording's footer."""

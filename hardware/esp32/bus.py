@@ -135,6 +135,7 @@ class Esp32Bus(HostClock):
         count = by_id[self._by_id]
         load = self._ask(datagrams.GET_LOAD, datagrams.parse_load)
         if self.now() - self._power_s > _POWER_EVERY_S:
+            # one that cannot be is none; an older one would hide that the supply has changed
             self._power = self._ask(datagrams.GET_POWER, datagrams.parse_power)
             self._power_s = self.now() if self._power else self._power_s
         joints = len(self.joint_names)

@@ -24,6 +24,7 @@ import numpy as np
 
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
+from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent
 from pupper_sysid.hardware.moves import raised_cosine
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.rates import RateLimit
@@ -92,6 +93,7 @@ class GuardedBus:
         self.limits, self.metadata = bus.limits, bus.metadata
         self.guard = limits or GuardLimits()
         self.report = GuardReport()
+        self.spent = TimeSpent(bus.now)
         self._watchdog = watchdog
         self._on = False
         self._stopped_for_safety = self._left_on = False
@@ -123,7 +125,12 @@ class GuardedBus:
         SafetyStop
             The sentence names the joint, the fault, and what to check.
         """
-        sample = self.bus.read()
+        with self.spent.on(BUS):
+            sample = self.bus.read()
+        with self.spent.on(GUARD):
+            return self._checked(sample)
+
+    def _checked(self, sample: BusSample) -> BusSample:
         valid = np.isfinite(sample.position_rad)
         self._present = np.where(valid, sample.position_rad, self._present)
         self._present_s[valid] = self.bus.now()
@@ -147,6 +154,10 @@ class GuardedBus:
         SafetyStop
             If the first command is far from the robot's pose, or the pose is outside the limits.
         """
+        with self.spent.on(GUARD):
+            return self._write(position_rad)
+
+    def _write(self, position_rad: Angles) -> Sent:
         command = np.asarray(position_rad, float)
         # one that is no number would stay in the velocity
         if command.shape != self._present.shape or np.isnan(command).any():
@@ -164,7 +175,8 @@ class GuardedBus:
             if slower is not allowed:
                 self.report.add("slowed", now)
             allowed = slower
-        sent = self.bus.write(allowed)
+        with self.spent.on(BUS):
+            sent = self.bus.write(allowed)
         self._beat()
         if np.isfinite(sent.time_s):
             self._sent, self._sent_s = sent.position_rad, now

@@ -2,25 +2,37 @@
 
 `GuardLimits` holds the thresholds. `Monitor` keeps the last seconds of commands and readings and
 raises `SafetyStop` for a fault; `hardware.safety.guard` decides what follows.
+
+A number that is none (NaN, infinite) never passes a check by comparing as false. As a position it
+is a missing reading, and silence ends the motion. As a voltage or temperature of a servo that
+returns its position it is out of range, like 3 V or 30 V. As a load it is a missing reading, which
+neither begins nor ends an overload: the servo's own protection and the checks of its motion remain.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import SafetyStop
+from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, ServoBus
 from pupper_sysid.hardware.feetech.registers import error_words
 
 Angles = NDArray[np.float64]
 
+ANY_SUPPLY_V = (3.5, 15.0)
+"""Range of the supply where the bus states none: from one lithium cell nearly empty (an XL330 needs
+3.7 V) to beyond the 14 V of a 12 V servo."""
+
 _CHECK_EVERY_S = 0.1
 _SAME_RAD = 1e-6  # far below any quantisation step: rounding errors of sums of angles
+_FEWEST_READINGS = 10
+_COARSEST_RAD = 2 * np.pi / 1024
+_FLICKER_STEPS = 4.04  # from -2 to +2 quantisation steps, and rounding
 
 
 @dataclass(frozen=True)
@@ -37,6 +49,17 @@ class GuardLimits:
     """A reading must change when its command has moved by this much within `frozen_after_s`."""
     frozen_after_s: float = 0.85
     """Longer than any run of lost polls: at a loss of 0.6, 30 in a row."""
+    follows_share: float = 0.04
+    """A reading must move by this share of its command's motion, where that is at least
+    `follows_rad`; less, within four quantisation steps, is noise about one place. Healthy servos
+    move by 0.64 of it and more; one on a bench at P 4 with 0.5 kg at 0.15 m by 0.02 at 7 Hz, by
+    more than four steps."""
+    follows_rad: float = 0.3
+    """Beyond the dead band of friction at low gains (±0.06 rad with a third of the Mini Pupper's
+    stiffness), and large enough for its share to be two steps of the coarsest encoder."""
+    follows_within_s: float = 2.0
+    """Time in which a command moves by `follows_rad`, and `frozen_after_s` for the reading to show
+    it: a tone of 0.3 rad at 0.2 Hz does."""
     astray_rad: float = 0.35
     """Largest distance of a joint from its command after `astray_after_s` at rest."""
     astray_after_s: float = 0.8
@@ -46,8 +69,10 @@ class GuardLimits:
     load_for_s: float = 1.5
     temperature_c: float = 65.0
     """The servo's own limits are 70 to 80 °C."""
+    coldest_c: float = -20.0
+    """Below, the sensor is broken: hobby servos are made for -20 °C and more."""
     voltage_v: tuple[float, float] | None = None
-    """Range of the supply; by default the bus's `voltage_band_v`."""
+    """Range of the supply; by default the bus's `voltage_band_v`, else `ANY_SUPPLY_V`."""
     fault_for_s: float = 0.3
     """Longest duration of a voltage, temperature or error bit out of order."""
     silent_for_s: float = 0.5
@@ -56,6 +81,18 @@ class GuardLimits:
     """Highest speed on the way back."""
     park_within_s: float = 3.0
     """Longest duration of the way back; longer ways are taken faster."""
+
+    def __post_init__(self):
+        for field in fields(self):
+            numbers = np.atleast_1d(np.array(getattr(self, field.name), float))
+            if field.name == "voltage_v" and self.voltage_v is None:
+                continue
+            positive = field.name == "coldest_c" or (numbers > 0).all()
+            if not (np.isfinite(numbers).all() and positive and (np.diff(numbers) > 0).all()):
+                raise InputError(
+                    f"GuardLimits: {field.name} is {getattr(self, field.name)}; it must be a "
+                    "positive number, of a range the lower one first."
+                )
 
 
 class Monitor:
@@ -66,9 +103,15 @@ class Monitor:
         # servo angles: a push rod changes a calf's joint angle with its thigh while its own servo
         # stands still
         self._servo_angles = bus.limits.servo_angles
-        supply: Any = limits.voltage_v or bus.metadata.get("voltage_band_v")
-        self._supply_v = tuple(supply) if supply else None
-        self._keep_s = max(limits.frozen_after_s, limits.load_for_s, limits.astray_after_s) + 0.2
+        supply: Any = limits.voltage_v or bus.metadata.get("voltage_band_v") or ANY_SUPPLY_V
+        self._supply_v = tuple(supply)
+        steps: Any = bus.metadata.get("command_quantum_rad") or {}
+        quantum = np.array([steps.get(name) or _COARSEST_RAD for name in bus.joint_names])
+        self._flicker_rad = _FLICKER_STEPS * quantum
+        self._now = bus.now
+        self._keep_s = 0.2 + max(
+            limits.frozen_after_s, limits.follows_within_s, limits.load_for_s, limits.astray_after_s
+        )
         self.reset(bus.now())
 
     def reset(self, now_s: float) -> None:
@@ -95,12 +138,13 @@ class Monitor:
         SafetyStop
             If a fault is found; the sentence names the joint, the fault and what to check.
         """
-        now = float(sample.time_s.max())
+        now = self._now()
         valid = np.isfinite(sample.position_rad)
         self._last_read_s[valid] = now
         self._check_silence(now)
         self._check_faults(sample, valid, now)
-        self._readings.append((now, self._servo_angles(sample.position_rad)))
+        position = np.where(valid, sample.position_rad, np.nan)
+        self._readings.append((now, self._servo_angles(position)))
         if sample.load is not None:
             self._loads.append((now, sample.load))
         if now < self._next_s:
@@ -112,6 +156,7 @@ class Monitor:
         if command is not None:
             self._check_frozen(now)
             self._check_astray(now, command)
+            self._check_following(now)
         self._check_load(now)
 
     def _check_silence(self, now: float) -> None:
@@ -129,23 +174,29 @@ class Monitor:
             )
 
     def _check_faults(self, sample: BusSample, valid: NDArray[np.bool_], now: float) -> None:
-        if sample.voltage_v is not None and self._supply_v:
+        if sample.voltage_v is not None:
             low, high = self._supply_v
-            bad = (sample.voltage_v < low) | (sample.voltage_v > high)
-            k = self._persistent("voltage", bad, np.isfinite(sample.voltage_v), now)
+            k = self._out_of("voltage", sample.voltage_v, low, high, valid, now)
             if k is not None:
+                volts = sample.voltage_v[k]
+                cure = "Charge the battery or check the supply."
+                if not 0 <= volts < np.inf:
+                    cure = "That is no measurement: check the servo's cable and its supply."
+                elif volts > high:
+                    cure = "Switch the supply off and check it: more destroys the servos."
                 raise SafetyStop(
-                    f"{self._names[k]}: the supply is {sample.voltage_v[k]:.1f} V, outside "
-                    f"{low:.1f} to {high:.1f} V. Charge the battery or check the supply."
+                    f"{self._names[k]}: the supply is {volts:.1f} V, outside {low:.1f} to "
+                    f"{high:.1f} V. {cure}"
                 )
         if sample.temperature_c is not None:
-            bad = sample.temperature_c > self._limits.temperature_c
-            k = self._persistent("heat", bad, np.isfinite(sample.temperature_c), now)
+            low, high = self._limits.coldest_c, self._limits.temperature_c
+            k = self._out_of("heat", sample.temperature_c, low, high, valid, now)
             if k is not None:
-                raise SafetyStop(
-                    f"{self._names[k]} is at {sample.temperature_c[k]:.0f} °C. Let it cool down, "
-                    "then use a smaller amplitude or fewer frequencies."
-                )
+                degrees = sample.temperature_c[k]
+                cure = "Let it cool down, then use a smaller amplitude or fewer frequencies."
+                if not low <= degrees < np.inf:
+                    cure = "That is no measurement: check its cable; its sensor may be broken."
+                raise SafetyStop(f"{self._names[k]} is at {degrees:.0f} °C. {cure}")
         if sample.status is not None:
             k = self._persistent("status", sample.status != 0, valid, now)
             if k is not None:
@@ -153,6 +204,18 @@ class Monitor:
                     f"{self._names[k]} reports an error: {error_words(int(sample.status[k]))}. "
                     "Relieve it, and switch its power off and on if the error stays."
                 )
+
+    def _out_of(
+        self, what: str, value: Angles, low: float, high: float, valid: NDArray[np.bool_],
+        now: float,
+    ) -> int | None:  # fmt: skip
+        """Index of a joint whose value has been out of range, or none, for `fault_for_s`.
+
+        Where the position is missing, too, a value that is none is a lost reading.
+        """
+        number = np.isfinite(value)
+        inside = number & (value >= low) & (value <= high)
+        return self._persistent(what, ~inside & (number | valid), inside, now)
 
     def _persistent(
         self, what: str, bad: NDArray[np.bool_], known: NDArray[np.bool_], now: float
@@ -169,21 +232,48 @@ class Monitor:
     def _check_frozen(self, now: float) -> None:
         """Stop if a command moved, long enough ago, and its readings did not change."""
         window = self._limits.frozen_after_s
-        read = np.array([x for t, x in self._readings if t >= now - window])
-        # a command of the last third may not show yet
-        sent = np.array([x for t, x in self._commands if now - window <= t <= now - window / 3])
-        if len(sent) < 2 or len(read) < 10 or now - self._readings[0][0] < window:
+        if now - self._readings[0][0] < window:
             return
-        moved = np.ptp(sent, axis=0) >= self._limits.frozen_command_rad
-        spread = np.nanmax(read, axis=0, initial=-np.inf) - np.nanmin(read, axis=0, initial=np.inf)
-        # a servo that was never read has a spread of minus infinity
-        k = _first(moved & (spread >= 0) & (spread < _SAME_RAD))
+        # a command of the last third may not show yet
+        moved, spread = self._motion(now - window, now - window / 3)
+        k = _first((moved >= self._limits.frozen_command_rad) & (spread < _SAME_RAD))
         if k is not None:
             raise SafetyStop(
-                f"{self._names[k]} was commanded to move by {np.ptp(sent[:, k]):.2f} rad within "
+                f"{self._names[k]} was commanded to move by {moved[k]:.2f} rad within "
                 f"{window:g} s, and its reading did not change once. It is blocked, without "
                 "power, or has stopped answering; switch the servos' power off and on."
             )
+
+    def _check_following(self, now: float) -> None:
+        """Stop if a command moved far, long enough ago, and its readings stayed within noise."""
+        limits = self._limits
+        moved, spread = self._motion(now - limits.follows_within_s, now - limits.frozen_after_s)
+        noise = np.minimum(limits.follows_share * moved, self._flicker_rad)
+        k = _first((moved >= limits.follows_rad) & (spread <= noise))
+        if k is not None:
+            raise SafetyStop(
+                f"{self._names[k]} was commanded to move by {moved[k]:.2f} rad within "
+                f"{limits.follows_within_s:g} s, and its reading stayed within {spread[k]:.3f} "
+                "rad. It is blocked, without power, or its reading is stuck but for noise; switch "
+                "the servos' power off and on."
+            )
+
+    def _motion(self, begin: float, shown: float) -> tuple[Angles, Angles]:
+        """Range of each command from `begin` to `shown`, and of its readings from `begin` on [rad].
+
+        That of readings is infinite where there are too few, or none after `shown`: silence is
+        another fault.
+        """
+        nothing = np.zeros(len(self._names))
+        sent = np.array([x for t, x in self._commands if begin <= t <= shown])
+        read = np.array([x for t, x in self._readings if t >= begin])
+        late = np.array([x for t, x in self._readings if t >= shown])
+        if len(sent) < 2 or len(read) < _FEWEST_READINGS or not len(late):
+            return nothing, nothing + np.inf
+        low = np.nanmin(read, axis=0, initial=np.inf)
+        high = np.nanmax(read, axis=0, initial=-np.inf)
+        seen = np.isfinite(late).any(axis=0)
+        return np.ptp(sent, axis=0), np.where(seen, high - low, np.inf)
 
     def _check_astray(self, now: float, command: Angles) -> None:
         """Stop if a joint has been at rest for a while, away from its command."""

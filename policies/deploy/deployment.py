@@ -22,7 +22,7 @@ from pupper_sysid.common.errors import BusError, PupperError, SafetyStop
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample, Sent
 from pupper_sysid.hardware.imu import Imu, ImuSample
-from pupper_sysid.hardware.loop import FixedRateLoop
+from pupper_sysid.hardware.loop import IMU, LOG, POLICY, VIEWS, FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.commands import Commands
@@ -178,6 +178,7 @@ def _walk(
     """The control loop."""
     period = controller.period_s
     loop = FixedRateLoop(bus, period, most_misses=max(round(STALL_S / period) - 1, 1))
+    spent = loop.spent
     # existing objects are not searched by the garbage collector in the middle of a step
     gc.collect()
     gc.freeze()
@@ -190,7 +191,8 @@ def _walk(
                 outcome.stop_reason = "end of commands"
                 return
             reading = bus.read()
-            sample = imu.imu()
+            with spent.on(IMU):
+                sample = _sample(imu)
             if sample is not None:
                 imu_s = bus.now()
                 outcome.clipped_imu_samples += sample.clipped
@@ -205,19 +207,22 @@ def _walk(
                 load_nm = np.nan_to_num(reading.load) * controller.stall_torque_nm
             senses = Senses(elapsed, command, reading.position_rad, load_nm, *_motion(sample))
             begun = time.perf_counter()
-            decision = controller.step(senses)
+            with spent.on(POLICY):
+                decision = controller.step(senses)
             outcome.steps.add(time.perf_counter() - begun)
             sent = bus.write(decision.target)
-            writer.append(senses, decision, sent.position_rad)
-            if rows:
-                rows.append(_rows(controller, sent, reading))
-            for watch in watchers:
-                watch(
-                    Tick(elapsed, senses, decision, sent.position_rad, reading,
-                         loop.missed_deadlines, sent.time_s)
-                )  # fmt: skip
+            with spent.on(LOG):
+                writer.append(senses, decision, sent.position_rad)
+                if rows:
+                    rows.append(_rows(controller, sent, reading))
+            with spent.on(VIEWS):
+                for watch in watchers:
+                    watch(
+                        Tick(elapsed, senses, decision, sent.position_rad, reading,
+                             loop.missed_deadlines, sent.time_s)
+                    )  # fmt: skip
             outcome.seconds = elapsed
-            if decision.observation[_GRAVITY][2] > -FALLEN_TILT:
+            if not decision.observation[_GRAVITY][2] <= -FALLEN_TILT:  # nor is NaN upright
                 outcome.fell = True
                 raise SafetyStop(f"the robot fell after {elapsed:.2f} s.")
     finally:
@@ -233,7 +238,8 @@ def _rest(bus: GuardedBus, imu: Imu, loop: FixedRateLoop, pose: Array) -> Rest:
         _send(bus, pose)
     for _ in loop.ticks(REST_SAMPLES * _REST_PERIOD_S):
         _send(bus, pose)
-        sample = imu.imu()
+        with loop.spent.on(IMU):
+            sample = _sample(imu)
         if sample is not None:
             rates.append(sample.rate_rad_s)
             forces.append(sample.acceleration_m_s2)
@@ -249,6 +255,15 @@ def _send(bus: GuardedBus, pose: Array) -> None:
     """Send a target and read, so that the guard can monitor its effect."""
     bus.write(pose)
     bus.read()
+
+
+def _sample(imu: Imu) -> ImuSample | None:
+    """Reading of the IMU; None also for one that holds a number that is none."""
+    sample = imu.imu()
+    if sample is None:
+        return None
+    numbers = np.concatenate([sample.rate_rad_s, sample.acceleration_m_s2])
+    return sample if np.isfinite(numbers).all() else None
 
 
 def _motion(sample: ImuSample | None) -> tuple[Array, Array]:

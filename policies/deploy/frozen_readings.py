@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.safety.monitor import GuardLimits
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.deployment import Tick
@@ -35,6 +36,7 @@ WINDOW_S = 2.0
 _LATE_S = 0.3  # motion that a reading may not show yet: dead time, servo lag, age
 _MOVED_RAD = 0.03  # five quantisation steps of the robot's proxy; the models' error in free run
 _SAME_RAD = 1e-6
+_FOLLOWS_SHARE = GuardLimits().follows_share  # of the model's motion; less is noise about one place
 _CHECK_EVERY_TICKS = 5
 
 
@@ -63,7 +65,8 @@ class FrozenReadings:
         Raises
         ------
         SafetyStop
-            If a reading has not changed once in the last two seconds, in which the model moved.
+            If a reading has not changed in the last two seconds, but for noise, in which the model
+            moved.
         """
         sent = self._to_servo(tick.sent)
         if not self._ticks:  # after standing still: at rest where it was commanded to be
@@ -79,11 +82,15 @@ class FrozenReadings:
         read = np.array(self._read)
         # a joint without any reading is the guard's business
         spread = np.nanmax(read, axis=0, initial=-np.inf) - np.nanmin(read, axis=0, initial=np.inf)
-        frozen = (moved > _MOVED_RAD) & (spread >= 0) & (spread < _SAME_RAD)
+        noise = np.maximum(_FOLLOWS_SHARE * moved, _SAME_RAD)
+        frozen = (moved > _MOVED_RAD) & (spread >= 0) & (spread < noise)
         if frozen.any():
             k = int(np.argmax(frozen))
+            same = "the same position"
+            if spread[k] >= _SAME_RAD:
+                same = f"positions within {spread[k]:.3f} rad"
             raise SafetyStop(
-                f"{JOINT_NAMES[k]} has reported the same position for {WINDOW_S:g} s, in which a "
+                f"{JOINT_NAMES[k]} has reported {same} for {WINDOW_S:g} s, in which a "
                 f"servo under its commands moves by {moved[k]:.2f} rad. It is blocked, without "
                 "power, or has stopped answering; switch the servos' power off and on."
             )

@@ -23,7 +23,7 @@ from pupper_sysid.common.errors import BusError, InputError, SafetyStop
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
-from pupper_sysid.hardware.loop import FixedRateLoop
+from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.sysid.recordings.files import RecordingWriter
@@ -227,11 +227,13 @@ class _Session:
             made = _rows(number, trial, index, sent_s, self._sent, sample, self._shift_s)
             if self._on_a_bench:
                 made = [r | {"p_gain": trial.p_gain, "torque_enabled": float(on)} for r in made]
-            writer.append(made)
+            with self._loop.spent.on(LOG):
+                writer.append(made)
             shown = self._sent if on else np.full(len(goal), np.nan)
-            self._observe(number, Sent(sent_s, shown), sample, self._loop.missed_deadlines)
+            with self._loop.spent.on(VIEWS):
+                self._observe(number, Sent(sent_s, shown), sample, self._loop.missed_deadlines)
+                self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
             rows += len(index)
-            self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
         return rows
 
     def _refuse_far(self, present: NDArray[np.float64]) -> None:
