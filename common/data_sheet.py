@@ -1,4 +1,4 @@
-"""Data sheet values of servos by model number: stall torque, no-load speed, counts.
+"""Data sheet values of servos by model number: stall torque, no-load speed, supply, counts.
 
 A free-air recording leaves the scale of the torques open; the stall torque of the servo's data
 sheet sets it. `stall_torque` gives that of the recorded servo at its supply voltage;
@@ -57,12 +57,15 @@ class DataSheet:
         Readings per turn of the output.
     ratings : tuple of Rating
         By rising voltage.
+    supply_range_v : (float, float) or None
+        Lowest and highest supply of all variants [V]; None where it is not known.
     """
 
     name: str
     model_number: int
     counts_per_turn: float
     ratings: tuple[Rating, ...]
+    supply_range_v: tuple[float, float] | None = None
 
     def at(self, supply_v: float | None = None) -> Rating:
         """Rating at a supply voltage, in proportion to the nearest that is stated.
@@ -107,6 +110,7 @@ _SHEETS = (
             Rating(7.4, 19.5 * _KG_CM, 52 * _RPM, _STS_7),
             Rating(12.0, 30 * _KG_CM, 45 * _RPM, _STS_12),
         ),
+        (4.0, 14.0),  # factory registers: 4.0 V, and 14.0 V of the 12 V variant
     ),
     DataSheet(
         "STS3250", 2825, 4096,
@@ -127,6 +131,7 @@ _SHEETS = (
                 "for its servo of this class",
             ),
         ),
+        (4.0, 8.7),  # a Mini Pupper switches them off at 4.0 V; two lithium cells, freshly charged
     ),
     DataSheet(
         "XL330-M288", 1200, 4096,
@@ -135,6 +140,7 @@ _SHEETS = (
             Rating(5.0, 0.52, 103 * _RPM, _XL330),
             Rating(6.0, 0.60, 123 * _RPM, _XL330),
         ),
+        (3.7, 6.0),  # e-Manual, input voltage
     ),
 )  # fmt: skip
 
@@ -200,6 +206,18 @@ def no_load_speed(model: str | int, supply_v: float | None = None) -> float | No
     """
     sheet = data_sheet(model)
     return sheet.at(supply_v).no_load_speed_rad_s if sheet else None
+
+
+def supply_range(model: str | int) -> tuple[float, float] | None:
+    """Lowest and highest supply voltage [V] of a servo model; None if it is not known.
+
+    Examples
+    --------
+    >>> supply_range("STS3215"), supply_range("MG90S")
+    ((4.0, 14.0), None)
+    """
+    sheet = data_sheet(model)
+    return sheet.supply_range_v if sheet else None
 
 
 def recorded_stall_torque(servos: Iterable[Mapping[str, Any]]) -> tuple[float, str] | None:

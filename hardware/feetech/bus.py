@@ -13,14 +13,14 @@ value.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.data_sheet import no_load_speed
+from pupper_sysid.common.data_sheet import no_load_speed, supply_range
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
@@ -313,11 +313,8 @@ class FeetechBus(HostClock):
         ]
 
     def _describe(self, device: str) -> dict[str, Any]:
-        supply = [
-            (VOLT_SCALE * own["min_voltage"], VOLT_SCALE * own["max_voltage"])
-            for setup in self._setups.values()
-            if (own := setup.get("registers", {})).get("max_voltage")
-        ]
+        bands = (supply_band(s["model"], s.get("registers", {})) for s in self._setups.values())
+        supply = [band for band in bands if band]
         known: dict[str, Any] = {
             "kind": "feetech",
             "readings": "live",
@@ -331,6 +328,20 @@ class FeetechBus(HostClock):
         if supply:
             known["voltage_band_v"] = [max(v[0] for v in supply), min(v[1] for v in supply)]
         return known | self.joint_map.metadata()
+
+
+def supply_band(model: str, registers: Mapping[str, int]) -> tuple[float, float] | None:
+    """Range of a servo's supply [V]: that of its registers, within its data sheet's.
+
+    None if neither is known. Registers whose range is empty are not used.
+    """
+    low = VOLT_SCALE * registers.get("min_voltage", 0)
+    high = VOLT_SCALE * registers.get("max_voltage", 0)
+    sheet = supply_range(model)
+    if sheet is None:
+        return (low, high) if low < high else None
+    inside = max(low, sheet[0]), min(high, sheet[1])
+    return inside if inside[0] < inside[1] else sheet
 
 
 def _protections(series: Series, memory: bytes | None) -> dict[str, int]:

@@ -1,0 +1,188 @@
+"""A reading stuck but for noise stops a robot; a healthy servo that moves little does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
+from pupper_sysid.hardware.safety.limits import PositionLimits
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+    BenchSpec,
+    Pendulum,
+    PendulumBench,
+    draw_bench,
+)
+from pupper_sysid.sysid.sweep.excitation import plan
+from pupper_sysid.sysid.sweep.recorder import record
+
+PERIOD_S = 0.02
+COARSE, FINE = 2 * np.pi / 1024, 2 * np.pi / 4096
+STOPS = "its reading stayed within"
+
+
+class Following:
+    """One servo that moves by a share of its command; its reading is noisy by whole steps."""
+
+    name, joint_names = "following", ("LF_hip",)
+
+    def __init__(self, quantum: float | None, share: float, noise_steps: int):
+        self.limits = PositionLimits(np.full(1, -3.0), np.full(1, 3.0))
+        self.metadata = {} if quantum is None else {"command_quantum_rad": {"LF_hip": quantum}}
+        self.quantum, self.share, self.noise = quantum or COARSE, share, noise_steps
+        self.time, self.goal, self.rng = 0.0, np.zeros(1), np.random.default_rng(0)
+        self.silent_from_s = np.inf
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, time_s: float) -> None:
+        self.time = max(self.time, time_s)
+
+    def write(self, position_rad) -> Sent:
+        self.goal = position_rad.copy()
+        return Sent(self.time, self.goal)
+
+    def read(self) -> BusSample:
+        noise = self.rng.integers(-self.noise, self.noise + 1)
+        count = np.round(self.share * self.goal / self.quantum) + noise
+        position = np.where(self.time < self.silent_from_s, count * self.quantum, np.nan)
+        return BusSample(np.full(1, self.time), position, np.zeros(1, int))
+
+    def torque(self, on: bool) -> bool:
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+def sweep_of(bus: Following, amplitude: float, hz: float, seconds: float = 6.0) -> None:
+    """Command a tone through a guard, which raises for a fault."""
+    guard = GuardedBus(bus, GuardLimits(astray_rad=9.0))
+    guard.torque(True)
+    guard.write(guard.read().position_rad)
+    start = guard.now()
+    for k in range(round(seconds / PERIOD_S)):
+        guard.sleep_until(start + (k + 1) * PERIOD_S)
+        guard.write(np.full(1, amplitude * np.sin(2 * np.pi * hz * (guard.now() - start))))
+        guard.read()
+
+
+@pytest.mark.parametrize("quantum", [COARSE, FINE, None])
+@pytest.mark.parametrize("hz", [0.2, 1.0, 4.0])
+def test_a_reading_frozen_but_for_a_step_stops_a_tone_of_six_tenths_of_a_radian(quantum, hz):
+    bus = Following(quantum, share=0.0, noise_steps=1)
+    with pytest.raises(SafetyStop, match=f"LF_hip was commanded to move by .* {STOPS}"):
+        sweep_of(bus, 0.3, hz)
+
+
+def test_a_fine_encoder_may_flicker_by_two_steps_to_both_sides_and_is_still_stuck():
+    with pytest.raises(SafetyStop, match=STOPS):
+        sweep_of(Following(FINE, share=0.0, noise_steps=2), 0.3, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("quantum", "share", "noise", "amplitude", "hz"),
+    [
+        # moves by more than a twenty-fifth of its command, or by more than four steps
+        (COARSE, 0.05, 0, 0.3, 1.0), (FINE, 0.02, 0, 0.3, 4.0), (FINE, 0.05, 1, 0.3, 1.0),
+        # the command itself moves little, so that friction may hold the servo
+        (COARSE, 0.0, 1, 0.14, 2.0), (FINE, 0.0, 1, 0.14, 2.0),
+    ],
+)  # fmt: skip
+def test_a_servo_that_moves_by_more_than_noise_or_is_commanded_little_goes_on(
+    quantum, share, noise, amplitude, hz
+):
+    sweep_of(Following(quantum, share, noise), amplitude, hz)
+
+
+def test_a_joint_that_falls_silent_is_said_to_be_silent_and_not_stuck():
+    bus = Following(FINE, share=1.0, noise_steps=0)
+    bus.silent_from_s = 3.0
+    with pytest.raises(SafetyStop, match="the bus has been silent"):
+        sweep_of(bus, 0.3, 1.0)
+
+
+def test_a_reading_that_is_infinite_is_a_missing_one():
+    bus = Following(FINE, share=1.0, noise_steps=0)
+    read = bus.read
+    bus.read = lambda: replace(read(), position_rad=np.full(1, np.inf if bus.time > 3.0 else 0.0))
+    with pytest.raises(SafetyStop, match="silent|did not change"):
+        sweep_of(bus, 0.05, 1.0)
+
+
+def test_a_bus_that_dates_a_reading_at_no_time_is_monitored_all_the_same():
+    """A time that is NaN would make every comparison of times false."""
+    bus = Following(FINE, share=0.0, noise_steps=1)
+    read = bus.read
+    bus.read = lambda: replace(read(), time_s=np.full(1, np.nan))
+    with pytest.raises(SafetyStop, match=STOPS):
+        sweep_of(bus, 0.3, 1.0)
+
+
+def test_a_sweep_of_an_emulated_robot_ends_when_a_reading_sticks_but_for_a_count(tmp_path):
+    class Stuck(EmulatedBus):
+        last, rng = 0.0, np.random.default_rng(1)
+
+        def read(self) -> BusSample:
+            sample = super().read()
+            position, k = sample.position_rad.copy(), self.joint_names.index("LF_thigh")
+            if self.now() < 6.0:
+                self.last = position[k]
+            else:
+                step = self.robot.spec.quantum_rad
+                position[k] = self.last + step * self.rng.integers(-1, 2)
+            return replace(sample, position_rad=position)
+
+    rng = np.random.default_rng(0)
+    bus = Stuck(draw_robot(rng), rng, keep_log=False)
+    with pytest.raises(SafetyStop, match=f"LF_thigh was commanded .* {STOPS}"):
+        record(bus, plan("sine", ["LF_thigh"], [2.0], duration_s=8.0), tmp_path / "sweep.csv")
+    assert bus.now() - 6.0 < 3.0
+
+
+def emulated(kind: str) -> EmulatedBus:
+    rng = np.random.default_rng(3)
+    if kind == "polled":
+        return EmulatedBus(draw_robot(rng, RobotSpec(loss=0.6)), rng, keep_log=False)
+    if kind == "sticky":  # half the published stiffness, more friction, a long dead time
+        spec = RobotSpec(
+            loss=0.6, dead_time_s=0.1, stiffness_per_inertia=6350, friction_per_inertia=250
+        )
+        return EmulatedBus(draw_robot(rng, spec), rng, keep_log=False)
+    robot = draw_bench(rng, Pendulum(0.5, 0.15), BenchSpec(registers=(("p", 8),)))
+    return EmulatedBus(robot, rng, plant=PendulumBench(robot), keep_log=False)
+
+
+@pytest.mark.parametrize("kind", ["polled", "sticky", "heavy pendulum"])
+def test_no_healthy_emulated_servo_is_stopped_at_any_tone(kind):
+    """Each joint at a tone of its own, 0.2 to 10 Hz and 0.02 to 0.3 rad, below 7 rad/s."""
+    bus = emulated(kind)
+    rng, joints = np.random.default_rng(5), len(bus.joint_names)
+    hz = np.geomspace(0.2, 10.0, joints) if joints > 1 else np.array([7.5])
+    amplitude = rng.permutation(np.geomspace(0.02, 0.3, joints)) if joints > 1 else np.array([0.15])
+    amplitude = np.minimum(amplitude, 7.0 / (2 * np.pi * hz))
+    guard = GuardedBus(bus)
+    guard.read()
+    guard.sleep_until(0.5)
+    guard.torque(True)
+    home = bus.robot.joint_map.rest_pose()
+    guard.write(home)
+    start = guard.now()
+    for k in range(round(8.0 / PERIOD_S)):
+        guard.sleep_until(start + (k + 1) * PERIOD_S)
+        guard.write(home + amplitude * np.sin(2 * np.pi * hz * (guard.now() - start)))
+        guard.read()
+
+
+@pytest.mark.parametrize("name", ["load", "temperature_c", "frozen_after_s", "speed_rad_s"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_a_threshold_that_compares_as_false_is_refused(name, value):
+    with pytest.raises(InputError, match=f"GuardLimits: {name} is"):
+        GuardLimits(**{name: value})

@@ -1,0 +1,166 @@
+"""A voltage or temperature outside its range on either side, or that is no number, is a fault."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.data_sheet import supply_range
+from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.feetech.bus import supply_band
+from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
+from pupper_sysid.hardware.safety.limits import PositionLimits
+
+PERIOD_S = 0.02
+NO_NUMBERS = [np.nan, np.inf, -np.inf]
+
+
+class Servos:
+    """Two servos at rest, whose second reports what it is set to."""
+
+    name, joint_names = "servos", ("LF_hip", "LF_thigh")
+
+    def __init__(self, band: list[float] | None = None):
+        self.limits = PositionLimits(np.full(2, -2.0), np.full(2, 2.0))
+        self.metadata = {} if band is None else {"voltage_band_v": band}
+        self.time, self.ticks = 0.0, 0
+        self.volts, self.degrees, self.load = 7.4, 30.0, 0.1
+        self.lost = lambda tick: False
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, time_s: float) -> None:
+        self.time = max(self.time, time_s)
+
+    def write(self, position_rad) -> Sent:
+        return Sent(self.time, position_rad)
+
+    def read(self) -> BusSample:
+        self.ticks += 1
+        if self.lost(self.ticks):
+            none = np.full(2, np.nan)
+            return BusSample(np.full(2, self.time), none, np.full(2, -1), none, none, none)
+        return BusSample(
+            np.full(2, self.time), np.zeros(2), np.full(2, 512),
+            np.array([7.4, self.volts]), np.array([30.0, self.degrees]),
+            np.array([0.1, self.load]),
+        )  # fmt: skip
+
+    def torque(self, on: bool) -> bool:
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+def hold(bus: Servos, seconds: float, limits: GuardLimits | None = None) -> GuardedBus:
+    """Hold the pose for a time; a fault is raised."""
+    guard = GuardedBus(bus, limits)
+    guard.torque(True)
+    for k in range(round(seconds / PERIOD_S)):
+        guard.sleep_until((k + 1) * PERIOD_S)
+        guard.write(np.zeros(2))
+        guard.read()
+    return guard
+
+
+@pytest.mark.parametrize("band", [[4.2, 8.7], None])
+@pytest.mark.parametrize("volts", [3.0, 30.0, -1.0, *NO_NUMBERS])
+def test_a_supply_out_of_range_on_either_side_or_none_stops_the_robot(band, volts):
+    bus = Servos(band)
+    bus.volts = volts
+    with pytest.raises(SafetyStop, match=rf"LF_thigh: the supply is {re.escape(f'{volts:.1f}')} V"):
+        hold(bus, 1.0)
+    assert bus.time < 0.5
+
+
+@pytest.mark.parametrize(
+    ("volts", "cure"),
+    [
+        (3.0, "Charge the battery"),
+        (30.0, "Switch the supply off"),
+        (-1.0, "That is no measurement"),
+        (np.nan, "That is no measurement"),
+    ],
+)
+def test_each_side_of_the_range_has_its_own_cure(volts, cure):
+    bus = Servos()
+    bus.volts = volts
+    with pytest.raises(SafetyStop, match=cure):
+        hold(bus, 1.0)
+
+
+@pytest.mark.parametrize("volts", [3.7, 5.0, 7.4, 12.6, 14.0])
+def test_every_supply_that_a_hobby_servo_runs_at_is_in_range_where_the_bus_states_none(volts):
+    bus = Servos()
+    bus.volts = volts
+    hold(bus, 1.0)
+
+
+@pytest.mark.parametrize("degrees", [66.0, 255.0, -40.0, *NO_NUMBERS])
+def test_a_temperature_out_of_range_on_either_side_or_none_stops_the_robot(degrees):
+    bus = Servos()
+    bus.degrees = degrees
+    with pytest.raises(SafetyStop, match=f"LF_thigh is at {degrees:.0f} °C"):
+        hold(bus, 1.0)
+    with pytest.raises(SafetyStop, match="cool down" if 65 < degrees < 300 else "no measurement"):
+        hold(bus, 1.0)
+
+
+@pytest.mark.parametrize(("name", "usual"), [("volts", 7.4), ("degrees", 30.0)])
+def test_a_number_that_is_none_for_a_moment_or_with_its_whole_reading_is_a_lost_one(name, usual):
+    bus = Servos()
+    setattr(bus, name, np.nan)
+    guard = hold(bus, 0.2)
+    setattr(bus, name, usual)
+    for _ in range(50):
+        guard.sleep_until(guard.now() + PERIOD_S)
+        guard.read()
+    lossy = Servos()
+    lossy.lost = lambda tick: tick % 25 > 5  # 0.4 s of each half second
+    hold(lossy, 3.0)
+
+
+@pytest.mark.parametrize("load", NO_NUMBERS)
+def test_a_load_that_is_none_neither_begins_an_overload_nor_ends_one(load):
+    bus = Servos()
+    bus.load = load
+    hold(bus, 3.0)
+    bus, read = Servos(), Servos.read
+
+    def overloaded():
+        sample = read(bus)
+        return replace(sample, load=np.array([0.1, load if bus.ticks % 3 else -0.95]))
+
+    bus.read = overloaded
+    with pytest.raises(SafetyStop, match="LF_thigh has worked at 95 % of full duty"):
+        hold(bus, 3.0)
+
+
+@pytest.mark.parametrize("volts", [(8.7, 4.2), (np.nan, 8.0), (4.0, np.inf), (5.0, 5.0)])
+def test_a_range_that_no_number_can_leave_or_meet_is_refused(volts):
+    with pytest.raises(InputError, match="voltage_v"):
+        GuardLimits(voltage_v=volts)
+
+
+@pytest.mark.parametrize(
+    ("model", "registers", "band"),
+    [
+        ("STS3215", {"min_voltage": 40, "max_voltage": 80}, (4.0, 8.0)),
+        ("STS3215", {"min_voltage": 40, "max_voltage": 140}, (4.0, 14.0)),
+        # registers that protect from nothing: the data sheet's range holds
+        ("STS3215", {"min_voltage": 0, "max_voltage": 255}, supply_range("STS3215")),
+        ("STS3215", {"min_voltage": 90, "max_voltage": 50}, supply_range("STS3215")),
+        ("SCS0009", {}, supply_range("SCS0009")),
+        ("another", {"min_voltage": 45, "max_voltage": 90}, (4.5, 9.0)),
+        ("another", {}, None),
+    ],
+)
+def test_the_band_of_a_servo_is_its_registers_within_its_data_sheet(model, registers, band):
+    found = supply_band(model, registers)
+    assert found == (band if band is None else pytest.approx(band))
