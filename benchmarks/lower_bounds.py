@@ -88,7 +88,10 @@ def main() -> int:
     if untrue and version == "3.11" and not options.tries:
         print(f"Not to be had together with the others: {', '.join(untrue)}.")
         failed = 1
-    print(f"The oldest versions on {version}:", "a test fails or a bound is untrue" if failed else "work")
+    print(
+        f"The oldest versions on {version}:",
+        "a test fails or a bound is untrue" if failed else "work",
+    )
     return failed
 
 

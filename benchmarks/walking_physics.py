@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from pupper_sysid.common.joints import LEGS
-from pupper_sysid.common.memory import keep_freed_memory
+from pupper_sysid.common.processes.memory import keep_freed_memory
 from pupper_sysid.policies.network.policy_file import Policy, load_policy
 from pupper_sysid.policies.train.speed import Paces, load
 from pupper_sysid.policies.walks.conditions import evaluation_task

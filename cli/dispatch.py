@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import tyro
 
-from pupper_sysid.cli.user_errors import CONFIG, end_politely, parse, user_errors
+from pupper_sysid.cli.user_errors import CONFIG, begin_work, end_politely, parse, user_errors
 from pupper_sysid.common.errors import InputError
 
 _SCREEN = 80
@@ -77,6 +77,8 @@ def run_command(
         command = parse(kind, rest, f"{program} {first}", described)
         if chosen.holds_bus:
             end_politely()
+        else:
+            begin_work()
         command.run()
 
 

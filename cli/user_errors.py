@@ -1,24 +1,23 @@
 """Exit codes and errors of every program: 0, 2 for bad input, 1 for anything else.
 
-A termination signal ends a program at once (143 after SIGTERM), as the system does by default; its
-worker processes end with it. Programs that hold a robot call `end_politely`, which stops them as
-Ctrl-C does. An error is one sentence; `--debug` shows the traceback. The options that every
-program has are here: `--debug`, `--read-limit`, `--version` and `--install-completion`.
+Ctrl-C, SIGTERM and SIGHUP end a program at once with one line, "Stopped.", and 130, 143 or 129 (see
+`common.processes.stop`); its worker processes end with it. Programs that hold a robot call
+`end_politely`, and park it first. An error is one sentence; `--debug` shows the traceback. The
+options that every program has are here: `--debug`, `--read-limit`, `--version` and
+`--install-completion`.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 from rich.text import Text
@@ -28,6 +27,8 @@ from pupper_sysid.cli.numerals import NUMERALS
 from pupper_sysid.cli.terminal import err, out
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import holding_outputs, versions
+from pupper_sysid.common.processes.stop import STOPPED, Stop, stoppable
+from pupper_sysid.common.processes.stop import end_politely as end_politely
 from pupper_sysid.common.reading.budget import reading_up_to
 from pupper_sysid.common.reading.numbers import decimal
 
@@ -74,7 +75,9 @@ def run_program(
     """Parse a program's arguments into `options` and run `work`; ends the process on errors."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, program) as rest:
-        work(parse(options, rest, program, description))
+        parsed = parse(options, rest, program, description)
+        begin_work()
+        work(parsed)
 
 
 def parse(
@@ -103,48 +106,28 @@ def parse(
     return parsed
 
 
-class _Stop:
-    """Handler of a termination signal: as Ctrl-C, and the signal decides the exit code."""
-
-    exit_code = 0
-
-    def __call__(self, number: int, frame: object) -> None:
-        self.exit_code = 128 + number
-        raise KeyboardInterrupt
-
-
-def end_politely() -> None:
-    """Treat SIGTERM and a closed terminal as Ctrl-C, so that the robot is parked first.
-
-    Ctrl-C works even where a script started the program with `&`, which has it ignored.
-    """
-    if threading.current_thread() is threading.main_thread():
-        stop = _Stop()
-        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        for name in ("SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number and signal.getsignal(number) != signal.SIG_IGN:  # `nohup` ignores the latter
-                signal.signal(number, stop)
-
-
-def _stop_no_more() -> None:
-    """Give termination signals back to the system, for the next program of this process."""
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number and isinstance(signal.getsignal(number), _Stop):
-            signal.signal(number, signal.SIG_DFL)
-
-
-def _signalled() -> int:
-    """Exit code for the termination signal that a polite program received; 0 for none."""
-    handler = signal.getsignal(signal.SIGTERM)
-    return handler.exit_code if isinstance(handler, _Stop) else 0
+def begin_work() -> None:
+    """Have a stop unwind from now on; before, nothing has to be undone."""
+    with stoppable() as stop:
+        stop.phase = "work"
 
 
 @contextmanager
 def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
     """Yield the arguments without those of every program; an exception becomes a sentence."""
+    with stoppable() as stop:
+        try:
+            with _sentences(arguments, program, stop) as rest:
+                yield rest
+            if stop.number:  # it ended with everything done
+                _stopped(stop)
+        finally:
+            stop.phase = "start" if stop.ends_process else "work"
+            forget()
+
+
+@contextmanager
+def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[list[str]]:
     debug = "--debug" in arguments
     _open_closed()
     streams = sys.stdout, sys.stderr
@@ -160,22 +143,21 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
                 yield rest
         finally:  # also what help printed, which ends the program by itself
             sys.stdout.flush()
-        if code := _signalled():  # it ended as after Ctrl-C, with everything done
-            sys.exit(code)
+    except KeyboardInterrupt:
+        _stopped(stop)
     except PupperError as error:
         if debug:
             raise
         _print_error(spell(str(error)))
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        err.print("Stopped.")
-        sys.exit(_signalled() or 1)
     except Exception as error:
         stream = error.filename if isinstance(error, OSError) else None
         if stream in (_OUTPUT, _ERRORS):  # its buffer would fail once more at the exit
             _silence(sys.stdout if stream == _OUTPUT else sys.stderr)
-            if isinstance(error, BrokenPipeError):  # `| head` closed its end: no error
-                sys.exit(0)
+        if stop.number and stop.phase != "robot":  # the interrupt, as a library passed it on
+            _stopped(stop)
+        if stream in (_OUTPUT, _ERRORS) and isinstance(error, BrokenPipeError):
+            sys.exit(0)  # `| head` closed its end: no error
         if debug:
             raise
         if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
@@ -188,8 +170,14 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         sys.exit(1)
     finally:
         sys.stdout, sys.stderr = streams
-        _stop_no_more()
-        forget()
+
+
+def _stopped(stop: Stop) -> NoReturn:
+    """Say that the program was stopped, and end it."""
+    if stop.ends_process and stop.number:
+        stop.end()
+    err.print(STOPPED)
+    sys.exit(stop.exit_code or 130)
 
 
 def _read_limit(arguments: Sequence[str]) -> tuple[float, list[str]]:

@@ -13,12 +13,13 @@ import stat
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.processes.stop import held, removed_at_stop
 from pupper_sysid.common.reading.content import open_regular
 
 PACKAGE = "pupper-sysid"
@@ -97,19 +98,45 @@ def write_text(path: Path, text: str, force: bool = False) -> None:
 
 def write_bytes(path: Path, data: bytes, force: bool = False) -> None:
     """Write `data` to `path` in one atomic step, so that no reader ever sees half of it."""
+    with replacing(path, force) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def replacing(path: Path, force: bool = False, hold: bool = True) -> Iterator[Path]:
+    """Yield the name of a temporary file that takes the place of `path` after the block.
+
+    It is beside `path`, has the same ending, and is removed after an error or a stop.
+
+    Parameters
+    ----------
+    path : Path
+    force : bool
+        Replace an existing file.
+    hold : bool
+        Whether a stop waits for the block; not for one that takes long.
+
+    Raises
+    ------
+    InputError
+        If `path` exists and `force` is not given, or it cannot be written.
+    """
     _refuse_existing(path, force)
     _refuse_held(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-            os.chmod(temporary, 0o644)  # mkstemp makes it private; results are meant to be shared
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+        with held() if hold else nullcontext():
+            handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}.", path.parent)
+            with removed_at_stop(name):
+                try:
+                    os.close(handle)
+                    yield Path(name)
+                    os.chmod(name, 0o644)  # mkstemp makes it private; results are to be shared
+                    os.replace(name, path)
+                except BaseException:
+                    with suppress(FileNotFoundError):
+                        os.unlink(name)
+                    raise
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
 

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 from pupper_sysid.common.figure_style import inline_svg, png, svg
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
+from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.results import plain
 
 Row = dict[str, Any]
@@ -201,11 +202,12 @@ def write_page(
     }
     for file in (path, *pngs, *svgs, *csvs):
         refuse_overwrite(file, force)
-    for file, image in (pngs | svgs).items():
-        write_bytes(file, image, force)
-    for file, text in csvs.items():
-        write_text(file, text, force)
-    write_text(path, html, force)
+    with held():  # a page without its pictures is none
+        for file, image in (pngs | svgs).items():
+            write_bytes(file, image, force)
+        for file, text in csvs.items():
+            write_text(file, text, force)
+        write_text(path, html, force)
     return WrittenPage(path, tuple(pngs), tuple(svgs), tuple(csvs))
 
 

@@ -79,8 +79,8 @@ def reference() -> str:
         "Generated from the code: what `--help` prints. Every program also takes `--version`, "
         "`--debug` (shows the traceback of an error), `--install-completion`, and "
         "`--read-limit N`, which reads files up to N times as large, long and wide as is usual "
-        "(1 to 1000). Exit codes: 0, 2 for bad input (one sentence says what and where), 1 for "
-        "anything else.", "",
+        "(1 to 1000). Exit codes: 0, 2 for bad input (one sentence says what and where), 130 after "
+        "Ctrl-C, 143 after SIGTERM, 129 after SIGHUP, 1 for anything else.", "",
     ]  # fmt: skip
     for module in _PROGRAMS:
         program = module.replace("_", "-")

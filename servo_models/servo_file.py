@@ -32,6 +32,7 @@ from pupper_sysid.common.border import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.reading.tensors import refuse_large_header
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
@@ -162,9 +163,10 @@ def save_servo_model(
     data = save_tensors({k: np.ascontiguousarray(v) for k, v in parameters.items()})
     whole = _validated({**contract, "weights_sha256": hashlib.sha256(data).hexdigest()}, folder)
     _build(whole, parameters, folder)  # what cannot be read back is not written
-    write_bytes(folder / WEIGHTS, data, force)
     text = json.dumps(whole.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
-    write_text(folder / CONTRACT, text + "\n", force)
+    with held():  # weights without a contract are no model
+        write_bytes(folder / WEIGHTS, data, force)
+        write_text(folder / CONTRACT, text + "\n", force)
     return whole
 
 

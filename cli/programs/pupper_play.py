@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +25,7 @@ from pupper_sysid.cli.policy_choice import policy_at, simulator, warn_of_fallbac
 from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, replacing
 from pupper_sysid.policies.deploy.commands import checked_command
 from pupper_sysid.sim.robot.terrain import Terrain
 
@@ -93,13 +94,14 @@ def _run(options: Play) -> None:
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)
     env.set_command(command)
-    screen, track = _Screen(env, options), _Track(env)
+    track = _Track(env)
     observation, _ = env.observe()
     policy.reset(env.action)
     start = env.robots.qpos[0, :2].copy()
     velocities, ended, away = [], "", np.zeros(2)
     step_s = task.control_step_s
-    with seconds_progress("walking", options.seconds) as advance:
+    with ExitStack() as files, seconds_progress("walking", options.seconds) as advance:
+        screen = _Screen(env, options, files)
         for step in range(1, round(options.seconds / step_s) + 1):
             action = policy.act(observation)
             found = env.step(action)
@@ -115,7 +117,7 @@ def _run(options: Play) -> None:
             if not screen.show(step_s, np.array(velocities[-1])):
                 break
             advance(step * step_s, options.seconds, "")
-    screen.close()
+        screen.close()
     track.write(options)
     moved = np.mean(velocities, axis=0) if velocities else np.zeros(3)
     if ended:
@@ -172,8 +174,8 @@ class _Track:
 class _Screen:
     """A video, a window, or nothing."""
 
-    def __init__(self, env: Any, options: Play):
-        self._env = env
+    def __init__(self, env: Any, options: Play, files: ExitStack):
+        self._env, self._files = env, files
         self._path = options.video or Path()
         self._film: Any = None
         self._viewer: Any = None
@@ -200,7 +202,10 @@ class _Screen:
         step_s = self._env.config.control_step_s
         lines = (f"{options.policy.name} on {Path(self._env.servos.source).name}",)
         try:
-            self._film = Film(self._path, self._model, step_s, lines, options.command)
+            with ExitStack() as opened:
+                file = opened.enter_context(replacing(self._path, options.force, hold=False))
+                self._film = Film(file, self._model, step_s, lines, options.command)
+                self._files.push(opened.pop_all())  # the file is kept if the walk is
         except InputError as error:
             if "imageio" in str(error):
                 raise

@@ -22,7 +22,7 @@ import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pupper_sysid.cli.terminal import err, out, print_json, warn
-from pupper_sysid.cli.user_errors import parse, user_errors
+from pupper_sysid.cli.user_errors import begin_work, parse, user_errors
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import hold_output, refuse_path
 from pupper_sysid.common.results import plain
@@ -68,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, "pupper-train") as rest:
-        _run(_parse(rest), rest)
+        options = _parse(rest)
+        begin_work()
+        _run(options, rest)
 
 
 def _parse(given: list[str]) -> Options:
@@ -130,12 +132,14 @@ def _run(options: Options, given: list[str]) -> None:
             f"{'Going on with' if options.resume else 'Training into'} {folder}.", soft_wrap=True
         )
     with _bar() as watch:
+        stopping = (lambda text: err.print(text)) if ranks.rank == 0 else (lambda text: None)
         if options.resume:
             learner = train(
-                folder, None, watch, *_extension(options, given), lambda text: warn([text])
-            )
+                folder, None, watch, *_extension(options, given), lambda text: warn([text]),
+                stopping,
+            )  # fmt: skip
         else:
-            learner = train(folder, run, watch)
+            learner = train(folder, run, watch, stopping=stopping)
     if ranks.rank > 0:
         return
     on = (

@@ -12,11 +12,8 @@ has no policies: they would see what no robot can.
 from __future__ import annotations
 
 import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +23,8 @@ import torch
 from rsl_rl.models import MLPModel
 
 from pupper_sysid.common.errors import InputError, PupperError
-from pupper_sysid.common.memory import keep_freed_memory
+from pupper_sysid.common.processes.memory import keep_freed_memory
+from pupper_sysid.common.processes.stop import finishing
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
@@ -51,7 +49,6 @@ LAST, BEST = "last.pt", "best.pt"
 _TEACHER = "teacher"
 _SAVE_EVERY = 10
 _JUDGE_EVERY = 50
-_GRACE_S = 0.7
 
 
 @dataclass(frozen=True)
@@ -131,12 +128,13 @@ def train(
     iterations: int | None = None,
     minutes: float | None = None,
     notice: Callable[[str], None] = lambda text: None,
+    stopping: Callable[[str], None] = lambda text: None,
 ) -> Learner:
     """Begin a run in an empty folder, or (with `run` None) resume the one in it.
 
-    Ctrl-C ends it after the present update, with everything saved. So does a termination signal if
-    the update ends in time; else the process ends within a second, and the run can be resumed from
-    its last checkpoint.
+    Ctrl-C ends it after the present update, with everything saved; a second one ends it at once
+    (KeyboardInterrupt). So does a termination signal if the update ends in time; else the process
+    ends within a second. The run can then be resumed from its last checkpoint.
 
     Parameters
     ----------
@@ -148,6 +146,8 @@ def train(
         New end of a resumed run.
     notice : callable
         Called with a sentence where a run does not go on exactly.
+    stopping : callable
+        Called after the first Ctrl-C with what it does.
 
     Raises
     ------
@@ -158,13 +158,14 @@ def train(
     """
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run
-    session = _Session(folder, settings, resumed, watch)
-    if not session.learner.exact and session.ranks.rank == 0:
-        notice(
-            f"{folder} was begun with another model of the robot, by an older version: it goes on "
-            "with the present one, from its networks and poses, not exactly as it would have."
-        )
-    with _interruptible() as stop_requested:
+    with finishing(stopping) as stop_requested:
+        session = _Session(folder, settings, resumed, watch)
+        if not session.learner.exact and session.ranks.rank == 0:
+            notice(
+                f"{folder} was begun with another model of the robot, by an older version: it goes "
+                "on with the present one, from its networks and poses, not exactly as it would "
+                "have."
+            )
         session.go(stop_requested)
     return session.learner
 
@@ -276,6 +277,8 @@ class _Session:
         if self.counters["imitated"] < self.run.imitation.iterations:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
+        if self.ranks.any(stop_requested()):
+            return
         if not self.counters["scores"]:
             self.counters["scores"] = self.judge(learner.averaged)
             self.keep_best()  # of imitation alone, so that PPO must be better
@@ -387,33 +390,3 @@ class _Session:
 def _rank_file(name: str, ranks: Ranks) -> str:
     """Name of a rank's checkpoint; each rank has its own environments."""
     return name if ranks.rank == 0 else name.replace(".pt", f".rank{ranks.rank}.pt")
-
-
-@contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and termination as a flag that is checked between updates.
-
-    Termination waits for the update for `_GRACE_S` only; then the system's default action ends the
-    process.
-    """
-    stop_requested = False
-    end = threading.Timer(_GRACE_S, signal.raise_signal, (signal.SIGTERM,))
-    end.daemon = True
-
-    def note(number, frame) -> None:
-        nonlocal stop_requested
-        stop_requested = True
-        if number == signal.SIGTERM and not end.is_alive():
-            signal.signal(number, signal.SIG_DFL)
-            end.start()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = {n: signal.signal(n, note) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: stop_requested
-    finally:
-        end.cancel()
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -19,20 +19,19 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed, parallel_config
 
 from pupper_sysid.common.errors import InputError, PupperError, refuse_outside
 from pupper_sysid.common.files import hold_output, sha256, write_text
 from pupper_sysid.common.joints import STALL_TORQUES_NM
+from pupper_sysid.common.processes.workers import Workers
 from pupper_sysid.common.reading.budget import read_limit, reading_up_to
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
@@ -242,15 +241,13 @@ def run_fleet(
             )
         else:
             todo.append((path, target))
-    with _backend(cluster) as parallel:
-        limit = read_limit()
-        work = parallel(jobs)(delayed(_one)(make, path, target, limit) for path, target in todo)
-        for name, problem in cast(Iterable[tuple[str, str]], work):
-            (fleet.failed if problem else fleet.made).append(name)
-            if problem:
-                fleet.problems[name] = problem
-            if progress:
-                progress(name)
+    tasks = [(make, path, target, read_limit()) for path, target in todo]
+    for name, problem in _here(tasks, jobs) if cluster is None else _on(cluster, tasks):
+        (fleet.failed if problem else fleet.made).append(name)
+        if problem:
+            fleet.problems[name] = problem
+        if progress:
+            progress(name)
     # a robot that failed may have an older target: its numbers would not be this recording's
     usable = [t for t in targets.values() if _called(t) in {*fleet.kept, *fleet.made}]
     fleet.tabulate(
@@ -351,22 +348,26 @@ def trust(cluster: str) -> str:
     )
 
 
-@contextmanager
-def _backend(cluster: str | None) -> Iterator[Callable[[int], Parallel]]:
-    """How to run in parallel: processes here, or a cluster's workers."""
+def _here(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[tuple[str, str]]:
+    """Do tasks of `_one` on processes of this computer."""
+    modules = {getattr(make, "func", make).__module__ for make, *_ in tasks}
+    with Workers(jobs, *modules, option="jobs") as workers:
+        for task in tasks:
+            workers.submit(None, _one, *task)
+        for _, result in workers.results():
+            yield result
 
-    def here(jobs: int) -> Parallel:
-        return Parallel(n_jobs=jobs, return_as="generator_unordered")
 
-    if cluster is None:
-        yield here
-        return
+def _on(cluster: str, tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, str]]:
+    """Do tasks of `_one` on a cluster's workers."""
     try:
         from distributed import Client
     except ImportError:
         raise InputError(
             "`cluster` needs Dask, which is not installed: `pip install 'pupper-sysid[dask]'`."
         ) from None
+    from joblib import Parallel, delayed, parallel_config
+
     try:
         client = Client(cluster, timeout=10)
     except (OSError, ValueError) as error:
@@ -375,7 +376,7 @@ def _backend(cluster: str | None) -> Iterator[Callable[[int], Parallel]]:
             "`dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from None
     with client, parallel_config(backend="dask"):
-        yield lambda jobs: Parallel(n_jobs=-1)
+        yield from Parallel(n_jobs=-1)(delayed(_one)(*task) for task in tasks)
 
 
 def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:

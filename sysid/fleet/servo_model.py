@@ -91,8 +91,4 @@ def _modes(path: Path, joints: Iterable[str], settings: ServoSettings) -> dict[s
 
 def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
     """Fit one robot's model."""
-    recording = load(path)
-    fit = fit_servo(recording, **vars(settings))
-    if fit.interrupted:  # one robot alone keeps what it has; a fleet makes it again
-        raise KeyboardInterrupt
-    fit.save(target, force=True)
+    fit_servo(load(path), **vars(settings), keep_unfinished=False).save(target, force=True)

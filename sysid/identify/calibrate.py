@@ -12,10 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pupper_sysid.common.errors import refuse_outside
 from pupper_sysid.common.joints import STALL_TORQUES_NM
+from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.identify.calibration_file import (
@@ -33,7 +34,6 @@ from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.identify.results import JointCalibrationResult
 from pupper_sysid.sysid.identify.search import SIMULATED
 from pupper_sysid.sysid.loaded.calibrate import fit_joints, loaded_joints, with_loaded
-from pupper_sysid.sysid.recordings.children import end_with_parent
 from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -122,6 +122,8 @@ def calibrate(
     """
     if stall_torque_nm is not None:  # before the work, not after it
         refuse_outside("`stall_torque_nm`", stall_torque_nm, *STALL_TORQUES_NM, "N·m")
+    if workers > 1:  # imports what it needs beside the look at the recordings
+        prepare(__name__)
     every, presets = usable_trials(recordings, joints), preset_parameters()
     loaded = {joint: every[joint] for joint in loaded_joints(every)}
     trials = {joint: own for joint, own in every.items() if joint not in loaded}
@@ -189,41 +191,26 @@ def side_by_side(
     InputError
         If a joint has too little motion; the others are not waited for.
     """
-    from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-
     ready: dict[str, PreparedJoint] = {}
     structures: dict[str, dict[str, StructureFit]] = {joint: {} for joint in trials}
-    found: dict[str, JointCalibrationResult] = {}
-    tasks: dict[Future[Any], tuple[str, str]] = {}
-    with ProcessPoolExecutor(workers, initializer=end_with_parent) as pool:
-
-        def start(joint: str, stage: str, *work: Any) -> None:
-            tasks[pool.submit(*work)] = (joint, stage)
-
-        try:
-            for joint, own in trials.items():
-                start(joint, "preparation", prepare_joint, joint, own, seed)
-            while tasks:
-                for future in wait(tasks, return_when=FIRST_COMPLETED).done:
-                    joint, stage = tasks.pop(future)
-                    made = future.result()
-                    if staged:
-                        staged(joint, stage or STAGES[-1])
-                    if stage == "preparation":
-                        ready[joint] = made
-                        for name in SIMULATED:
-                            start(joint, name, fit_structure, made, name)
-                    elif stage in SIMULATED:
-                        own = structures[joint]
-                        own[stage] = made
-                        if len(own) == len(SIMULATED):
-                            start(joint, "", conclude, joint, ready[joint], own, presets)
-                    else:
-                        found[joint] = made
-                        if progress:
-                            progress(joint)
-        except BaseException:  # an error, Ctrl-C: leaving the block would wait for the rest
-            for worker in (pool._processes or {}).values():
-                worker.kill()
-            raise
-    return {joint: found[joint] for joint in trials}
+    results: dict[str, JointCalibrationResult] = {}
+    with Workers(workers, __name__) as pool:
+        for joint, own in trials.items():
+            pool.submit((joint, STAGES[0]), prepare_joint, joint, own, seed)
+        for (joint, stage), result in pool.results():
+            if staged:
+                staged(joint, stage)
+            if stage == STAGES[0]:
+                ready[joint] = result
+                for name in SIMULATED:
+                    pool.submit((joint, name), fit_structure, result, name)
+            elif stage in SIMULATED:
+                fits = structures[joint]
+                fits[stage] = result
+                if len(fits) == len(SIMULATED):
+                    pool.submit((joint, STAGES[-1]), conclude, joint, ready[joint], fits, presets)
+            else:
+                results[joint] = result
+                if progress:
+                    progress(joint)
+    return {joint: results[joint] for joint in trials}

@@ -10,8 +10,8 @@ from zlib import crc32
 import numpy as np
 
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
+from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
-from pupper_sysid.sysid.recordings.children import end_with_parent
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 Recordings = Recording | Sequence[Recording]
@@ -99,6 +99,8 @@ def each_joint(
     InputError
         If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
+    if workers > 1:  # imports what it needs beside the look at the recordings
+        prepare(getattr(work, "func", work).__module__)
     return map_joints(work, usable_trials(recordings, joints), workers, progress)
 
 
@@ -123,26 +125,12 @@ def map_joints(
     progress : callable, optional
         Called with a joint's name when it is done.
     """
-    found: dict[str, Found] = {}
-
-    def done(joint: str, result: Found) -> None:
-        found[joint] = result
-        if progress:
-            progress(joint)
-
-    if workers <= 1 or len(tasks) <= 1:
+    results: dict[str, Found] = {}
+    with Workers(workers) as pool:
         for joint, task in tasks.items():
-            done(joint, work(joint, task))
-    else:
-        from concurrent.futures import ProcessPoolExecutor, as_completed
-
-        with ProcessPoolExecutor(min(workers, len(tasks)), initializer=end_with_parent) as pool:
-            try:
-                futures = {pool.submit(work, joint, task): joint for joint, task in tasks.items()}
-                for future in as_completed(futures):
-                    done(futures[future], future.result())
-            except BaseException:  # an error, Ctrl-C: leaving the block would wait for the rest
-                for worker in (pool._processes or {}).values():
-                    worker.kill()
-                raise
-    return {joint: found[joint] for joint in tasks}
+            pool.submit(joint, work, joint, task)
+        for joint, result in pool.results():
+            results[joint] = result
+            if progress:
+                progress(joint)
+    return {joint: results[joint] for joint in tasks}

@@ -6,10 +6,7 @@ caller gives as `Body`: shapes that do not change, and where each body is over t
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, replacing
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.view.channels import Channel, channels, guard_events
 
@@ -80,24 +77,13 @@ def write_rerun(
     refuse_overwrite(path, force)
     stream = RerunStream(recording.sha256)
     found = channels(recording)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(handle)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
-    try:
-        stream.save(Path(temporary))
+    with replacing(path, force) as temporary:
+        stream.save(temporary)
         last_s = max(channel.time_s[-1] for channel in found)
         stream.add(found, guard_events(recording, last_s))
         stream.show(bodies)
         stream.move(time_s, bodies)
         stream.close()
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    finally:
-        with suppress(FileNotFoundError):
-            os.unlink(temporary)
 
 
 class RerunStream:

@@ -103,8 +103,9 @@ class FitServo:
         joints = terminal.pick_joints(recordings, self.joints)
         with terminal.share_progress(f"fitting {self.arch}") as advance:
             fit = fit_servo(
-                recordings, joints, self.arch, self.preset, split, self.readings, self.seed, advance
-            )
+                recordings, joints, self.arch, self.preset, split, self.readings, self.seed,
+                advance, keep_unfinished=False,
+            )  # fmt: skip
         elapsed = time.perf_counter() - started
         fit.save(folder, self.force)
         if self.json:

@@ -88,8 +88,6 @@ class Monitor:
                 return
             with live_views(bus, wanted) if wanted else nullcontext() as views:
                 self._show(watched, views)
-        except KeyboardInterrupt:  # the usual way to end a monitor
-            terminal.err.print("Stopped.")
         finally:
             bus.close()
 

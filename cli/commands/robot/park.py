@@ -81,19 +81,16 @@ class Park:
         terminal.err.print("Watching over the robots of this user.")
         since_s: dict[tuple[tuple[int, int], ...], float] = {}
         tried: set[tuple[tuple[int, int], ...]] = set()
-        try:
-            while True:
-                left = {note.processes: note for note in notes() if not note.in_control()}
-                now = time.monotonic()
-                since_s = {one: since_s.get(one, now) for one in left}
-                for one, note in left.items():
-                    # a driver that was stopped for less goes on, and would switch on again
-                    if now - since_s[one] > HANG_S:
-                        _take(note, min(self.seconds, _OTHERS_WAIT_S), say=one not in tried)
-                        tried.add(one)
-                time.sleep(_LOOK_S)
-        except KeyboardInterrupt:
-            terminal.err.print("Stopped.")
+        while True:
+            left = {note.processes: note for note in notes() if not note.in_control()}
+            now = time.monotonic()
+            since_s = {one: since_s.get(one, now) for one in left}
+            for one, note in left.items():
+                # a driver that was stopped for less goes on, and would switch on again
+                if now - since_s[one] > HANG_S:
+                    _take(note, min(self.seconds, _OTHERS_WAIT_S), say=one not in tried)
+                    tried.add(one)
+            time.sleep(_LOOK_S)
 
 
 def _take(note: Note, seconds: float, say: bool = True) -> bool:
