@@ -1,4 +1,7 @@
-"""A termination signal ends any command within a second, its worker processes with it."""
+"""Ctrl-C, SIGTERM and SIGHUP: one line, the exit code, nothing left, at any moment.
+
+`benchmarks/stop_anywhere.py` does the same at random moments of real commands.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,89 +19,218 @@ import pytest
 from support.package import ROOT
 
 SWEEP = ROOT / "data/samples/sweep.csv"
-POLICY = ROOT / "data/samples/policies/mlp"
-COMMANDS = {
-    "delay": ("pupper_sysid", "delay", SWEEP),
-    "calibrate": ("pupper_sysid", "calibrate", SWEEP, "--out", "c.yaml"),
-    "analyze": ("pupper_analyze", "gait", POLICY, "--seconds", "60", "--robots", "64"),
-}
-WITH_WORKERS = ("delay", "calibrate")
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
+PROGRAM = """
+from pupper_sysid.common.processes.stop import finishing, stop_process
+stop_process()
+import hashlib, os, time, weakref
+from pathlib import Path
+from pupper_sysid.cli.user_errors import begin_work, end_politely, user_errors
+from pupper_sysid.common.files import replacing
+from pupper_sysid.common.processes.workers import Workers
 
-def children(parent: int) -> list[int]:
-    """Processes whose parent this is."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:  # it has just ended
-            continue
-        if int(fields[1]) == parent and fields[0] != "Z":
-            found.append(int(path.parent.name))
-    return found
+def begin():
+    print("begun", flush=True)
 
-
-def alive(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def wait_until(true, seconds: float) -> bool:
+def wait(seconds):
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        if true():
-            return True
-        time.sleep(0.02)
-    return False
+        pass
 
+def pool():
+    with Workers(2) as workers:
+        workers.submit("", time.sleep, 60)
+        workers.submit("", time.sleep, 60)
+        begin()
+        list(workers.results())
 
-def cpu_s(process: int) -> float:
-    """Processor time of a process [s]."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+def swallowed():
+    class Thing: pass
+    begin()
+    while True:
+        thing = Thing()
+        reference = weakref.ref(thing, lambda _: wait(0.3))
+        del thing
 
+def caught():
+    begin()
+    while True:
+        try:
+            time.sleep(60)
+        except BaseException:
+            pass
 
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_a_termination_signal_ends_commands_and_their_workers_within_a_second(tmp_path):
-    running = {}
+def compiled():
+    begin()
+    hashlib.pbkdf2_hmac("sha256", b"a", b"b", 10**9)
+
+def passed_on():
+    begin()
     try:
-        for name, (program, *arguments) in COMMANDS.items():
-            running[name] = subprocess.Popen(
-                [sys.executable, "-m", f"pupper_sysid.cli.programs.{program}",
-                 *map(str, arguments)],
-                cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            )  # fmt: skip
-        for name, process in running.items():
-            # in the midst of it: workers are there, or torch is imported
-            busy = (lambda p=process: len(children(p.pid)) >= 2) if name in WITH_WORKERS else (
-                lambda p=process: p.poll() is not None or cpu_s(p.pid) > 1.5)  # fmt: skip
-            assert wait_until(busy, 60), name
-        time.sleep(0.3)
-        for name, process in running.items():
-            assert process.poll() is None, (name, process.stderr.read())
-            workers = children(process.pid)
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=1.0) == -signal.SIGTERM, name  # 143 in a shell
-            assert wait_until(lambda w=workers: not any(map(alive, w)), 1.0), name
-            assert b"Traceback" not in process.stderr.read()
-        assert list(tmp_path.iterdir()) == []  # and nothing is half written
+        time.sleep(60)
+    except KeyboardInterrupt:
+        raise RuntimeError("cannot join thread before it is started")
+
+def writing():
+    with replacing(Path("result.txt")) as file:
+        file.write_text("half")
+        begin()
+        time.sleep(60)
+
+def training():
+    with finishing(lambda text: os.write(2, f"{text}\\n".encode())) as stop_requested:
+        begin()
+        while not stop_requested():
+            time.sleep(0.1)
+        Path("saved").touch()
+
+def long_training():
+    with finishing(lambda text: os.write(2, f"{text}\\n".encode())):
+        begin()
+        time.sleep(60)
+
+def robot():
+    end_politely()
+    begin()
+    try:
+        time.sleep(60)
     finally:
-        for process in running.values():
-            process.kill()
-            process.wait()
-            process.stderr.close()
+        time.sleep(1.2)  # longer than a program may take without a robot
+        Path("parked").touch()
+
+with user_errors([], "pupper-sysid"):
+    begin_work()
+    WORK()
+"""
+
+
+@contextmanager
+def started(folder: Path, *command: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A program in a session of its own, in which nothing is left afterwards."""
+    process = subprocess.Popen(
+        [sys.executable, *command], cwd=folder, start_new_session=True, preexec_fn=not_ignored,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        with process:
+            yield process
+    finally:
+        for left in session(process.pid):
+            os.kill(left, signal.SIGKILL)
 
 
 def not_ignored() -> None:
     """Have Ctrl-C act, though the tests may run in the background, where a shell ignores it."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
 
 
 def ignored() -> None:
     """As a script starts a program with `&`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def session(leader: int) -> list[int]:
+    """Processes of a session that have not ended."""
+    processes = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:  # it has just ended
+            continue
+        if int(fields[3]) == leader and fields[0] != "Z":
+            processes.append(int(path.parent.name))
+    return processes
+
+
+def until(true: Callable[[], bool], seconds: float) -> bool:
+    end = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def begun(process: subprocess.Popen[bytes]) -> None:
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"begun\n"
+
+
+def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
+    """Exit code and stderr of a program that has ended with all its processes."""
+    _, err = process.communicate(timeout=10)
+    assert until(lambda: session(process.pid) == [], 5.0)
+    return process.returncode, err.decode()
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_stop_is_one_line_and_its_exit_code_and_leaves_no_process(tmp_path, number):
+    with started(tmp_path, "-c", PROGRAM.replace("WORK", "pool")) as process:
+        begun(process)
+        time.sleep(0.05 * number % 0.3)  # while the workers start, and after
+        os.killpg(process.pid, number)
+        assert ended(process) == (128 + number, "Stopped.\n")
+
+
+@pytest.mark.parametrize("work", ["swallowed", "caught", "compiled", "passed_on", "writing"])
+def test_no_code_keeps_a_stop_from_ending_a_program(tmp_path, work):
+    with started(tmp_path, "-c", PROGRAM.replace("WORK", work)) as process:
+        begun(process)
+        time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert ended(process) == (130, "Stopped.\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_saves_after_the_first_ctrl_c(tmp_path):
+    with started(tmp_path, "-c", PROGRAM.replace("WORK", "training")) as process:
+        begun(process)
+        os.killpg(process.pid, signal.SIGINT)
+        process.send_signal(signal.SIGINT)  # as torchrun passes on what its group has received
+        assert ended(process) == (130, "finishing this iteration; again ends at once\n")
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_second_ctrl_c_ends_a_training_at_once(tmp_path):
+    with started(tmp_path, "-c", PROGRAM.replace("WORK", "long_training")) as process:
+        begun(process)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        assert process.stderr.readline() == b"finishing this iteration; again ends at once\n"
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        assert ended(process) == (130, "Stopped.\n")
+
+
+def test_a_robot_is_parked_however_long_that_takes(tmp_path):
+    with started(tmp_path, "-c", PROGRAM.replace("WORK", "robot")) as process:
+        begun(process)
+        process.send_signal(signal.SIGTERM)
+        assert ended(process) == (143, "Stopped.\n")
+    assert (tmp_path / "parked").exists()
+
+
+def test_ctrl_c_acts_while_the_libraries_are_imported(tmp_path):
+    program = "pupper_sysid.cli.programs.pupper_sysid"
+    with started(tmp_path, "-X", "importtime", "-m", program, "delay", str(SWEEP)) as process:
+        assert process.stderr is not None
+        while b"tyro._strings" not in process.stderr.readline():
+            pass
+        os.killpg(process.pid, signal.SIGINT)
+        code, err = ended(process)
+        assert code == 130 and err.endswith("Stopped.\n") and "Traceback" not in err
+
+
+def test_ctrl_c_at_the_terminal_stops_a_calibration_whose_workers_start(tmp_path):
+    program = "pupper_sysid.cli.programs.pupper_sysid"
+    with started(tmp_path, "-m", program, "calibrate", str(SWEEP)) as process:
+        assert until(lambda: len(session(process.pid)) >= 3, 60.0)  # with the server
+        os.killpg(process.pid, signal.SIGINT)
+        assert ended(process) == (130, "Stopped.\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.wall_clock
@@ -110,23 +244,7 @@ def test_ctrl_c_stops_a_robot_that_a_script_started_in_the_background(tmp_path):
         assert process.stdout is not None and process.stdout.readline()  # it reads servos
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=10)
-    finally:
-        process.kill()
-        process.wait()
-
-
-def test_an_interrupted_calculation_does_not_wait_for_its_workers(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "calibrate",
-         str(SWEEP)],
-        cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-        preexec_fn=not_ignored,
-    )  # fmt: skip
-    try:
-        assert wait_until(lambda: len(children(process.pid)) >= 2, 60)
-        process.send_signal(signal.SIGINT)  # to it alone, as no terminal does
-        _, err = process.communicate(timeout=10)
-        assert process.returncode == 1 and err.strip().endswith(b"Stopped.")
+        assert process.returncode == 130
     finally:
         process.kill()
         process.wait()
