@@ -40,20 +40,20 @@ def lower_bounds(project: dict) -> Iterator[tuple[str, Version]]:
             yield requirement.name, bound
 
 
-def install(python: str, venv: Path, extras: Sequence[str], tries: Sequence[str]) -> None:
+def install(base: str, venv: Path, extras: Sequence[str], tries: Sequence[str]) -> None:
     """Make `venv` and install the oldest versions, `tries` in place of them where given."""
     if not (venv / "bin/uv").exists():
-        subprocess.run([python, "-m", "venv", venv], check=True)
+        subprocess.run([base, "-m", "venv", venv], check=True)
         subprocess.run([venv / "bin/pip", "install", "--quiet", "uv"], check=True)
     uv = [venv / "bin/uv", "pip"]
-    oldest = venv / "oldest.txt"
+    python, oldest = venv / "bin/python", venv / "oldest.txt"
     subprocess.run(
-        [*uv, "compile", "--quiet", "--resolution", "lowest-direct", "--python", venv / "bin/python",
+        [*uv, "compile", "--quiet", "--python", python, "--resolution", "lowest-direct",
          "--only-binary", ":all:", "--no-binary", "feetech-servo-sdk",  # has no wheel
          *(f"--extra={extra}" for extra in extras), ROOT / "pyproject.toml", "-o", oldest],
         check=True,
     )  # fmt: skip
-    into = [*uv, "install", "--quiet", "--python", venv / "bin/python"]
+    into = [*uv, "install", "--quiet", "--python", python]
     subprocess.run([*into, "-r", oldest], check=True)
     subprocess.run([*into, "--no-deps", "-e", ROOT], check=True)
     if tries:

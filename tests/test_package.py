@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import yaml
 
 from support.package import FILES, FOLDERS, MODULES, PROJECT, ROOMS, ROOT
 
@@ -123,6 +124,7 @@ def wheel(tmp_path_factory) -> Path:
 def test_the_wheel_has_one_top_level_name_and_all_its_files(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
+        assert {"LICENSE", "NOTICE"} <= {Path(n).name for n in names if ".dist-info/licenses/" in n}
         (top_level,) = (n for n in names if n.endswith(".dist-info/top_level.txt"))
         assert archive.read(top_level).decode().split() == ["pupper_sysid"]
     assert {name.split("/")[0] for name in names} == {"pupper_sysid", top_level.split("/")[0]}
@@ -164,6 +166,79 @@ def test_the_wheel_works_beside_folders_of_the_same_names(wheel, tmp_path):
     program = "from pupper_sysid.cli.programs.pupper_sysid import main; main()"
     assert run(program, "--version").startswith("pupper-sysid")
     assert "LF_hip" in run(program, "doctor", ROOT / "data/samples/sweep.csv")
+
+
+# ----- metadata and set-up
+
+
+def test_the_oldest_python_is_the_same_everywhere():
+    project = PROJECT["project"]
+    prefix = "Programming Language :: Python :: 3."
+    minors = [int(line.removeprefix(prefix)) for line in project["classifiers"] if prefix in line]
+    assert minors == list(range(minors[0], minors[-1] + 1))
+    assert project["requires-python"] == f">=3.{minors[0]}"
+    assert f"needs Python 3.{minors[0]} or newer" in (ROOT / "Makefile").read_text()
+
+
+def test_the_notice_names_the_source_and_the_licence_of_every_servo_card():
+    notice = " ".join((ROOT / "NOTICE").read_text().split())
+    cards = [yaml.safe_load(p.read_text()) for p in ROOT.glob("servo_models/cards/data/*.yaml")]
+    sources = {f"{card['source']['url']} {card['source']['licence']}" for card in cards}
+    assert sources and {source for source in sources if source not in notice} == set()
+
+
+def script(path: Path, version: str) -> Path:
+    """Stand-in for a Python of that version that has no module at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f'#!/bin/sh\ntest "$1" = -c && echo {version}\n')
+    path.chmod(0o755)
+    return path
+
+
+def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`make` in a folder that has nothing but what set-up looks at."""
+    if not shutil.which("make"):
+        pytest.skip("make is not installed")
+    for name in ("pyproject.toml", "constraints.txt"):
+        (folder / name).touch()
+    clean = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL", "PYTHON")}
+    return subprocess.run(
+        ["make", "-f", ROOT / "Makefile", *arguments],
+        cwd=folder, env=clean, capture_output=True, text=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("present", "named", "words"),
+    [
+        (None, "3.10", "is Python 3.10. pupper-sysid needs Python 3.11 or newer"),
+        (None, "3.9", "is Python 3.9."),
+        (None, "2.7", "is Python 2.7."),
+        (None, None, "nowhere/python does not run. pupper-sysid needs Python 3.11 or newer"),
+        (None, "3.12", "install python3-venv"),
+        ("3.10", "3.12", ".venv is of Python 3.10. Run make clean first."),
+        ("3.11", "3.12", ".venv is of Python 3.11,"),
+    ],
+)
+def test_set_up_says_which_python_is_needed_before_pip_runs(tmp_path, present, named, words):
+    python = script(tmp_path / "python", named) if named else "nowhere/python"
+    if present:
+        script(tmp_path / ".venv/bin/python", present)
+    done = make(tmp_path, "demo", f"PYTHON={python}")
+    assert done.returncode != 0 and words in done.stderr and "No module" not in done.stderr
+    assert "make demo PYTHON=python3.12" in done.stderr or "make clean" in done.stderr
+    assert (tmp_path / ".venv").exists() == bool(present)
+
+
+def test_set_up_says_that_the_python_of_its_environment_is_gone(tmp_path):
+    (tmp_path / ".venv").mkdir()
+    (tmp_path / ".venv/.installed").touch()
+    assert "Run make clean" in make(tmp_path, "demo").stderr
+
+
+def test_an_environment_of_a_newer_python_is_kept_when_none_is_named(tmp_path):
+    script(tmp_path / ".venv/bin/python", "3.12")
+    assert make(tmp_path, "interpreter").returncode == 0
 
 
 # ----- clocks
