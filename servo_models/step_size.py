@@ -124,11 +124,31 @@ def delay_at_step(
     delay = np.atleast_1d(parameters.dead_time_s)
     if time_step_s == fitted_step_s and engine == MUJOCO:
         return delay
-    fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
-    there, rest = tones_in_steps_of(parameters, time_step_s, engine)
-    if not (rest - usual < _UNSTABLE).all():
+    change = lag_of_steps(parameters, time_step_s, fitted_step_s, engine)
+    if not np.isfinite(change).all():
         raise InputError(
             f"a servo of this calibration is not stable in physics steps of {1e3 * time_step_s:g} "
             "ms; take shorter ones."
         )
-    return delay + fitted - there
+    return delay - change
+
+
+def lag_of_steps(
+    parameters: DelayedPDParameters,
+    time_step_s: float,
+    fitted_step_s: float = TIME_STEP_S,
+    engine: Engine = MUJOCO,
+) -> NDArray[np.float64]:
+    """Lag that steps of `time_step_s` have more than those of `fitted_step_s` [s].
+
+    Parameters as for `delay_at_step`.
+
+    Returns
+    -------
+    ndarray, shape (servos,)
+        NaN where the motion in those steps is not the tones': the servo is not stable, or hardly
+        moves at their frequencies.
+    """
+    fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
+    there, rest = tones_in_steps_of(parameters, time_step_s, engine)
+    return np.where(rest - usual < _UNSTABLE, there - fitted, np.nan)

@@ -28,7 +28,7 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.servo_models.step_size import delay_at_step
+from pupper_sysid.servo_models.step_size import lag_of_steps
 from pupper_sysid.sysid.identify.candidates.models import CandidateModel
 from pupper_sysid.sysid.identify.candidates.simulation import TrialData
 from pupper_sysid.sysid.identify.output_error import Fit, Problem, costs
@@ -119,10 +119,12 @@ class Posterior:
             effort / own["no_load_speed_rad_s"] if "no_load_speed_rad_s" in own else 0.0,
         )  # fmt: skip
         # what the fit's steps add to the dead time that half as long ones ask for
-        more = value - float(delay_at_step(servo, 0.5 * TIME_STEP_S, TIME_STEP_S)[0])
+        more = float(lag_of_steps(servo, 0.5 * TIME_STEP_S, TIME_STEP_S)[0])
+        grain = ndtri(0.5 + LEVEL / 2) * STEPPING_SD_S
+        if not np.isfinite(more):  # too slow for the tones that tell: up to a whole step
+            more, grain = 0.0, max(grain, TIME_STEP_S)
         low, high = np.quantile(self.values[:, 0], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]) + more
         low, high = min(low, value), max(high, value)
-        grain = ndtri(0.5 + LEVEL / 2) * STEPPING_SD_S
         return Interval(
             value,
             max(float(value - np.hypot(value - low, grain)), 0.0),

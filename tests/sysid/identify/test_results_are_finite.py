@@ -14,12 +14,13 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Feedback, RatiosToArmature
 from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
-from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.feedback.poll_loss import count_loss
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
 from pupper_sysid.sysid.identify.candidates.models import candidate_model
+from pupper_sysid.sysid.identify.posterior import Posterior
 from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.identify.scores import Scores
 from pupper_sysid.sysid.identify.search import SIMULATED
@@ -175,3 +176,23 @@ def test_a_lag_at_the_end_of_its_search_is_in_the_file(slow, lag):
     found = calibrated(slow, late).joint(lag.joint).lag
     assert found.lag_s is not None and found.lag_s.value == 1.15
     assert found.raw_lag_s is not None and found.raw_lag_s.identified == "no"
+
+
+def test_a_servo_too_slow_for_the_tones_of_the_step_check_has_a_dead_time_within_a_step():
+    model = candidate_model(SIMULATED[0])
+    values = {p.name: p.nominal for p in model.parameters}
+    # friction stops it within the strokes of tones that its speed limit lets through
+    values |= {
+        "stiffness_per_s2": 2900.0,
+        "damping_per_s": 1783.0,
+        "friction_rad_s2": 25.0,
+        "effort_rad_s2": 516.0,
+        "velocity_limit_rad_s": 0.463,
+        "dead_time_s": 0.196,
+    }
+    fitted = np.array([values[name] for name in model.names])
+    drawn = Posterior(model, np.tile(fitted, (20, 1)), fitted, 1.0, 1.0)
+    found = drawn.intervals(fitted)["dead_time_s"]
+    assert found.value == 0.196
+    assert TIME_STEP_S <= found.value - found.low < 2 * TIME_STEP_S
+    assert TIME_STEP_S <= found.high - found.value < 2 * TIME_STEP_S
