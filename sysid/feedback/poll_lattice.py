@@ -129,8 +129,11 @@ class PollLattice(Result):
 
     @derived
     def mean_age_s(self) -> float:
-        """Mean age of a reading implied by period and loss [s]; NaN where the loss is unknown."""
-        return self.poll_period_s * (0.5 + self.loss / (1 - self.loss))
+        """Mean age of a reading implied by period and loss [s]; NaN where the loss is unknown.
+
+        Infinite where every poll failed.
+        """
+        return self._age(self.loss)
 
     @property
     def assumed_loss(self) -> float:
@@ -163,8 +166,10 @@ class PollLattice(Result):
             for period in (self.poll_period_s, *self.rivals_s)
             for p in (min(end, 0.999) for end in self._loss_at(period))
         ]
-        loss = self.assumed_loss
-        return Interval(self.poll_period_s * (0.5 + loss / (1 - loss)), min(ends), max(ends))
+        return Interval(self._age(self.assumed_loss), min(ends), max(ends))
+
+    def _age(self, loss: float) -> float:
+        return math.inf if loss >= 1 else self.poll_period_s * (0.5 + loss / (1 - loss))
 
     def _loss_at(self, period_s: float) -> tuple[float, float]:
         """Jeffreys' interval of the loss if polls come each `period_s`: as many succeed."""
