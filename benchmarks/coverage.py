@@ -1,15 +1,16 @@
-"""Do the 90 % intervals of a calibration hold the truth? Random robots of three worlds, one table.
+"""Do 90 % intervals hold the truth? Emulated robots and servos in four worlds, one table each.
 
-    .venv/bin/python benchmarks/coverage.py --world emulated --robots 240
-    .venv/bin/python benchmarks/coverage.py --world live --robots 120
-    .venv/bin/python benchmarks/coverage.py --world real --robots 120
+    .venv/bin/python benchmarks/coverage.py --world sweep --robots 240
+    .venv/bin/python benchmarks/coverage.py --world motion --robots 120
+    .venv/bin/python benchmarks/coverage.py --world pendulum --robots 40
+    .venv/bin/python benchmarks/coverage.py --world strokes --robots 60
 
-`emulated`: robots of the emulator on a polled bus, one joint swept, compared with their truth.
-`live`: servos of `benchmarks/twins.py` (Stribeck friction, backlash and command jitter beyond the
-model, half with a set-point of limited rate, half with back-EMF) whose every row is a read, at 30,
-50, 100 and 200 Hz. `real`: the recordings in `$PUPPER_REAL_DATA` played by such servos whose
-numbers are draws from the recording's own posterior, half of each structure, with the recording's
-command jitter, poll and losses. A quantity counts where the calibration calls it identified.
+`sweep`: robots on a polled, lossy bus, one joint swept at four tones, through `calibrate`.
+`motion`: the same robots under chirps, multisines, steps and pseudo-random binary commands, half
+polled and half live; the recording does not state which, and the lag is that of the motion.
+`pendulum`: servos with a pendulum at three P gains, stepped by MuJoCo at 1 kHz, with counts, a dead
+zone and a minimum start force, through `sysid.loaded`.
+`strokes`: servos with play of 0 to 2° and dead zones of 0 to 5 counts, through `sysid.backlash`.
 """
 
 from __future__ import annotations
@@ -17,181 +18,288 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import sys
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import numpy as np
-import twins
-from random_robots import sweep_random_robot
+import pandas as pd
+from numpy.typing import NDArray
+from random_robots import SweptRobot, sweep_random_robot
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.sim.emulator.servos.pendulum import PendulumServo, PendulumServoParameters
+from pupper_sysid.sysid.backlash.measure import backlash
 from pupper_sysid.sysid.compare.truth import truth_table
-from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.posterior import posterior
-from pupper_sysid.sysid.identify.preparation import prepare_joint
-from pupper_sysid.sysid.identify.search import SIMULATED
-from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.feedback.staleness import staleness
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.lag.lag_budget import lag_budget
+from pupper_sysid.sysid.loaded.joint_fit import fit_loaded_joint
+from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
 
-REAL = Path(
-    os.environ.get("PUPPER_REAL_DATA") or Path(__file__).resolve().parents[2] / "shared" / "real"
-)
-SWEEPS = ("real_motor_0_LF_hip_amp0.3.csv", "real_motor_1_LF_thigh_amp0.3.csv",
-          "mini_pupper_full_band/thigh_1-10hz.csv")  # fmt: skip
-LINEAR = ("dead_time_s", "offset_rad", "poll_period_s", "loss", "mean_age_s", "lag_s",
-          "command_jitter_s", "back_emf")  # fmt: skip
+MOTIONS = ("chirp", "multisine", "steps", "prbs")
+RATIOS = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit_rad_s",
+          "torque at full duty", "armature", "friction", "back-EMF")  # fmt: skip
+"""Quantities whose width is printed as the ratio of the interval's ends."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity of one robot."""
+    """One quantity of one robot; a verdict instead of an interval where `verdict` is not empty."""
 
     quantity: str
-    low: float
-    high: float
-    identified: bool
-    truth: float
+    truth: float = float("nan")
+    low: float = float("nan")
+    value: float = float("nan")
+    high: float = float("nan")
+    identified: bool = True
+    verdict: str = ""
 
 
-def emulated(seed: int) -> list[Row]:
-    """Rows of one robot of the emulator."""
+def row(quantity: str, interval: Interval, truth: float, identified: bool = True) -> Row:
+    """A row of an interval."""
+    return Row(quantity, truth, interval.low, interval.value, interval.high, identified)
+
+
+# ------------------------------------------------------------------------------ robots in free air
+
+
+def swept(seed: int) -> Iterator[Row]:
+    """Calibrate one joint of a robot from four tones."""
     rng = np.random.default_rng([20261122, 7, seed])
     loss, noise = float(rng.uniform(0.0, 0.5)), float(rng.uniform(0.002, 0.008))
-    robot = sweep_random_robot(rng, loss, noise, "1,2,4,8")
-    made = calibrate(robot.recording, [robot.joint])
-    table = truth_table(made, robot.bus.truth(), robot.recording)
-    return [
-        Row(r.quantity, r.found.low, r.found.high, r.identified != "no", r.truth)
-        for r in table.quantities
-        if r.found is not None and np.isfinite([r.found.low, r.found.high]).all()
-    ]
+    robot = sweep_random_robot(rng, "1,2,4,8", loss=loss, reading_noise_rad=noise)
+    result = calibrate(robot.recording, [robot.joint])
+    for quantity in truth_table(result, robot.bus.truth(), robot.recording).quantities:
+        found = quantity.found
+        if found is not None and np.isfinite([found.low, found.high]).all():
+            yield row(quantity.quantity, found, quantity.truth, quantity.identified != "no")
 
 
-def of_twin(own: twins.Servo, made: CalibrationResult) -> Iterator[Row]:
-    """Rows of one synthetic servo."""
-    joint = made.calibration.joint(twins.JOINT)
-    ratios, f = joint.actuator.ratios_to_armature, joint.feedback
-    speed = own.velocity_limit if np.isfinite(own.velocity_limit) else 1000.0
-    for name, q, truth in (
-        ("dead_time_s", joint.actuator.dead_time_s, own.truth()["dead_time_s"]),
-        ("stiffness", ratios.stiffness, own.stiffness),
-        ("damping", ratios.damping, own.damping),
-        ("friction_loss", ratios.friction_loss, own.friction),
-        ("effort_limit", ratios.effort_limit, own.effort),
-        ("velocity_limit_rad_s", joint.actuator.velocity_limit_rad_s, speed),
-        ("back_emf", ratios.back_emf, own.back_emf),
-        ("command_jitter_s", joint.actuator.command_jitter_s, own.command_jitter_s),
-        ("offset_rad", f.offset_rad, own.offset_rad),
-        ("poll_period_s", f.poll_period_s, own.poll_s),
-        ("loss", f.loss, own.loss),
-        ("mean_age_s", f.mean_age_s, own.poll_s * (0.5 + own.loss / (1 - own.loss))),
-    ):
-        if q.low is not None and q.high is not None:
-            yield Row(name, q.low, q.high, q.identified != "no", truth)
+def moved(seed: int) -> Iterator[Row]:
+    """Measure the lag of one joint in motion without single tones."""
+    rng = np.random.default_rng([20261122, 77, seed])
+    kind, live = MOTIONS[seed % len(MOTIONS)], bool(seed // len(MOTIONS) % 2)
+    excitation = partial(plan, kind, frequencies_hz=parse_frequencies("1-5"), duration_s=20.0)
+    chosen = {"loss": 0.0, "poll_period_s": 0.0} if live else {}
+    robot = sweep_random_robot(rng, excitation, **chosen)
+    # the motion has to decide whether readings are live
+    header = {k: v for k, v in robot.recording.metadata.items() if k != "readings"}
+    recording = Recording.from_frame(robot.recording.table, metadata=header)
+    trials = recording.trials(robot.joint)
+    truth = "live" if live else "polled"
+    verdict = staleness(trials).kind
+    yield Row(f"readings that are {truth}", verdict=verdict)
+    lag = lag_budget(robot.joint, trials, np.random.default_rng(seed)).lag_s
+    yield row(f"lag, {kind}, {truth} [s]", lag, true_lag(robot))
+    yield row("lag, all [s]", lag, true_lag(robot))
 
 
-def live(seed: int) -> list[Row]:
-    """Rows of one servo that answers every read."""
-    own, recording = twins.twin(10_000 + seed, ("slew", "back-EMF")[seed % 2], False, True)
-    return list(of_twin(own, calibrate(recording)))
+def true_lag(robot: SweptRobot, longest_s: float = 1.0, earliest_s: float = 0.05) -> float:
+    """Time shift at which true motion and held command correlate best, as defined for `lag` [s]."""
+    (trial,) = robot.recording.trials(robot.joint)
+    motion = robot.bus.motion(trial)
+    sent = np.searchsorted(trial.send_time_s, motion.time_s, side="right") - 1
+    command, position = trial.command_rad[sent], motion.position_rad
+    count, step_s = len(command), 0.001
+    first, last = round(longest_s / step_s), count - round(earliest_s / step_s)
+    # one window of the motion against each shifted window of the command
+    window = position[first:last] - position[first:last].mean()
+    shifts = np.arange(-round(earliest_s / step_s) + 1, first)
+    scores = np.empty(len(shifts))
+    for n, shift in enumerate(shifts):
+        earlier = command[first - shift : last - shift]
+        scores[n] = window @ (earlier - earlier.mean()) / np.std(earlier)
+    top = int(np.clip(np.argmax(scores), 1, len(scores) - 2))
+    left, middle, right = scores[top - 1 : top + 2]
+    return float(step_s * (shifts[top] + 0.5 * (left - right) / (left - 2 * middle + right)))
 
 
-@lru_cache
-def of_recording(name: str) -> tuple:
-    """A real sweep, its joint, and the posterior of each structure."""
-    recording = load(REAL / name)
-    joint = recording.joints[0]
-    ready = prepare_joint(joint, tuple(recording.trials(joint)), 0)
-    drawn = {
-        s: posterior(
-            candidate_model(s), ready.data, ready.noise_rad, ready.first[s], ready.fit_rng()
-        ).values
-        for s in SIMULATED
-    }
-    return recording, joint, ready.lag.feedback, drawn
+# ----------------------------------------------------------------------------- servos with a load
+
+COUNT_RAD = 2 * np.pi / 4096
+LOOP_S, READ_AFTER_S, RUN_S, DROP_S = 0.01, 0.002, 6.0, 2.5
+LOADED = {
+    "torque at full duty": ("stall_torque", "torque_nm"),
+    "armature": ("armature", "armature_kg_m2"),
+    "friction": ("friction_loss", "friction_nm"),
+    "back-EMF": ("back_emf", "back_emf_nm_s_rad"),
+    "dead time [s]": ("dead_time_s", "dead_time_s"),
+}
+"""Quantity: its names in the fit and in the emulated servo."""
 
 
-def real(seed: int) -> list[Row]:
-    """Rows of one synthetic servo in the place of a real one."""
-    rng = np.random.default_rng([20261122, 8, seed])
-    recording, joint, lattice, drawn = of_recording(SWEEPS[seed % len(SWEEPS)])
-    structure = SIMULATED[seed % 2]
-    model, draws = candidate_model(structure), drawn[structure]
-    v = dict(zip(model.names, draws[rng.integers(len(draws))], strict=True))
-    effort = v["effort_rad_s2"]
-    own = twins.Servo(
-        dead_time_s=v["dead_time_s"], stiffness=v["stiffness_per_s2"], damping=v["damping_per_s"],
-        friction=v["friction_rad_s2"], effort=effort,
-        velocity_limit=v.get("velocity_limit_rad_s", np.inf),
-        back_emf=effort / v["no_load_speed_rad_s"] if "no_load_speed_rad_s" in v else 0.0,
-        command_jitter_s=float(rng.uniform(0.0, 0.003)), offset_rad=float(rng.normal(0, 0.005)),
-        quantum_rad=np.pi / 550, noise_rad=float(rng.uniform(0.001, 0.005)),
-        poll_s=lattice.poll_period_s, loss=lattice.loss, poll_jitter_s=0.0008,
+def loaded(seed: int) -> Iterator[Row]:
+    """Fit a servo that swings, follows steps and drops a pendulum at three P gains."""
+    rng = np.random.default_rng([20261123, seed])
+    servo = random_pendulum_servo(rng)
+    load = {"mass_kg": servo.mass_kg, "length_m": servo.length_m}
+    trials = []
+    for gain in (8, 16, 32):
+        for kind in ("chirp", "steps", "drop"):
+            header = {"readings": "live", "servos": {"servo": {"p_gain": gain}},
+                      "loads": {"servo": load}, "joints": ["servo"]}  # fmt: skip
+            table = pendulum_run(servo, gain, kind, rng)
+            trials += Recording.from_frame(table, metadata=header).trials("servo")
+    fit = fit_loaded_joint("servo", trials, 0)
+    for quantity, (name, true_name) in LOADED.items():
+        yield row(quantity, fit.numbers[name], getattr(servo, true_name))
+
+
+def random_pendulum_servo(rng: np.random.Generator) -> PendulumServoParameters:
+    """Draw a servo of 0.4 to 4 N·m and a mass that it can lift."""
+    torque = float(np.exp(rng.uniform(np.log(0.4), np.log(4.0))))
+    length = float(rng.uniform(0.08, 0.15))
+    gravity = torque * rng.uniform(0.15, 0.4)
+    inertia = gravity / 9.81 * length
+    return PendulumServoParameters(
+        torque_nm=torque,
+        duty_per_rad=float(rng.uniform(0.03, 0.12)),
+        back_emf_nm_s_rad=float(torque / rng.uniform(4.0, 12.0)),
+        friction_nm=float(torque * rng.uniform(0.02, 0.1)),
+        armature_kg_m2=float(inertia * np.exp(rng.uniform(np.log(0.15), np.log(2.0)))),
+        dead_time_s=float(rng.uniform(0.004, 0.03)),
+        mass_kg=float(gravity / 9.81 / length),
+        length_m=length,
+        count_rad=COUNT_RAD,
+    )
+
+
+def pendulum_run(
+    servo: PendulumServoParameters, gain: int, kind: str, rng: np.random.Generator
+) -> pd.DataFrame:
+    """Rows of one run; in a drop the torque is off from `DROP_S` on."""
+    registers = {"p": gain, "d": 0, "min_start_force": int(rng.integers(0, 16)),
+                 "dead_zone_cw": 1, "dead_zone_ccw": 1}  # fmt: skip
+    emulated = PendulumServo(servo, 0.0, registers)
+    time_s = LOOP_S * np.arange(int(RUN_S / LOOP_S))
+    commands = {
+        "chirp": lambda: 0.9 * np.sin(1.2 * time_s**2),
+        "steps": lambda: rng.uniform(-1.0, 1.0, 20)[(time_s / 0.4).astype(int)],
+        "drop": lambda: -1.4 * np.clip(time_s / 2.0, 0, 1),
+    }[kind]()
+    send_s, on = time_s + 0.05, np.ones(len(time_s))
+    if kind == "drop":
+        on[send_s >= DROP_S] = 0.0
+    goals, positions = COUNT_RAD * np.round(commands / COUNT_RAD), np.empty(len(time_s))
+    for k, at_s in enumerate(send_s):
+        if on[k]:
+            emulated.command(at_s, goals[k])
+        elif on[k - 1]:
+            emulated.torque(at_s, False)
+        positions[k] = emulated.position_at(at_s + READ_AFTER_S)
+    return pd.DataFrame(
+        {"send_time_s": send_s, "read_time_s": send_s + READ_AFTER_S, "command_rad": goals,
+         "position_rad": COUNT_RAD * np.round(positions / COUNT_RAD), "torque_enabled": on,
+         "joint": "servo", "trial": 0, "frequency_hz": np.nan}
     )  # fmt: skip
-    commands = [
-        (t.frequency_hz, t.send_time_s - t.send_time_s[0], t.command_rad)
-        for t in recording.trials(joint)
-    ]
-    return list(of_twin(own, calibrate(twins.record(own, commands, rng))))
 
 
-def _quietly(world: str, seed: int) -> list[Row] | None:
-    """Rows of one robot; None where `calibrate` refuses it, such as one that cannot move."""
+def stroked(seed: int) -> Iterator[Row]:
+    """Measure play, dead zone and hysteresis from slow strokes at P 8 and P 32."""
+    from support.strokes import stroked as strokes
+
+    rng = np.random.default_rng(1000 + seed)
+    degrees, zone = float(rng.uniform(0, 2)), int(rng.integers(0, 6))
+    recording, servo = strokes(seed, degrees, zone)
+    result = backlash(recording)["bench"]
+    dead_zone = result.dead_zone_rad
+    assert dead_zone is not None
+    if result.backlash_rad is not None:
+        yield row("backlash [rad]", result.backlash_rad, servo.backlash_rad)
+    bounded = "" if dead_zone.value > 0 else ", bounded from above"
+    yield row(f"dead zone{bounded} [rad]", dead_zone, zone * servo.count_rad)
+    for gain in result.gains:
+        if gain.p_gain == 8 or dead_zone.value == 0:  # else the dead zone sets it
+            stiffness = servo.torque_nm * servo.duty_per_rad * gain.p_gain
+            width = 2 * servo.friction_nm / stiffness
+            yield row(f"hysteresis at P {gain.p_gain:g} [rad]", gain.hysteresis_rad, width)
+
+
+# ------------------------------------------------------------------------------------------- table
+
+WORLDS = {"sweep": swept, "motion": moved, "pendulum": loaded, "strokes": stroked}
+
+
+def rows_of(world: str, seed: int) -> list[Row] | None:
+    """Rows of one robot; None where it is refused, such as one that cannot move."""
     warnings.simplefilter("ignore")
     try:
-        return {"emulated": emulated, "live": live, "real": real}[world](seed)
+        return list(WORLDS[world](seed))
     except InputError:
         return None
 
 
+def held(rows: list[Row]) -> str:
+    """How many intervals hold the truth."""
+    if not rows:
+        return "–"
+    # a quantisation step has no width, but that of its last digits
+    inside = sum(r.low - 1e-6 * abs(r.truth) <= r.truth <= r.high + 1e-6 * abs(r.truth)
+                 for r in rows)  # fmt: skip
+    return f"{inside} ({100 * inside / len(rows):.0f} %)"
+
+
+def line(quantity: str, rows: list[Row]) -> str:
+    """A row of the table: coverage, width, error, and coverage where not identified."""
+    known, others = ([r for r in rows if r.identified is yes] for yes in (True, False))
+    if not known:
+        return f"| {quantity} | 0 of {len(rows)} | – | – | – | {held(others)} |"
+    ends: NDArray[np.float64] = np.array([(r.low, r.high) for r in known])
+    error = np.abs([r.value - r.truth for r in known])
+    if quantity in RATIOS:
+        width = f"× {np.median(ends[:, 1] / np.maximum(ends[:, 0], 1e-12)):.2f}"
+        shown = f"{np.median(error / np.abs([r.truth for r in known])):.1%}"
+    else:
+        width, shown = f"{np.median(ends[:, 1] - ends[:, 0]):.2g}", f"{np.median(error):.2g}"
+    return (
+        f"| {quantity} | {len(known)} of {len(rows)} | {held(known)} | {width} | {shown} "
+        f"| {held(others)} |"
+    )
+
+
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--world", choices=("emulated", "live", "real"), default="emulated")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--world", choices=WORLDS, default="sweep")
     parser.add_argument("--robots", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first robot")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    found: dict[str, list[Row]] = defaultdict(list)
+    by_quantity: dict[str, list[Row]] = defaultdict(list)
+    verdicts: dict[str, Counter[str]] = defaultdict(Counter)
+    seeds = range(options.first, options.first + options.robots)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        results = pool.map(partial(_quietly, options.world), range(options.robots))
         done = refused = 0
         with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C: the table of what is done
-            for done, rows in enumerate(results, 1):  # noqa: B007
-                refused += rows is None
-                for row in rows or ():
-                    found[row.quantity].append(row)
+            for rows in pool.map(partial(rows_of, options.world), seeds):
+                done, refused = done + 1, refused + (rows is None)
+                for one in rows or ():
+                    if one.verdict:
+                        verdicts[one.quantity][one.verdict] += 1
+                    else:
+                        by_quantity[one.quantity].append(one)
         pool.shutdown(wait=False, cancel_futures=True)
-    print(f"{done} robots, {options.world}, {refused} refused")
-    print("| quantity | identified | holds the truth | median width | not identified: holds |")
-    print("|" + "---|" * 5)
-    for quantity, rows in found.items():
-        known = [r for r in rows if r.identified]
-        others = [r for r in rows if not r.identified]
-
-        def held(some: list[Row]) -> str:
-            # a quantisation step has no width, but that of its last digits
-            slack = [1e-6 * abs(r.truth) for r in some]
-            inside = sum(
-                r.low - d <= r.truth <= r.high + d for r, d in zip(some, slack, strict=True)
-            )
-            return f"{inside} ({100 * inside / len(some):.0f} %)" if some else "–"
-
-        width = "–"
-        if known and quantity in LINEAR:
-            width = f"{np.median([r.high - r.low for r in known]):.2g}"
-        elif known:
-            width = f"× {np.median([r.high / max(r.low, 1e-12) for r in known]):.2f}"
-        print(f"| {quantity} | {len(known)} of {len(rows)} | {held(known)} | {width} | "
-              f"{held(others)} |")  # fmt: skip
+    print(f"{done} robots, {options.world}, {refused} refused\n")
+    for quantity, counts in verdicts.items():
+        print(f"{quantity}: " + ", ".join(f"{n} called {word}" for word, n in counts.items()))
+    print("| quantity | identified | holds the truth | median width | median error "
+          "| not identified: holds |")  # fmt: skip
+    print("|" + "---|" * 6)
+    for quantity, rows in sorted(by_quantity.items()):
+        print(line(quantity, rows))
 
 
 if __name__ == "__main__":

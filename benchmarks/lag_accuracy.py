@@ -1,7 +1,7 @@
 """How accurate is the measured lag? Random emulated robots, every estimator, one table.
 
 Each robot is drawn with its own servos, read losses from 0 to 0.6, count size, poll period and
-jitters; one joint is swept from 1 to 10 Hz through the recorder, exactly as a user would. The
+jitters; one joint is swept from 1 to 10 Hz through the recorder, as by `sweep`. The
 truth is the lag of the joint's real motion, without noise and every millisecond, against the held
 command, averaged over the tones with the estimator's own weights. (Sampling the motion once per
 loop would not do: it ripples with the steps of the command, and once per loop sees one phase of
@@ -55,7 +55,8 @@ def measure(seed: int) -> Result | None:
     rng = np.random.default_rng([20261121, seed])
     # reading noise up to what the recordings of a real robot scatter by, 11 to 14 mrad
     noise = float(rng.uniform(0.001, 0.014))
-    robot = sweep_random_robot(rng, float(rng.uniform(0.0, 0.6)), noise, "1-10")
+    loss = float(rng.uniform(0.0, 0.6))
+    robot = sweep_random_robot(rng, "1-10", loss=loss, reading_noise_rad=noise)
     trials = robot.recording.trials(robot.joint)
     lattice = find_poll_lattice(trials, np.random.default_rng(0))
     try:
@@ -130,6 +131,8 @@ def table(results: list[Result]) -> str:
     ]
     for low, high in ((0.0, 0.2), (0.2, 0.4), (0.4, 0.61)):
         chosen = np.array([low <= r.loss < high for r in results])
+        if not chosen.any():
+            continue
         error = np.array([r.estimates["hold-aware (default)"] - r.truth for r in results])[chosen]
         lines.append(
             f"Loss {low:.1f}–{high:.1f}: {chosen.sum()} robots, bias {1e3 * error.mean():+.2f} ms, "
@@ -142,8 +145,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", type=int, default=240)
     parser.add_argument("--workers", type=int, default=2)
-    given = parser.parse_args()
-    with ProcessPoolExecutor(given.workers) as pool:
-        found = list(pool.map(measure, range(given.robots), chunksize=4))
-    print(table([r for r in found if r]))
-    print(f"Refused, because the servo has more friction than torque: {found.count(None)}.")
+    options = parser.parse_args()
+    with ProcessPoolExecutor(options.workers) as pool:
+        results = list(pool.map(measure, range(options.robots), chunksize=4))
+    print(table([r for r in results if r]))
+    print(f"Refused, because the servo has more friction than torque: {results.count(None)}.")

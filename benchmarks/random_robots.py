@@ -1,8 +1,9 @@
-"""Random emulated robots, swept as a user would, whose true motion and delay are known."""
+"""Random emulated robots, recorded as by `sweep`, whose true motion and dead time are known."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from pupper_sysid.sim.emulator.servos.plant import FreeAirServos
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
-from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
+from pupper_sysid.sysid.sweep.excitation import Plan, parse_frequencies, plan
 from pupper_sysid.sysid.sweep.recorder import record
 
 
@@ -57,7 +58,7 @@ def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
 
 @dataclass(frozen=True)
 class SweptRobot:
-    """A robot that was swept, and what it really is."""
+    """A recorded robot and its true parameters."""
 
     spec: RobotSpec
     joint: str
@@ -66,27 +67,40 @@ class SweptRobot:
     bus: WitnessedBus
 
     def dead_time_s(self, step_s: float) -> float:
-        """The joint's own, as a simulation in such steps has to have it."""
+        """True dead time of the joint, for a simulation in steps of `step_s`."""
         return float(delay_at_step(self.servo, step_s, PHYSICS_STEP_S)[0])
 
 
 def sweep_random_robot(
-    rng: np.random.Generator, loss: float, reading_noise_rad: float, tones: str
+    rng: np.random.Generator, excitation: str | Callable[[list[str]], Plan], **chosen: float
 ) -> SweptRobot:
-    """Draw a robot with such readings and sweep one of its joints, chosen by lot."""
-    spec = random_spec(rng, loss=loss, reading_noise_rad=reading_noise_rad)
+    """Draw a robot and record one of its joints, chosen at random.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    excitation : str or callable
+        Tones such as "1-10" [Hz], or the plan of a list of joints.
+    **chosen : float
+        Fields of `RobotSpec` to fix instead of drawing.
+    """
+    spec = random_spec(rng, **chosen)
     joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
     robot = draw_robot(rng, spec)
     bus = WitnessedBus(robot, rng, joint)
+    if isinstance(excitation, str):
+        trials = plan("sine", [joint], parse_frequencies(excitation))
+    else:
+        trials = excitation([joint])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "sweep.csv"
-        record(bus, plan("sine", [joint], parse_frequencies(tones)), path)
+        record(bus, trials, path)
         recording = load(path)
     return SweptRobot(spec, joint, robot.servos[JOINT_NAMES.index(joint)].actuator, recording, bus)
 
 
 class RememberingServo(FreeAirServo):
-    """A servo that can also be asked where it was a little earlier."""
+    """A servo that remembers its past positions."""
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
@@ -113,7 +127,7 @@ class WitnessedServos(FreeAirServos):
 
 
 class WitnessedBus(EmulatedBus):
-    """An emulated bus that writes down where one joint is, every millisecond."""
+    """An emulated bus that logs the true position of one joint every millisecond."""
 
     def __init__(self, robot: EmulatedRobot, rng: np.random.Generator, joint: str):
         self._witnessed = JOINT_NAMES.index(joint)
@@ -123,7 +137,7 @@ class WitnessedBus(EmulatedBus):
         self.position: list[float] = []
 
     def sleep_until(self, time_s: float) -> None:
-        """Look at the joint on the way."""
+        """Log the joint up to that time."""
         start = self.time[-1] + 1e-3 if self.time else 0.0
         super().sleep_until(time_s)
         for now in np.arange(start, self.now(), 1e-3):
@@ -131,7 +145,7 @@ class WitnessedBus(EmulatedBus):
             self.position.append(self._servos.angle(self._witnessed, float(now)))
 
     def motion(self, trial: Trial) -> Readings:
-        """The joint's true motion during `trial`."""
+        """True motion of the joint during `trial`."""
         time, position = np.array(self.time), np.array(self.position)
         inside = (time >= trial.send_time_s[0]) & (time <= trial.send_time_s[-1])
         time, position = time[inside], position[inside]

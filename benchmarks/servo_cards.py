@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from loaded_real import FITTED_S, JOINTS, MOTIONS, REAL, first, track
+from real_recordings import FITTED_S, JOINTS, MOTIONS, REAL, first, track
 
 from pupper_sysid.servo_models.cards.card import Gains, ServoCard, Source
 from pupper_sysid.sysid.export.servo_card import to_card, to_drive_card

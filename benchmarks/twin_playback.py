@@ -5,7 +5,7 @@ with four sets of servos: the published ones (`paper`, `release`), those calibra
 of one hip and one thigh, which have not seen the walk, and those refitted on its loops 0 and 1.
 Scored on loop 2, with the offsets of the others. Readings are predicted with the poll of the
 sweeps; the published settings, whose delay was found with ideal feedback, also without it. A linear
-filter and an MLP fitted to loops 0 and 1 stand beside them (`servo_model_accuracy.py`).
+filter and an MLP fitted to loops 0 and 1 stand beside them (`real_recordings.py walk`).
 
     .venv/bin/python benchmarks/twin_playback.py --picture docs/pictures/twin.png
 """
@@ -22,14 +22,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from matplotlib.figure import Figure
-from servo_model_accuracy import REAL, SPLIT
-from sweep_to_walk import SWEEPS, WALK
+from real_recordings import REAL, SPLIT, SWEEPS, WALK
 
 from pupper_sysid.common.figure_style import ORANGE, PINK, save, styled
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.policies.twin.actuators import Actuator, of_calibration, robot_for
 from pupper_sysid.policies.twin.figures import draw_bars, draw_joint
-from pupper_sysid.policies.twin.gyro import read_imu, spectrum
 from pupper_sysid.policies.twin.twin import ActuatorTwin, Condition, Twin, twin
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
 from pupper_sysid.sysid.identify.calibrate import calibrate
@@ -61,7 +59,7 @@ def line_of(name: str, model: ActuatorTwin) -> str:
 
 
 def evidence_of(found: Twin) -> str:
-    """Table of what each actuator says of where the robot was."""
+    """Table of each actuator's evidence of where the robot was."""
     lines = ["| actuator | torques | correlation | share of the motion | share of the load |",
              "|---|---|---|---|---|"]  # fmt: skip
     for name, model in found.models.items():
@@ -73,42 +71,6 @@ def evidence_of(found: Twin) -> str:
                 "–" if x is None else f"{x.value:.2f} ({x.low:.2f}–{x.high:.2f})" for x in shares
             )
             lines.append(f"| {name} | {scale} | {row} |")
-    return "\n".join(lines)
-
-
-def joints_of(found: Twin) -> str:
-    """Table of RMS errors by joint."""
-    names = (CALIBRATED, REFITTED)
-    head = [f"{name}, {place}" for name in names for place in ("air", "ground")]
-    lines = [f"| mrad | {' | '.join(head)} | repeatability |", "|---" * (len(head) + 2) + "|"]
-    for joint, floor in found.repeatability_rad.items():
-        errors = [
-            own.joints[joint].rmse_rad
-            for name in names
-            for own in (found.models[name].air, found.models[name].ground)
-            if own is not None
-        ]
-        row = " | ".join(f"{1e3 * x:.1f}" for x in [*errors, floor])
-        lines.append(f"| {joint} | {row} |")
-    return "\n".join(lines)
-
-
-def gyro_of(found: Twin) -> str:
-    """Table of the spectra of the robot's IMU logs, and of the simulated gyro in the playback."""
-    logs = {}
-    for path in sorted((REAL / "mini_pupper_imu").glob("hw_[lm]*.csv")):
-        log = read_imu(path)
-        logs[path.stem] = spectrum(log.time_s, [log.rate_rad_s])
-    for name, model in found.models.items():
-        if model.ground is not None:
-            logs[f"simulated playback, {name}"] = model.ground.gyro
-    lines = ["| deviation rad/s, peak Hz, its share of the variance | x | y | z |",
-             "|---|---|---|---|"]  # fmt: skip
-    for name, gyro in logs.items():
-        if gyro is not None:
-            axes = zip(gyro.deviation_rad_s, gyro.peak_hz, gyro.peak_share, strict=True)
-            row = " | ".join(f"{d:.2f}, {peak:.2f}, {share:.2f}" for d, peak, share in axes)
-            lines.append(f"| {name} | {row} |")
     return "\n".join(lines)
 
 
@@ -166,7 +128,7 @@ def main() -> None:
               f"| {mrad(fitted[name].rmse_free_run_rad)} | – | – | – | – | – |")  # fmt: skip
     print(f"| repeatability | {1e3 * np.mean(list(found.repeatability_rad.values())):.1f} "
           "| – | – | – | – | – |\n")  # fmt: skip
-    print(f"{joints_of(found)}\n\n{evidence_of(found)}\n\n{gyro_of(found)}\n")
+    print(f"{evidence_of(found)}\n")
     evidence = found.models[CALIBRATED].evidence
     assert evidence is not None
     print(f"{CALIBRATED}: {evidence.why}")

@@ -1,1 +1,0 @@
-"""Hostile files, options and outputs for `benchmarks/file_campaign.py`."""

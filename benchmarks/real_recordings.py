@@ -1,0 +1,254 @@
+"""Servo models on recordings of real servos: motions and gains that were not fitted.
+
+    .venv/bin/python benchmarks/real_recordings.py walk sweep xl330 so101 [--bam PYTHON]
+
+Recordings are found in `$PUPPER_REAL_DATA`, else in `../shared/real`. All errors are of free runs.
+
+`walk`: kinds of servo model fitted to loops 0 and 1 of a Mini Pupper 2's walk at 25 Hz, scored on
+loop 2. `sweep`: the sweeps of its hip and thigh are calibrated, and predict the same joints of that
+walk, as positions and as readings of the sweep's poll. `xl330`: a Dynamixel XL330 with a pendulum,
+fitted at P 100, 400 and 800, scored at P 200; with `--bam`, the Python of BAM's environment
+(`peers/install.sh`), BAM's models are fitted to the same recordings. `so101`: the STS3215 of an arm,
+fitted to the first 40 s of three motions, scored on the rest and on a fourth motion.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
+from pupper_sysid.servo_models.loaded_servo import COLUMNS
+from pupper_sysid.sysid.compare.compare import compare
+from pupper_sysid.sysid.compare.readings import (
+    as_rows,
+    calibrated_run,
+    reading_rules,
+    run_with_offset,
+    with_ages,
+)
+from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, fit_loaded_joint
+from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
+from pupper_sysid.sysid.loaded.runs import Run, at_steps, prepare, simulate
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
+from pupper_sysid.sysid.servo_fit.scores import LINEAR, Tracks, errors, rms, stacked
+from pupper_sysid.sysid.servo_fit.windows import everything
+
+HERE = Path(__file__).resolve().parent
+REAL = Path(os.environ.get("PUPPER_REAL_DATA") or HERE.parents[1] / "shared" / "real")
+SWEEPS = ("real_motor_0_LF_hip_amp0.3.csv", "real_motor_1_LF_thigh_amp0.3.csv")
+WALK = "playback_lstm_25hz.csv"
+SPLIT = Split(
+    "trained on loops 0 and 1, tested on 2",
+    lambda number, elapsed, group: number < 2,
+    lambda number, elapsed, group: number == 2,
+)
+MODELS = (("fir", "default"), ("delayed-pd", "default"), ("mlp", "paper"), ("lstm", "default"),
+          ("mlp", "default"))  # fmt: skip
+"""Architecture and preset of `fit-servo`."""
+JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
+MOTIONS = ("chirp_sweep", "prbs_excitation", "step_response", "frequency_sweep")
+FITTED_S = 40.0
+"""Of each motion of the SO-101 but the last, of which nothing is fitted."""
+
+
+def print_rows(head: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
+    """Print a Markdown table, row by row as they come."""
+    head = list(head)
+    print(f"\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
+    for row in rows:
+        print(f"| {' | '.join(row)} |", flush=True)
+
+
+def mrad(value_rad: float) -> str:
+    """An error in mrad."""
+    return f"{1e3 * value_rad:.1f}"
+
+
+# ---------------------------------------------------------------------------------- Mini Pupper 2
+
+
+def walk(seed: int) -> None:
+    """Kinds of servo model on the unseen loop of the walk, mean of 12 joints."""
+    recording = load(REAL / WALK)
+
+    def rows() -> Iterable[list[str]]:
+        for arch, preset in MODELS:
+            begun = time.process_time()
+            fit = fit_servo(recording, None, arch, preset, SPLIT, seed=seed)
+            error, floor = fit.rmse_free_run_rad, fit.mean.repeatability_rad
+            yield [
+                arch + (", as published" if preset == "paper" else ""),
+                mrad(fit.mean.rmse_one_step_rad), mrad(error.value),
+                f"{mrad(error.low)} … {mrad(error.high)}",
+                mrad(max(s.rmse_free_run_rad for s in fit.joints.values())),
+                mrad(error.value - floor), f"{time.process_time() - begun:.0f}",
+            ]  # fmt: skip
+
+    print_rows(
+        ("model", "one step", "free run", "90 % interval", "worst joint", "above repeatability",
+         "processor s"), rows(),
+    )  # fmt: skip
+
+
+def sweep(seed: int) -> None:
+    """The walk of two joints predicted by a calibration of their sweeps, all rows."""
+    recording = load(REAL / WALK)
+    result = calibrate([load(REAL / name) for name in SWEEPS], seed=seed)
+    joints = list(result.joints)
+    data = as_rows(servo_data([recording], joints, "all"), joints)
+    rules = reading_rules(data, "the walk", {"the sweeps": result.calibration})
+    aged = with_ages(data, rules)
+    offsets = {j: result.calibration.joint(j).feedback.offset_rad.value for j in joints}
+    calibrated = calibrated_run(result.calibration, data)
+    moved = {
+        joint: [track + offsets[joint] for track in tracks]
+        for joint, tracks in calibrated(stacked(data)[1]).items()
+    }
+    lines = {
+        "calibration: position, offset of the sweep": rows_error(moved, data),
+        **by_rule("calibration", calibrated, data, aged),
+    }
+    for preset in PRESETS:
+        lines |= by_rule(preset, calibrated_run(load_calibration(preset), data), data, aged)
+    scored = compare(recording, [result.calibration], joints).models[LINEAR]
+    name = f"{LINEAR} to the walk's other loops"
+    lines[name] = {j: s.rmse_raw_rad for j, s in scored.joints.items()}
+    print_rows(
+        ("mrad", *joints, "mean"),
+        (
+            [name, *map(mrad, by_joint.values()), mrad(float(np.mean(list(by_joint.values()))))]
+            for name, by_joint in lines.items()
+        ),
+    )
+
+
+def rows_error(tracks: Tracks, data: ServoData) -> dict[str, float]:
+    """RMS of all rows as logged against the predicted readings, by joint [rad]."""
+    return {j: rms(e.raw) for j, e in errors(None, tracks, data, everything).items()}
+
+
+def by_rule(
+    name: str, run: Callable[[NDArray[np.float64]], Tracks], data: ServoData, aged: ServoData
+) -> dict[str, dict[str, float]]:
+    """Errors with the walk's offset, of positions and of readings with their age."""
+    return {
+        f"{name}: position, offset of the walk": rows_error(run_with_offset(run, data)[0], data),
+        f"{name}: reading, offset of the walk": rows_error(run_with_offset(run, aged)[0], aged),
+    }
+
+
+# ------------------------------------------------------------------------------- servos under load
+
+
+def row_errors(fit: LoadedFit, trial: Trial) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Model minus reading of every row [rad], and its time [s]."""
+    run = prepare(trial, fit.lattice, fit.reference_voltage_v)
+    assert run is not None
+    return at_steps(track(fit, run), run.row_step) - run.row_rad, run.row_step * run.step_s
+
+
+def track(fit: LoadedFit, run: Run) -> NDArray[np.float64]:
+    """Positions that a fitted servo predicts at the edges of the steps of a run [rad]."""
+    servo, row = fit.servo.arrays(), np.zeros((1, WIDTH))
+    row[0, : len(COLUMNS)] = [float(servo[name]) for name in COLUMNS]
+    for column, name in ((-2, "gravity_nm"), (-1, "hanging_rad"), (0, "offset_rad")):
+        row[0, OFFSET + column] = fit.numbers[name].value if name in fit.numbers else 0.0
+    return simulate(row, np.array([float(servo["dead_time_s"])]), run)[:, 0]
+
+
+def dead_time(fit: LoadedFit) -> str:
+    """With its interval, in ms."""
+    d = fit.numbers["dead_time_s"]
+    return f"{1e3 * d.value:.1f} [{1e3 * d.low:.1f}, {1e3 * d.high:.1f}]"
+
+
+def xl330(seed: int, bam: str | None, bam_trials: int) -> None:
+    """Mean absolute error at the gain that was not fitted, by trajectory."""
+    files = sorted((REAL / "bam_xl330").glob("*.json"))
+    gain = {f: json.loads(f.read_text())["kp"] for f in files}
+    fitted, scored = ([f for f in files if (gain[f] == 200) is unseen] for unseen in (False, True))
+
+    def rows() -> Iterable[list[str]]:
+        fit = fit_loaded_joint("xl330", [t for f in fitted for t in load(f).trials("xl330")], seed)
+        trials = [load(f).trials("xl330")[0] for f in scored]
+        values = {f"pupper-sysid, dead time {dead_time(fit)} ms": [
+            float(np.mean(np.abs(row_errors(fit, trial)[0]))) for trial in trials
+        ]}  # fmt: skip
+        for model in ("m4", "m6") if bam else ():
+            command = [bam, HERE / "peers" / "bam_pendulum.py", model, bam_trials, seed, "xl330",
+                       *fitted, "--", *scored]  # fmt: skip
+            answer = subprocess.run(
+                [*map(str, command)], check=True, capture_output=True, text=True
+            )
+            values[f"BAM 1.0.2, {model.upper()}"] = json.loads(answer.stdout)["mae_rad"]
+        for name, by_file in values.items():
+            yield [name, *map(mrad, by_file), mrad(float(np.mean(by_file)))]
+
+    print_rows(("mean absolute error, mrad", *(f.stem for f in scored), "mean"), rows())
+
+
+def so101(seed: int) -> None:
+    """RMS errors of what was not fitted, by joint and motion."""
+    recordings = {m: load(REAL / "sage_so101" / m) for m in MOTIONS}
+    every: list[list[float]] = []
+
+    def rows() -> Iterable[list[str]]:
+        for joint in JOINTS:
+            trials = {m: r.trials(joint)[0] for m, r in recordings.items()}
+            fit = fit_loaded_joint(joint, [first(trials[m]) for m in MOTIONS[:3]], seed)
+            values = []
+            for motion, trial in trials.items():
+                error, time_s = row_errors(fit, trial)
+                counted = (time_s > FITTED_S) | (motion == MOTIONS[3])
+                values.append(float(np.sqrt(np.nanmean(error[counted] ** 2))))
+            every.append(values)
+            yield [joint, fit.structure, *map(mrad, values), dead_time(fit)]
+        yield ["mean", "", *map(mrad, np.mean(every, axis=0)), ""]
+
+    print_rows(("RMS, mrad", "structure", *MOTIONS, "dead time, ms"), rows())
+
+
+def first(trial: Trial) -> Trial:
+    """The part of a trial that is fitted."""
+    use = trial.send_time_s <= trial.send_time_s[0] + FITTED_S
+    return replace(
+        trial, send_time_s=trial.send_time_s[use], read_time_s=trial.read_time_s[use],
+        command_rad=trial.command_rad[use], position_rad=trial.position_rad[use],
+        position_count=None,
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Print the tables of the parts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("parts", nargs="+", choices=("walk", "sweep", "xl330", "so101"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--bam", help="Python of BAM's environment")
+    parser.add_argument("--bam-trials", type=int, default=2500)
+    options = parser.parse_args()
+    for part in options.parts:
+        if part == "xl330":
+            xl330(options.seed, options.bam, options.bam_trials)
+        else:
+            {"walk": walk, "sweep": sweep, "so101": so101}[part](options.seed)
+
+
+if __name__ == "__main__":
+    main()
