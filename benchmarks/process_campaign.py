@@ -28,12 +28,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from emulators import KINDS, hurry, served
 
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import lock_name, runtime_folder
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
+from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
+KINDS = ("feetech", "esp32")
 PATIENCE_S, AFTER_S, SWINGS_S = 12.0, 0.7, (0.3, 1.0)
 HEADROOM = 2 << 20
 """Memory that a starved process may still take [bytes]."""
@@ -110,8 +118,8 @@ class Drive:
     master: int
     """The terminal's other end, for a driver that has one."""
     held: ExitStack
-    """What is to be ended afterwards."""
-    struck_s: float = 0.0
+    """Processes and files to end afterwards."""
+    injected_s: float = 0.0
 
     @property
     def both(self) -> tuple[int, int]:
@@ -119,67 +127,67 @@ class Drive:
         return self.watchdog, self.driver.pid
 
 
-Strike = Callable[[Drive], None]
+Fault = Callable[[Drive], None]
 LIMP, GOES_ON = "limp", "goes on"
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Something that happens to processes."""
+    """A fault of one process or both, and what should follow."""
 
-    whom: str
+    process: str
     what: str
-    strike: Strike
+    inject: Fault
     expected: str = LIMP
     supervised: bool = False
     terminal: bool = False
 
 
-def send(drive: Drive, number: int, *whom: int) -> None:
+def send(drive: Drive, number: int, *processes: int) -> None:
     """Send a signal; both get it before either can notice."""
-    drive.struck_s = time.monotonic()
-    for one in whom:
+    drive.injected_s = time.monotonic()
+    for process in processes:
         with contextlib.suppress(ProcessLookupError):
-            os.kill(one, number)
+            os.kill(process, number)
 
 
-def to_driver(number: int) -> Strike:
+def to_driver(number: int) -> Fault:
     """A signal to the driver."""
     return lambda drive: send(drive, number, drive.driver.pid)
 
 
-def to_watchdog(number: int) -> Strike:
+def to_watchdog(number: int) -> Fault:
     """A signal to the watchdog."""
     return lambda drive: send(drive, number, drive.watchdog)
 
 
-def to_both(number: int) -> Strike:
+def to_both(number: int) -> Fault:
     """A signal to both, stopped before so that neither notices the other's end."""
 
-    def strike(drive: Drive) -> None:
+    def inject(drive: Drive) -> None:
         send(drive, signal.SIGSTOP, *drive.both)
         send(drive, number, *drive.both)
 
-    return strike
+    return inject
 
 
-def paused(stop: Strike, go_on: Strike, seconds: float) -> Strike:
+def paused(stop: Fault, go_on: Fault, seconds: float) -> Fault:
     """Stopped, and continued after some time."""
 
-    def strike(drive: Drive) -> None:
+    def inject(drive: Drive) -> None:
         stop(drive)
-        struck = drive.struck_s
+        injected = drive.injected_s
         time.sleep(seconds)
         go_on(drive)
-        drive.struck_s = struck
+        drive.injected_s = injected
 
-    return strike
+    return inject
 
 
-def lock_wanted(then: Strike) -> Strike:
+def lock_wanted(then: Fault) -> Fault:
     """Another process waits for the robot's lock, and gets it when the driver ends."""
 
-    def strike(drive: Drive) -> None:
+    def inject(drive: Drive) -> None:
         kind, _, where = drive.where.partition(":")
         lock = where if kind == "feetech" else str(runtime_folder() / lock_name(Path(where)))
         waiting = subprocess.Popen(["flock", "-x", lock, "sleep", "30"], start_new_session=True)
@@ -187,13 +195,13 @@ def lock_wanted(then: Strike) -> Strike:
         time.sleep(0.2)
         then(drive)
 
-    return strike
+    return inject
 
 
-def starved(then: Strike, driver: bool, watchdog: bool) -> Strike:
+def starved(then: Fault, driver: bool, watchdog: bool) -> Fault:
     """Without memory beyond what they have (`ulimit -v`)."""
 
-    def strike(drive: Drive) -> None:
+    def inject(drive: Drive) -> None:
         for wanted, process in ((driver, drive.driver.pid), (watchdog, drive.watchdog)):
             if wanted:
                 pages = int(Path(f"/proc/{process}/statm").read_text().split()[0])
@@ -201,20 +209,20 @@ def starved(then: Strike, driver: bool, watchdog: bool) -> Strike:
                 resource.prlimit(process, resource.RLIMIT_AS, (most, most))
         then(drive)
 
-    return strike
+    return inject
 
 
 def pipe_full(drive: Drive) -> None:
     """A stopped watchdog, and more messages than its pipe takes."""
     send(drive, signal.SIGSTOP, drive.watchdog)
-    struck = drive.struck_s
+    injected = drive.injected_s
     send(drive, signal.SIGUSR2, drive.driver.pid)
-    drive.struck_s = struck
+    drive.injected_s = injected
 
 
 def hang_up(drive: Drive) -> None:
     """The terminal is closed."""
-    drive.struck_s = time.monotonic()
+    drive.injected_s = time.monotonic()
     os.close(drive.master)
     drive.master = -1
 
@@ -223,24 +231,24 @@ def parked_by_hand(drive: Drive) -> None:
     """Both are killed, and `park` is called."""
     to_both(signal.SIGKILL)(drive)
     time.sleep(1.0)
-    drive.struck_s = time.monotonic()
+    drive.injected_s = time.monotonic()
     drive.held.enter_context(subprocess.Popen(PARK, stderr=subprocess.DEVNULL))
 
 
 def killed_then_stopped(drive: Drive) -> None:
     """The watchdog is stopped for two seconds while it parks."""
     send(drive, signal.SIGKILL, drive.driver.pid)
-    struck = drive.struck_s
+    injected = drive.injected_s
     time.sleep(0.05)
     paused(to_watchdog(signal.SIGSTOP), to_watchdog(signal.SIGCONT), 2.0)(drive)
-    drive.struck_s = struck
+    drive.injected_s = injected
 
 
 KILL, STOP, GO_ON = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT
 HOARD, HOUR, TALK = signal.SIGUSR1, signal.SIGRTMIN, signal.SIGRTMIN + 1
 
 
-def short(to: Callable[[int], Strike], seconds: float) -> Strike:
+def short(to: Callable[[int], Fault], seconds: float) -> Fault:
     """Stopped for some time."""
     return paused(to(STOP), to(GO_ON), seconds)
 
@@ -277,7 +285,7 @@ SCENARIOS = (
 
 @dataclass
 class Tally:
-    """What came of one scenario."""
+    """Outcomes of one scenario."""
 
     limp_s: list[float] = field(default_factory=list)
     on_again: int = 0
@@ -306,8 +314,8 @@ def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
         os.close(writes)
         if tty >= 0:
             os.close(tty)
-        with os.fdopen(reads, "rb") as said:
-            line = said.readline()
+        with os.fdopen(reads, "rb") as pipe:
+            line = pipe.readline()
         drive = Drive(where, driver, int(line or 0), master, held)
         try:
             yield drive if line else None
@@ -321,10 +329,33 @@ def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
             driver.communicate()
 
 
-def let_go(server) -> None:
-    """Switch all servos off."""
-    for k in range(len(JOINT_NAMES)):
-        server.emulator.bench.torque(k, server.now(), False)
+@contextmanager
+def served(kind: str, seed: int) -> Iterator[tuple[FeetechPty | ProxySocket, str]]:
+    """A running server of one emulated robot, and the address of its bus."""
+    rng = np.random.default_rng(seed)
+    # read directly, a servo answers for the very moment: no polls in between, none lost
+    direct = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
+    robot = draw_robot(rng, RobotSpec() if kind == "esp32" else direct)
+    layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+    bench = ServoBench(robot, layout, rng.spawn(1)[0])
+    with tempfile.TemporaryDirectory(prefix="robot") as name:
+        path = Path(name) / "bus"
+        if kind == "esp32":
+            server = ProxySocket(ProxyEmulator(bench, rng), path)
+        else:
+            server = FeetechPty(FeetechEmulator(bench, STS3215, rng), path)
+        thread = threading.Thread(target=server.serve, daemon=True)
+        thread.start()
+        if thread.native_id:
+            with contextlib.suppress(OSError, AttributeError):  # servos are no program
+                how = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+                os.sched_setscheduler(thread.native_id, how, os.sched_param(10))
+        try:
+            yield server, f"{kind}:{path}"
+        finally:
+            server.stop()
+            thread.join(5.0)
+            server.close()
 
 
 def limp(server) -> bool:
@@ -334,7 +365,8 @@ def limp(server) -> bool:
 
 def once(server, where: str, scenario: Scenario, rng: np.random.Generator, tally: Tally) -> bool:
     """One repeat; False if it has to be repeated."""
-    let_go(server)
+    for k in range(len(JOINT_NAMES)):
+        server.emulator.bench.torque(k, server.now(), False)
     with driven(where, scenario) as drive:
         if drive is None:
             return False
@@ -351,7 +383,7 @@ def once(server, where: str, scenario: Scenario, rng: np.random.Generator, tally
 
         watcher = threading.Thread(target=watch)
         watcher.start()  # a pause ends after the robot may be limp
-        scenario.strike(drive)
+        scenario.inject(drive)
         watcher.join(2.0 if scenario.expected == GOES_ON else PATIENCE_S)
         at.set()
         watcher.join()
@@ -359,10 +391,12 @@ def once(server, where: str, scenario: Scenario, rng: np.random.Generator, tally
         again = np.isfinite(limp_s[0]) and not limp(server)
         tally.on_again += again
         if np.isfinite(limp_s[0]):
-            tally.limp_s.append(limp_s[0] - drive.struck_s)
-        found = LIMP if np.isfinite(limp_s[0]) else GOES_ON
+            tally.limp_s.append(limp_s[0] - drive.injected_s)
+        outcome = LIMP if np.isfinite(limp_s[0]) else GOES_ON
         running = drive.driver.poll() is None
-        tally.as_expected += found == scenario.expected and not again and (found == LIMP or running)
+        tally.as_expected += (
+            outcome == scenario.expected and not again and (outcome == LIMP or running)
+        )
     return True
 
 
@@ -381,10 +415,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="runtime") as runtime:
         os.environ["XDG_RUNTIME_DIR"] = runtime
         for kind in KINDS:
-            with served(kind, options.seed) as (server, where, _):
-                hurry()
+            with served(kind, options.seed) as (server, where):
                 for number, scenario in enumerate(SCENARIOS):
-                    if options.only not in f"{scenario.whom} {scenario.what}":
+                    if options.only not in f"{scenario.process} {scenario.what}":
                         continue
                     rng = np.random.default_rng([options.seed, number])
                     tally, done = Tally(), 0
@@ -402,7 +435,7 @@ def main() -> None:
                     rows += 1
                     failed += options.repeats - tally.as_expected
                     print(
-                        f"| {kind} | {scenario.whom} | {scenario.what} | {done} | {shown} "
+                        f"| {kind} | {scenario.process} | {scenario.what} | {done} | {shown} "
                         f"| {tally.on_again} | {tally.as_expected} of {done} | {tally.undriven} |",
                         flush=True,
                     )

@@ -8,7 +8,7 @@ Recordings are found in `$PUPPER_REAL_DATA`, else in `../shared/real`. All error
 loop 2. `sweep`: the sweeps of its hip and thigh are calibrated, and predict the same joints of that
 walk, as positions and as readings of the sweep's poll. `xl330`: a Dynamixel XL330 with a pendulum,
 fitted at P 100, 400 and 800, scored at P 200; with `--bam`, the Python of BAM's environment
-(`peers/install.sh`), BAM's models are fitted to the same recordings. `so101`: the STS3215 of an arm,
+(`peers/install.sh`), BAM's models are fitted to the same. `so101`: the STS3215 of an arm,
 fitted to the first 40 s of three motions, scored on the rest and on a fourth motion.
 """
 

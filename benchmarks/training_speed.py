@@ -4,20 +4,15 @@
 
 Prints three tables: the environment against a bare `Batch.step` on the same model, threads, states
 and controls, in turns in slices of 0.2 s, for 20 to 8,192 environments; what delay, feedback model,
-terrain and physics cost; PPO end to end for each architecture, and the Transformer's update on
-sequences against one window per sample. `--only environments` leaves the others out.
+terrain and physics cost; PPO end to end for each architecture. `--only environments` prints the
+first alone.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import resource
-import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
-from pathlib import Path
 from typing import get_args
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,7 +22,6 @@ import numpy as np
 import torch
 
 from pupper_sysid.common.processes.memory import keep_freed_memory
-from pupper_sysid.policies.network.attention import CONTEXT, CausalAttention
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.train.run_file import preset
 from pupper_sysid.policies.train.speed import Paces, load, measure, ratios
@@ -40,22 +34,6 @@ SIZES = (20, 100, 512, 2048, 8192)
 PAPER = {"mlp": "30,000", "lstm": "15,000–20,000", "transformer": "5,500"}
 
 
-def resident_kb() -> float:
-    """Memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1024
-
-
-def environment(size: int, threads: int) -> tuple[dict[str, float], float]:
-    """Rates and ratios of the environment, and what a robot takes [kB]."""
-    keep_freed_memory()
-    servos = servo_ranges(ACTUATOR)
-    Paces(PupperEnv(Walking(), servos, 1, 0, threads))  # what is loaded only once
-    before = resident_kb()
-    env = PupperEnv(Walking(), servos, size, 0, threads)
-    taken = (resident_kb() - before) / size
-    return ratios(Paces(env).slices()), taken
-
-
 def row(found: dict[str, float]) -> str:
     """Cells of a table."""
     low, high = found["env_ratio_low"], found["env_ratio_high"]
@@ -66,21 +44,17 @@ def row(found: dict[str, float]) -> str:
 
 
 def environments(threads: int) -> None:
-    """Cost against number of environments, and memory."""
+    """Cost against number of environments."""
     print(
         f"Threads {threads}, load {load():.1f}; median of slices of 0.2 s, and their middle half.\n"
     )
     print(
         "| environments | bare Batch.step, steps/s | PupperEnv, steps/s | ratio | "
-        "of processor time | kB per robot |"
+        "of processor time |\n|---|---|---|---|---|"
     )
-    print("|---|---|---|---|---|---|")
     for size in SIZES:
-        # a process of its own: freed memory is kept, and would hide what the next one takes
-        with ProcessPoolExecutor(1, get_context("spawn")) as own_process:
-            found, kb = own_process.submit(environment, size, threads).result()
-        memory = f"{kb:.0f}" if size >= 1024 else "–"
-        print(f"| {size:,} | {row(found)} | {memory} |", flush=True)
+        env = PupperEnv(Walking(), servo_ranges(ACTUATOR), size, 0, threads)
+        print(f"| {size:,} | {row(ratios(Paces(env).slices()))} |", flush=True)
 
 
 def parts(threads: int) -> None:
@@ -134,38 +108,6 @@ def end_to_end(threads: int) -> None:
             )
 
 
-def attention() -> None:
-    """One pass over sequences against one window per sample: forward and backward."""
-    steps, robots, size = 24, 128, 60
-    torch.manual_seed(0)
-    layer = CausalAttention(size)
-    tokens = torch.randn(robots, CONTEXT - 1 + steps, size)
-    present = torch.ones(robots, CONTEXT - 1 + steps, dtype=torch.bool)
-    windows = tokens.unfold(1, CONTEXT, 1).transpose(2, 3).reshape(-1, CONTEXT, size)
-    there = torch.ones(len(windows), CONTEXT, dtype=torch.bool)
-
-    def sequence() -> torch.Tensor:
-        return layer(tokens, present, steps).reshape(-1, layer.width)
-
-    def window() -> torch.Tensor:
-        # what a window per sample computes: every position, of which only the last is used
-        return layer(windows, there, CONTEXT)[:, -1]
-
-    assert torch.allclose(sequence(), window(), atol=1e-5)
-    rates = []
-    for run in (sequence, window):
-        best = np.inf
-        for _ in range(5):
-            begun = time.perf_counter()
-            run().square().sum().backward()
-            best = min(best, time.perf_counter() - begun)
-        rates.append(robots * steps / best)
-    print(
-        f"\nTransformer, forward and backward: {rates[0]:,.0f} samples/s in sequence form, "
-        f"{rates[1]:,.0f} with one window per sample: {rates[0] / rates[1]:.1f} times."
-    )
-
-
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -177,7 +119,6 @@ def main() -> None:
     environments(options.threads)
     if options.only is None:
         parts(options.threads)
-        attention()
         end_to_end(options.threads)
 
 

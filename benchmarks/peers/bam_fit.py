@@ -14,6 +14,7 @@ import numpy as np
 from bam.logs import Logs
 from bam.model import load_model
 from bam.simulate import Simulator
+from bam_pendulum import processed
 from exchange import Fitted, serve
 
 TRIALS = 600
@@ -32,32 +33,26 @@ def write(trial, path):
     path.write_text(json.dumps({**about, "trajectory": "sweep", "entries": entries}))
 
 
-def call(module, *arguments, folder):
-    command = [sys.executable, "-m", module, *map(str, arguments)]
-    subprocess.run(
-        command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-
-def processed(trials, root):
-    raw, logs = Path(root) / "raw", Path(root) / "logs"
-    raw.mkdir(), logs.mkdir()
-    for number, trial in enumerate(trials):
-        write(trial, raw / f"{number}.json")
-    call("bam.process", "--raw", raw, "--logdir", logs, folder=root)
-    return logs
+def logs_of(trials, root):
+    files = [Path(root) / f"{number}.json" for number in range(len(trials))]
+    for trial, file in zip(trials, files, strict=True):
+        write(trial, file)
+    return processed(files, root, "sweep")
 
 
 def fit(trials):
     with tempfile.TemporaryDirectory() as root:
-        logs = processed(trials, root)
-        call("bam.fit", "--logdir", logs, "--actuator", "sts3215", "--model", "m4",
-             "--trials", TRIALS, "--output", "params.json", folder=root)  # fmt: skip
+        command = [
+            sys.executable, "-m", "bam.fit", "--logdir", str(logs_of(trials, root)),
+            "--actuator", "sts3215", "--model", "m4", "--trials", str(TRIALS),
+            "--output", "params.json",
+        ]  # fmt: skip
+        subprocess.run(command, cwd=root, check=True, capture_output=True)
         model = load_model(f"{root}/params.json")
 
     def predict(trial):
         with tempfile.TemporaryDirectory() as root:
-            log = Logs(str(processed([trial], root))).make_batch()
+            log = Logs(str(logs_of([trial], root))).make_batch()
         path = Simulator(model).rollout_log(log, simulate_control=True)[0]
         time = trial.time_s[0] + np.array([e["timestamp"][0] for e in log["entries"]])
         return np.interp(trial.grid_s, time, np.array(path).ravel()) + trial.rest_rad

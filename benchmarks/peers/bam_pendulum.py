@@ -28,6 +28,7 @@ SEEDED = (
 
 
 def processed(files, root, name):
+    root = Path(root)
     raw, logs = root / f"{name}-raw", root / f"{name}-logs"
     raw.mkdir(), logs.mkdir()
     for file in files:
@@ -51,15 +52,16 @@ def main():
         ]  # fmt: skip
         subprocess.run(command, cwd=root, check=True, stdout=subprocess.DEVNULL)
         fitted = load_model(str(root / "params.json"))
-        found = []
+        errors = []
         for log in Logs(str(processed(sys.argv[cut + 1 :], root, "score"))).logs:
             path = Simulator(fitted).rollout_log(log, simulate_control=True)[0]
             true = [e["position"] for e in log["entries"]]
-            found.append(float(np.mean(np.abs(np.array(path).ravel() - np.array(true)))))
+            errors.append(float(np.mean(np.abs(np.array(path).ravel() - np.array(true)))))
         parameters = json.loads((root / "params.json").read_text())
-        print(json.dumps({"mae_rad": found, "parameters": parameters}))
+        print(json.dumps({"mae_rad": errors, "parameters": parameters}))
     finally:
         shutil.rmtree(root)
 
 
-main()
+if __name__ == "__main__":
+    main()

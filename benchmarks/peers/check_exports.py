@@ -1,28 +1,24 @@
-"""Do the released simulators know the names that our exports use, and delay as we say?
+"""Do the released simulators know the names that our exports use, and move as we do?
 
     .venv/bin/python benchmarks/peers/check_exports.py
 
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with those of
-`tests/support/exported_servos.py`, which the tests hold the exports against. mjlab's delay buffer
-is run with the exported settings, and with the ones that its documentation suggests. Where
-`install.sh` has been run, Newton, mjlab and Isaac Lab's actuators run their exports: a tone through
-servos behind a floating base, against our own simulation.
+`tests/support/exported_servos.py`, which the tests hold the exports against. Where `install.sh` has
+been run, Newton, mjlab and Isaac Lab's actuators run their exports: a tone through servos behind a
+floating base, against our own simulation.
 """
 
 from __future__ import annotations
 
 import ast
-import importlib
 import subprocess
 import sys
 import tempfile
-import types
 import zipfile
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine
@@ -82,24 +78,6 @@ def fields(root: Path, part: str, names: tuple[str, ...]) -> set[str]:
     return found
 
 
-def delivered(root: Path, **settings) -> list[int]:
-    """Which command mjlab's buffer gives in each of 40 steps after a reset."""
-    for name in ("mjlab", "mjlab.utils"):
-        package = types.ModuleType(name)
-        package.__path__ = [str(root / name.replace(".", "/"))]
-        sys.modules[name] = package
-    buffers = importlib.import_module("mjlab.utils.buffers")
-    buffer = buffers.DelayBuffer(
-        batch_size=1, generator=torch.Generator().manual_seed(0), **settings
-    )
-    buffer.reset()
-    given = []
-    for k in range(40):
-        buffer.append(torch.tensor([[float(k)]]))
-        given.append(int(buffer.compute()[0, 0]))
-    return given
-
-
 def tone(step_s: float) -> tuple[NDArray, NDArray]:
     """Times of steps, and what a loop of 50 Hz commands of a tone in each."""
     at = step_s * np.arange(round(3.0 / step_s))
@@ -141,8 +119,8 @@ def print_tones(folder: Path) -> None:
     at, commands = tone(TIME_STEP_S)
     servo = calibration.delayed_pd()
     servo.reset(np.zeros(len(calibration.joint_names)))
-    told = np.repeat(commands[:, None], servo.batch[0], axis=1)
-    ours = phasors(at + TIME_STEP_S, servo.rollout(told))
+    commanded = np.repeat(commands[:, None], servo.batch[0], axis=1)
+    ours = phasors(at + TIME_STEP_S, servo.rollout(commanded))
     print(
         f"\n| {TONE_HZ:g} Hz, steps of {1e3 * STEP_S:g} ms | joint | amplitude | ours | lag ms "
         "| ours | delay rounded to steps by |\n|---|---|---|---|---|---|---|"
@@ -186,16 +164,6 @@ def main() -> None:
         bad += len(unknown)
         print(f"| newton | {version} | {', '.join(unknown) or 'none'} |")
 
-        exported = {"min_lag": 5, "max_lag": 5, "update_period": 0, "hold_prob": 0.0}
-        print("\n| settings of mjlab's delay | age of the command in steps 20 to 29 |\n|---|---|")
-        for settings in (
-            exported | {"per_env_phase": False},
-            {"min_lag": 3, "max_lag": 7},
-            {"min_lag": 5, "max_lag": 5, "hold_prob": 1.0},
-            {"min_lag": 5, "max_lag": 5, "update_period": 1000},
-        ):
-            ages = [k - g for k, g in enumerate(delivered(folder / "mjlab", **settings))][20:30]
-            print(f"| {', '.join(f'{k}={v}' for k, v in settings.items())} | {ages} |")
         print_tones(folder)
     sys.exit(1 if bad else 0)
 

@@ -13,7 +13,6 @@ measured (held), against fresh readings of tones it has not seen (unseen), again
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import os
 import subprocess
@@ -69,13 +68,13 @@ class Case:
     robot: SweptRobot | None = None
 
     def dead_time_s(self, step_s: float) -> float:
-        """The servo's own, as a simulation in such steps has to have it; NaN if unknown."""
+        """True dead time, for a simulation in steps of `step_s`; NaN if unknown."""
         return float("nan") if self.robot is None else self.robot.dead_time_s(step_s)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method made of one case. Errors are RMS [rad]."""
+    """Errors of one method on one case, RMS [rad]."""
 
     method: str
     case: str
@@ -90,10 +89,10 @@ class Outcome:
 
 
 def emulated(seed: int) -> Case:
-    """A robot of its own, one of its joints swept at 1, 2, 4 and 8 Hz."""
+    """A random robot, one of its joints swept at 1, 2, 4 and 8 Hz."""
     rng = np.random.default_rng([20261122, seed])
     loss, noise = float(rng.uniform(0.0, 0.5)), float(rng.uniform(0.002, 0.012))
-    robot = sweep_random_robot(rng, loss, noise, "1,2,4,8")
+    robot = sweep_random_robot(rng, "1,2,4,8", loss=loss, reading_noise_rad=noise)
     bus = robot.bus
     motion = []
     for trial in robot.recording.trials(robot.joint):
@@ -104,7 +103,7 @@ def emulated(seed: int) -> Case:
 
 
 def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:
-    """Through `calibrate`, exactly as the command does it."""
+    """Through `calibrate`, as the command does it."""
     began = time.perf_counter()
     result = calibrate([case.recording], [case.joint], workers=1)[case.joint]
     seconds = time.perf_counter() - began
@@ -199,27 +198,14 @@ def track_of(positions_rad: list[list[float]], data: tuple[TrialData, ...]) -> l
     ]
 
 
-def code_lines(path: Path) -> int:
-    """Lines of a script that say something: no comments, no docstrings, no empty ones."""
-    text = path.read_text()
-    quoted: set[int] = set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            quoted |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return sum(
-        bool(line.strip()) and not line.strip().startswith("#") and number not in quoted
-        for number, line in enumerate(text.splitlines(), 1)
-    )
-
-
 def table(outcomes: list[Outcome], names: list[str]) -> str:
     """Medians over the cases that every method of the table has seen, as Markdown."""
     shared = {o.case for o in outcomes if o.method == names[0]}
     shared &= set.intersection(*({o.case for o in outcomes if o.method == n} for n in names))
     lines = [
         "| method | held | unseen tone | raw | true motion | dead time off, ms | 90 % interval "
-        "holds it | its width ms | s per joint | lines |",
-        "|" + "---|" * 10,
+        "holds it | its width ms | s per joint |",
+        "|" + "---|" * 9,
     ]
     for name in names:
         own = [o for o in outcomes if o.method == name and o.case in shared]
@@ -231,14 +217,12 @@ def table(outcomes: list[Outcome], names: list[str]) -> str:
         ]
         errors = [f"{1e3 * m:.1f}" if np.isfinite(m) else "–" for m in middle[:4]]
         off = np.median([abs(o.delay_error_s) for o in known]) if known else np.nan
-        script = PEERS["mujoco.sysid 4.0.0" if name == RETIMED else name][0] if name != OURS else ""
         cells = [
             *errors,
             f"{1e3 * off:.1f}" if np.isfinite(off) else "–",
             f"{sum(bool(o.covered) for o in spans)} of {len(spans)}" if spans else "none stated",
             f"{1e3 * np.median([o.width_s for o in spans]):.1f}" if spans else "–",
             f"{middle[4]:.1f}",
-            str(code_lines(HERE / script)) if script else "1 command",
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + f"\n\nErrors in mrad, medians of {len(shared)} recordings."
@@ -251,17 +235,6 @@ def real_cases(folder: Path) -> list[Case]:
         recording = load(path)
         cases += [Case(f"real {joint}", recording, joint) for joint in recording.joints]
     return cases
-
-
-def say(outcome: Outcome) -> None:
-    """One line on standard error."""
-    o = outcome
-    print(
-        f"{o.case} | {o.method} | held {1e3 * o.held:.1f} unseen {1e3 * o.unseen:.1f} raw "
-        f"{1e3 * o.raw:.1f} true {1e3 * o.true:.1f} dead time {1e3 * o.delay_error_s:+.1f} ms "
-        f"{o.covered} {o.seconds:.1f} s",
-        file=sys.stderr, flush=True,
-    )  # fmt: skip
 
 
 def main() -> None:
@@ -283,12 +256,11 @@ def main() -> None:
             case = emulated(member) if isinstance(member, int) else member
             mine, data = ours(case)
             outcomes.append(mine)
-            say(mine)
             for name, (script, environment) in methods.items():
                 if name in SLOW and isinstance(member, int) and number >= options.slow:
                     continue
                 outcomes.append(theirs(name, script, environment, case, data))
-                say(outcomes[-1])
+            print(case.name, file=sys.stderr, flush=True)
         if outcomes:
             print(f"{title}\n\n{table(outcomes, [*methods, OURS])}\n", flush=True)
 
