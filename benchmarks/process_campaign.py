@@ -127,7 +127,11 @@ class Drive:
         return self.watchdog, self.driver.pid
 
 
-Fault = Callable[[Drive], None]
+Fault = Callable[[Drive], object]
+KILL, STOP, GO_ON = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT
+HOARD, FILL, HOUR, TALK = (
+    signal.SIGUSR1, signal.SIGUSR2, signal.SIGRTMIN, signal.SIGRTMIN + 1,
+)  # fmt: skip
 LIMP, GOES_ON = "limp", "goes on"
 
 
@@ -163,23 +167,18 @@ def to_watchdog(number: int) -> Fault:
 
 def to_both(number: int) -> Fault:
     """A signal to both, stopped before so that neither notices the other's end."""
+    return lambda drive: [send(drive, n, *drive.both) for n in (STOP, number)]
+
+
+def in_turn(first: Fault, seconds: float, second: Fault) -> Fault:
+    """One fault, and another some time later; time counts from the first."""
 
     def inject(drive: Drive) -> None:
-        send(drive, signal.SIGSTOP, *drive.both)
-        send(drive, number, *drive.both)
-
-    return inject
-
-
-def paused(stop: Fault, go_on: Fault, seconds: float) -> Fault:
-    """Stopped, and continued after some time."""
-
-    def inject(drive: Drive) -> None:
-        stop(drive)
-        injected = drive.injected_s
+        first(drive)
+        injected_s = drive.injected_s
         time.sleep(seconds)
-        go_on(drive)
-        drive.injected_s = injected
+        second(drive)
+        drive.injected_s = injected_s
 
     return inject
 
@@ -212,14 +211,6 @@ def starved(then: Fault, driver: bool, watchdog: bool) -> Fault:
     return inject
 
 
-def pipe_full(drive: Drive) -> None:
-    """A stopped watchdog, and more messages than its pipe takes."""
-    send(drive, signal.SIGSTOP, drive.watchdog)
-    injected = drive.injected_s
-    send(drive, signal.SIGUSR2, drive.driver.pid)
-    drive.injected_s = injected
-
-
 def hang_up(drive: Drive) -> None:
     """The terminal is closed."""
     drive.injected_s = time.monotonic()
@@ -235,22 +226,9 @@ def parked_by_hand(drive: Drive) -> None:
     drive.held.enter_context(subprocess.Popen(PARK, stderr=subprocess.DEVNULL))
 
 
-def killed_then_stopped(drive: Drive) -> None:
-    """The watchdog is stopped for two seconds while it parks."""
-    send(drive, signal.SIGKILL, drive.driver.pid)
-    injected = drive.injected_s
-    time.sleep(0.05)
-    paused(to_watchdog(signal.SIGSTOP), to_watchdog(signal.SIGCONT), 2.0)(drive)
-    drive.injected_s = injected
-
-
-KILL, STOP, GO_ON = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT
-HOARD, HOUR, TALK = signal.SIGUSR1, signal.SIGRTMIN, signal.SIGRTMIN + 1
-
-
 def short(to: Callable[[int], Fault], seconds: float) -> Fault:
     """Stopped for some time."""
-    return paused(to(STOP), to(GO_ON), seconds)
+    return in_turn(to(STOP), seconds, to(GO_ON))
 
 
 SCENARIOS = (
@@ -269,9 +247,13 @@ SCENARIOS = (
     Scenario("watchdog", "SIGSTOP, SIGCONT after 0.2 s", short(to_watchdog, 0.2), GOES_ON),
     Scenario("watchdog", "SIGSTOP, SIGCONT after 2 s", short(to_watchdog, 2.0)),
     Scenario("watchdog", "SIGKILL, lock taken", lock_wanted(to_watchdog(KILL))),
-    Scenario("watchdog", "SIGSTOP, pipe full", pipe_full),
+    Scenario("watchdog", "SIGSTOP, pipe full", in_turn(to_watchdog(STOP), 0.0, to_driver(FILL))),
     Scenario("watchdog", "out of memory, driver SIGKILL", starved(to_driver(KILL), False, True)),
-    Scenario("watchdog", "SIGSTOP for 2 s, driver SIGKILL", killed_then_stopped),
+    Scenario(
+        "watchdog",
+        "SIGSTOP for 2 s, driver SIGKILL",
+        in_turn(to_driver(KILL), 0.05, short(to_watchdog, 2.0)),
+    ),
     Scenario("both", "SIGSTOP for 3 s (machine suspended)", short(to_both, 3.0)),
     Scenario("both", "out of memory", starved(to_driver(HOARD), True, True)),
     Scenario("both", "SIGKILL, supervised", to_both(KILL), supervised=True),

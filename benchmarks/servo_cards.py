@@ -101,7 +101,7 @@ def robstride(kind: str, seed: int) -> ServoCard:
     The collector sends a velocity with each position, and the drive's D gain acts on the velocity's
     error. That is the same as a position that leads by D gain over P gain times the velocity.
     """
-    fits, drives, recordings, told = {}, {}, [], []
+    fits, drives, recordings, notes_of_joints = {}, {}, [], []
     for path in sorted((REAL / "ktune_robstride").glob("*.json")):
         log = json.loads(path.read_text())
         config = log["config"]
@@ -116,7 +116,7 @@ def robstride(kind: str, seed: int) -> ServoCard:
         drives[joint] = config["kp"], config["max_torque"]
         reported = np.array([row["torque"] for row in log["data"]])
         slope, together = torques(fits[joint], led, config["kp"], reported)
-        told.append(
+        notes_of_joints.append(
             f"{joint}: P gain {config['kp']:g} N·m/rad, D gain {config['kd']:g} N·m·s/rad as set. "
             f"The drive reports up to {np.abs(reported).max():.1f} N·m, {slope:.2f} times the "
             f"torque of these numbers (correlation {together:.2f})."
@@ -129,7 +129,7 @@ def robstride(kind: str, seed: int) -> ServoCard:
         ),
         "the leg itself, one joint at a time",
         notes=(
-            *told,
+            *notes_of_joints,
             "The type is that in the names of the robot's joints: the logs, of branch rs_tune, "
             "state an actuator's number only.",
             "The D gain acts on the difference to the commanded velocity, which was sent, too: "
@@ -169,11 +169,11 @@ def main() -> None:
     parser.add_argument("--only", choices=CARDS, help="one card")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=OUT)
-    given = parser.parse_args()
-    for name in [given.only] if given.only else CARDS:
+    options = parser.parse_args()
+    for name in [options.only] if options.only else CARDS:
         begun = time.monotonic()
-        card = CARDS[name](given.seed)
-        card.save(given.out / f"{name}.yaml", force=True)
+        card = CARDS[name](options.seed)
+        card.save(options.out / f"{name}.yaml", force=True)
         print(f"{name}: {time.monotonic() - begun:.0f} s")
         for score in card.scores:
             print(f"  {1e3 * score.value:6.1f} mrad  {score.what}")

@@ -101,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    options = parser.parse_args()
     walk = load(REAL / WALK)
     robot = robot_for(walk)
     first = Recording.from_frame(walk.table[walk.table["trial"] < 2], metadata=walk.metadata)
@@ -113,11 +113,11 @@ def main() -> None:
         name: of_calibration(own, robot, walk) for name, own in made.items()
     }
     published = {name: actuators[name] for name in PRESETS}
-    loops = {"test_loops": [2], "seed": given.seed}
+    loops = {"test_loops": [2], "seed": options.seed}
     found = twin(walk, actuators, robot, **loops)
     ideal = twin(walk, published, robot, **loops).models
     models = {f"{name}, ideal feedback": own for name, own in ideal.items()} | found.models
-    fitted = fit_servo(walk, None, "mlp", split=SPLIT, seed=given.seed).scored
+    fitted = fit_servo(walk, None, "mlp", split=SPLIT, seed=options.seed).scored
     print("| servos | in the air: RMS mrad (90 %) | mean abs. | on the ground: RMS mrad (90 %) | "
           "mean abs. | upright | the robot was |")  # fmt: skip
     print("|---|---|---|---|---|---|---|")
@@ -132,13 +132,13 @@ def main() -> None:
     evidence = found.models[CALIBRATED].evidence
     assert evidence is not None
     print(f"{CALIBRATED}: {evidence.why}")
-    if given.picture:
+    if options.picture:
         errors = {
             words: fitted[name].rmse_free_run_rad.value
             for name, words in (("linear", "linear filter"), ("mlp", "MLP"))
         }
         drawn = picture(replace(found, models=models), errors)
-        save(drawn, given.picture, force=True)
+        save(drawn, options.picture, force=True)
 
 
 if __name__ == "__main__":

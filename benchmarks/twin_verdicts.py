@@ -158,8 +158,8 @@ def polled(robot: EmulatedRobot) -> Calibration:
     return base.model_copy(update={"joints": joints})
 
 
-def told(seed: int) -> tuple[dict, Evidence] | None:
-    """One robot: the truth, and what the twin test says; None if it fell or was stopped."""
+def tested(seed: int) -> tuple[dict, Evidence] | None:
+    """Truth and evidence of one robot; None if it fell or was stopped."""
     rng = np.random.default_rng([20261124, seed])
     kind, ground = ("trot", "tones")[seed % 2], bool(seed // 2 % 2)
     zero = (0.0, 0.005, 0.02)[seed // 4 % 3]
@@ -180,21 +180,17 @@ def main() -> None:
     """Print the verdicts by truth."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", type=int, default=60)
-    parser.add_argument("--each", action="store_true", help="a line per robot")
-    given = parser.parse_args()
+    options = parser.parse_args()
     counts: dict[tuple, Counter] = {}
     left_out = 0
-    for seed in range(given.robots):
-        found = told(seed)
-        if found is None:
+    for seed in range(options.robots):
+        result = tested(seed)
+        if result is None:
             left_out += 1
             continue
-        truth, evidence = found
+        truth, evidence = result
         key = ("ground" if truth["ground"] else "air", truth["kind"], truth["zero"])
         counts.setdefault(key, Counter())[evidence.verdict] += 1
-        if given.each:
-            share = evidence.motion[0].correlation if evidence.motion[0] else None
-            print(seed, *key, evidence.verdict, share, evidence.load_share[0], flush=True)
     print(f"{left_out} fell, or were stopped by the guard, and are left out.\n")
     print("| truth | commands | zeros mrad | ground | air | cannot tell |")
     print("|---|---|---|---|---|---|")

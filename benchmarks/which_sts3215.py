@@ -1,4 +1,4 @@
-"""Published models of the STS3215 and our own on motions of an SO-101 arm that no one fitted.
+"""Published models of the STS3215 and our own on unseen motions of an SO-101 arm.
 
     .venv/bin/python benchmarks/which_sts3215.py
 
@@ -546,15 +546,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--joints", nargs="+", choices=JOINTS, default=JOINTS)
     parser.add_argument("--print-only", action="store_true", help="write no files")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     found = {}
-    for joint in asked.joints:
+    for joint in options.joints:
         begun = time.process_time()
         found[joint] = _plain(evaluate(joint))
         print(f"{joint}: {time.process_time() - begun:.0f} s of processor time", flush=True)
     inputs = {m: load(REAL / "sage_so101" / m).sha256 for m in MOTIONS}
     cards = {card: numbers_hash(load_card(card)) for card in MODELS.values()}
-    publish({"recordings": inputs, "cards": cards, "joints": found}, write=not asked.print_only)
+    publish({"recordings": inputs, "cards": cards, "joints": found}, write=not options.print_only)
 
 
 if __name__ == "__main__":

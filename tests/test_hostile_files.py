@@ -53,7 +53,7 @@ from support.saved_servo_models import saved
 
 SAMPLES = Path(__file__).parents[1] / "data" / "samples"
 CARDS = Path(__file__).parents[1] / "servo_models" / "cards" / "data"
-EXAMPLES = max(settings.default.max_examples // 8, 1)
+EXAMPLES = max(settings.default.max_examples // 12, 1)
 CPU_S = 5.0
 """Processor time of one reading; the slowest refusal takes a few milliseconds."""
 MEMORY_BYTES = 2 << 30
@@ -387,6 +387,27 @@ def test_what_is_no_file_of_the_kind_at_all_is_refused(good_files, name):
         for content in (b"", b"\n \n\t\n", bytes(range(256)) * 20, b"[" * 100_000):
             path.write_bytes(content)
             assert limited(lambda: kind.read(path))
+    finally:
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("SAGE", b"timestamp", b"\x1b[2Jtimestamp"),
+        ("LeRobot", b"knee.pos", b"\\u001b[2J"),
+        ("recording", b"send_time_s", b"\x1b[2Jsend_time_s"),
+    ],
+)
+def test_control_characters_of_names_are_not_in_the_refusal(good_files, name, good, bad):
+    kind = KINDS[name]
+    if kind.needs:
+        pytest.importorskip(kind.needs)
+    path = good_files(name)
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(whole.replace(good, bad, 1))
+        assert limited(lambda: kind.read(path))
     finally:
         path.write_bytes(whole)
 

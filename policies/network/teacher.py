@@ -4,7 +4,7 @@ A teacher learns from nothing, by PPO. Adam moves every weight about as far whet
 signal or noise, and PPO limits how far all of them together move the actions. So inputs that say
 nothing about a gait cost most of what an update may change: with the 145 numbers that a critic sees
 a teacher travelled after 1.4 million samples, with 19 of these after 0.5, and with the products of
-command and clock after 0.4 ("What it took" in `benchmarks/README.md`).
+command and clock after 0.4 (one run each).
 """
 
 from __future__ import annotations

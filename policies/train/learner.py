@@ -54,8 +54,9 @@ class TerminalPPO(PPO):
     At a time-out it adds the value of the state that was reached. Where a robot is then given a new
     command or a push, the step before is credited with the value of the state without them: no
     action can bring them about, and what they cost was nine tenths of the variance of the
-    advantages ("What it took" in `benchmarks/README.md`). So a policy learns to recover from a
-    push, but is not paid for standing in a way that makes pushes matter less.
+    advantages (measured by repeating steps from the same states with other noise of the actions).
+    So a policy learns to recover from a push, but is not paid for standing in a way that makes
+    pushes matter less.
     """
 
     def process_env_step(

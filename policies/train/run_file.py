@@ -121,7 +121,8 @@ def _first_gait_imitated(kind: Kind) -> Run:
         architecture=Architecture(kind, hidden, 64, (256, 128, 64)), task=PRESETS["fast"],
         learner=Hyperparameters(
             # many small updates with little white noise: noise that lasts is credited with what it
-            # does in the other half of a stride, and more of it loosens dry friction
+            # does in the other half of a stride, and more of it loosens dry friction; at a
+            # divergence of 0.01 an MLP's score fell by 0.02 in 200 updates, at 0.02 it rose by 0.02
             steps_per_environment=steps, epochs=3, critic_warmup=40, freeze_normaliser=True,
             desired_kl=0.02 if without_memory else 0.01, learning_rate=1e-5, discount=0.97,
             gae_lambda=0.9,

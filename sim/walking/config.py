@@ -259,7 +259,8 @@ _SCRATCH = Walking(
         foot_slip=-1.0, joint_position=-0.2, action_rate=-0.5, action_jerk=-0.2,
     ),
 )  # fmt: skip
-"""Settings with which a walk is found from nothing; see `benchmarks/README.md`."""
+"""Settings with which a walk is found from nothing ("A walk from nothing" in
+`benchmarks/README.md`)."""
 
 PRESETS = {
     "fast": Walking(

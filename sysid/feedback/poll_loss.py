@@ -30,7 +30,7 @@ _OF_TOP_SPEED = 0.5  # below it a joint with friction may stand
 _EARLY_OR_LATE_S = (-0.01, 0.0, 0.01)  # by which the model's motion may err
 _GRID_S, _SMOOTHING_S, _LONGEST_LAG_S = 0.002, 0.015, 0.3
 # of the count without a model: where motion starts and ends is not known to a poll; measured on
-# random servos (benchmarks/poll_intervals.py)
+# 200 random servos
 _OVERDISPERSION = 1.6
 _IMPOSSIBLE_SD = 3.0
 

@@ -24,7 +24,8 @@ Motion = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Expected position [rad] of a joint at times [s] on the recording's clock."""
 
 NATS = 10.0
-"""Gain in log-likelihood that a change point needs."""
+"""Gain in log-likelihood that a change point needs: no slip is then named in 196 trials of random
+servos without one, and 85 % of jumps of 0.4 to 0.5 periods are followed."""
 
 SMALLEST_JUMP = 0.2
 """In periods; smaller jumps are within a wandering period's reach and not called slips."""

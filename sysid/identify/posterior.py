@@ -37,8 +37,7 @@ from pupper_sysid.sysid.identify.search import fresh_residuals
 HARMONICS = (1, 2, 3)
 STEPPING_SD_S = 0.5 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
-standard deviation over random emulated servos with half that step
-(`benchmarks/dead_time_accuracy.py`)."""
+standard deviation over 60 random emulated servos with half that step."""
 _CHAINS = 32
 _SETTLING, _GENERATIONS = 130, 140
 _LEFT_OUT = 20  # generations after the change of steps

@@ -14,7 +14,7 @@ from pupper_sysid.sysid.loaded.structures import Structure
 
 _STEPPING_SHARE = 0.006
 """Relative error that physics steps leave, whatever the number of readings: standard deviation over
-random emulated servos that move in other steps (`benchmarks/loaded_pendulum.py`)."""
+eight random emulated servos with other steps (world `pendulum` of `benchmarks/coverage.py`)."""
 
 _SHARP_DEAD_TIME_S = 0.015
 

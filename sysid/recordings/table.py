@@ -160,10 +160,11 @@ def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> 
         return
     spare = [str(c) for c in table.columns if c not in columns]
     near = difflib.get_close_matches(lacking[0], spare, n=1, cutoff=0.5)
-    hint = f" Was '{near[0]}' meant? Rename it." if near else ""
+    hint = f" Was '{printable(near[0])}' meant? Rename it." if near else ""
+    present = printable(", ".join(map(str, table.columns)))
     raise InputError(
-        f"{path}: column {', '.join(lacking)} is missing; it has "
-        f"{', '.join(map(str, table.columns))}.{hint} A recording needs {', '.join(columns)}."
+        f"{path}: column {', '.join(lacking)} is missing; it has {present}.{hint} "
+        f"A recording needs {', '.join(columns)}."
     )
 
 

@@ -1,6 +1,6 @@
 """Slow strokes give hysteresis, dead zone and play, each where it can be told from the others.
 
-Coverage over 60 servos: `benchmarks/backlash.py`.
+Coverage over 60 servos: `benchmarks/coverage.py --world strokes`.
 """
 
 from __future__ import annotations

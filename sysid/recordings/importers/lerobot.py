@@ -24,6 +24,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS
 from pupper_sysid.common.reading.names import distinct, one_each
+from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.parquet import read_columns
 from pupper_sysid.sysid.recordings.importers.shared.log import (
     Log,
@@ -157,7 +158,7 @@ def _names(path: Path, info: Any) -> dict[str, list[str]]:
     if not both:
         raise InputError(
             f"{path}: no joint has both {_ACTION} and {_STATE}; action has "
-            f"{', '.join(found[_ACTION])[:200]}."
+            f"{printable(', '.join(found[_ACTION])[:200])}."
         )
     return found | {"joints": positions or both}
 

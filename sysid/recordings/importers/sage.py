@@ -126,8 +126,8 @@ def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], N
     lacking = [c for c in ("timestamp", "positions") if c not in header]
     if lacking:
         raise InputError(
-            f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(header)[:200]}. "
-            "A SAGE table needs timestamp and positions."
+            f"{path}: column {', '.join(lacking)} is missing; it has "
+            f"{printable(', '.join(header)[:200])}. A SAGE table needs timestamp and positions."
         )
     at, where = header.index("timestamp"), header.index("positions")
     times, values = [], []

@@ -48,7 +48,7 @@ def test_good_recordings_of_random_servos_are_for_use():
     for seed in range(8):
         recording = good_recording(np.random.default_rng([11, seed]))
         found += [f.verdict for f in findings(recording.trials(JOINT)) if f.verdict != "use"]
-    assert found == []  # one in a hundred asks for care: benchmarks/garbage.py
+    assert found == []  # of 329 good joints one asked for care
 
 
 @pytest.mark.parametrize(("rate", "step"), [(150.0, 0.0057), (150.0, 0.012), (32.0, 0.0015)])
