@@ -74,21 +74,22 @@ def figures_of(name: str, stages: Sequence[str] = STAGES) -> Figures:
     stages : sequence of str
         Of `STAGES`.
     """
+    joints: Sequence[str] | None = None
     if name in EMULATED:
-        recordings: Recordings = EMULATED[name].record()
-        origin, calibrated = EMULATED[name].origin(recordings), None
+        recordings = [EMULATED[name].record()]
+        head, origin = recordings, EMULATED[name].origin(recordings[0])
     else:
-        recordings = REAL[name].record()
-        origin, calibrated = REAL[name].origin(), REAL[name].calibrated
-    joints = chosen_joints(recordings)
+        recordings, joints = REAL[name].record(), REAL[name].calibrated
+        head, origin = REAL[name].head(recordings), REAL[name].origin()
+    every = chosen_joints(recordings)
     found: Figures = {"recording": origin}
     if "doctor" in stages:
         found["doctor"] = _doctor(recordings)
     if "lag" in stages:
-        found["lag"] = {joint: _or_refusal(_lag, recordings, joint) for joint in joints}
+        found["lag"] = {joint: _or_refusal(_lag, recordings, joint) for joint in every}
     if "calibrate" in stages:
         found["calibrate"] = {
-            joint: _or_refusal(_calibrate, recordings, joint) for joint in calibrated or joints
+            joint: _or_refusal(_calibrate, head, joint) for joint in joints or every
         }
     return found
 
@@ -373,16 +374,17 @@ def main(arguments: list[str] | None = None) -> int:
         if is_absent(name):
             print(f"{name}: not here, left as it is", file=sys.stderr)
             continue
-        started = time.process_time()
-        after = figures_of(name, options.stages)
-        frozen = read()  # now, so that two runs may share the work
-        before = frozen.get(name, {})
-        # a renewed figure counts as changed where its stored digits are
-        changes += differences(
-            {key: before.get(key) for key in after}, after, options.exact or options.renew, name
-        )
-        if options.renew:
-            write(frozen | {name: before | after})
-        print(f"{name}: {time.process_time() - started:.1f} s of processor time", file=sys.stderr)
+        for stage in options.stages:
+            started = time.process_time()
+            after = figures_of(name, [stage])
+            frozen = read()  # now, so that two runs may share the work
+            before = frozen.get(name, {})
+            # a renewed figure counts as changed where its stored digits are
+            exact = options.exact or options.renew
+            changes += differences({key: before.get(key) for key in after}, after, exact, name)
+            if options.renew:
+                write(frozen | {name: before | after})
+            spent = time.process_time() - started
+            print(f"{name}, {stage}: {spent:.1f} s of processor time", file=sys.stderr)
     print(table(changes) if changes else "No figure differs.")
     return 1 if changes and not options.renew else 0

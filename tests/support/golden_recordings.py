@@ -9,7 +9,7 @@ servo. A real recording is a file, a folder, or several files that are pooled, b
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -186,12 +186,15 @@ class Real:
     pattern : str
         Below the folder of real recordings; a `*` stands for several files.
     calibrated : tuple of str or None
-        Joints that are calibrated; None for all of them. The others have lags only: a joint of the
-        SO-101 takes minutes.
+        Joints that are calibrated; None for all of them. The others have lags only.
+    calibrated_s : float
+        Length of the recording from its start that is calibrated [s]: two minutes of an SO-101's
+        joint take three minutes of processor time.
     """
 
     pattern: str
     calibrated: tuple[str, ...] | None = None
+    calibrated_s: float = float("inf")
 
     @property
     def paths(self) -> list[Path]:
@@ -202,15 +205,25 @@ class Real:
         """The recordings."""
         return [ps.load(path) for path in self.paths]
 
+    def head(self, recordings: Sequence[ps.Recording]) -> list[ps.Recording]:
+        """The part of the recordings that is calibrated."""
+        every = [(r, r.table["send_time_s"] - r.table["send_time_s"].min()) for r in recordings]
+        return [replace(r, table=r.table[time <= self.calibrated_s]) for r, time in every]
+
     def origin(self) -> dict[str, Any]:
-        """Its files with their SHA-256."""
+        """Its files with their SHA-256, and what of them is calibrated."""
         files = [
             file
             for path in self.paths
             for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
             if file.is_file()
         ]
-        return {
+        part: dict[str, Any] = {}
+        if self.calibrated is not None:
+            part["calibrated_joints"] = list(self.calibrated)
+        if np.isfinite(self.calibrated_s):
+            part["calibrated_s"] = self.calibrated_s
+        return part | {
             "files_sha256": {
                 file.relative_to(FOLDER).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
                 for file in files
@@ -225,10 +238,10 @@ REAL = {
     "mini_pupper_playback": Real(
         "playback_lstm_25hz.csv", ("LF_hip", "LF_thigh", "LF_calf", "RB_thigh")
     ),
-    "so101_chirp": Real("sage_so101/chirp_sweep", ("Elbow",)),
-    "so101_frequencies": Real("sage_so101/frequency_sweep", ("Elbow",)),
-    "so101_prbs": Real("sage_so101/prbs_excitation", ("Elbow",)),
-    "so101_steps": Real("sage_so101/step_response", ("Elbow",)),
+    "so101_chirp": Real("sage_so101/chirp_sweep", ("Elbow",), 40.0),
+    "so101_frequencies": Real("sage_so101/frequency_sweep", ("Elbow",), 40.0),
+    "so101_prbs": Real("sage_so101/prbs_excitation", ("Elbow",), 40.0),
+    "so101_steps": Real("sage_so101/step_response", ("Elbow",), 40.0),
     "xl330_pendulum": Real("bam_xl330/*.json"),
     "lerobot_so101": Real("lerobot_so101", ("shoulder_pan", "elbow_flex")),
     "robstride_41": Real("ktune_robstride/real_41_*.json"),
