@@ -1,4 +1,4 @@
-"""The guard over arbitrary commands: what reaches the bus obeys limits, speed and acceleration."""
+"""The guard and its limits over arbitrary commands: what reaches the bus obeys all bounds."""
 
 from __future__ import annotations
 
@@ -69,14 +69,17 @@ def switched_on(coordinates: str) -> tuple[GuardedBus, Follower]:
 
 
 angle = st.floats(-7, 7) | st.sampled_from([np.inf, -np.inf, 1e300, -1e300])
-command = st.tuples(
-    st.lists(angle, min_size=JOINTS, max_size=JOINTS), st.sampled_from([0.0, 1e-5, 0.002, 0.02, 1])
-)
+angles = st.lists(angle, min_size=JOINTS, max_size=JOINTS)
+coordinates = st.sampled_from(sorted(MAPS))
 
 
-@pytest.mark.parametrize("coordinates", MAPS)
 @FEW
-@given(script=st.lists(command, min_size=1, max_size=12))
+@given(
+    coordinates=coordinates,
+    script=st.lists(
+        st.tuples(angles, st.sampled_from([0.0, 1e-5, 0.002, 0.02, 1])), min_size=1, max_size=12
+    ),
+)
 def test_whatever_is_commanded_what_reaches_the_bus_is_within_limits_and_speed(coordinates, script):
     guard, bus = switched_on(coordinates)
     for goal, pause_s in script:
@@ -99,49 +102,80 @@ def test_whatever_is_commanded_what_reaches_the_bus_is_within_limits_and_speed(c
     assert (gained[:, free] <= (ACCELERATION_RAD_S2 * dt + 1e-6)).all()
 
 
-@pytest.mark.parametrize("coordinates", MAPS)
-@FEW
+@settings(FEW, max_examples=20)
 @given(
-    goal=st.lists(angle, min_size=JOINTS, max_size=JOINTS),
-    nan=st.sets(st.integers(0, JOINTS - 1), min_size=1),
-)
-def test_a_command_that_is_no_number_is_refused_and_leaves_the_guard_as_it_was(
-    coordinates, goal, nan
+    coordinates=coordinates, goal=angles, nan=st.sets(st.integers(0, JOINTS - 1), min_size=1),
+    shape=st.sampled_from([(), (0,), (11,), (13,), (12, 1), (1, 12), (0, 12)]),
+)  # fmt: skip
+def test_a_command_that_is_not_one_number_per_joint_is_refused_and_changes_nothing(
+    coordinates, goal, nan, shape
 ):
     guard, bus = switched_on(coordinates)
-    bad, before = np.array(goal), len(bus.received)
-    bad[list(nan)] = np.nan
+    holes, before = np.array(goal), len(bus.received)
+    holes[list(nan)] = np.nan
     bus.time += 0.02
-    with pytest.raises(BusError, match="must be 12 numbers"):
-        guard.write(bad)
+    for bad in (holes, np.zeros(shape)):
+        with pytest.raises(BusError, match="must be 12 numbers"):
+            guard.write(bad)
     assert len(bus.received) == before
     guard.write(bus.position)
     assert np.isfinite(bus.received[-1][1]).all()
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (11,), (13,), (12, 1), (1, 12), (0, 12)])
-def test_a_command_that_is_not_one_number_per_joint_is_refused(shape):
-    guard, bus = switched_on("servo")
-    with pytest.raises(BusError, match="must be 12 numbers"):
-        guard.write(np.zeros(shape))
-    guard.write(bus.position)
-
-
-@pytest.mark.parametrize("coordinates", MAPS)
 @FEW
-@given(away=st.lists(st.floats(-1, 1), min_size=JOINTS, max_size=JOINTS))
-def test_a_first_command_is_refused_exactly_when_it_would_move_a_joint_too_far(coordinates, away):
+@given(
+    coordinates=coordinates, away=st.lists(st.floats(-1, 1), min_size=JOINTS, max_size=JOINTS),
+    share=st.sampled_from([0.1, 0.3, 1.0]),
+)  # fmt: skip
+def test_a_first_command_is_refused_exactly_when_it_would_move_a_joint_too_far(
+    coordinates, away, share
+):
     bus = Follower(coordinates)
     guard = GuardedBus(bus)
     guard.torque(True)
     start = bus.position.copy()
-    allowed = bus.limits.clip(start + np.array(away))
-    far = np.abs(allowed - start).max()
+    goal = start + share * np.array(away)
+    far = np.abs(bus.limits.clip(goal) - start).max()
     try:
-        guard.write(start + np.array(away))
+        guard.write(goal)
         assert far <= FIRST_RAD and len(bus.received) == 1
     except SafetyStop:
         assert far > FIRST_RAD and not bus.received
+
+
+# ---- limits ----
+
+
+def limits_of(low, high, sign: int, end: float) -> PositionLimits:
+    """A thigh and a calf; `calf + sign * thigh` within ±`end`."""
+    both = Coupling(np.array([1]), np.array([0]), sign, np.array([-end]), np.array([end]))
+    return PositionLimits(np.array(low, float), np.array(high, float), both)
+
+
+def test_a_goal_is_clipped_to_the_box_then_the_calf_to_the_bound_that_it_shares_with_its_thigh():
+    for sign, pose, clipped in (
+        (+1, [1.0, 1.0], [1.0, 0.5]),  # calf + thigh at most 1.5
+        (+1, [-2.0, 0.0], [-2.0, 0.5]),  # and at least -1.5
+        (-1, [1.0, -1.0], [1.0, -0.5]),  # calf - thigh at least -1.5
+        (-1, [-1.0, 1.0], [-1.0, 0.5]),
+        (+1, [5.0, 0.0], [3.0, -1.5]),  # the thigh clips first, then its calf
+        (+1, [0.2, 0.3], [0.2, 0.3]),
+    ):
+        limits = limits_of([-3.0, -2.0], [3.0, 2.0], sign, 1.5)
+        assert limits.clip(np.array(pose)) == pytest.approx(clipped), (sign, pose)
+    # where the two bounds contradict each other the box wins
+    narrow = limits_of([-3.0, -0.5], [3.0, 0.5], 1, 1.0)
+    assert narrow.clip(np.array([3.0, 0.0])) == pytest.approx([3.0, -0.5])
+
+
+def test_the_margin_is_the_travel_of_each_joint_alone_to_its_nearer_bound():
+    box = PositionLimits(np.array([-1.0, 0.0]), np.array([2.0, 0.5]))
+    assert box.margin(np.array([0.5, 0.4])) == pytest.approx([1.5, 0.1])
+    assert box.margin(np.array([5.0, 0.25])) == pytest.approx([0.0, 0.25])
+    # the thigh's is its own; the calf's ends where the sum of both does
+    shared = limits_of([-1.0, -1.0], [1.0, 1.0], 1, 0.5)
+    for thigh, margin in ((0.4, [0.6, 0.1]), (-0.4, [0.6, 0.1]), (0.1, [0.9, 0.4])):
+        assert shared.margin(np.array([thigh, 0.0])) == pytest.approx(margin)
 
 
 box = st.floats(-3, 3)
