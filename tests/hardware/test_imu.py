@@ -48,31 +48,27 @@ def test_rates_about_the_chips_axes_are_rates_about_the_trunks():
     np.testing.assert_allclose(sample_of(rate_deg_s=(0, 0, 90)).rate_rad_s, [0, 0, -np.pi / 2])
 
 
-@pytest.mark.parametrize(
-    ("axis", "up"),
-    [
-        ((0, 1, 0), (-np.sin(0.5), 0, np.cos(0.5))),  # nose down: forward points down
-        ((-1, 0, 0), (0, -np.sin(0.5), np.cos(0.5))),  # rolled to the left: left points down
-        ((0, 0, 1), (0, 0, 1)),  # turned to the left: still level
-    ],
-    ids=["nose down", "roll left", "yaw left"],
-)
-def test_a_chip_on_the_simulated_trunk_tells_tilt_and_turn_with_the_right_signs(axis, up):
+def test_a_chip_on_the_simulated_trunk_tells_tilt_and_turn_with_the_right_signs():
     servo = DelayedPDParameters(0.0, 0.0, 0.0, 1e-3, 1.0, 1.0, 0.0)
     xml = robot_xml(dict.fromkeys(JOINT_NAMES, servo), 0.002)
     # held up in the air, at rest but for its turning
     model = mujoco.MjModel.from_xml_string(xml.replace("<body ", '<body gravcomp="1" '))
-    data = mujoco.MjData(model)
-    mujoco.mju_axisAngle2Quat(data.qpos[3:7], np.array(axis, float), 0.5)
-    data.qpos[2], data.qpos[7:] = 1.0, default_pose()
-    data.qvel[3:6] = 0.3 * np.array(axis)
-    mujoco.mj_forward(model, data)
-    read = [data.sensor(name).data for name in ("accelerometer", "gyro")]
-    sample = from_chip(0.0, np.concatenate([read[0] / G, np.degrees(read[1])]))
-    assert sample is not None
-    # the site turns with the trunk about its own origin: no acceleration, but gravity's reaction
-    np.testing.assert_allclose(sample.acceleration_m_s2 / 9.81, up, atol=0.02)
-    np.testing.assert_allclose(sample.rate_rad_s, 0.3 * np.array(axis), atol=1e-12)
+    for axis, up in (
+        ((0, 1, 0), (-np.sin(0.5), 0, np.cos(0.5))),  # nose down: forward points down
+        ((-1, 0, 0), (0, -np.sin(0.5), np.cos(0.5))),  # rolled to the left: left points down
+        ((0, 0, 1), (0, 0, 1)),  # turned to the left: still level
+    ):
+        data = mujoco.MjData(model)
+        mujoco.mju_axisAngle2Quat(data.qpos[3:7], np.array(axis, float), 0.5)
+        data.qpos[2], data.qpos[7:] = 1.0, default_pose()
+        data.qvel[3:6] = 0.3 * np.array(axis)
+        mujoco.mj_forward(model, data)
+        read = [data.sensor(name).data for name in ("accelerometer", "gyro")]
+        sample = from_chip(0.0, np.concatenate([read[0] / G, np.degrees(read[1])]))
+        assert sample is not None
+        # the site turns with the trunk about its own origin: no acceleration but g's reaction
+        np.testing.assert_allclose(sample.acceleration_m_s2 / 9.81, up, atol=0.02)
+        np.testing.assert_allclose(sample.rate_rad_s, 0.3 * np.array(axis), atol=1e-12)
 
 
 def test_the_chips_numbers_come_back_from_a_sample():
@@ -87,14 +83,12 @@ def test_words_are_sixteenths_of_a_degree_and_16384ths_of_a_g():
     np.testing.assert_array_equal(words, [0, 1 / 16384, -1, 0, 1 / 16, -2 / 16])
 
 
-@pytest.mark.parametrize(
-    ("g", "clipped"), [(1.99, False), (-1.99, False), (2.3, True), (-2.3, True)]
-)
-def test_a_number_at_the_end_of_its_range_is_marked(g, clipped):
-    sample = from_chip(0.0, as_words(np.array([0.0, g, -1.0, 0.0, 0.0, 0.0])))
-    assert sample is not None and sample.clipped is clipped
-    # 16 bits end at +32767/16384 g and -2 g
-    assert abs(sample.acceleration_m_s2[0]) <= 2 * G
+def test_a_number_at_the_end_of_its_range_is_marked():
+    for g in (1.99, -1.99, 2.3, -2.3):
+        sample = from_chip(0.0, as_words(np.array([0.0, g, -1.0, 0.0, 0.0, 0.0])))
+        assert sample is not None and sample.clipped is (abs(g) > 2)
+        # 16 bits end at +32767/16384 g and -2 g
+        assert abs(sample.acceleration_m_s2[0]) <= 2 * G
 
 
 def test_six_zeros_are_a_read_that_failed():
@@ -115,20 +109,13 @@ def test_the_reply_is_26_bytes_of_little_endian_floats():
     assert raw is not None and raw.tolist() == [1.0, -2.0, 0.5, 0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        b"",
-        imu_reply(*[0.0] * 6)[:-1],
-        bytes([26, 3]) + bytes(24),
-        imu_reply(float("nan"), 0, 0, 0, 0, 0),
-        imu_reply(0, 0, float("inf"), 0, 0, 0),
-        imu_reply(0, 2.1, 0, 0, 0, 0),
-        imu_reply(0, 0, -1, 0, -2049, 0),
-    ],
-)
-def test_a_reply_that_no_chip_could_have_given_is_none(wrong):
-    assert datagrams.parse_imu(wrong) is None
+def test_a_reply_that_no_chip_could_have_given_is_none():
+    for wrong in (
+        b"", imu_reply(*[0.0] * 6)[:-1], bytes([26, 3]) + bytes(24),
+        imu_reply(float("nan"), 0, 0, 0, 0, 0), imu_reply(0, 0, float("inf"), 0, 0, 0),
+        imu_reply(0, 2.1, 0, 0, 0, 0), imu_reply(0, 0, -1, 0, -2049, 0),
+    ):  # fmt: skip
+        assert datagrams.parse_imu(wrong) is None, wrong
 
 
 # ---- the bus ----
@@ -144,8 +131,8 @@ def path(monkeypatch):
 def read_imu(path: Path, *replies: bytes | None) -> ImuSample | None:
     """What the bus makes of successive answers."""
     # a client that leaves has its last request carried out once more
-    given = iter([*replies, None])
-    with on_a_socket(ScriptedProxy(lambda request: next(given)), path):
+    answers = iter([*replies, None])
+    with on_a_socket(ScriptedProxy(lambda request: next(answers)), path):
         bus = Esp32Bus(path)
         sample = bus.imu()
         bus.close()
@@ -155,26 +142,16 @@ def read_imu(path: Path, *replies: bytes | None) -> ImuSample | None:
 GOOD, OTHER, THIRD = (imu_reply(0, 0, -1, x, 0, 0) for x in (1.0, 2.0, 3.0))
 
 
-@pytest.mark.parametrize(
-    "replies",
-    [(GOOD, GOOD), (OTHER, GOOD, GOOD), (GOOD, OTHER, GOOD)],
-    ids=["two agree", "the block was refreshed", "one was spoilt"],
-)
-def test_a_reading_counts_when_two_answers_agree(path, replies):
-    sample = read_imu(path, *replies)
-    assert sample is not None
-    np.testing.assert_allclose(sample.rate_rad_s, [0.0, np.radians(1.0), 0.0])
-    np.testing.assert_allclose(sample.acceleration_m_s2, [0.0, 0.0, G])
-    assert 0 <= sample.time_s < 5
-
-
-@pytest.mark.parametrize(
-    "replies",
-    [(GOOD, OTHER, THIRD), (imu_reply(*[0.0] * 6),) * 2, (None,), (GOOD, b"\x1a\x04\x00")],
-    ids=["no two agree", "the chip's read failed", "silence", "cut short"],
-)
-def test_otherwise_there_is_none(path, replies):
-    assert read_imu(path, *replies) is None
+def test_a_reading_counts_exactly_when_two_answers_agree(path):
+    for replies in ((GOOD, GOOD), (OTHER, GOOD, GOOD), (GOOD, OTHER, GOOD)):
+        sample = read_imu(path, *replies)
+        assert sample is not None, replies
+        np.testing.assert_allclose(sample.rate_rad_s, [0.0, np.radians(1.0), 0.0])
+        np.testing.assert_allclose(sample.acceleration_m_s2, [0.0, 0.0, G])
+        assert 0 <= sample.time_s < 5
+    none, failed = (None,), (imu_reply(*[0.0] * 6),) * 2
+    for replies in ((GOOD, OTHER, THIRD), failed, none, (GOOD, b"\x1a\x04\x00")):
+        assert read_imu(path, *replies) is None, replies
 
 
 def test_a_robot_on_a_stand_reports_gravity_and_nothing_else():

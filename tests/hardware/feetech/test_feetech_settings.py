@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def sts(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.1)
     with on_a_port(still_servos(STS3215, ids=[1])) as server:
         yield server
 
@@ -92,43 +92,14 @@ def test_the_other_series_keeps_its_lock_elsewhere(monkeypatch):
         bus.close()
 
 
-CHANGED = """
-import sys, time
-from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
-bus = open_guarded(parse_address(sys.argv[1]))
-bus.set_register("RF_hip", "p", 8)
-print("changed", flush=True)
-time.sleep(60)
-"""
-
-
-@pytest.mark.wall_clock
-def test_the_watchdog_sets_registers_back_if_the_driver_is_killed(sts):
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHANGED, f"feetech:{sts.device}"], stdout=subprocess.PIPE, cwd=ROOT
-    )
-    assert process.stdout is not None and process.stdout.readline() == b"changed\n"
-    assert p_of(sts) == 8
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    until = time.monotonic() + 8.0
-    while p_of(sts) != 32:
-        assert time.monotonic() < until, "the gain was not set back"
-        time.sleep(0.02)
-
-
 @pytest.mark.wall_clock
 def test_registers_of_servos_that_were_unplugged_are_set_back_once_they_return(sts):
     guard = open_guarded(parse_address(f"feetech:{sts.device}"))
     guard.set_register("RF_hip", "p", 8)
-    sts.emulator.unplug_for_s = 2.0
+    sts.emulator.unplug_for_s = 1.0
     time.sleep(0.1)
     guard.close()
-    until = time.monotonic() + 8.0
-    while p_of(sts) != 32:
-        assert time.monotonic() < until, "the gain was not set back"
-        time.sleep(0.02)
+    assert wait_until(lambda: p_of(sts) == 32, 8.0)
 
 
 def set_protection(server, **values: int) -> None:
@@ -189,20 +160,31 @@ def test_the_torque_stays_off_if_a_servo_does_not_take_its_protection(sts):
     assert (1, True) not in bench_of(sts.emulator).torques
 
 
-PROTECTED = CHANGED.replace('bus.set_register("RF_hip", "p", 8)', "bus.torque(True)")
+CHANGED = """
+import sys, time
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.feetech import line
+line.REPLY_TIMEOUT_S = 0.1  # the servos share a busy machine with their driver
+bus = open_guarded(parse_address(sys.argv[1]))
+bus.set_register("RF_hip", "p", 8)
+bus.torque(True)
+print("changed", flush=True)
+time.sleep(60)
+"""
 
 
 @pytest.mark.wall_clock
-def test_the_watchdog_sets_protections_back_if_the_driver_is_killed(sts):
+def test_the_watchdog_sets_registers_and_protections_back_if_the_driver_is_killed(sts):
     set_protection(sts, **OFF)
     process = subprocess.Popen(
-        [sys.executable, "-c", PROTECTED, f"feetech:{sts.device}"], stdout=subprocess.PIPE, cwd=ROOT
+        [sys.executable, "-c", CHANGED, f"feetech:{sts.device}"], stdout=subprocess.PIPE, cwd=ROOT
     )
     assert process.stdout is not None and process.stdout.readline() == b"changed\n"
-    assert protection(sts) == FACTORY
+    assert p_of(sts) == 8 and protection(sts) == FACTORY
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert wait_until(lambda: protection(sts) == OFF, 12.0)
+    assert wait_until(lambda: protection(sts) == OFF and p_of(sts) == 32, 12.0)
 
 
 def test_an_emulated_servo_that_is_blocked_reports_overload_after_its_protection_time(sts):

@@ -245,6 +245,20 @@ def test_lost_commands_and_missing_readings_are_counted():
     assert guard.report.summary() == NOTHING_CHANGED | {"unsent": 1, "missing": 3}
 
 
+def test_a_recordings_footer_has_the_first_500_changed_commands_and_counts_all():
+    bus = PlainBus(high=0.1)
+    guard = ready(bus)
+    drive(guard, 0.04, lambda t: np.array([0.12, 0.0]))
+    # at the recording's times, which are the bus's and a shift
+    assert guard.report.footer(0.5) == {
+        "guard": NOTHING_CHANGED | {"clipped": 2},
+        "guard_events": [[0.52, "clipped"], [0.54, "clipped"]],
+    }
+    drive(guard, 10.0, lambda t: np.array([0.12, 0.0]))
+    footer = guard.report.footer()
+    assert footer["guard"]["clipped"] == 502 and len(footer["guard_events"]) == 500
+
+
 def test_a_guard_is_not_guarded_twice():
     guard = GuardedBus(PlainBus())
     assert guarded(guard) is guard
@@ -268,6 +282,17 @@ def test_the_torque_waits_for_every_position_but_not_longer_than_a_lost_reading(
 
     bus.read = once_silent
     assert GuardedBus(bus).torque(True)
+
+
+def test_a_limp_robot_is_not_judged_and_leaving_it_sends_nothing():
+    bus = PlainBus()
+    guard = GuardedBus(bus)
+    bus.heat = 80.0
+    for _ in range(50):
+        guard.sleep_until(guard.now() + PERIOD)
+        guard.read()
+    guard.close()
+    assert bus.written == [] and bus.log == ["close"]
 
 
 def test_a_robot_that_was_moved_by_hand_while_limp_is_found_anew():
