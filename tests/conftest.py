@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import hypothesis
 import pytest
 
+from support.package import ROOT
 from support.real_recordings import real_recording
 
 # the same examples on every machine; `--hypothesis-profile search` looks for new ones
@@ -31,6 +32,17 @@ def real_sweeps() -> list[Path]:
 
 
 @pytest.fixture(scope="session")
+def hip(tmp_path_factory) -> Path:
+    """Two tones (2 and 4 Hz) of one joint of the sample sweep: quick to fit."""
+    lines = (ROOT / "data/samples/sweep.csv").read_text().splitlines(keepends=True)
+    header = [line for line in lines if line[0] == "#" or line.startswith("send_time")]
+    rows = [line for line in lines if ",1,LF_hip," in line or ",3,LF_hip," in line]
+    path = tmp_path_factory.mktemp("hip") / "hip.csv"
+    path.write_text("".join([*header, *rows]))
+    return path
+
+
+@pytest.fixture(scope="session")
 def real_playback() -> Path:
     """Three loops of a walking policy's actions on a Mini Pupper 2, at 25 Hz."""
     return real_recording("playback_lstm_25hz.csv")
@@ -44,7 +56,7 @@ def walker():
     from pupper_sysid.sim.walking.config import Walking
     from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
-    samples = Path(__file__).resolve().parents[1] / "data/samples"
+    samples = ROOT / "data/samples"
     trial = Trial(
         Walking(), servo_ranges(samples / "calibrated.yaml"), robots=2, seconds=7.5, threads=1
     )

@@ -35,18 +35,6 @@ def python(code: str, folder: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture
-def recording(tmp_path) -> Path:
-    """Two tones of one joint of the sample."""
-    rows = SWEEP.read_text().splitlines(keepends=True)
-    header = [line for line in rows if line[0] == "#" or line.startswith("send_time")]
-    kept = [line for line in rows if ",LF_hip,2," in line or ",LF_hip,4," in line]
-    path = tmp_path / "hip.csv"
-    path.write_text("".join([*header, *kept]))
-    assert kept
-    return path
-
-
 def test_every_name_is_there_and_no_other():
     assert set(ps.__all__) == set(ps._MODULES) and set(ps.__all__) <= set(dir(ps))
     for name in ps.__all__:
@@ -62,12 +50,12 @@ def test_importing_the_front_door_imports_nothing_else(tmp_path):
     assert [m for m in loaded if m.startswith("pupper_sysid.")] == []
 
 
-def test_load_lag_calibrate_and_save_need_neither_torch_nor_matplotlib(recording, tmp_path):
+def test_load_lag_calibrate_and_save_need_neither_torch_nor_matplotlib(hip, tmp_path):
     text = python(
         WITHOUT
         + f"""
 import pupper_sysid as ps
-recording = ps.load({str(recording)!r})
+recording = ps.load({str(hip)!r})
 print(ps.lag(recording, "LF_hip"))
 calibrated = ps.calibrate(recording, "LF_hip")
 calibrated.save("calibrated.yaml")
@@ -86,10 +74,10 @@ except ps.InputError as error:
     ("command", "function"),
     [("doctor", ps.examine), ("delay", ps.lag), ("bode", ps.frequency_response)],
 )
-def test_a_result_is_the_json_of_its_command(capsys, recording, command, function):
-    code, out, err = run(capsys, command, recording, "--json")
+def test_a_result_is_the_json_of_its_command(capsys, hip, command, function):
+    code, out, err = run(capsys, command, hip, "--json")
     assert code == 0, err
-    found = function(ps.load(recording))
+    found = function(ps.load(hip))
     assert found.to_dict() == json.loads(out)
     assert list(found.to_frame()["joint"].unique()) == ["LF_hip"]
     assert found.plot().axes
@@ -116,7 +104,7 @@ def test_a_joint_that_was_not_recorded_is_refused():
         ps.lag(ps.load(SWEEP), ["RB_calf"])
 
 
-def test_lag_and_calibration_of_many_tones_find_one_dead_time():
-    recording = ps.load(SWEEP)
-    dead_time = ps.lag(recording, "LF_thigh")["LF_thigh"].dead_time_s
-    assert dead_time == ps.calibrate(recording, "LF_thigh")["LF_thigh"].dead_time_s
+def test_lag_and_calibration_find_one_dead_time(hip):
+    recording = ps.load(hip)
+    dead_time = ps.lag(recording)["LF_hip"].dead_time_s
+    assert dead_time == ps.calibrate(recording)["LF_hip"].dead_time_s

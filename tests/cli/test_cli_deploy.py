@@ -185,12 +185,15 @@ def analyze(capsys, what, *arguments) -> dict:
     return found
 
 
-def test_the_gait_of_the_shipped_policy_is_a_trot(capsys, here):
+def test_the_gait_of_the_shipped_policy_is_a_trot_and_its_picture_is_not_written_over(capsys, here):
     gait = analyze(capsys, "gait")["gaits"]["lstm"]
     assert gait["frequency_hz"]["value"] == pytest.approx(3.6, abs=0.15)
     assert gait["diagonal"]["value"] > 0.6 and gait["rhythmic"] == 1.0
+    again = refused(capsys, pupper_analyze, "gait", POLICY, "--actuator", CALIBRATION)
+    assert "exists already" in again
 
 
+@pytest.mark.slow
 def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
     capsys, here, monkeypatch
 ):
@@ -203,11 +206,13 @@ def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
     assert rows["senses and last action frozen"]["share"] < 0.2
 
 
+@pytest.mark.slow
 def test_orbits_close(capsys, here):
     orbits = analyze(capsys, "attractor")["orbits"]["lstm"]
     assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "count"), [("terrain", 7), ("compliance", 6)])
 def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, count):
     rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
@@ -262,12 +267,6 @@ def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):
         "--actuator",
         CALIBRATION,
     )
-
-
-def test_pictures_are_not_written_over(capsys, here):
-    analyze(capsys, "gait")
-    again = refused(capsys, pupper_analyze, "gait", POLICY, "--actuator", CALIBRATION)
-    assert "exists already" in again
 
 
 def test_an_analysis_of_nothing_is_refused(capsys, here):

@@ -47,6 +47,7 @@ def playback(path: str, loops: int = 3, rows: int = 60, step_s: float = 0.04, st
     return path
 
 
+@pytest.mark.slow
 def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys, real_playback):
     code, out, err = run(
         capsys, "fit-servo", real_playback, "--train-loops", "0,1", "--test-loops", "2", "--json",
@@ -69,6 +70,7 @@ def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys, real_playback):
     assert saved.contract.inputs[0] == "command_rad[t]" and not saved.contract.feedback
 
 
+@pytest.mark.slow
 def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real_sweeps):
     code, out, err = run(
         capsys, "fit-servo", *real_sweeps, "--train-before", "2",
@@ -81,7 +83,10 @@ def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real
     assert mean["rmse_raw_rad"] == pytest.approx(mean["rmse_held_rad"])
 
 
-@pytest.mark.parametrize("arch", ["fir", "mlp", "lstm", "delayed-pd"])
+@pytest.mark.parametrize(
+    "arch",
+    ["fir", "mlp", *(pytest.param(a, marks=pytest.mark.slow) for a in ("lstm", "delayed-pd"))],
+)
 def test_what_was_fitted_is_saved_and_compared_with_a_calibration(capsys, quick, arch):
     sample = SAMPLE / "playback.csv"
     code, _, err = run(capsys, "fit-servo", sample, "--arch", arch, "--joints", "LF_hip,LF_calf")

@@ -125,6 +125,7 @@ def test_one_robot_alone_and_in_a_fleet_get_the_same_numbers(sweeps, tmp_path, c
     assert alone.actuator == among.actuator and alone.feedback == among.feedback
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_what_one_process_gives(sweeps, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(

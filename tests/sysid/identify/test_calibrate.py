@@ -190,6 +190,7 @@ def real(real_sweeps):
     return calibrate([load(p) for p in real_sweeps], seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("joint", "lag", "held", "unseen"),
     [("LF_hip", 40.4, 14.5e-3, 19e-3), ("LF_thigh", 42.4, 18.5e-3, 22.5e-3)],
@@ -212,6 +213,7 @@ def test_the_real_sweeps_reach_the_best_published_figures(real, joint, lag, held
     assert found.candidate_models[found.model].scores.rmse_leave_one_frequency_out_rad <= unseen
 
 
+@pytest.mark.slow
 def test_the_paper_setting_is_ten_times_further_off(real):
     ours = np.mean(
         [r.candidate_models["delayed_pd"].scores.rmse_held_rad ** 2 for r in real.values()]
@@ -220,6 +222,7 @@ def test_the_paper_setting_is_ten_times_further_off(real):
     assert np.sqrt(paper / ours) >= 10
 
 
+@pytest.mark.slow
 def test_models_fitted_to_1_2_3_hz_predict_4_hz(real):
     left_out = [
         r.candidate_models[r.model].scores.rmse_by_left_out_frequency_rad["4"] ** 2

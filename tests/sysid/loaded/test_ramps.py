@@ -75,7 +75,7 @@ def found(*recordings: Recording) -> tuple[float, tuple[Run, ...]]:
     return scales.acceleration_rad_s2, runs
 
 
-@pytest.mark.parametrize("seed", [2, 6])
+@pytest.mark.parametrize("seed", [2, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_limit_is_found_in_the_chirp_that_has_it_and_not_in_jumps_without(seed: int):
     limit, (chirp, jumps) = found(
         recording(CHIRP, LIMIT_RAD_S2, seed), recording(JUMPS, np.inf, seed)
@@ -84,6 +84,7 @@ def test_a_limit_is_found_in_the_chirp_that_has_it_and_not_in_jumps_without(seed
     assert chirp.ramp_share == 1.0 and np.isinf(jumps.ramp_share)
 
 
+@pytest.mark.slow
 def test_a_recording_with_a_larger_limit_gets_a_share_of_its_own():
     limit, (chirp, jumps) = found(
         recording(CHIRP, LIMIT_RAD_S2, 6), recording(JUMPS, 8 * LIMIT_RAD_S2, 6)
@@ -92,6 +93,7 @@ def test_a_recording_with_a_larger_limit_gets_a_share_of_its_own():
     assert chirp.ramp_share == 1.0 and jumps.ramp_share == 8.0
 
 
+@pytest.mark.slow
 def test_no_limit_is_found_where_there_is_none():
     limit, runs = found(recording(CHIRP, np.inf, 3), recording(JUMPS, np.inf, 3))
     assert np.isnan(limit)

@@ -264,6 +264,7 @@ def test_bad_input_is_one_sentence(capsys, tmp_path):
     assert code == 2 and not out and "none.csv" in said and "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_a_real_servo_is_followed_better_than_by_regression_on_derivatives(real_sweeps):
     (r,) = sparse_equations(load(real_sweeps[0])).values()
     # published: 24 mrad for SINDy through a spline with the best delay, in sample
