@@ -184,8 +184,8 @@ class Stop:
 
     def _note(self, number: int) -> None:
         """The first signal of the phase `finish`."""
-        self._line.acquire(blocking=False)  # `STOPPED` is for the second one
         if number == signal.SIGINT:
+            self._line.acquire(blocking=False)  # `STOPPED` is for the second one
             self._say(FINISHING)
         elif not self.ends_process:
             signal.signal(number, signal.SIG_DFL)

@@ -169,7 +169,7 @@ def test_an_emulator_that_never_gets_to_serve_leaves_no_device(capsys, monkeypat
 
     monkeypatch.setattr("pupper_sysid.cli.terminal.out.print", interrupted)
     code, _, err = run(capsys, "emulate", *kind, "s")
-    assert code == 1 and "Stopped." in err and list(Path().iterdir()) == [Path("t.yaml")]
+    assert code == 130 and "Stopped." in err and list(Path().iterdir()) == [Path("t.yaml")]
 
 
 def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):

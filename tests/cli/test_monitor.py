@@ -157,7 +157,7 @@ def test_ctrl_c_ends_it_as_it_should(capsys, monkeypatch):
 
     monkeypatch.setattr("pupper_sysid.cli.commands.robot.monitor.Watched.look", interrupted)
     code, _, err = run(capsys, "monitor", "--bus", "emulated")
-    assert code == 0 and err == "Stopped."
+    assert code == 130 and err == "Stopped."
 
 
 def test_a_monitored_emulated_robot_does_not_remember_its_readings():

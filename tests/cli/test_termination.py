@@ -205,6 +205,13 @@ def test_a_second_ctrl_c_ends_a_training_at_once(tmp_path):
         assert ended(process) == (130, "Stopped.\n")
 
 
+def test_an_iteration_that_outlasts_sigterm_is_given_up(tmp_path):
+    with started(tmp_path, "-c", PROGRAM.replace("WORK", "long_training")) as process:
+        begun(process)
+        process.send_signal(signal.SIGTERM)
+        assert ended(process) == (143, "Stopped.\n")
+
+
 def test_a_robot_is_parked_however_long_that_takes(tmp_path):
     with started(tmp_path, "-c", PROGRAM.replace("WORK", "robot")) as process:
         begun(process)
