@@ -62,7 +62,7 @@ class Following:
         pass
 
 
-def sweep_of(bus: Following, amplitude: float, hz: float, seconds: float = 6.0) -> None:
+def sweep_of(bus: Following, amplitude: float, hz: float, seconds: float = 4.5) -> None:
     """Command a tone through a guard, which raises for a fault."""
     guard = GuardedBus(bus, GuardLimits(astray_rad=9.0))
     guard.torque(True)
@@ -175,7 +175,7 @@ def test_no_healthy_emulated_servo_is_stopped_at_any_tone(kind):
     home = bus.robot.joint_map.rest_pose()
     guard.write(home)
     start = guard.now()
-    for k in range(round(8.0 / PERIOD_S)):
+    for k in range(round(5.0 / PERIOD_S)):
         guard.sleep_until(start + (k + 1) * PERIOD_S)
         guard.write(home + amplitude * np.sin(2 * np.pi * hz * (guard.now() - start)))
         guard.read()
