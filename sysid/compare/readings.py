@@ -68,11 +68,14 @@ def in_words(rules: Mapping[str, ReadingRule]) -> list[str]:
 
 
 def _sentence(rule: str, source: str, own: Sequence[ReadingRule]) -> str:
-    poll = (
-        f"poll {_span([1e3 * r.poll_period_s for r in own], 1)} ms, "
-        f"loss {_span([r.loss for r in own], 2)}, "
-        f"mean age {_span([1e3 * r.mean_age_s for r in own], 1)} ms"
-    )
+    parts = {"poll": ("poll_period_s", 1e3, 1, " ms"), "loss": ("loss", 1, 2, ""),
+             "mean age": ("mean_age_s", 1e3, 1, " ms")}  # fmt: skip
+    known = [
+        f"{what} {_span(values, digits)}{unit}"
+        for what, (key, scale, digits, unit) in parts.items()
+        if (values := [scale * v for r in own if math.isfinite(v := getattr(r, key))])
+    ]
+    poll = ", ".join(known)
     return {
         "live": f"the readings of {source} are live and predicted at their read",
         "own dates": f"predicted at the dates of {source}'s own poll lattice ({poll})",
@@ -116,21 +119,19 @@ def _rule(
     if lattice.kind == "every read":
         return ReadingRule(rule="live", source=source, poll_period_s=0.0, loss=0.0, mean_age_s=0.0)
     if lattice.kind == "lattice":
-        known = HeldFeedback(lattice.poll_period_s, lattice.assumed_loss)
-        return _polled("own dates", source, known)
+        return ReadingRule(
+            rule="own dates", source=source, poll_period_s=lattice.poll_period_s,
+            loss=lattice.loss, mean_age_s=lattice.mean_age_s,
+        )  # fmt: skip
     for name, calibration in calibrations.items():
         if joint in calibration.joint_names:
             known = calibration.held_feedback(joint)
             if known.poll_period_s > 0:
-                return _polled("expected", name, known)
+                return ReadingRule(
+                    rule="expected", source=name, poll_period_s=known.poll_period_s,
+                    loss=known.loss, mean_age_s=known.mean_age_s,
+                )  # fmt: skip
     return ReadingRule(rule="as logged", source=source)
-
-
-def _polled(rule: str, source: str, known: HeldFeedback) -> ReadingRule:
-    return ReadingRule(
-        rule=rule, source=source, poll_period_s=known.poll_period_s, loss=known.loss,
-        mean_age_s=known.mean_age_s,
-    )  # fmt: skip
 
 
 def ages(poll_period_s: float, loss: float, count: int = _INSTANTS) -> NDArray[np.float64]:
