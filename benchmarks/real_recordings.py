@@ -60,7 +60,7 @@ SPLIT = Split(
     lambda number, elapsed, group: number == 2,
 )
 MODELS = (("fir", "default"), ("delayed-pd", "default"), ("mlp", "paper"), ("lstm", "default"),
-          ("mlp", "default"))  # fmt: skip
+          ("mlp", "default"), ("lstm", "paper"))  # fmt: skip
 """Architecture and preset of `fit-servo`."""
 JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 MOTIONS = ("chirp_sweep", "prbs_excitation", "step_response", "frequency_sweep")
