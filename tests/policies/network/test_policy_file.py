@@ -23,61 +23,50 @@ from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import CONTRACT, WEIGHTS, load_policy, refuse_bad
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.refusals import assert_each_refused
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 
 
-def write(folder, kind="mlp", change=None, force=True):
-    """A policy of `kind`; `change(weights)` may spoil the weights before."""
-    run = tiny_run(kind)
-    run = replace(run, architecture=replace(run.architecture, hidden=(32, 16), memory=24))
-    weights = {k: v.clone() for k, v in networks(kind)[0].state_dict().items()}
-    if change:
-        change(weights)
-    history = HISTORY if kind == "mlp-actions" else 0
-    write_policy(folder, weights, run, servo_ranges(CALIBRATION), history, {"seed": 0}, force)
-    return weights
+def write(folder: Path, weights: dict[str, torch.Tensor], force: bool = True) -> None:
+    """Write an MLP of `networks` with these weights."""
+    run = tiny_run()
+    run = replace(run, architecture=replace(run.architecture, hidden=(32, 16)))
+    write_policy(folder, weights, run, servo_ranges(CALIBRATION), 0, {"seed": 0}, force)
 
 
-def rewrite_contract(folder, **changes):
+def rewrite_contract(folder: Path, **changes) -> None:
     path = folder / CONTRACT
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def rewrite_weights(folder, change):
-    """Change weights and make the contract's hash fit again."""
-    weights = load_file(folder / WEIGHTS)
-    change(weights)
-    save_file(weights, folder / WEIGHTS)
+def rewrite_weights(folder: Path, data: bytes | None = None) -> None:
+    """Make the contract's hash fit the weights, or other ones."""
+    if data is not None:
+        (folder / WEIGHTS).write_bytes(data)
     rewrite_contract(folder, weights_sha256=sha256(folder / WEIGHTS))
 
 
-def refusal(folder) -> str:
-    with pytest.raises(InputError) as refused:
-        load_policy(folder)
-    text = str(refused.value)
-    assert "\n" not in text and str(folder) in text and text.endswith(".")
-    return text
+# ------------------------------------------------------------------------------ written and read
 
 
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_a_policy_that_was_written_is_read_back_bit_for_bit(tmp_path, kind):
-    weights = write(tmp_path, kind)
-    policy = load_policy(tmp_path)
-    for name, tensor in policy.network.state_dict().items():
-        assert torch.equal(tensor, weights[name])
-    contract = policy.contract
-    assert contract.kind == kind and contract.hidden == [32, 16]
-    assert contract.observation_size == 60 + 36 * (kind == "mlp-actions")
-    assert list(contract.default_pose_rad) == list(JOINT_NAMES)
-    assert contract.actuator_sha256 == sha256(Path(CALIBRATION))
+def test_a_policy_that_was_written_is_read_back_bit_for_bit(saved_policies):
+    for kind in ALL_KINDS:
+        policy = load_policy(saved_policies[kind])
+        weights = networks(kind)[0].state_dict()
+        for name, tensor in policy.network.state_dict().items():
+            assert torch.equal(tensor, weights[name]), (kind, name)
+        contract = policy.contract
+        assert contract.kind == kind and contract.hidden == [32, 16]
+        assert contract.observation_size == 60 + 36 * (kind == "mlp-actions")
+        assert list(contract.default_pose_rad) == list(JOINT_NAMES)
+        assert contract.actuator_sha256 == sha256(Path(CALIBRATION))
 
 
-def test_a_policy_keeps_a_memory_and_forgets_it_at_a_reset(tmp_path):
-    write(tmp_path, "lstm")
-    policy, fresh = load_policy(tmp_path), load_policy(tmp_path)
+def test_a_policy_keeps_a_memory_and_forgets_it_at_a_reset(saved_policies):
+    policy, fresh = (load_policy(saved_policies["lstm"]) for _ in range(2))
     start = np.zeros((2, 12))
-    policy.reset(start)
-    fresh.reset(start)
+    for one in (policy, fresh):
+        one.reset(start)
     seen = np.random.default_rng(0).normal(size=(6, 2, 60))
     for row in seen[:5]:
         policy.act(row)
@@ -87,9 +76,8 @@ def test_a_policy_keeps_a_memory_and_forgets_it_at_a_reset(tmp_path):
     np.testing.assert_array_equal(policy.act(seen[5]), fresh.act(seen[5]))
 
 
-def test_a_policy_with_past_actions_remembers_its_own(tmp_path):
-    write(tmp_path, "mlp-actions")
-    policy = load_policy(tmp_path)
+def test_a_policy_with_past_actions_remembers_its_own(saved_policies):
+    policy = load_policy(saved_policies["mlp-actions"])
     rng = np.random.default_rng(0)
     start = rng.normal(size=(2, 12))
     policy.reset(start)
@@ -103,71 +91,65 @@ def test_a_policy_with_past_actions_remembers_its_own(tmp_path):
         past = [action, *past[:-1]]
 
 
-def test_a_policy_is_not_written_over_another_unless_asked(tmp_path):
-    write(tmp_path)
+@pytest.mark.parametrize("kind", ["mlp-actions", "lstm", "transformer"])
+def test_a_policy_for_one_robot_acts_with_the_same_bits_and_keeps_its_own_state(
+    kind, saved_policies
+):
+    policy = load_policy(saved_policies[kind])
+    own = policy.for_one()
+    rng = np.random.default_rng(0)
+    for robot in (policy, own):
+        robot.reset(np.zeros((1, 12)))
+    for _ in range(20):
+        seen = rng.standard_normal((1, 60)).astype(np.float32)
+        np.testing.assert_array_equal(own.act(seen), policy.act(seen))
+    policy.reset(np.zeros((3, 12)))
+    assert policy.act(np.zeros((3, 60), np.float32)).shape == (3, 12)
+    assert own.act(seen).shape == (1, 12)
+
+
+def test_a_policy_is_not_written_over_another_unless_asked(copied):
+    folder = copied()
     with pytest.raises(FileExistsRefusal):
-        write(tmp_path, force=False)
+        write(folder, networks("mlp")[0].state_dict(), force=False)
 
 
-def test_weights_that_were_tampered_with_are_refused(tmp_path):
-    write(tmp_path)
-    data = bytearray((tmp_path / WEIGHTS).read_bytes())
-    data[-1] ^= 1
-    (tmp_path / WEIGHTS).write_bytes(bytes(data))
-    assert "is not the file that contract.json describes" in refusal(tmp_path)
+def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(copied):
+    folder = copied()
+    written = json.loads((folder / CONTRACT).read_text())
+    older = {k.replace("dead_time_s", "delay_s"): v for k, v in written.items()}
+    (folder / CONTRACT).write_text(json.dumps(older | {"schema_version": 1}))
+    assert load_policy(folder).contract.model_dump(mode="json", by_alias=True) == written
 
 
-def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(tmp_path):
-    write(tmp_path)
-    written = json.loads((tmp_path / CONTRACT).read_text())
-    found = {k.replace("dead_time_s", "delay_s"): v for k, v in written.items()}
-    (tmp_path / CONTRACT).write_text(json.dumps(found | {"schema_version": 1}))
-    assert load_policy(tmp_path).contract.model_dump(mode="json", by_alias=True) == written
+# ------------------------------------------------------------------------------ refused
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"schema": "pupper-servo"}, "schema"),
-        ({"schema_version": 4}, "Upgrade pupper-sysid"),
-        ({"schema_version": 0}, "schema_version"),
-        ({"kind": "perceptron"}, "kind"),
-        ({"hidden": []}, "does not fit"),
-        ({"hidden": [32, 17]}, "does not fit"),
-        ({"hidden": [32, -1]}, "hidden"),
-        ({"kind": "gru"}, "does not fit"),
-        ({"action_history": 1}, "does not fit"),
-        ({"action_scale_rad": 0.0}, "action_scale_rad"),
-        ({"control_step_s": "0.02"}, "control_step_s"),
-        ({"base_velocity": "guessed"}, "base_velocity"),
-        ({"extra": 1}, "extra"),
+def test_a_contract_that_was_tampered_with_is_refused(copied):
+    folder = copied()
+    good = (folder / CONTRACT).read_text()
+
+    def load(contract):
+        text = contract if isinstance(contract, str) else json.dumps(json.loads(good) | contract)
+        (folder / CONTRACT).write_text(text, encoding="latin-1")
+        load_policy(folder)
+
+    cases = [
+        ({"schema": "pupper-servo"}, "schema"), ({"schema_version": 4}, "Upgrade pupper-sysid"),
+        ({"schema_version": 0}, "schema_version"), ({"kind": "perceptron"}, "kind"),
+        ({"hidden": []}, "does not fit"), ({"hidden": [32, 17]}, "does not fit"),
+        ({"hidden": [32, -1]}, "hidden"), ({"kind": "gru"}, "does not fit"),
+        ({"action_history": 1}, "does not fit"), ({"action_scale_rad": 0.0}, "action_scale_rad"),
+        ({"control_step_s": "0.02"}, "control_step_s"), ({"extra": 1}, "extra"),
+        ({"control_step_s": 1e-9}, "control_step_s"), ({"base_velocity": "any"}, "base_velocity"),
         ({"default_pose_rad": {"LF_hip": 0.0}}, "default_pose_rad"),
         ({"default_pose_rad": {"LF_hip": 50.0}}, "default_pose_rad"),
-        ({"velocity_steps": 10**9}, "velocity_steps"),
-        ({"control_step_s": 1e-9}, "control_step_s"),
+        ({"velocity_steps": 10**9}, "velocity_steps"), ({"dead_time_s": []}, "dead_time_s"),
         ({"dead_time_s": [0.01, float("nan")]}, "dead_time_s"),
-        ({"dead_time_s": []}, "dead_time_s"),
         ({"weights_sha256": "0" * 63}, "weights_sha256"),
-    ],
-)
-def test_a_contract_that_was_tampered_with_is_refused(tmp_path, change, words):
-    write(tmp_path)
-    rewrite_contract(tmp_path, **change)
-    assert words in refusal(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"schema": NaN}', "\x00\xff"])
-def test_a_contract_that_is_no_json_object_is_refused(tmp_path, text):
-    write(tmp_path)
-    (tmp_path / CONTRACT).write_text(text, encoding="latin-1")
-    refusal(tmp_path)
-
-
-@pytest.mark.parametrize("name", [CONTRACT, WEIGHTS])
-def test_a_policy_without_one_of_its_files_is_refused(tmp_path, name):
-    write(tmp_path)
-    (tmp_path / name).unlink()
-    assert f"no {name} in it" in refusal(tmp_path)
+        *((text, "") for text in ("", "{", "[]", "null", '{"schema": NaN}', "\x00\xff")),
+    ]  # fmt: skip
+    assert_each_refused(cases, load, names=folder)
 
 
 def narrower(weights):
@@ -190,35 +172,29 @@ def constant(weights):
     weights["mlp.4.weight"].zero_()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (narrower, "does not fit"), (without_one, "does not fit"),
-        (not_a_number, "not numbers"), (infinite_normaliser, "not numbers"),
-        (constant, "is constant"),
-    ],
-)  # fmt: skip
-def test_weights_that_cannot_walk_are_refused_when_read(tmp_path, change, words):
-    write(tmp_path)
-    rewrite_weights(tmp_path, change)
-    assert words in refusal(tmp_path)
+def test_weights_that_cannot_walk_are_refused_when_read(copied):
+    def load(change):
+        folder = copied()
+        weights = load_file(folder / WEIGHTS)
+        change(weights)
+        save_file(weights, folder / WEIGHTS)
+        rewrite_weights(folder)
+        load_policy(folder)
+
+    cases = [
+        (narrower, "does not fit"), (without_one, "does not fit"), (not_a_number, "not numbers"),
+        (infinite_normaliser, "not numbers"), (constant, "is constant"),
+    ]  # fmt: skip
+    assert_each_refused(cases, load, names="/policy")
 
 
-@pytest.mark.parametrize("change", [not_a_number, infinite_normaliser, constant])
-def test_weights_that_cannot_walk_are_not_written(tmp_path, change):
-    with pytest.raises(InputError):
-        write(tmp_path, change=change)
-    assert not (tmp_path / CONTRACT).exists() and not (tmp_path / WEIGHTS).exists()
-
-
-def test_weights_that_are_no_safetensors_are_refused_without_unpickling(tmp_path):
-    write(tmp_path)
-    torch.save({"mlp.0.weight": torch.zeros(1)}, tmp_path / WEIGHTS)
-    rewrite_contract(tmp_path, weights_sha256=sha256(tmp_path / WEIGHTS))
-    assert "does not fit" in refusal(tmp_path)
-
-
-def test_the_gate_refuses_actions_that_overflow():
+def test_weights_that_cannot_walk_are_not_written(tmp_path):
+    for change in (not_a_number, infinite_normaliser, constant):
+        weights = {k: v.clone() for k, v in networks("mlp")[0].state_dict().items()}
+        change(weights)
+        with pytest.raises(InputError):
+            write(tmp_path, weights)
+        assert not list(tmp_path.iterdir()), change
     network = PolicyNetwork("mlp", 60, (4,), 1, False)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -227,26 +203,69 @@ def test_the_gate_refuses_actions_that_overflow():
         refuse_bad(network, "It")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
+def test_files_that_are_absent_altered_or_of_another_kind_are_refused(copied):
+    """Weights that are no safetensors are not unpickled."""
+    pickled = copied(folder=copied().parent / "pickled")
+    torch.save({"mlp.0.weight": torch.zeros(1)}, pickled / WEIGHTS)
+
+    def load(spoil):
+        folder = copied()
+        spoil(folder)
+        load_policy(folder)
+
+    def altered(folder):
+        data = bytearray((folder / WEIGHTS).read_bytes())
+        data[-1] ^= 1
+        (folder / WEIGHTS).write_bytes(bytes(data))
+
+    cases = [
+        (altered, "is not the file that contract.json describes"),
+        (lambda folder: (folder / CONTRACT).unlink(), f"no {CONTRACT} in it"),
+        (lambda folder: (folder / WEIGHTS).unlink(), f"no {WEIGHTS} in it"),
+        (lambda f: rewrite_weights(f, (pickled / WEIGHTS).read_bytes()), "does not fit"),
+    ]
+    assert_each_refused(cases, load, names="/policy")
+    with pytest.raises(InputError, match="neither a run nor a policy"):
+        policy_at(pickled.parent)
+
+
+def test_files_that_ask_for_much_memory_or_time_are_refused_before_they_get_it(copied):
+    folder = copied()
+    rewrite_contract(folder, hidden=[8192] * 16)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="weights of another shape"):
+        load_policy(folder)
+    # 15 layers of 8192² weights would be 4 GB
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
+
+    folder, entry = copied(), '{"dtype":"F32","shape":[0],"data_offsets":[0,0]}'
+    tensors = ("{" + ",".join(f'"{k}":{entry}' for k in range(10**6)) + "}").encode()
+    rewrite_weights(folder, struct.pack("<Q", len(tensors)) + tensors)
+    started = time.process_time()
+    with pytest.raises(InputError, match="its list of tensors, has"):
+        load_policy(folder)
+    assert time.process_time() - started < 2
+
+
+def test_a_policy_that_expects_another_observation_is_not_run(copied):
+    for change in (
         {"velocity_steps": 1},
         {"observation": [{"name": "everything", "size": 60, "unit": "1"}]},
-    ],
-)
-def test_a_policy_that_expects_another_observation_is_not_run(tmp_path, change):
-    write(tmp_path)
-    simulator(tmp_path, load_policy(tmp_path), None, CALIBRATION, None)
-    rewrite_contract(tmp_path, **change)
-    with pytest.raises(InputError, match="observation is not the one"):
-        simulator(tmp_path, load_policy(tmp_path), None, CALIBRATION, None)
+    ):
+        folder = copied()
+        simulator(folder, load_policy(folder), None, CALIBRATION, None)
+        rewrite_contract(folder, **change)
+        with pytest.raises(InputError, match="observation is not the one"):
+            simulator(folder, load_policy(folder), None, CALIBRATION, None)
+
+
+# ------------------------------------------------------------------------------ its servos
 
 
 def test_the_actuator_of_the_training_is_found_beside_a_policy_and_known_by_its_hash(
-    tmp_path, monkeypatch, capsys
+    tmp_path, copied, monkeypatch, capsys
 ):
-    folder, elsewhere = tmp_path / "mine/policies/one", tmp_path / "elsewhere"
-    write(folder)
+    folder, elsewhere = copied(folder=tmp_path / "mine/policies/one"), tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
     policy = load_policy(folder)
@@ -258,70 +277,22 @@ def test_the_actuator_of_the_training_is_found_beside_a_policy_and_known_by_its_
     assert chosen_actuator(folder, policy, None, None) == "calibrated.yaml"
     assert "not the file with which" in " ".join(capsys.readouterr().err.split())
     (tmp_path / "mine/calibrated.yaml").write_text(original)
-    found = str(tmp_path / "mine/calibrated.yaml")
-    assert trained_actuator(folder, policy, None) == (found, True)
+    beside = str(tmp_path / "mine/calibrated.yaml")
+    assert trained_actuator(folder, policy, None) == (beside, True)
     assert chosen_actuator(folder, policy, None, "paper") == "paper"
-    assert simulator(folder, policy, None, None, None)[1].source == found
+    assert simulator(folder, policy, None, None, None)[1].source == beside
     assert "not the file with which" not in " ".join(capsys.readouterr().err.split())
 
 
-def test_what_is_neither_run_nor_policy_is_refused(tmp_path):
-    with pytest.raises(InputError, match="neither a run nor a policy"):
-        policy_at(tmp_path)
-
-
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_a_policy_for_one_robot_acts_with_the_same_bits_and_keeps_its_own_state(kind, tmp_path):
-    write(tmp_path, kind)
-    policy = load_policy(tmp_path)
-    own = policy.for_one()
-    rng = np.random.default_rng(0)
-    for robot in (policy, own):
-        robot.reset(np.zeros((1, 12)))
-    for _ in range(30):
-        seen = rng.standard_normal((1, 60)).astype(np.float32)
-        np.testing.assert_array_equal(own.act(seen), policy.act(seen))
-    policy.reset(np.zeros((3, 12)))
-    assert policy.act(np.zeros((3, 60), np.float32)).shape == (3, 12)
-    assert own.act(seen).shape == (1, 12)
-
-
-def test_a_contract_that_asks_for_much_memory_is_refused_before_it_is_given(tmp_path):
-    folder = tmp_path / "policy"
-    write(folder)
-    rewrite_contract(folder, hidden=[8192] * 16)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(InputError, match="weights of another shape"):
-        load_policy(folder)
-    # 15 layers of 8192² weights would be 4 GB
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
-
-
-def test_a_list_of_a_million_tensors_is_refused_at_once(tmp_path):
-    folder = tmp_path / "policy"
-    write(folder)
-    tensors = ",".join(
-        f'"{k}":{{"dtype":"F32","shape":[0],"data_offsets":[0,0]}}' for k in range(10**6)
-    )
-    data = ("{" + tensors + "}").encode()
-    (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(data)) + data)
-    rewrite_contract(folder, weights_sha256=sha256(folder / WEIGHTS))
-    started = time.process_time()
-    with pytest.raises(InputError, match="its list of tensors, has"):
-        load_policy(folder)
-    assert time.process_time() - started < 2
-
-
-@pytest.mark.parametrize("kind", ["mlp", "lstm", "lstm_from_nothing", "mlp_from_nothing"])
 def test_the_shipped_policies_find_their_servos_wherever_the_samples_are_copied(
-    tmp_path, monkeypatch, kind
+    tmp_path, monkeypatch
 ):
     shipped = Path(CALIBRATION).parent
     (tmp_path / "samples").mkdir()
     shutil.copy(CALIBRATION, tmp_path / "samples")
     shutil.copytree(shipped / "policies", tmp_path / "samples/policies")
     monkeypatch.chdir(tmp_path)
-    folder = Path("samples/policies") / kind
-    policy, run = policy_at(folder)
-    found, same = trained_actuator(folder, policy, run)
-    assert same and found == str(tmp_path / "samples/calibrated.yaml")
+    for folder in sorted(Path("samples/policies").iterdir()):
+        policy, run = policy_at(folder)
+        servos = str(tmp_path / "samples/calibrated.yaml")
+        assert trained_actuator(folder, policy, run) == (servos, True)

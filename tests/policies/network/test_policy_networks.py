@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
 
+import numpy as np
 import onnx
 import pytest
 import torch
+from tensordict import TensorDict
 
+from pupper_sysid.common.errors import PupperError
+from pupper_sysid.policies.network.actor_critic import build
 from pupper_sysid.policies.network.attention import (
     CONTEXT,
     WIDTH,
@@ -18,11 +21,20 @@ from pupper_sysid.policies.network.attention import (
     empty_context,
     step,
 )
-from pupper_sysid.policies.network.policy_export import export_policy, write_policy
-from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
+from pupper_sysid.policies.network.policy_export import export_policy
+from pupper_sysid.policies.network.policy_file import Contract, load_policy
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
+from pupper_sysid.policies.network.teacher import inputs
 from pupper_sysid.policies.train.training import action_history
+from pupper_sysid.sim.walking.observation import (
+    OBSERVATION_PARTS,
+    OBSERVATION_SIZE,
+    PRIVILEGED_PARTS,
+    PRIVILEGED_SIZE,
+)
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sysid.export import network as network_export
 from support.tiny_training import (
     ALL_KINDS,
     CALIBRATION,
@@ -58,27 +70,27 @@ def alone(kind: str, actor) -> PolicyNetwork:
     return network
 
 
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_a_policy_alone_acts_as_the_trainers_actor_does_through_resets(kind):
-    actor, _ = networks(kind)
-    network = alone(kind, actor)
-    generator = torch.Generator().manual_seed(1)
-    state = network.initial_state(3)
-    with torch.inference_mode():
-        for t in range(30):
-            seen = observations(3, generator)
-            flat = torch.cat([seen[g] for g in actor.obs_groups], dim=-1)
-            expected = actor(seen)
-            action, *state = network(flat, *state)
-            torch.testing.assert_close(action, expected, atol=1e-6, rtol=0)
-            ended = torch.tensor([t == 20, t in (7, 8), False])
-            actor.reset(ended)
-            state = [s.clone() for s in state]
-            for part in state:
-                part[:, ended] = 0.0
+def test_a_policy_alone_acts_as_the_trainers_actor_does_through_resets():
+    for kind in ALL_KINDS:
+        actor, _ = networks(kind)
+        network = alone(kind, actor)
+        generator = torch.Generator().manual_seed(1)
+        state = network.initial_state(3)
+        with torch.inference_mode():
+            for t in range(30):
+                seen = observations(3, generator)
+                flat = torch.cat([seen[g] for g in actor.obs_groups], dim=-1)
+                expected = actor(seen)
+                action, *state = network(flat, *state)
+                torch.testing.assert_close(action, expected, atol=1e-6, rtol=0, msg=kind)
+                ended = torch.tensor([t == 20, t in (7, 8), False])
+                actor.reset(ended)
+                state = [s.clone() for s in state]
+                for part in state:
+                    part[:, ended] = 0.0
 
 
-@pytest.mark.parametrize("kind", ALL_KINDS)
+@pytest.mark.parametrize("kind", ["mlp-actions", *WITH_MEMORY])
 def test_the_update_sees_the_very_policy_that_acted(kind):
     """The probability ratio is 1 before anything is learned: fresh, carried over, and relearned."""
     learner = ppo(kind, ROBOTS, STEPS)
@@ -111,20 +123,18 @@ def test_the_update_sees_the_very_policy_that_acted(kind):
         storage.clear()
 
 
-@pytest.mark.parametrize("kind", WITH_MEMORY)
-def test_what_was_before_a_rollout_matters_to_its_first_steps(kind):
+def test_what_was_before_a_rollout_matters_to_its_first_steps():
     """Or the test above would say nothing about what is carried over."""
-    learner = ppo(kind, ROBOTS, STEPS)
+    learner = ppo("transformer", ROBOTS, STEPS)
     generator = torch.Generator().manual_seed(3)
     for _ in range(2):
         learner.storage.clear()
         roll(learner, episode_ends(), generator)
     batch = next(learner.storage.recurrent_mini_batch_generator(1, 1))
     state = batch.hidden_states[0]
-    nothing = tuple(0 * s for s in state) if isinstance(state, tuple) else 0 * state
     now, then = (
         learner.actor(batch.observations, masks=batch.masks, hidden_state=s).detach()
-        for s in (state, nothing)
+        for s in (state, 0 * state)
     )
     differ = ((now - then).abs() > 1e-4).any(dim=-1)
     # robot 2's last episode ended with the rollout before
@@ -153,34 +163,28 @@ def test_a_changed_observation_changes_the_sixteen_latents_from_it_on_and_no_oth
     assert float(difference[0, changed + 16 :].max()) < 1e-6
 
 
-@pytest.mark.parametrize(("age", "matters"), [(0, True), (15, True), (16, False), (17, False)])
-def test_acting_step_by_step_the_window_is_sixteen_observations(age, matters):
-    made, steps = attention(), 30
-    given = torch.randn(steps, 1, 5)
-    other = given.clone()
-    other[steps - 1 - age] += 1.0
-    latents = []
-    for series in (given, other):
-        context = empty_context(1, 5, series)
+def test_acting_step_by_step_a_transformer_sees_sixteen_observations_as_in_a_sequence():
+    made, steps = attention(), 40
+    series = torch.randn(steps, 2, 5)
+
+    def walk(series: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        context, latents = empty_context(2, 5, series), []
         with torch.inference_mode():
             for row in series:
                 latent, context = step(made, torch.nn.Identity(), row, context)
-        latents.append(latent)
-    assert bool((latents[0] - latents[1]).abs().max() > 1e-4) is matters
-    assert context.shape == (CONTEXT - 1, 1, 6) and latents[0].shape == (1, WIDTH)
+                latents.append(latent)
+        return torch.stack(latents, dim=1), context
 
-
-def test_a_sequence_and_a_walk_step_by_step_give_the_same_latents():
-    made, steps = attention(), 40
-    given = torch.randn(steps, 2, 5)
-    context, walked = empty_context(2, 5, given), []
+    walked, context = walk(series)
+    assert context.shape == (CONTEXT - 1, 2, 6) and walked.shape == (2, steps, WIDTH)
     with torch.inference_mode():
-        for row in given:
-            latent, context = step(made, torch.nn.Identity(), row, context)
-            walked.append(latent)
-        present = torch.ones(2, steps, dtype=torch.bool)
-        whole = made(given.transpose(0, 1), present, steps)
-    torch.testing.assert_close(torch.stack(walked, dim=1), whole, atol=SINGLE, rtol=0)
+        whole = made(series.transpose(0, 1), torch.ones(2, steps, dtype=torch.bool), steps)
+    torch.testing.assert_close(walked, whole, atol=SINGLE, rtol=0)
+    for age, matters in ((0, True), (15, True), (16, False)):
+        other = series.clone()
+        other[steps - 1 - age] += 1.0
+        moved = (walk(other)[0] - walked)[:, -1].abs().max()
+        assert bool(moved > 1e-4) is matters, age
 
 
 def test_a_transformer_remembers_nothing_from_before_its_episode():
@@ -209,20 +213,23 @@ def test_only_the_network_with_past_actions_sees_them():
 # ------------------------------------------------------------------------------ other files
 
 
-@pytest.fixture(scope="module", params=ALL_KINDS)
-def folder(request, tmp_path_factory):
-    run = tiny_run(request.param)
-    run = replace(run, architecture=replace(run.architecture, hidden=(32, 16), memory=24))
-    actor, _ = networks(request.param)
-    folder = tmp_path_factory.mktemp(request.param) / "policy"
-    history = HISTORY if request.param == "mlp-actions" else 0
-    write_policy(folder, actor.state_dict(), run, servo_ranges(CALIBRATION), history, {"seed": 0})
-    return folder
+def test_a_policy_is_loaded_without_its_trainer(saved_policies):
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from pupper_sysid.policies.network.policy_file import load_policy\n"
+        "[load_policy(Path(folder)) for folder in sys.argv[1:]]\n"
+        "assert 'rsl_rl' not in sys.modules and 'tensordict' not in sys.modules"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, saved_policies.values())],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
 
 
-@pytest.fixture(scope="module")
-def policy(folder):
-    return load_policy(folder)
+@pytest.fixture(params=ALL_KINDS)
+def policy(request, saved_policies):
+    return load_policy(saved_policies[request.param])
 
 
 INPUTS = {
@@ -231,19 +238,10 @@ INPUTS = {
 }  # fmt: skip
 
 
-def test_a_policy_is_loaded_without_its_trainer(folder):
-    code = (
-        "import sys; from pathlib import Path\n"
-        "from pupper_sysid.policies.network.policy_file import load_policy\n"
-        "load_policy(Path(sys.argv[1]))\n"
-        "assert 'rsl_rl' not in sys.modules and 'tensordict' not in sys.modules"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_an_onnx_file_acts_like_the_policy_and_carries_its_contract(policy, tmp_path):
-    path = tmp_path / "policy.onnx"
+def test_an_exported_file_acts_like_the_policy_and_onnx_carries_its_contract(policy, tmp_path):
+    scripted, path = tmp_path / "policy.pt", tmp_path / "policy.onnx"
+    assert export_policy(policy, "torchscript", scripted) <= 1e-5
+    acts_alike(policy, torch.jit.load(scripted))
     assert export_policy(policy, "onnx", path) <= 1e-5
     model = onnx.load(path)
     ins = [i.name for i in model.graph.input]
@@ -252,15 +250,9 @@ def test_an_onnx_file_acts_like_the_policy_and_carries_its_contract(policy, tmp_
         "actions", *(name.replace("_in", "_out") for name in ins[1:])
     ]  # fmt: skip
     carried = {entry.key: entry.value for entry in model.metadata_props}
-    expected = policy.contract.model_dump(mode="json", by_alias=True)
-    assert json.loads(carried["contract"]) == expected
-    assert acts_alike(policy, _onnx_runner(path, ins))
-
-
-def test_a_torchscript_file_acts_like_the_policy(policy, tmp_path):
-    path = tmp_path / "policy.pt"
-    assert export_policy(policy, "torchscript", path) <= 1e-5
-    assert acts_alike(policy, torch.jit.load(path))
+    contract = Contract.model_validate(json.loads(carried["contract"]))
+    assert contract == policy.contract and contract.servo is not None
+    acts_alike(policy, _onnx_runner(path, ins))
 
 
 def _onnx_runner(path, ins):
@@ -275,7 +267,7 @@ def _onnx_runner(path, ins):
     return run
 
 
-def acts_alike(policy, run) -> bool:
+def acts_alike(policy, run) -> None:
     """Over twenty steps: more than a Transformer's context, more than the export checks."""
     generator = torch.Generator().manual_seed(6)
     mine = theirs = policy.network.initial_state(1)
@@ -285,31 +277,60 @@ def acts_alike(policy, run) -> bool:
             action, *mine = policy.network(seen, *mine)
             other, *theirs = run(seen, *theirs)
         torch.testing.assert_close(action, other, atol=1e-5, rtol=0)
-    return True
 
 
-def test_a_file_that_acts_otherwise_is_not_written(policy, tmp_path, monkeypatch):
-    from pupper_sysid.common.errors import PupperError
-    from pupper_sysid.sysid.export import network
-
-    real = network._torchscript
+def test_a_file_that_acts_otherwise_is_not_written(saved_policies, tmp_path, monkeypatch):
+    real = network_export._torchscript
 
     def off_by_a_little(*given):
         data, run = real(*given)
         return data, lambda *inputs: [run(*inputs)[0] + 2e-5, *run(*inputs)[1:]]
 
-    monkeypatch.setattr(network, "_torchscript", off_by_a_little)
+    monkeypatch.setattr(network_export, "_torchscript", off_by_a_little)
     with pytest.raises(PupperError, match="differs from the model"):
-        export_policy(policy, "torchscript", tmp_path / "policy.pt")
+        export_policy(load_policy(saved_policies["lstm"]), "torchscript", tmp_path / "policy.pt")
     assert not (tmp_path / "policy.pt").exists()
 
 
-@pytest.mark.parametrize(
-    ("dead_time_s", "steps"), [(0.0, 1), (0.001, 2), (0.020, 2), (0.076, 5), (0.100, 6)]
-)
-def test_past_actions_cover_the_longest_delay_and_one_step_more(dead_time_s, steps):
+def test_past_actions_cover_the_longest_delay_and_one_step_more():
     """k = ceil(delay / 20 ms) + 1."""
     servos = servo_ranges(CALIBRATION)
-    servos = servos.later(dead_time_s - servos.longest_dead_time_s)
-    assert action_history(tiny_run("mlp-actions"), servos) == steps
-    assert action_history(tiny_run("lstm"), servos) == 0
+    for dead_time_s, steps in ((0.0, 1), (0.001, 2), (0.020, 2), (0.076, 5), (0.100, 6)):
+        late = servos.later(dead_time_s - servos.longest_dead_time_s)
+        assert action_history(tiny_run("mlp-actions"), late) == steps
+        assert action_history(tiny_run("lstm"), late) == 0
+
+
+# ------------------------------------------------------------------------------ a teacher
+
+
+def test_a_teacher_sees_command_imu_and_the_clock_with_its_harmonics_and_nothing_else():
+    turns = 0.1
+    generator = torch.Generator().manual_seed(0)
+    sizes = {"policy": OBSERVATION_SIZE, "privileged": PRIVILEGED_SIZE, "noise": 12}
+    seen = TensorDict(
+        {k: torch.randn(5, n, generator=generator) for k, n in sizes.items()}, batch_size=[5]
+    )
+    clock, angles = PRIVILEGED_PARTS["clock"], 2 * np.pi * turns * np.array([1, 2, 3])
+    cos, sin = np.cos(angles), np.sin(angles)
+    seen["privileged"][:, clock] = torch.tensor([cos[0], sin[0], 0.3]).float()
+
+    shown = inputs(seen)
+    assert shown.shape == (5, 34)
+    torch.testing.assert_close(shown[:, :9], seen["policy"][:, 3:12])
+    np.testing.assert_allclose(shown[0, 9:16], [0.3, *cos, *sin], atol=1e-6)
+    strokes = np.multiply.outer(seen["policy"][0, 9:12], [*cos, *sin])
+    np.testing.assert_allclose(shown[0, 16:], strokes.flatten(), atol=1e-6)
+
+    architecture = Architecture("mlp", (16,), 8, (16,), privileged_actor=True)
+    actor, critic = build(architecture, seen, Hyperparameters(), 0.02)
+    actor.update_normalization(seen)
+    before, valued = actor(seen), critic(seen)
+    other = seen.clone()
+    other["policy"][:, OBSERVATION_PARTS["joint_velocity"]] += 1.0
+    for name in ("friction", "base_linear_velocity"):
+        other["privileged"][:, PRIVILEGED_PARTS[name]] += 1.0
+    torch.testing.assert_close(actor(other), before)
+    assert not torch.allclose(critic(other), valued)
+    other["privileged"][:, clock] *= -1.0
+    assert not torch.allclose(actor(other), before)
