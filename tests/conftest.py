@@ -48,7 +48,7 @@ def real_playback() -> Path:
     return real_recording("playback_lstm_25hz.csv")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def walker():
     """The shipped LSTM, and two robots with calibrated servos to walk on."""
     from pupper_sysid.policies.analysis.robustness import Trial

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from pupper_sysid.policies.analysis.trial import Trial
 from pupper_sysid.policies.walks.rollouts import Rollout
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 STEP = 0.02
 """Their control step [s]."""
@@ -30,3 +33,15 @@ def walked(command, forward, left, turn, seconds=6.0, robots=3, action=None) -> 
         np.zeros((*shape, 4), np.float32), np.zeros((*shape, 12)), np.ones((*shape, 4), bool),
         np.zeros((*shape, 3)), np.array(path), np.ones(shape, bool), np.zeros(robots, bool),
     )  # fmt: skip
+
+
+def recorded(plain: Rollout, *others: Rollout) -> Trial:
+    """A trial whose walks are known: one alone is `plain`, several are the `others` in turn."""
+
+    class Recorded(Trial):
+        def walks(self, policy, conditions, part=(0.0, 1.0)):
+            if len(conditions) == 1 or not others:
+                return [plain] * len(conditions)
+            return [others[i * len(others) // len(conditions)] for i in range(len(conditions))]
+
+    return Recorded(Walking(), servo_ranges("ideal"), robots=plain.alive.shape[1])

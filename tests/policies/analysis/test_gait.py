@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import LEGS
 from pupper_sysid.policies.analysis.gait import (
     amplitude,
@@ -25,6 +24,7 @@ from pupper_sysid.policies.analysis.rhythm import frequency, null_r2, sine_fit_r
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position
 from pupper_sysid.sim.robot.trot import Trot
+from support.refusals import assert_each_refused
 
 STEP_S = 0.02
 TROT = Trot(frequency_hz=3.25)
@@ -63,39 +63,33 @@ def tones(hz: float, seconds: float, noise: np.ndarray, rng: np.random.Generator
 # ------------------------------------------------------------------------------ frequency
 
 
-@pytest.mark.parametrize("hz", [0.9, 3.25, 7.03])
-@pytest.mark.parametrize("seconds", [5.0, 12.34])
-def test_the_frequency_of_a_trot_is_found_within_a_hundredth_of_a_hertz(hz, seconds):
-    joints, _ = trot(seconds, hz, start=1.0)
-    found = frequency(joints, STEP_S)
-    assert found.value == pytest.approx(hz, abs=0.01)
-    assert found.low <= found.value <= found.high
-    assert sine_frequency(joints, STEP_S) == pytest.approx(hz, abs=0.01)
+def test_the_frequency_of_a_trot_is_found_within_a_hundredth_of_a_hertz():
+    for hz, seconds in ((0.9, 5.0), (3.25, 12.34), (7.03, 5.0), (7.03, 12.34)):
+        joints, _ = trot(seconds, hz, start=1.0)
+        found = frequency(joints, STEP_S)
+        assert found.value == pytest.approx(hz, abs=0.01)
+        assert found.low <= found.value <= found.high
+        assert sine_frequency(joints, STEP_S) == pytest.approx(hz, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "memory", "channels", "most"),
+def test_the_interval_of_the_frequency_holds_the_truth_nine_times_in_ten():
+    """In noise as strong as the rhythm; 100 draws know a coverage of 90 % to ±3 %."""
+    trials = 100
     # in very red noise errors of neighbouring strides cancel: rather too wide than too narrow
-    [(5.0, 0.5, 12, 0.97), (5.0, 0.9, 4, 0.97), (8.0, 0.95, 4, 0.99)],
-)
-def test_the_interval_of_the_frequency_holds_the_truth_nine_times_in_ten(
-    seconds, memory, channels, most
-):
-    """In noise as strong as the rhythm; 300 draws know a coverage of 90 % to ±1.7 %."""
-    rng = np.random.default_rng(1)
-    held, trials = 0, 300
-    for _ in range(trials):
-        hz = rng.uniform(2.0, 6.0)
-        noise = red_noise(memory, (round(seconds / STEP_S), channels), rng)
-        found = frequency(tones(hz, seconds, noise, rng), STEP_S)
-        held += found.low <= hz <= found.high
-    assert 0.80 <= held / trials <= most
+    for seconds, memory, channels, most in ((5.0, 0.5, 12, 0.97), (8.0, 0.95, 4, 0.99)):
+        rng, held = np.random.default_rng(1), 0
+        for _ in range(trials):
+            hz = rng.uniform(2.0, 6.0)
+            noise = red_noise(memory, (round(seconds / STEP_S), channels), rng)
+            found = frequency(tones(hz, seconds, noise, rng), STEP_S)
+            held += found.low <= hz <= found.high
+        assert 0.80 <= held / trials <= most
 
 
 def test_an_interval_grows_with_the_wandering_of_the_rhythm():
     """A random walk of D rad/√s leaves the mean rate over T uncertain by at least D / (2π √T)."""
     rng = np.random.default_rng(2)
-    held, width, trials = 0, [], 60
+    held, width, trials = 0, [], 40
     for _ in range(trials):
         noise = 0.3 * red_noise(0.9, (500, 4), rng)
         found = frequency(tones(4.0, 10.0, noise, rng, wander=0.5), STEP_S)
@@ -113,13 +107,22 @@ def test_a_strong_drift_and_a_still_joint_do_not_hide_the_gait():
     assert frequency(joints, STEP_S).value == pytest.approx(3.25, abs=0.01)
 
 
-def test_a_signal_shorter_than_five_seconds_or_still_is_refused():
+def test_signals_that_are_short_still_or_of_other_shapes_are_refused():
     joints, _ = trot(5.0)
     frequency(joints, STEP_S)
-    with pytest.raises(InputError, match=r"4\.98 s is too short"):
-        frequency(joints[1:], STEP_S)
-    with pytest.raises(InputError, match="Nothing moves"):
-        frequency(np.full((300, 12), 0.1), STEP_S)
+    cases = [
+        (lambda: frequency(joints[1:], STEP_S), "4.98 s is too short"),
+        (lambda: frequency(np.full((300, 12), 0.1), STEP_S), "Nothing moves"),
+        (lambda: correlation(joints, joints[1:]), "cannot be compared"),
+        (lambda: correlation(np.ones((50, 12)), joints[:50]), "Nothing moves"),
+        (
+            lambda: describe(
+                rollout([3.2, 3.3], fell_at={0: 6.0, 1: 3.0}), np.random.default_rng(0)
+            ),
+            "No robot walked for 7 s: the longest was up for 6.0 s",
+        ),
+    ]
+    assert_each_refused(cases, lambda measure: measure())
 
 
 # ------------------------------------------------------------------------------ R²
@@ -142,13 +145,13 @@ def test_r2_is_one_for_a_sine_zero_for_another_frequency_and_zero_for_a_still_jo
 
 
 def test_noise_is_as_regular_as_its_null_and_a_trot_is_more():
-    """Of 30 noises, the rank among their own surrogates is even: mean 1/2 ± 0.05 (one sigma)."""
+    """Of 20 noises, the rank among their own surrogates is even: mean 1/2 ± 0.065 (one sigma)."""
     rng = np.random.default_rng(4)
     ranks = []
-    for _ in range(30):
+    for _ in range(20):
         noise = red_noise(0.9, (300, 4), rng)
         own = sine_fit_r2(noise, STEP_S, sine_frequency(noise, STEP_S)).mean()
-        ranks.append((null_r2(noise, STEP_S, rng, draws=40).mean(axis=1) < own).mean())
+        ranks.append((null_r2(noise, STEP_S, rng, draws=25).mean(axis=1) < own).mean())
     assert np.mean(ranks) == pytest.approx(0.5, abs=0.17)
     joints, _ = trot(6.0)
     own = sine_fit_r2(joints, STEP_S, 3.25).mean()
@@ -172,6 +175,10 @@ def test_a_trot_has_its_duty_its_phases_and_diagonal_feet_together():
     np.testing.assert_allclose(contact.mean(axis=0), TROT.duty, atol=0.01)
     np.testing.assert_allclose(phases(contact, STEP_S, 3.25), BEHIND, atol=0.01)
     assert diagonal_coordination(contact) == pytest.approx(1.0)
+    contact[:, 2] = True  # a foot that never lifts has no phase
+    lifted = np.isfinite(phases(contact, STEP_S, 3.25))
+    np.testing.assert_array_equal(lifted, [True, True, False, True])
+    assert np.isnan(diagonal_coordination(contact))
 
 
 def test_phases_are_shares_of_a_cycle_behind_the_first_even_if_the_rhythm_wanders():
@@ -181,14 +188,6 @@ def test_phases_are_shares_of_a_cycle_behind_the_first_even_if_the_rhythm_wander
     walk = 0.5 * np.sqrt(STEP_S) * np.cumsum(rng.standard_normal(len(time)))
     angle = (2 * np.pi * 3.0 * time + walk)[:, None] - 2 * np.pi * late
     np.testing.assert_allclose(phases(np.cos(angle), STEP_S, 3.0), late, atol=0.01)
-
-
-def test_a_foot_that_never_lifts_has_no_phase():
-    _, contact = trot(6.0)
-    contact[:, 2] = True
-    found = phases(contact, STEP_S, 3.25)
-    np.testing.assert_array_equal(np.isnan(found), [False, False, True, False])
-    assert np.isnan(diagonal_coordination(contact)) and contact[:, 2].all()
 
 
 def test_feet_that_take_turns_count_against_and_independent_ones_not_at_all():
@@ -243,10 +242,6 @@ def test_a_joint_that_stopped_keeps_nothing_of_the_gait():
     # two of eight: straight ahead, hips stand still in the trot itself
     assert correlation(joints, stopped) == pytest.approx(0.75)
     assert correlation(joints, -joints) == pytest.approx(-1.0)
-    with pytest.raises(InputError, match="cannot be compared"):
-        correlation(joints, joints[1:])
-    with pytest.raises(InputError, match="Nothing moves"):
-        correlation(np.ones((50, 12)), joints[:50])
 
 
 # ------------------------------------------------------------------------------ report
@@ -317,11 +312,6 @@ def test_robots_that_stand_have_no_frequency_and_no_rhythm():
     assert np.isnan(found.frequency_hz.value) and np.isnan(found.phase[0].value)
     assert found.rhythmic == 0.0 and found.action_r2.value == 0.0 and found.jitter_rad.value == 0.0
     assert found.duty[0].value == 1.0
-
-
-def test_a_rollout_in_which_nobody_walked_for_long_is_not_described():
-    with pytest.raises(InputError, match=r"No robot walked for 7 s: the longest was up for 6\.0 s"):
-        describe(rollout([3.2, 3.3], fell_at={0: 6.0, 1: 3.0}), np.random.default_rng(0))
 
 
 def test_the_search_for_a_sine_keeps_to_its_band():

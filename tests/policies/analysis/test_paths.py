@@ -3,60 +3,57 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pupper_sysid.policies.analysis.autonomy import (
+    NUDGE_M_S,
+    PUSH_M_S,
     RatePoint,
     _pusher,
-    _shift,
     push_response,
     rate_exponent,
     rate_response,
 )
-from pupper_sysid.policies.analysis.paths import _measured, compliance
+from pupper_sysid.policies.analysis.paths import DirectionWalk, compliance
 from pupper_sysid.policies.analysis.robustness import terrain
 from pupper_sysid.policies.walks.conditions import DIRECTIONS
+from pupper_sysid.policies.walks.rollouts import Rollout
 from reproduction.evidence import scales
-from support.walks import STEP, walked
-
-ROOT = Path(__file__).resolve().parents[3]
+from support.walks import STEP, recorded, walked
 
 
-def test_a_straight_walk_at_half_speed_has_half_the_share_and_neither_drift_nor_arc():
-    found = _measured(walked((0.2, 0.0, 0.0), 0.1, 0.0, 0.0))
-    assert found["share"].value == pytest.approx(0.5, rel=0.01)
-    assert found["drift"].value == pytest.approx(0.0, abs=1e-9)
-    assert found["arc_rad_m"].value == pytest.approx(0.0, abs=1e-9)
-    assert np.isnan(found["wander_m"].value)
+def measured(walk: Rollout) -> DirectionWalk:
+    return compliance(None, recorded(walk))[0]  # pyright: ignore[reportArgumentType]
 
 
-def test_drift_is_to_the_left_of_the_command_and_an_arc_is_heading_per_metre():
-    found = _measured(walked((-0.2, 0.0, 0.0), -0.2, 0.05, 0.0))
+def test_speed_drift_arc_and_wandering_of_a_path_are_those_of_its_motion():
+    half = measured(walked((0.2, 0.0, 0.0), 0.1, 0.0, 0.0))
+    assert half.share.value == pytest.approx(0.5, rel=0.01)
+    assert half.drift.value == pytest.approx(0.0, abs=1e-9)
+    assert half.arc_rad_m.value == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(half.wander_m.value) and half.survival == 1.0
     # walking backward, the robot's left is to the right of where it goes
-    assert found["drift"].value == pytest.approx(-0.25, rel=0.01)
-    curved = _measured(walked((0.2, 0.0, 0.0), 0.2, 0.0, -0.06))
-    assert curved["arc_rad_m"].value == pytest.approx(-0.3, rel=0.03)
-
-
-def test_a_turn_on_the_spot_wanders_nowhere():
-    found = _measured(walked((0.0, 0.0, -0.4), 0.0, 0.0, -0.3))
-    assert found["share"].value == pytest.approx(0.75, rel=0.01)
-    assert found["wander_m"].value == pytest.approx(0.0, abs=1e-9)
-    assert np.isnan(found["drift"].value)
+    backward = measured(walked((-0.2, 0.0, 0.0), -0.2, 0.05, 0.0))
+    assert backward.drift.value == pytest.approx(-0.25, rel=0.01)
+    curved = measured(walked((0.2, 0.0, 0.0), 0.2, 0.0, -0.06))
+    assert curved.arc_rad_m.value == pytest.approx(-0.3, rel=0.03)
+    turned = measured(walked((0.0, 0.0, -0.4), 0.0, 0.0, -0.3))
+    assert turned.share.value == pytest.approx(0.75, rel=0.01)
+    assert turned.wander_m.value == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(turned.drift.value)
 
 
 def test_a_robot_that_fell_went_nowhere_and_says_nothing_of_drift():
     rollout = walked((0.2, 0.0, 0.0), 0.2, 0.0, -0.06, robots=2)
     rollout.alive[150:, 0] = False
-    found = _measured(rollout)
-    assert found["share"].value == pytest.approx(0.5, rel=0.01)
-    assert found["arc_rad_m"].value == pytest.approx(-0.3, rel=0.03)
+    one = measured(rollout)
+    assert one.share.value == pytest.approx(0.5, rel=0.01)
+    assert one.arc_rad_m.value == pytest.approx(-0.3, rel=0.03)
     rollout.alive[150:] = False
-    nobody = _measured(rollout)
-    assert nobody["share"].value == 0.0 and np.isnan(nobody["drift"].value)
+    none = measured(rollout)
+    assert none.share.value == 0.0 and np.isnan(none.drift.value)
 
 
 def waves(hz: float, ahead: float, steps: int) -> np.ndarray:
@@ -65,33 +62,37 @@ def waves(hz: float, ahead: float, steps: int) -> np.ndarray:
     return np.sin(2 * np.pi * (phase + np.linspace(0, 0.5, 12)))[:, None, :].astype(np.float32)
 
 
-@pytest.mark.parametrize("ahead", [-0.3, 0.0, 0.1, 0.45])
-def test_the_shift_between_two_walks_is_that_of_their_phases(ahead):
+def test_the_shift_that_a_push_leaves_is_that_of_the_phases():
+    """Walks of 10 s: a plain one, and for each speed of a push one that is ahead of it."""
     steps = round(10.0 / STEP)
-    plain, pushed = (
-        walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(3.1, a, steps)) for a in (0.0, ahead)
-    )
-    assert _shift(plain, pushed, 200, (1.0, 3.0), 0, 3.1) == pytest.approx(ahead, abs=0.01)
+    for hz, nudged, pushed, tolerance in (
+        (3.1, 0.0, 0.1, 0.01), (3.1, -0.3, 0.45, 0.01),
+        (0.6, 0.0, 0.1, 0.05),  # the window of its last push would end after the walk
+    ):  # fmt: skip
+        plain, nudge, push = (
+            walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(hz, ahead, steps))
+            for ahead in (0.0, nudged, pushed)
+        )
 
-
-def test_the_last_push_of_a_slow_gait_is_judged_by_what_there_is():
-    steps = round(10.0 / STEP)
-    plain, pushed = (
-        walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(0.6, a, steps)) for a in (0.0, 0.1)
-    )
-    # pushed after 5.5 s, its window would end after 10.5 s
-    assert _shift(plain, pushed, 275, (3.0, 5.0), 0, 0.6) == pytest.approx(0.1, abs=0.05)
+        trial = recorded(plain, nudge, push)
+        small, large = push_response(None, trial)  # pyright: ignore[reportArgumentType]
+        assert (small.push_m_s, large.push_m_s) == (NUDGE_M_S, PUSH_M_S)
+        assert small.shift_early == pytest.approx(abs(nudged), abs=tolerance)
+        assert large.shift_late == pytest.approx(abs(pushed), abs=tolerance)
+        assert large.shifts == pytest.approx([pushed] * len(large.shifts), abs=tolerance)
+        assert large.kept == pytest.approx(1.0, abs=0.1), "the phase stays where it was pushed"
 
 
 def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):
     policy, trial = walker
-    trial = replace(trial, seconds=2.0)
-    plain, pushed = trial.walk(policy), trial.walk(policy, None, _pusher(60, 0.3))
-    np.testing.assert_array_equal(plain.velocity[:60], pushed.velocity[:60])
+    trial = replace(trial, seconds=0.5)
+    plain, pushed = trial.walk(policy), trial.walk(policy, None, _pusher(15, 0.3))
+    np.testing.assert_array_equal(plain.velocity[:15], pushed.velocity[:15])
     # a foot on the ground takes some of it within the step
-    assert (pushed.velocity[60, :, 1] - plain.velocity[60, :, 1]).min() > 0.1
+    assert (pushed.velocity[15, :, 1] - plain.velocity[15, :, 1]).min() > 0.1
 
 
+@pytest.mark.slow
 def test_a_push_shifts_the_phase_more_than_a_nudge(walker, monkeypatch):
     monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy._PUSHES", 1)
     nudge, push = push_response(*walker)
@@ -99,24 +100,24 @@ def test_a_push_shifts_the_phase_more_than_a_nudge(walker, monkeypatch):
     assert len(push.shifts) == len(push.phases) == 2
 
 
-def test_it_is_asked_at_other_rates_with_other_scales_and_on_other_ground(walker, monkeypatch):
+def test_a_policy_walks_at_other_rates_with_other_scales_and_on_other_ground(walker, monkeypatch):
     policy, trial = walker
     monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy.RATES_HZ", (50.0, 71.43))
     usual, faster = rate_response(policy, trial)
     assert usual.survival == 1 and usual.frequency_hz == pytest.approx(3.6, abs=0.15)
     assert faster.rate_hz == pytest.approx(71.43, abs=0.01)
     assert usual.cycles_per_step == pytest.approx(usual.frequency_hz / 50)
-    short = replace(trial, seconds=1.5)
+    short = replace(trial, seconds=0.4)
     assert [r.scale_rad for r in scales(policy, short)] == [0.45, 0.5, 0.6, 0.75]
     rows = {r.ground: r.survival for r in terrain(policy, short)}
     assert set(rows) >= {"flat", "rough", "slopes", "troughs", "steps"} and rows["flat"] == 1.0
 
 
-def test_it_goes_where_it_is_told(walker, monkeypatch):
+def test_a_policy_goes_where_it_is_commanded(walker, monkeypatch):
     policy, trial = walker
     some = {k: DIRECTIONS[k] for k in ("forward", "turn left", "stand")}
     monkeypatch.setattr("pupper_sysid.policies.analysis.paths.DIRECTIONS", some)
-    forward, turn = compliance(policy, trial)
+    forward, turn = compliance(policy, replace(trial, seconds=5.0))
     assert forward.direction == "forward" and forward.share.value > 0.7
     assert turn.share.value > 0.3 and np.isnan(turn.drift.value)
 

@@ -13,15 +13,13 @@ from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.attractor import orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response
 from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
-from pupper_sysid.policies.analysis.trial import Trial, moving_frequency
+from pupper_sysid.policies.analysis.trial import moving_frequency
 from pupper_sysid.policies.walks import perturbations
 from pupper_sysid.policies.walks.perturbations import JOINTS
 from pupper_sysid.policies.walks.rollouts import Rollout
-from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
-from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.walks import recorded
 
-ROOT = Path(__file__).resolve().parents[3]
 STEPS, ROBOTS = 60, 3
 
 
@@ -35,13 +33,18 @@ def test_the_parts_of_the_observation_are_where_the_paper_says():
     assert JOINTS == slice(12, 48) and PARTS["last_action"] == slice(48, 60)
 
 
-def test_a_delay_shows_what_was_and_leaves_the_rest_alone():
-    seen = perturbations.applied(perturbations.delayed(JOINTS, 8), counting())
-    expected = np.maximum(np.arange(STEPS) - 8, 0)
-    np.testing.assert_array_equal(seen[:, 0, 12], expected)
-    np.testing.assert_array_equal(seen[:, 1, 47], expected)
-    np.testing.assert_array_equal(seen[:, 0, 11], np.arange(STEPS))
-    np.testing.assert_array_equal(seen[:, 0, 48], np.arange(STEPS))
+def test_each_change_alters_the_joints_in_its_way_and_leaves_the_rest_alone():
+    steps = np.arange(STEPS)
+    late = perturbations.applied(perturbations.delayed(JOINTS, 8), counting())
+    for robot, number in ((0, 12), (1, 47)):
+        np.testing.assert_array_equal(late[:, robot, number], np.maximum(steps - 8, 0))
+    held = perturbations.applied(perturbations.held(JOINTS, 5), counting())
+    np.testing.assert_array_equal(held[:, 0, 20], 5 * (steps // 5))
+    zeroed = perturbations.applied(perturbations.zeroed(JOINTS), counting())
+    assert not zeroed[..., JOINTS].any()
+    for changed in (late, held, zeroed):
+        np.testing.assert_array_equal(changed[:, 0, 11], steps)
+        np.testing.assert_array_equal(changed[:, 0, 48], steps)
 
 
 def test_a_jittered_delay_never_goes_back_in_time_and_keeps_its_bounds():
@@ -53,22 +56,12 @@ def test_a_jittered_delay_never_goes_back_in_time_and_keeps_its_bounds():
     assert len(np.unique(lag[10:])) > 3 and (lag[:, 0] != lag[:, 1]).any()
 
 
-def test_held_values_are_refreshed_on_a_lattice():
-    seen = perturbations.applied(perturbations.held(JOINTS, 5), counting())[:, 0, 20]
-    np.testing.assert_array_equal(seen, 5 * (np.arange(STEPS) // 5))
-
-
 def test_noise_has_the_size_that_was_asked_for_per_number():
     sigma = np.linspace(0.1, 2.0, 36)
     change = perturbations.noisy(JOINTS, sigma, np.random.default_rng(0))
     added = perturbations.applied(change, np.zeros((4000, 1, 60), np.float32))
     np.testing.assert_allclose(added[:, 0, JOINTS].std(axis=0), sigma, rtol=0.06)
     assert not added[..., :12].any() and not added[..., 48:].any()
-
-
-def test_zeros_are_zeros():
-    seen = perturbations.applied(perturbations.zeroed(JOINTS), counting())
-    assert not seen[..., JOINTS].any() and seen[5, 0, 0] == 5
 
 
 def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker):
@@ -83,9 +76,11 @@ def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker
     assert plain["fixed"].frequency_hz == pytest.approx(3.6, abs=0.15)
 
 
-def test_an_ablation_hurts_more_the_more_is_taken(walker):
+def test_an_ablation_hurts_more_the_more_is_taken(walker, monkeypatch):
     policy, trial = walker
-    rows = [r for r in ablation(policy, trial, channels=("last_action",))]
+    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.NOISE_SHARES", (0.05, 2.0))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.HOLD_MS", (80,))
+    rows = ablation(policy, trial, channels=("last_action",))
     noise = [r.correlation for r in rows if r.kind == "noise"]
     assert noise[0] > 0.9 and noise[-1] < noise[0] - 0.2
     assert {r.kind for r in rows} == {"noise", "zero", "hold"}
@@ -99,16 +94,6 @@ def test_joints_that_stand_apart_but_do_not_move_have_no_frequency():
 
 
 # ------------------------------------------------------------------ policies that do not walk
-
-
-def recorded(rollout: Rollout) -> Trial:
-    """A trial whose walks are all this one."""
-
-    class Recorded(Trial):
-        def walks(self, policy, conditions, part=(0.0, 1.0)):
-            return [rollout] * len(conditions)
-
-    return Recorded(Walking(), servo_ranges("ideal"), robots=rollout.alive.shape[1])
 
 
 def fallen(rollout: Rollout, robots: list[int], after_s: float) -> Rollout:
@@ -150,10 +135,9 @@ def replace_robots(rollout: Rollout, robots: list[int]) -> Rollout:
     return replace(rollout, **parts, fell=rollout.fell[robots])
 
 
-@pytest.mark.parametrize("after_s", [0.5, 3.0])
-def test_where_all_fell_there_are_no_numbers_and_no_crash(walker, after_s):
+def test_where_all_fell_there_are_no_numbers_and_no_crash(walker):
     policy, trial = walker
-    gone = recorded(fallen(trial.walk(policy), [0, 1], after_s))
+    gone = recorded(fallen(trial.walk(policy), [0, 1], 0.5))
     assert all(np.isnan(r.share) for r in frozen(policy, gone))
     assert all(np.isnan(r.frequency_hz) for r in delay_curve(policy, gone, (0, 80)))
     assert orbits(policy, gone, (0.0, 160.0)) == {} and push_response(policy, gone) == ()
@@ -176,19 +160,14 @@ def test_a_policy_that_stands_has_no_orbit_and_no_phase(walker):
     assert all(np.isnan(r.correlation) for r in ablation(policy, standing, ("last_action",)))
 
 
-def test_an_eighth_policy_is_drawn_as_well():
+def test_an_eighth_policy_is_drawn_as_well_and_what_no_walk_has_is_not():
     row = DelayPoint(
         mode="fixed", extra_delay_ms=0, survival=1.0, frequency_hz=3.0, amplitude_rad=0.1
     )
     figure = figures.delay_figure({f"policy {k}": [row] for k in range(9)})
     assert [len(axes.lines) for axes in figure.axes] == [9, 9, 9]
-
-
-def test_what_no_walk_has_is_not_drawn():
-    row = DelayPoint(
-        mode="fixed", extra_delay_ms=0, survival=1.0, frequency_hz=np.nan, amplitude_rad=np.nan
-    )
-    assert len(figures.delay_figure({"policy": [row]}).axes) == 1
+    still = replace(row, frequency_hz=np.nan, amplitude_rad=np.nan)
+    assert len(figures.delay_figure({"policy": [still]}).axes) == 1
 
 
 def test_a_picture_says_which_policies_walked_on_what_under_which_command():
