@@ -143,136 +143,96 @@ def test_without_evidence_nothing_is_decided():
     assert all("--recordings" in c.how for c in nothing)
 
 
-def test_a_gru_with_the_lstms_reward_contradicts_and_one_with_a_third_confirms():
-    gru = evidence("gru")
-    assert verdicts(*BOTH, gru)["T1"] == "does not hold here"
-    poor = replace(gru, trained=gru.trained | {"reward": 2.0})
-    assert verdicts(*BOTH, poor)["T1"] == "holds"
+def test_a_claim_about_policies_is_judged_by_what_its_evidence_says():
+    """Each case: policies, claim, verdict, and words that its numbers or its reasons must have."""
+    (mlp, lstm), gru, nan = BOTH, evidence("gru"), float("nan")
+    untestable, contradicted = "not testable here", "does not hold here"
 
+    def frozen(share: float, **tests) -> PolicyEvidence:
+        return with_tests(lstm, frozen=changed(lstm.autonomy.frozen, share=share), **tests)
 
-def test_an_oscillator_in_the_cell_would_be_one_and_a_loop_through_the_action_is_half_of_one():
-    mlp, lstm = BOTH
-    assert verdicts(mlp, lstm)["X1"] == "holds partly"
-    inside = changed(lstm.autonomy.frozen, share=0.9)
-    assert verdicts(mlp, with_tests(lstm, frozen=inside))["X1"] == "holds"
-    driven = changed(lstm.autonomy.frozen, share=0.1)
-    assert verdicts(mlp, with_tests(lstm, frozen=driven))["X1"] == "does not hold here"
+    def delayed(policy: PolicyEvidence, hz, name: str = "") -> PolicyEvidence:
+        delay = changed(policy.delay, frequency_hz=hz)
+        return replace(policy, delay=delay, name=name or policy.name)
 
+    def knowing(place: int, share: float) -> PolicyEvidence:
+        rows = list(lstm.compliance)
+        rows[place] = replace(rows[place], share=known(share))
+        return replace(lstm, compliance=rows)
 
-def test_an_lstm_that_does_not_walk_is_no_oscillator_to_judge():
-    mlp, lstm = BOTH
-    still = changed(lstm.autonomy.frozen, share=float("nan"))
-    assert verdicts(mlp, with_tests(lstm, frozen=still, push=()))["X1"] == "not testable here"
-    # without a push response, frozen inputs in replay decide
-    assert verdicts(mlp, with_tests(lstm, push=()))["X1"] == "holds partly"
-
-
-def test_an_erratic_mlp_and_a_constant_lstm_are_told_apart():
-    mlp, lstm = BOTH
-    assert verdicts(mlp, lstm)["G2"] == "holds" and verdicts(mlp, lstm)["G3"] == (
-        "does not hold here"
-    )
-    wild = changed(mlp.delay, frequency_hz=drifting)
-    assert verdicts(replace(mlp, delay=wild), lstm)["G3"] == "holds"
-    assert verdicts(mlp, replace(lstm, delay=wild))["G2"] == "does not hold here"
-
-
-def test_two_policies_that_each_keep_a_rate_of_their_own_are_not_erratic():
-    slow, quick = (changed(BOTH[0].delay, frequency_hz=hz) for hz in (2.5, 2.9))
-    four = [
-        replace(p, name=f"{p.kind}-{i}", delay=delay)
-        for p in BOTH for i, delay in enumerate((slow, quick))
-    ]  # fmt: skip
-    found = verdicts(*four)
-    assert found["G2"] == "holds" and found["G3"] == "does not hold here"
-    wild = changed(slow, frequency_hz=drifting)
-    one_wild = [replace(p, delay=wild) if p.name.endswith("-1") else p for p in four]
-    assert verdicts(*one_wild)["G2"] == verdicts(*one_wild)["G3"] == "holds partly"
-
-
-def test_a_policy_without_a_rhythm_is_neither_constant_nor_erratic():
-    mlp, lstm = BOTH
-    still = changed(mlp.delay, frequency_hz=float("nan"))
-    found = claims(replace(mlp, delay=still), replace(lstm, delay=still))
-    for id_ in ("G2", "G3"):
-        assert found[id_].verdict == "not testable here" and "no rhythm" in found[id_].how
-
-
-def test_noise_that_is_never_worse_than_zeros_contradicts():
-    mlp, lstm = BOTH
     robust = changed(mlp.ablation, correlation=lambda r: 0.95 if r.kind == "noise" else 0.7)
-    found = claims(mlp, replace(lstm, ablation=robust))["B2"]
-    assert found.verdict == "does not hold here" and "LSTM ∞" in found.ours
-    # one of two is not left out of the mean
-    found = claims(mlp, lstm, replace(lstm, name="b", ablation=robust))["B2"]
-    assert "LSTM ∞" in found.ours
-
-
-def test_policies_that_were_given_but_have_no_number_are_not_asked_for():
-    mlp, lstm = BOTH
-    lost = changed(lstm.ablation, correlation=float("nan"))
-    how = claims(mlp, replace(lstm, ablation=lost))["B2"].how
-    assert "Of the LSTM that was given there is no number" in how and "Give a run" not in how
-    nothing = {"frequency_hz": float("nan"), "survival": 0.0}
-    fallen = [replace(r, **nothing) if r.rate_hz < 50 else r for r in mlp.autonomy.rate]
-    found = claims(with_tests(mlp, rate=fallen), with_tests(lstm, rate=fallen))["D1"]
-    assert found.verdict == "does not hold here" and "MLP 0, LSTM 0 %" in found.ours
-
-
-@pytest.mark.parametrize("place", [0, 1])
-def test_a_direction_in_which_nothing_is_known_hides_nowhere(place):
-    mlp, lstm = BOTH
-    rows = list(lstm.compliance)
-    rows[place] = replace(rows[place], share=known(0.0))
-    assert verdicts(mlp, replace(lstm, compliance=rows))["C1"] == "does not hold here"
-    rows[place] = replace(rows[place], share=known(float("nan")))
-    assert "LSTM" not in claims(mlp, replace(lstm, compliance=rows))["C1"].ours
-
-
-@pytest.mark.parametrize(
-    ("id_", "trained"),
-    [
-        ("T3", {"curriculum": True}), ("T3", {"curriculum": None}), ("B3", {"ground": "rough"}),
-        ("B3", {"ground": None}),
-    ],
-)  # fmt: skip
-def test_how_a_policy_was_trained_is_looked_at_not_taken_for_granted(id_, trained):
-    mlp, lstm = BOTH
-    assert verdicts(mlp, lstm)[id_] != "not testable here"
-    assert verdicts(replace(mlp, **trained), lstm)[id_] == "not testable here"
-
-
-def test_the_page_says_what_a_policy_imitated_first():
-    mlp, lstm = BOTH
-    assert "Imitation of a trot came first." in claims(mlp, lstm)["T3"].how
+    robust = replace(lstm, ablation=robust)
+    lost = replace(lstm, ablation=changed(lstm.ablation, correlation=nan))
+    fallen = [
+        replace(r, frequency_hz=nan, survival=0.0) if r.rate_hz < 50 else r
+        for r in mlp.autonomy.rate
+    ]  # fmt: skip
+    two_rates = [
+        delayed(p, hz, f"{p.kind}-{hz}") for p in BOTH for hz in (2.5, 2.9)
+    ]  # fmt: skip
+    one_wild = [delayed(p, drifting) if p.name.endswith("2.9") else p for p in two_rates]
+    poor = replace(gru, trained=gru.trained | {"reward": 2.0})
     taught = replace(mlp, first_gait="a teacher that learned from nothing")
-    assert "a teacher that learned from nothing or a trot" in claims(taught, lstm)["T3"].how
+    cases = [
+        ((*BOTH, gru), "T1", contradicted, ""), ((*BOTH, poor), "T1", "holds", ""),
+        (BOTH, "X1", "holds partly", ""), ((mlp, frozen(0.9)), "X1", "holds", ""),
+        ((mlp, frozen(0.1)), "X1", contradicted, ""),
+        # one that does not walk is no oscillator; without pushes, frozen inputs decide
+        ((mlp, frozen(nan, push=())), "X1", untestable, ""),
+        ((mlp, with_tests(lstm, push=())), "X1", "holds partly", ""),
+        (BOTH, "G2", "holds", ""), (BOTH, "G3", contradicted, ""),
+        ((delayed(mlp, drifting), lstm), "G3", "holds", ""),
+        ((mlp, delayed(lstm, drifting)), "G2", contradicted, ""),
+        # policies of a kind that each keep a rate of their own are not erratic
+        (two_rates, "G2", "holds", ""), (two_rates, "G3", contradicted, ""),
+        (one_wild, "G2", "holds partly", ""), (one_wild, "G3", "holds partly", ""),
+        ((delayed(mlp, nan), lstm), "G3", untestable, "no rhythm"),
+        ((mlp, delayed(lstm, nan)), "G2", untestable, "no rhythm"),
+        ((mlp, robust), "B2", contradicted, "LSTM ∞"),
+        # one of two is not left out of the mean
+        ((mlp, lstm, replace(robust, name="b")), "B2", contradicted, "LSTM ∞"),
+        ((mlp, lost), "B2", untestable, "Of the LSTM that was given there is no number"),
+        (
+            (with_tests(mlp, rate=fallen), with_tests(lstm, rate=fallen)), "D1", contradicted,
+            "MLP 0, LSTM 0 %",
+        ),
+        *(((mlp, knowing(place, 0.0)), "C1", contradicted, "") for place in (0, 1)),
+        *(((replace(mlp, curriculum=c), lstm), "T3", untestable, "") for c in (True, None)),
+        *(((replace(mlp, ground=g), lstm), "B3", untestable, "") for g in ("rough", None)),
+        (BOTH, "T3", contradicted, "Imitation of a trot came first."),
+        ((taught, lstm), "T3", contradicted, "a teacher that learned from nothing or a trot"),
+    ]  # fmt: skip
+    problems = []
+    for policies, id_, verdict, words in cases:
+        row = claims(*policies)[id_]
+        if row.verdict != verdict or words not in row.ours + row.how:
+            problems.append(f"{id_}: {verdict}, {words!r}: {row}")
+    assert not problems, "\n".join(problems)
+    for place in (0, 1):
+        assert "LSTM" not in claims(mlp, knowing(place, nan))["C1"].ours
     alone = [replace(policy, first_gait=None) for policy in BOTH]
     assert "Imitation" not in claims(*alone)["T3"].how
+    assert claims(*BOTH)["B3"].verdict != untestable
 
 
-@pytest.mark.parametrize(
-    ("run", "first"),
-    [
-        (Run(), "a trot"), (Run(imitation=Imitation(iterations=0)), None),
-        (Run(imitation=Imitation(teacher="own")), "a teacher that learned from nothing"),
-        (Run(imitation=Imitation(teacher="runs/T")), "a teacher that learned from nothing"),
-    ],
-)  # fmt: skip
-def test_what_was_imitated_first_is_read_from_the_settings(run, first):
-    assert imitated(run) == first
+def test_what_was_imitated_first_is_read_from_the_settings():
+    learned = "a teacher that learned from nothing"
+    for imitation, first in (
+        (Imitation(), "a trot"), (Imitation(iterations=0), None),
+        (Imitation(teacher="own"), learned), (Imitation(teacher="runs/T"), learned),
+    ):  # fmt: skip
+        assert imitated(Run(imitation=imitation)) == first
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "verdict"),
-    [(-0.03, -0.01, "holds"), (0.01, 0.03, "does not hold here"), (-0.01, 0.01, "holds partly")],
-)
-def test_stacks_differ_only_if_the_interval_of_their_difference_says_so(low, high, verdict):
+def test_stacks_differ_only_if_the_interval_of_their_difference_says_so():
     keys = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
     row = {"falls": 0.0} | {k: known(0.05) for k in keys}
-    less = {f"less_{k}": Interval((low + high) / 2, low, high) for k in keys}
-    stacks = [row | {"stack": "encoders"}, row | {"stack": "servo model"} | less]
-    assert verdicts(*BOTH, stacks=stacks)["D3"] == verdict
+    for low, high, verdict in (
+        (-0.03, -0.01, "holds"), (0.01, 0.03, "does not hold here"), (-0.01, 0.01, "holds partly")
+    ):  # fmt: skip
+        less = {f"less_{k}": Interval((low + high) / 2, low, high) for k in keys}
+        stacks = [row | {"stack": "encoders"}, row | {"stack": "servo model"} | less]
+        assert verdicts(*BOTH, stacks=stacks)["D3"] == verdict
 
 
 def test_servos_that_make_a_saw_tooth_rounder_are_seen_in_the_sine_fit():
@@ -333,15 +293,22 @@ def test_a_sweep_says_how_much_of_the_lag_is_stale_feedback(tmp_path):
     assert claims["A3"].verdict == "does not hold here"
 
 
-def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch):
+POLICIES = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
+ARGUMENTS = (*POLICIES, "--actuator", SAMPLES / "calibrated.yaml")
+
+
+@pytest.fixture
+def gathered(tmp_path, monkeypatch):
+    """Policies that walk well are known to, without walks; results go to an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "reproduction.evidence.gather",
         lambda name, policy, *rest: evidence(policy.contract.kind, name),
     )
-    policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
-    arguments = (*policies, "--actuator", SAMPLES / "calibrated.yaml")
-    code, out, err = run_program(capsys, program, *arguments, "--json")
+
+
+def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, gathered):
+    code, out, err = run_program(capsys, program, *ARGUMENTS, "--json")
     assert code == 0, err
     assert " ".join(err.split()).count("they take the numbers of") == 1, "said once, not by policy"
     found = json.loads(out)
@@ -357,7 +324,7 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
         assert (tmp_path / "analysis/claims" / picture).stat().st_size > 5000
     assert "Table I" in page
     assert "--command 0.15 0 0 --robots 16 --seconds 10 --seed 0" in page
-    contract = json.loads((policies[0] / "contract.json").read_text())
+    contract = json.loads((POLICIES[0] / "contract.json").read_text())
     for digest in (contract["weights_sha256"], sha256(SAMPLES / "calibrated.yaml")):
         assert digest in page
     assert f"mujoco {version('mujoco')}" in page
@@ -372,33 +339,25 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, monkeypatch
     assert "Table I" in report and report.count('<svg class="drawing"') == len(found["pictures"])
     assert all(claim["id"] in report for claim in found["claims"])
     if shutil.which("chromium"):
-        looks_right(Path(found["report"]), tmp_path, 375, dark=False)
-        looks_right(Path(found["report"]), tmp_path, 1280, dark=True)
-    again = refused(capsys, program, *arguments)
+        looks_right(Path(found["report"]), tmp_path, 375, dark=True)
+    again = refused(capsys, program, *ARGUMENTS)
     assert "claims.md exists already" in again
-    twice = refused(capsys, program, policies[0], policies[0], *arguments[2:], "--out", "b")
+    twice = refused(capsys, program, POLICIES[0], POLICIES[0], *ARGUMENTS[2:], "--out", "b")
     assert "rename" in twice
     Path("c/figures").mkdir(parents=True)
     Path("c/figures/ablation.png").touch()
-    taken = refused(capsys, program, *arguments, "--out", "c")
+    taken = refused(capsys, program, *ARGUMENTS, "--out", "c")
     assert "ablation.png exists already" in taken
 
 
-def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "reproduction.evidence.gather",
-        lambda name, policy, *rest: evidence(policy.contract.kind, name),
-    )
+def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, gathered, monkeypatch):
     monkeypatch.setattr("reproduction.page._draw", lambda *evidence: [])  # drawn above
-    policies = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]
-    arguments = (*policies, "--actuator", SAMPLES / "calibrated.yaml")
-    code, out, err = run_program(capsys, program, *arguments, "--json", "--out", "a")
+    code, out, err = run_program(capsys, program, *ARGUMENTS, "--json", "--out", "a")
     assert code == 0, err
     first = {c["id"]: c for c in json.loads(out)["claims"]}
     assert first["C1"]["verdict"] == "holds"
     table = Path("a/tables/claims.csv")
-    code, _, err = run_program(capsys, program, *arguments, "--beside", table, "--out", "b")
+    code, _, err = run_program(capsys, program, *ARGUMENTS, "--beside", table, "--out", "b")
     assert code == 0, err
     alike = Path("b/claims.md").read_text()
     assert "Every claim that both pages have is judged alike." in alike
@@ -409,7 +368,7 @@ def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, tmp
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    code, _, err = run_program(capsys, program, *arguments, "--beside", table, "--out", "c")
+    code, _, err = run_program(capsys, program, *ARGUMENTS, "--beside", table, "--out", "c")
     assert code == 0, err
     (row,) = csv.DictReader(Path("c/tables/beside.csv").open())
     assert (row["id"], row["verdict"], row["verdict_there"]) == (
@@ -421,18 +380,15 @@ def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, tmp
     assert "Judged otherwise" in Path("c/claims.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_what_is_no_table_of_claims_is_refused_before_any_walk(capsys, tmp_path):
+    table, policy = tmp_path / "table.csv", SAMPLES / "policies/lstm"
+    for text, words in (
         ("id,claim\nA1,x\n", "has no column `ours`"),
         ("id,ours,verdict\nA1,x,perhaps\n", "verdict of A1 is 'perhaps'"),
-    ],
-)
-def test_what_is_no_table_of_claims_is_refused_before_any_walk(capsys, tmp_path, text, words):
-    table = tmp_path / "table.csv"
-    table.write_text(text)
-    policy = SAMPLES / "policies/lstm"
-    assert words in refused(capsys, program, policy, "--beside", table, "--out", tmp_path / "out")
+    ):
+        table.write_text(text)
+        answer = refused(capsys, program, policy, "--beside", table, "--out", tmp_path / "out")
+        assert words in answer
 
 
 def test_a_kind_of_policy_about_which_nothing_was_published_is_refused(capsys, tmp_path):

@@ -17,6 +17,7 @@ from pupper_sysid.sim.robot.servo_robot import mini_pupper_robot, robot_of
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.package import ROOT
+from support.refusals import assert_each_refused
 
 CALIBRATION = str(ROOT / "data/samples/calibrated.yaml")
 LOOP_STEPS = 20  # a command every 40 ms
@@ -117,16 +118,12 @@ def test_a_calibration_of_the_recording_itself_does_not_judge_it(played, tmp_pat
     assert "Nothing here says" in found.verdict_in_words
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [({"test_loops": [3]}, "has no loop 3: its loops are 0"), ({"test_loops": [0]}, "one must be")],
-)
-def test_loops_that_cannot_be_scored_are_refused(played, options, says):
-    with pytest.raises(InputError, match=says):
-        compared(played["air"], "ideal", **options)
-
-
-def test_a_recording_that_does_not_fit_the_memory_is_refused(played, monkeypatch):
+def test_loops_that_cannot_be_scored_and_walks_beyond_the_memory_are_refused(played, monkeypatch):
+    cases = [
+        ({"test_loops": [3]}, "has no loop 3: its loops are 0"),
+        ({"test_loops": [0]}, "one must be"),
+    ]
+    assert_each_refused(cases, lambda options: compared(played["air"], "ideal", **options))
     monkeypatch.setattr("pupper_sysid.policies.twin.playing._MOST_BYTES", 1000)
     with pytest.raises(InputError, match="1 robots over 3 s do not fit the memory"):
         compared(played["air"], "ideal")
