@@ -97,8 +97,10 @@ def compare(
         If a model cannot be read, or is for another rate or other joints.
     """
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
-    trials = usable_trials(recordings, names)
     calibrations = _calibrations(models)
+    for name, calibration in calibrations.items():  # before the work, not after it
+        refuse_missing_joints(calibration, name, names)
+    trials = usable_trials(recordings, names)
     if needs_runs(recordings, names, list(calibrations.values())):
         found = compare_runs(recordings, calibrations, names, seed, lattices)
         return _with_learned(found, recordings, models, names, readings, seed, lattices)

@@ -260,6 +260,7 @@ def test_a_quick_look_is_smaller_and_says_so(capsys, trained, monkeypatch):
     assert "--seconds is 0.0; it must be a positive number" in said
 
 
+@pytest.mark.slow
 def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_before(
     capsys, trained, monkeypatch
 ):
