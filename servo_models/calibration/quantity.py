@@ -197,8 +197,8 @@ def measured(kind: type[_Part], **entries: Any) -> _Part:
     Parameters
     ----------
     kind : type
-    entries : Quantity or other values
-        The part's fields.
+    **entries : Any
+        The part's fields, some of them a `Quantity`.
     """
     for name, entry in entries.items():
         if not isinstance(entry, Quantity):

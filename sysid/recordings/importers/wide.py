@@ -124,7 +124,7 @@ def expanded(
         For messages.
     arrays : mapping of str to ndarray, shape (rows,) or (rows, joints)
     names : sequence of str
-        Of the joints; arrays of another width get `joint_0`, `joint_1`, …
+        Of the joints; arrays of another width get `joint_0`, `joint_1` and so on.
     named : str, optional
         What in the log holds these names; None if it does not name its joints.
 
