@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,11 @@ import pytest
 from pupper_sysid.common.data_sheet import supply_range
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.clock import HostClock
+from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware.esp32.bus import Esp32Bus
 from pupper_sysid.hardware.feetech.bus import supply_band
+from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.hardware.safety.limits import PositionLimits
 
@@ -164,3 +169,27 @@ def test_a_range_that_no_number_can_leave_or_meet_is_refused(volts):
 def test_the_band_of_a_servo_is_its_registers_within_its_data_sheet(model, registers, band):
     found = supply_band(model, registers)
     assert found == (band if band is None else pytest.approx(band))
+
+
+@pytest.mark.parametrize("volts", [30.0, -1.0, np.nan])
+def test_a_voltage_that_cannot_be_replaces_the_last_one_of_the_proxy(volts):
+    """The proxy's divider ends at 10.3 V; what it held before must not hide what it says now."""
+    answers = {
+        datagrams.GET_POSITION: struct.pack("<BB12H", 26, datagrams.GET_POSITION, *[512] * 12),
+        datagrams.GET_LOAD: struct.pack("<BB12h", 26, datagrams.GET_LOAD, *[0] * 12),
+    }
+    bus = Esp32Bus.__new__(Esp32Bus)
+    HostClock.__init__(bus)
+    bus.joint_map = load_joint_map("mini_pupper_2").per_servo()
+    bus.joint_names, bus._by_id = bus.joint_map.joint_names, np.array(bus.joint_map.ids) - 1
+    bus._socket, bus._power, bus._power_s = None, None, -np.inf
+    bus._exchange = lambda request: answers[request[1]]
+
+    def voltage(present: float) -> np.ndarray:
+        bus._power_s = -np.inf  # it is asked for twice a second
+        answers[datagrams.GET_POWER] = struct.pack("<BB2f", 10, datagrams.GET_POWER, present, 0.5)
+        return bus.read().voltage_v
+
+    assert voltage(7.5) == pytest.approx(7.5)
+    assert np.isnan(voltage(volts)).all()
+    assert voltage(7.5) == pytest.approx(7.5)
