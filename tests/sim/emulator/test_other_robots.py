@@ -11,7 +11,9 @@ import pytest
 import yaml
 
 from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.registers import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
@@ -19,12 +21,13 @@ from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.robot import hinges, robot_map
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
-from pupper_sysid.sim.robot.robot_map import joint_map_of
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run, run_program
 from support.exported_servos import in_free_air
+from support.refusals import assert_each_refused
 from support.servo_servers import on_a_port
 
 ARM = """<mujoco><worldbody>
@@ -40,12 +43,25 @@ BENCH = """<mujoco><worldbody>
 <body><freejoint/><geom size=".01"/></body>
 </worldbody></mujoco>"""
 
+BODY = (
+    "<mujoco>{}<worldbody><body>"
+    '<joint name="k" axis="0 0 1" range="{}"/>{}</body>{}</worldbody></mujoco>'
+)
+GEOM = '<geom size=".02"/>'
+
 
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("arm.xml").write_text(ARM)
     Path("bench.xml").write_text(BENCH)
+
+
+@pytest.fixture
+def read_here(monkeypatch):
+    """Models are read in this process, without its limits of memory and time."""
+    monkeypatch.setattr(hinges, "_limit_this_process", lambda: None)
+    monkeypatch.setattr(robot_map, "hinges_of", lambda path: hinges._read(str(path)))
 
 
 def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys):
@@ -65,25 +81,20 @@ def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys)
     assert pose["elbow"] == 0.0 and min(found["margin_rad"].values()) > 0.39
 
 
-def test_what_is_guessed_is_said_with_what_corrects_it(capsys):
+def test_what_is_guessed_is_said_with_what_corrects_it(capsys, read_here):
     code, out, _ = run(capsys, "init-robot", "arm.xml")
     said = " ".join(out.split())
     assert code == 0 and "Ids and signs are for you to check" in said
     # ids first: a centre is measured for the servo that has the joint's id
     assert 0 < said.find("monitor --joint-map arm.joints.yaml") < said.find("calibrate-joints")
-
-
-def test_limits_in_the_wrong_unit_are_said(capsys):
-    hinge = '<joint name="{}" axis="0 0 1" range="-1.5 1.5"/><geom size=".02"/>'
-    Path("odd_unit.xml").write_text(
-        f"<mujoco><worldbody><body>{hinge.format('lift')}</body></worldbody></mujoco>"
-    )
+    # limits in radians, where MuJoCo takes degrees
+    Path("odd_unit.xml").write_text(BODY.format("", "-1.5 1.5", GEOM, ""))
     code, _, err = run(capsys, "init-robot", "odd_unit.xml", "--json")
-    assert code == 0 and "lift: less than 0.05 rad of margin" in " ".join(err.split())
+    assert code == 0 and "k: less than 0.05 rad of margin" in " ".join(err.split())
     assert 'angle="radian"' in err
 
 
-def test_hinges_driven_through_tendons_and_in_the_parent_s_frame_are_taken_and_others_named(capsys):
+def test_hinges_that_an_actuator_drives_by_any_way_are_taken_and_others_named(capsys, read_here):
     driven = """</worldbody><tendon><fixed name="t"><joint joint="elbow" coef="1"/></fixed></tendon>
     <actuator><position joint="base_yaw"/><position jointinparent="shoulder"/>
     <position tendon="t"/></actuator>"""
@@ -94,16 +105,16 @@ def test_hinges_driven_through_tendons_and_in_the_parent_s_frame_are_taken_and_o
     assert "left out" in err and "wrist_pitch, wrist_roll, gripper" in " ".join(err.split())
 
 
-def test_the_mini_pupper_s_own_model_has_its_twelve_joints():
+def test_the_mini_pupper_s_own_model_has_its_twelve_joints(read_here):
     Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
-    layout, left_out = joint_map_of(Path("pupper.xml"), "scs0009")
+    layout, left_out = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
     assert layout.joint_names == JOINT_NAMES and left_out == []
 
 
-def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys):
+def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys, read_here):
     for words in (
         "init-robot arm.xml",
-        "sweep --joint-map arm.joints.yaml --joints elbow,gripper --freqs 1,2,3,4 --truth "
+        "sweep --joint-map arm.joints.yaml --joints elbow --freqs 2,4 --duration 3 --truth "
         "--out arm.csv",
         "calibrate arm.csv --out arm.yaml",
         "fit-servo arm.csv --arch fir --out servo",
@@ -113,24 +124,22 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
         code, _, err = run(capsys, *words.split())
         assert code == 0, f"{words}: {err}"
     recording, found = load(Path("arm.csv")), load_calibration(Path("arm.yaml"))
-    assert recording.joints == ["elbow", "gripper"] == list(found.joint_names)
-    truth = yaml.safe_load(Path("arm.truth.yaml").read_text())["joints"]
-    for name in found.joint_names:
-        own = found.joint(name).actuator
-        assert own.dead_time_s.value == pytest.approx(
-            truth[name]["actuator"]["dead_time_s"], abs=4e-3
-        )
-        assert found.joint(name).feedback.poll_period_s.value == 0.0
-    model = load_servo_model(Path("servo"), joints=["gripper"]).model
-    start = float(recording.trials("gripper")[0].command_rad[0])
+    assert recording.joints == ["elbow"] == list(found.joint_names)
+    truth = yaml.safe_load(Path("arm.truth.yaml").read_text())["joints"]["elbow"]["actuator"]
+    dead_time_s = found.joint("elbow").actuator.dead_time_s.value
+    assert dead_time_s == pytest.approx(truth["dead_time_s"], abs=4e-3)
+    assert found.joint("elbow").feedback.poll_period_s.value == 0.0
+    model = load_servo_model(Path("servo"), joints=["elbow"]).model
+    start = float(recording.trials("elbow")[0].command_rad[0])
     model.reset([start])
     assert float(model.step([start])[0]) == pytest.approx(start, abs=0.02)
     arm = in_free_air(Path("servos.xml").read_text(), found.joint_names)
-    assert arm.nu == 2 and arm.nsensor == 2
+    assert arm.nu == 1 and arm.nsensor == 1
 
 
 @pytest.mark.wall_clock
-def test_one_servo_on_a_bench_is_swept_over_a_serial_line_and_calibrated(capsys):
+def test_one_servo_on_a_bench_is_swept_over_a_line_and_calibrated(capsys, read_here, monkeypatch):
+    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)  # they share this process
     code, _, err = run(capsys, "init-robot", "bench.xml")
     assert code == 0, err
     layout = load_joint_map(Path("bench.joints.yaml"))
@@ -151,55 +160,48 @@ def test_one_servo_on_a_bench_is_swept_over_a_serial_line_and_calibrated(capsys)
     assert own.dead_time_s.value == pytest.approx(true, abs=8e-3)
 
 
-def test_what_is_no_robot_is_refused_in_a_sentence(capsys):
-    Path("broken.xml").write_text("<mujoco><worldbody><body></worldbody></mujoco>")
-    Path("fixed.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+def read(text: str) -> None:
+    """Make a joint map of a model."""
+    Path("odd.xml").write_text(text)
+    robot_map.joint_map_of(Path("odd.xml"), "sts3215")
+
+
+def test_what_is_no_robot_is_refused_by_what_is_wrong(capsys, read_here):
     slide = '<actuator><position joint="lift"/></actuator></mujoco>'
     lift = '<body><joint name="lift" type="slide"/><geom size=".02"/></body></worldbody>'
-    Path("lift.xml").write_text(ARM.replace("</worldbody>", lift).replace("</mujoco>", slide))
-    Path("odd.xml").write_text(ARM.replace("base_yaw", "base yaw!"))
-    program = pupper_sysid
-    assert "MuJoCo's viewer" in refused(capsys, program, "init-robot", "broken.xml")
-    assert "no hinge joint" in refused(capsys, program, "init-robot", "fixed.xml")
-    assert "drive none of its hinges" in refused(capsys, program, "init-robot", "lift.xml")
-    assert "letters, digits" in refused(capsys, program, "init-robot", "odd.xml")
-    assert "is no file" in refused(capsys, program, "init-robot", "nowhere.xml")
-    code, _, _ = run(capsys, "init-robot", "arm.xml")
-    assert code == 0
-    assert "exists already" in refused(capsys, program, "init-robot", "arm.xml")
-    assert "no joint" in refused(
-        capsys, program, "sweep", "--joint-map", "arm.joints.yaml", "--joints", "LF_hip"
+    ignored = "the range of joint k is not two rising numbers"  # as MuJoCo does
+    ends = ("nan nan", "60 -60", "10 10", "1e300 2e300", "inf 3")
+    assert_each_refused(
+        [
+            ("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>", "no hinge joint"),
+            (ARM.replace("</worldbody>", lift).replace("</mujoco>", slide), "none of its hinges"),
+            (ARM.replace("base_yaw", "base yaw!"), "letters, digits"),
+            *((BODY.format("", e, GEOM, ""), ignored) for e in ends),
+        ],
+        read,
     )
+    assert run(capsys, "init-robot", "arm.xml")[0] == 0
+    assert "exists already" in refused(capsys, pupper_sysid, "init-robot", "arm.xml")
+    unknown = ("sweep", "--joint-map", "arm.joints.yaml", "--joints", "LF_hip")
+    assert "no joint" in refused(capsys, pupper_sysid, *unknown)
 
 
-BODY = (
-    "<mujoco>{}<worldbody><body>"
-    '<joint name="k" axis="0 0 1" range="{}"/>{}</body>{}</worldbody></mujoco>'
+BOMBS = (
+    '<asset><texture name="t" type="2d" builtin="flat" width="60000" height="60000"/></asset>',
+    '<asset><hfield name="h" nrow="60000" ncol="60000" size="1 1 1 1"/></asset>',
+    "<worldbody>" + "<replicate count='1000'>" * 3 + "<geom size='1'/>"
+    "</replicate></replicate></replicate></worldbody>",
+    '<include file="pipe"/>',
 )
-GEOM = '<geom size=".02"/>'
 
 
-@pytest.mark.parametrize("ends", ["nan nan", "60 -60", "10 10", "1e300 2e300", "inf 3"])
-def test_a_range_that_mujoco_ignores_is_refused(capsys, ends):
-    Path("range.xml").write_text(BODY.format("", ends, GEOM, ""))
-    said = refused(capsys, pupper_sysid, "init-robot", "range.xml")
-    assert "the range of joint k is not two rising numbers" in said
-
-
-@pytest.mark.parametrize(
-    "bomb",
-    [
-        '<asset><texture name="t" type="2d" builtin="flat" width="60000" height="60000"/></asset>',
-        '<asset><hfield name="h" nrow="60000" ncol="60000" size="1 1 1 1"/></asset>',
-        "<worldbody>" + "<replicate count='1000'>" * 3 + "<geom size='1'/>"
-        "</replicate></replicate></replicate></worldbody>",
-        '<include file="pipe"/>',
-    ],
-)
-def test_a_model_that_takes_too_much_to_read_is_refused(capsys, monkeypatch, bomb):
-    monkeypatch.setattr("pupper_sysid.sim.robot.hinges._TIME_S", 1)
-    if "pipe" in bomb:
-        os.mkfifo("pipe")
-    Path("bomb.xml").write_text(BODY.format(bomb, "-1 1", GEOM, ""))
-    said = refused(capsys, pupper_sysid, "init-robot", "bomb.xml")
-    assert "take height fields, textures" in said
+def test_a_model_that_cannot_be_read_or_takes_too_much_is_refused(monkeypatch):
+    assert_each_refused(
+        [("<mujoco><worldbody><body></worldbody></mujoco>", "MuJoCo's viewer")], read
+    )
+    with pytest.raises(InputError, match="nowhere.xml is no file"):
+        robot_map.joint_map_of(Path("nowhere.xml"), "sts3215")
+    monkeypatch.setattr(hinges, "_TIME_S", 1)
+    os.mkfifo("pipe")
+    heavy = "take height fields, textures"
+    assert_each_refused([(BODY.format(bomb, "-1 1", GEOM, ""), heavy) for bomb in BOMBS], read)

@@ -27,30 +27,21 @@ from support.robot_in_air import error_in_air, in_free_space, standing
 
 H = 0.002
 STIFF = DelayedPDParameters(
-    stiffness=20.0,
-    damping=0.25,
-    friction_loss=0.0,
-    armature=8e-4,
-    effort_limit=1e3,
-    velocity_limit=1e3,
-    dead_time_s=0.0,
-)
+    stiffness=20.0, damping=0.25, friction_loss=0.0, armature=8e-4, effort_limit=1e3,
+    velocity_limit=1e3, dead_time_s=0.0,
+)  # fmt: skip
 
 # facts/hardware.md C4, left legs: mass [kg], centre [m], inertia xx yy zz xy xz yz [kg m²]
 PUBLISHED = {
-    "hip": (
-        0.023343,
-        (0.0068, 0.0052, 0.0066),
-        (4.01e-6, 4.63e-6, 5.06e-6, -7.1e-7, -4.9e-8, -1.0e-7),
-    ),
-    "thigh": (
-        0.004137,
-        (-0.0012, 0.0041, -0.0170),
-        (1.42e-6, 1.48e-6, 2.63e-7, 2.5e-8, -1.9e-7, -1.8e-8),
-    ),
-    "calf": (0.002549, (0.0003, -0.0001, -0.0379), (1.47e-6, 1.57e-6, 1.22e-7, 0.0, 2.1e-7, 0.0)),
-}
+    "hip": (0.023343, (0.0068, 0.0052, 0.0066),
+            (4.01e-6, 4.63e-6, 5.06e-6, -7.1e-7, -4.9e-8, -1.0e-7)),
+    "thigh": (0.004137, (-0.0012, 0.0041, -0.0170),
+              (1.42e-6, 1.48e-6, 2.63e-7, 2.5e-8, -1.9e-7, -1.8e-8)),
+    "calf": (0.002549, (0.0003, -0.0001, -0.0379),
+             (1.47e-6, 1.57e-6, 1.22e-7, 0.0, 2.1e-7, 0.0)),
+}  # fmt: skip
 MIRROR = np.diag([1.0, -1.0, 1.0])
+KNEES: tuple[Knee, ...] = ("linkage", "serial")
 
 
 def model_of(
@@ -74,35 +65,22 @@ def tensor(xx, yy, zz, xy, xz, yz) -> np.ndarray:
 # ----------------------------------------------------------------------------- masses and sizes
 
 
-def test_the_robot_weighs_465_grams():
-    assert model_of().body_mass.sum() == pytest.approx(0.465, abs=1e-9)
-
-
-@pytest.mark.parametrize("kind", PUBLISHED)
-@pytest.mark.parametrize("leg", LEGS)
-def test_leg_bodies_have_the_published_mass_centre_and_inertia_mirrored_on_the_right(leg, kind):
-    mass, centre, moments = PUBLISHED[kind]
-    turn = np.eye(3) if leg.startswith("L") else MIRROR
+def test_every_body_has_the_published_mass_centre_and_inertia_mirrored_on_the_right():
     model = model_of()
-    body = model.body(f"{leg}_{kind}")
-    assert body.mass[0] == pytest.approx(mass, rel=1e-9)
-    np.testing.assert_allclose(body.ipos, turn @ centre, atol=1e-9)
-    np.testing.assert_allclose(
-        inertia(model, f"{leg}_{kind}"), turn @ tensor(*moments) @ turn, atol=1e-12
-    )
-
-
-def test_the_trunk_is_the_published_one_scaled_to_the_robots_mass():
-    model = model_of()
+    assert model.body_mass.sum() == pytest.approx(0.465, abs=1e-9)
+    for leg in LEGS:
+        turn = np.eye(3) if leg.startswith("L") else MIRROR
+        for kind, (mass, centre, moments) in PUBLISHED.items():
+            name = f"{leg}_{kind}"
+            assert model.body(name).mass[0] == pytest.approx(mass, rel=1e-9), name
+            np.testing.assert_allclose(model.body(name).ipos, turn @ centre, atol=1e-9)
+            own = turn @ tensor(*moments) @ turn
+            np.testing.assert_allclose(inertia(model, name), own, atol=1e-12, err_msg=name)
     # 0.465 - 4 · (0.023343 + 0.004137 + 0.002549), and the tensor by 0.344884 / 0.125594
     assert model.body("trunk").mass[0] == pytest.approx(0.344884, abs=1e-6)
     np.testing.assert_allclose(model.body("trunk").ipos, (-0.0016, 0.0003, -0.0020))
-    np.testing.assert_allclose(
-        inertia(model, "trunk"),
-        2.746 * tensor(8.24e-5, 3.61e-4, 3.64e-4, 1.2e-6, -1.0e-5, 2.9e-7),
-        rtol=1e-3,
-        atol=1e-9,
-    )
+    trunk = 2.746 * tensor(8.24e-5, 3.61e-4, 3.64e-4, 1.2e-6, -1.0e-5, 2.9e-7)
+    np.testing.assert_allclose(inertia(model, "trunk"), trunk, rtol=1e-3, atol=1e-9)
 
 
 def test_right_legs_are_mirror_images_of_left_ones():
@@ -132,25 +110,23 @@ def test_the_standing_robots_soles_are_on_the_ground_where_the_facts_say():
         assert foot[2] - FOOT_RADIUS_M == pytest.approx(0.0, abs=1e-4)
 
 
-@pytest.mark.parametrize("physics", ["evaluation", "training"])
-def test_a_robot_one_millimetre_lower_is_one_millimetre_deep_in_the_ground(physics):
-    model = model_of(physics=physics)
-    data = standing(model)
-    data.qpos[2] -= 0.001
-    mujoco.mj_forward(model, data)
-    feet = {model.geom(f"{leg}_foot").id for leg in LEGS}
-    assert {g for pair in data.contact.geom for g in pair} == feet | {model.geom("ground").id}
-    assert data.contact.dist.min() == pytest.approx(-0.001, abs=1e-4)
-
-
-@pytest.mark.parametrize("physics", ["evaluation", "training"])
-def test_the_simulated_robot_stands_with_its_weight_on_its_feet(physics):
-    model = model_of(physics=physics)
-    data = standing(model)
-    mujoco.mj_step(model, data, 500)
-    assert data.qpos[2] == pytest.approx(STANDING_HEIGHT_M, abs=0.003)
-    load = sum(data.sensor(f"{leg}_foot_touch").data[0] for leg in LEGS)
-    assert load == pytest.approx(0.465 * 9.81, rel=0.02)
+def test_a_robot_one_millimetre_lower_is_one_millimetre_deep_and_one_let_go_stands_on_its_feet():
+    for physics in ("evaluation", "training"):
+        model = model_of(physics=physics)
+        data = standing(model)
+        data.qpos[2] -= 0.001
+        mujoco.mj_forward(model, data)
+        feet = {model.geom(f"{leg}_foot").id for leg in LEGS}
+        assert {g for pair in data.contact.geom for g in pair} == feet | {model.geom("ground").id}
+        assert data.contact.dist.min() == pytest.approx(-0.001, abs=1e-4)
+        data = standing(model)
+        mujoco.mj_step(model, data, 500)
+        assert data.qpos[2] == pytest.approx(STANDING_HEIGHT_M, abs=0.003)
+        load = sum(data.sensor(f"{leg}_foot_touch").data[0] for leg in LEGS)
+        assert load == pytest.approx(0.465 * 9.81, rel=0.02)
+        # at rest the chip, which hangs upside down, reads minus one g on its z
+        reading = data.sensor("accelerometer").data / 9.81
+        np.testing.assert_allclose(reading, [0.0, 0.0, -1.0], atol=0.05)
 
 
 def test_joints_have_the_published_limits_in_the_projects_order():
@@ -200,11 +176,8 @@ def test_forward_kinematics_are_mujocos():
         data.qpos[7:] = pose
         mujoco.mj_kinematics(model, data)
         for i, leg in enumerate(LEGS):
-            np.testing.assert_allclose(
-                foot_position(leg, *pose[3 * i : 3 * i + 3]),
-                data.site(f"{leg}_foot").xpos,
-                atol=1e-12,
-            )
+            foot = foot_position(leg, *pose[3 * i : 3 * i + 3])
+            np.testing.assert_allclose(foot, data.site(f"{leg}_foot").xpos, atol=1e-12)
 
 
 def test_a_positive_hip_angle_swings_the_left_foot_outward_and_the_right_one_inward():
@@ -217,19 +190,19 @@ def test_a_positive_hip_angle_swings_the_left_foot_outward_and_the_right_one_inw
 # ----------------------------------------------------------------------------------------- knee
 
 
-@pytest.mark.parametrize("knee", ["linkage", "serial"])
-def test_moving_the_thigh_alone_keeps_the_calfs_absolute_angle_only_behind_a_linkage(knee):
-    model = model_of(knee)
-    data = standing(model)
-    in_free_space(model, data)
-    data.ctrl[model.actuator("LF_thigh").id] += 0.3
-    mujoco.mj_step(model, data, 400)
-    thigh, calf = data.joint("LF_thigh").qpos[0], data.joint("LF_calf").qpos[0]
-    assert thigh == pytest.approx(0.785 + 0.3, abs=1e-3)
-    if knee == "linkage":
-        assert thigh + calf == pytest.approx(0.785 - 1.57, abs=1e-3)
-    else:
-        assert calf == pytest.approx(-1.57, abs=1e-3)
+def test_moving_the_thigh_alone_keeps_the_calfs_absolute_angle_only_behind_a_linkage():
+    for knee in KNEES:
+        model = model_of(knee)
+        data = standing(model)
+        in_free_space(model, data)
+        data.ctrl[model.actuator("LF_thigh").id] += 0.3
+        mujoco.mj_step(model, data, 400)
+        thigh, calf = data.joint("LF_thigh").qpos[0], data.joint("LF_calf").qpos[0]
+        assert thigh == pytest.approx(0.785 + 0.3, abs=1e-3)
+        if knee == "linkage":
+            assert thigh + calf == pytest.approx(0.785 - 1.57, abs=1e-3)
+        else:
+            assert calf == pytest.approx(-1.57, abs=1e-3)
 
 
 # ------------------------------------------------------------------------------------------ IMU
@@ -246,14 +219,6 @@ def test_the_imu_sits_upside_down_with_x_and_y_exchanged():
     np.testing.assert_allclose(data.sensor("gyro").data, [0.2, 0.1, -0.3], atol=1e-12)
 
 
-def test_at_rest_the_accelerometer_reads_minus_one_g_on_the_chips_z():
-    model = model_of()
-    data = standing(model)
-    mujoco.mj_step(model, data, 500)
-    reading = data.sensor("accelerometer").data / 9.81
-    np.testing.assert_allclose(reading, [0.0, 0.0, -1.0], atol=0.05)
-
-
 # --------------------------------------------------------------------------------------- servos
 
 
@@ -266,16 +231,13 @@ def swinging(actuator: str, knee: Knee, physics: Physics = "evaluation") -> np.n
     return error_in_air(model, [servos[name] for name in JOINT_NAMES], exactly_solved=False)
 
 
-@pytest.mark.parametrize("knee", ["linkage", "serial"])
-@pytest.mark.parametrize("actuator", ACTUATORS)
-def test_with_weightless_links_every_servo_of_the_robot_is_the_fitted_servo(actuator, knee):
-    np.testing.assert_allclose(swinging(actuator, knee), 0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("knee", ["linkage", "serial"])
-def test_the_iterations_of_training_are_enough_for_the_measured_friction(knee):
-    # a count is 5.7 mrad; a tenth of it cannot be measured
-    assert swinging(ACTUATORS[0], knee, "training").max() < math.pi / 550 / 10
+def test_with_weightless_links_every_servo_of_the_robot_is_the_fitted_servo():
+    for knee in KNEES:
+        for actuator in ACTUATORS:
+            np.testing.assert_allclose(swinging(actuator, knee), 0.0, atol=1e-6)
+        # the iterations of training are enough for the measured friction: a count is 5.7 mrad,
+        # and a tenth of it cannot be measured
+        assert swinging(ACTUATORS[0], knee, "training").max() < math.pi / 550 / 10
 
 
 def test_each_actuator_has_its_own_joints_numbers():
