@@ -295,6 +295,35 @@ def test_a_limp_robot_is_not_judged_and_leaving_it_sends_nothing():
     assert bus.written == [] and bus.log == ["close"]
 
 
+def test_protections_that_are_off_are_on_while_the_torque_is_and_off_again_at_the_end():
+    class Unprotected(PlainBus):
+        def __init__(self):
+            super().__init__()
+            self.values = {"overload": 0, "p": 32}
+
+        def protections_to_set(self):
+            return {"LF_calf": {"overload": 80}}
+
+        def register(self, joint, name):
+            return self.values[name]
+
+        def set_register(self, joint, name, value):
+            self.values = self.values | {name: value}
+
+        def torque(self, on):
+            self.log.append(f"overload {self.values['overload']}")
+            return super().torque(on)
+
+    bus = Unprotected()
+    guard = GuardedBus(bus)
+    guard.set_register("LF_calf", "p", 8)
+    guard.torque(True)
+    assert bus.values == {"overload": 80, "p": 8}
+    guard.close()
+    assert bus.values == {"overload": 0, "p": 32}
+    assert bus.log == ["overload 80", "torque True", "overload 80", "torque False", "close"]
+
+
 def test_a_robot_that_was_moved_by_hand_while_limp_is_found_anew():
     bus = PlainBus()
     guard = ready(bus)
@@ -322,6 +351,7 @@ def test_a_program_that_takes_over_goes_home_although_a_servo_does_not_confirm()
     with pytest.raises(BusError, match="confirm"):
         guard.torque(True)
     guard.take_over()
+    assert bus.log[-1] == "torque True"
     guard.park(np.zeros(2))
     np.testing.assert_allclose(bus.goal, 0.0, atol=1e-6)
     assert bus.log[-1] == "torque False"
@@ -430,6 +460,17 @@ def test_a_healthy_robot_is_left_alone_and_so_is_one_whose_fault_passes_in_a_mom
         drive(guard, 0.2, swing)
         afflict(bus, healthy)
         drive(guard, 2.0, swing)
+
+
+def test_what_a_bus_does_not_report_is_not_judged():
+    bus = PlainBus()
+    bus.metadata, bus.volts = {}, 3.9  # of a supply whose range is not known
+    drive(ready(bus), 1.0, swing)
+    bus = PlainBus()
+    read = bus.read
+    unknown = {"voltage_v": None, "temperature_c": None, "load": None, "status": None}
+    bus.read = lambda: replace(read(), **unknown)
+    drive(ready(bus), 2.0, swing)
 
 
 def test_a_command_too_recent_to_show_does_not_make_a_servo_frozen():

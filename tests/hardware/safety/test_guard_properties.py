@@ -176,6 +176,9 @@ def test_the_margin_is_the_travel_of_each_joint_alone_to_its_nearer_bound():
     shared = limits_of([-1.0, -1.0], [1.0, 1.0], 1, 0.5)
     for thigh, margin in ((0.4, [0.6, 0.1]), (-0.4, [0.6, 0.1]), (0.1, [0.9, 0.4])):
         assert shared.margin(np.array([thigh, 0.0])) == pytest.approx(margin)
+    # calf - thigh within ±0.5: the calf may go 0.2 further up, to 0.7
+    apart = limits_of([-1.0, -1.0], [1.0, 1.0], -1, 0.5)
+    assert apart.margin(np.array([0.2, 0.5])) == pytest.approx([0.8, 0.2])
 
 
 box = st.floats(-3, 3)

@@ -83,29 +83,28 @@ def lags_s(calibration, step_s: float, changed: Callable[[str], str] = str) -> n
     return np.arctan2(-phasor.real, -phasor.imag) / turn
 
 
-def test_an_export_for_longer_steps_lags_as_long_as_the_calibration_says(calibration):
+def test_an_export_lags_as_long_as_the_calibration_says_in_any_steps_and_engine(
+    calibration, monkeypatch
+):
     expected = lags_s(calibration, TIME_STEP_S)
-    np.testing.assert_allclose(lags_s(calibration, 0.005), expected, atol=6e-4)
-    np.testing.assert_allclose(lags_s(calibration, 0.001), expected, atol=6e-4)
+    for step_s in (0.005, 0.001):
+        np.testing.assert_allclose(lags_s(calibration, step_s), expected, atol=6e-4)
     # what the step of 5 ms alone would have done
     more = delays_at_step(calibration, 0.005)
     for name, joint in calibration.joints.items():
         assert 0.0015 < more[name].value - joint.actuator.dead_time_s.value < 0.004
+    for engine in (EXPLICIT_PD, MJLAB_PD):  # which do not limit the speed of set points
 
+        def as_they_do(text: str, engine=engine) -> str:
+            text = re.sub(r' slewmax="[^"]*"', "", text)
+            return text if engine.implicit else text.replace(INTEGRATOR, "Euler")
 
-@pytest.mark.parametrize("engine", [EXPLICIT_PD, MJLAB_PD])
-def test_simulators_without_limited_set_points_get_the_lag_that_these_make(
-    calibration, engine, monkeypatch
-):
-    expected = lags_s(calibration, TIME_STEP_S)
-    monkeypatch.setattr(mjcf, "delays_at_step", lambda *of: delays_at_step(*of, engine))
+        def their_delays(*of, engine=engine):
+            return delays_at_step(*of, engine)
 
-    def as_they_do(text: str) -> str:
-        text = re.sub(r' slewmax="[^"]*"', "", text)
-        return text if engine.implicit else text.replace(INTEGRATOR, "Euler")
-
-    there = lags_s(calibration, 0.005, as_they_do)
-    np.testing.assert_allclose(there, expected, atol=1e-3)
+        monkeypatch.setattr(mjcf, "delays_at_step", their_delays)
+        there = lags_s(calibration, 0.005, as_they_do)
+        np.testing.assert_allclose(there, expected, atol=1e-3)
 
 
 def _held(trial, at: np.ndarray) -> np.ndarray:
@@ -188,15 +187,6 @@ def test_back_emf_brakes_in_every_simulator(braking, monkeypatch, tmp_path):
     assert all(j["actuator"]["back_emf_nm_s_per_rad"]["value"] == 0.0321 for j in joints.values())
 
 
-def test_the_isaac_lab_export_takes_the_names_of_limits_that_are_there(calibration, monkeypatch):
-    text = to_isaaclab(calibration, 0.005)
-    for fields, name in ((ISAACLAB, "effort_limit"), (ISAACLAB_3, "actuator_effort_limit")):
-        recorder = _Recorder(fields)
-        executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
-        limits = [j.actuator.effort_limit_nm.value for j in calibration.joints.values()]
-        assert [made[name] for made in recorder.made] == limits
-
-
 def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     calibration, monkeypatch
 ):
@@ -214,6 +204,12 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
         assert delays[name].high <= made["max_delay"] * 0.005
         assert made["max_delay"] - made["min_delay"] <= 2
     assert space["FEEDBACK"]["LF_hip"]["loss"] == calibration.joint("LF_hip").feedback.loss.value
+    # the name of the torque limit is that of the release that is installed
+    limits = [j.actuator.effort_limit_nm.value for j in calibration.joints.values()]
+    assert [made["effort_limit"] for made in recorder.made] == limits
+    newer = _Recorder(ISAACLAB_3)
+    executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", newer, monkeypatch)
+    assert [made["actuator_effort_limit"] for made in newer.made] == limits
 
 
 def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibration, monkeypatch):
@@ -266,19 +262,17 @@ def test_the_json_export_holds_every_number_with_its_interval(calibration):
     assert found["inputs"][0]["sha256"] == calibration.inputs[0].sha256
 
 
-@pytest.mark.parametrize("to", sorted(SIMULATORS))
-def test_every_export_says_where_its_numbers_come_from_and_a_wild_name_cannot_break_it(
-    calibration, to
-):
-    wild = calibration.model_copy(update={"robot": 'a"""b-->c & <d>\\'})
-    text = SIMULATORS[to](wild, 0.004)
-    assert calibration.inputs[0].sha256[:12] in text and "data sheet" in text
-    if to == "mjcf":
-        in_free_air(text, calibration.joint_names)
-    elif to == "json":
-        json.loads(text)
-    else:
-        assert ast.get_docstring(ast.parse(text))
+def test_every_export_says_where_its_numbers_come_from_and_a_wild_name_cannot_break_it(calibration):
+    for to in sorted(SIMULATORS):
+        wild = calibration.model_copy(update={"robot": 'a"""b-->c & <d>\\'})
+        text = SIMULATORS[to](wild, 0.004)
+        assert calibration.inputs[0].sha256[:12] in text and "data sheet" in text
+        if to == "mjcf":
+            in_free_air(text, calibration.joint_names)
+        elif to == "json":
+            json.loads(text)
+        else:
+            assert ast.get_docstring(ast.parse(text))
 
 
 def test_newton_networks_give_the_effort_of_the_pd(calibration, tmp_path, capsys):
@@ -286,16 +280,8 @@ def test_newton_networks_give_the_effort_of_the_pd(calibration, tmp_path, capsys
     from onnx.reference import ReferenceEvaluator
 
     folder = tmp_path / "newton"
-    code, _, err = run_program(
-        capsys,
-        pupper_sysid,
-        "export",
-        CALIBRATED,
-        "--to",
-        "newton",
-        "--out",
-        folder,
-    )
+    arguments = ("export", CALIBRATED, "--to", "newton", "--out", folder)
+    code, _, err = run_program(capsys, pupper_sysid, *arguments)
     assert code == 0, err
     own = calibration.joint("LF_thigh").actuator
     model = onnx.load(folder / "LF_thigh.onnx")
@@ -346,42 +332,33 @@ def test_exports_are_written_by_name_and_never_over_something(capsys, tmp_path, 
     assert "exists already" in refused(capsys, pupper_sysid, *arguments)
 
 
-def test_what_cannot_become_an_actuator_is_refused_with_the_way_out(capsys, tmp_path):
-    sweep = ROOT / "data/samples/sweep.csv"
-    assert "pupper-sysid calibrate" in refused(
-        capsys, pupper_sysid, "export", sweep, "--to", "mjcf"
-    )
-    policy = ROOT / "data/samples/policies/lstm"
-    assert "--to onnx" in refused(capsys, pupper_sysid, "export", policy, "--to", "mjlab")
-    assert "--physics-step" in refused(
-        capsys,
-        pupper_sysid,
-        "export",
-        CALIBRATED,
-        "--to",
-        "mjlab",
-        "--physics-step",
-        "5",
-    )
+def test_what_cannot_become_an_actuator_is_refused_with_the_way_out(capsys):
+    samples = ROOT / "data/samples"
+    for words, cure in (
+        ((samples / "sweep.csv", "--to", "mjcf"), "pupper-sysid calibrate"),
+        ((samples / "policies/lstm", "--to", "mjlab"), "--to onnx"),
+        ((CALIBRATED, "--to", "mjlab", "--physics-step", "5"), "--physics-step"),
+    ):
+        assert cure in refused(capsys, pupper_sysid, "export", *words)
 
 
-@pytest.mark.parametrize("to", ["mjcf", "isaaclab", "mjlab", "newton"])
-def test_steps_in_which_a_servo_only_rattles_are_refused(capsys, tmp_path, to):
-    # its torque is limited, so it does not fly away: it swings between the limits
-    said = refused(
-        capsys, pupper_sysid, "export", CALIBRATED, "--to", to, "--physics-step", "0.05",
-        "--out", tmp_path / "x",
-    )  # fmt: skip
-    assert "not stable in physics steps of 50 ms; take shorter ones" in said
+def test_steps_in_which_a_servo_only_rattles_are_refused(capsys, tmp_path):
+    for to in ("mjcf", "isaaclab", "mjlab", "newton"):
+        # its torque is limited, so it does not fly away: it swings between the limits
+        said = refused(
+            capsys, pupper_sysid, "export", CALIBRATED, "--to", to, "--physics-step", "0.05",
+            "--out", tmp_path / "x",
+        )  # fmt: skip
+        assert "not stable in physics steps of 50 ms; take shorter ones" in said
 
 
-@pytest.mark.parametrize("target", ["mjcf", "isaaclab", "mjlab", "newton"])
 def test_what_a_target_cannot_carry_of_a_servo_under_load_is_said_in_it(
-    capsys, tmp_path, monkeypatch, target
+    capsys, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    run_program(capsys, pupper_sysid, "export", "xl330-m288", "--to", target, "--out", "made")
-    made = tmp_path / "made"
-    files = made.rglob("*.py") if made.is_dir() else [made]
-    said = " ".join(" ".join(p.read_text().split()) for p in files)
-    assert "not carried over: friction that grows with the motor's torque" in said
+    for to in ("mjcf", "isaaclab", "mjlab", "newton"):
+        run_program(capsys, pupper_sysid, "export", "xl330-m288", "--to", to, "--out", to)
+        made = tmp_path / to
+        files = made.rglob("*.py") if made.is_dir() else [made]
+        said = " ".join(" ".join(p.read_text().split()) for p in files)
+        assert "not carried over: friction that grows with the motor's torque" in said, to
