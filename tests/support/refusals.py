@@ -13,8 +13,8 @@ def assert_each_refused(
 ) -> None:
     """Fail with all cases that `use` accepts, or refuses in other words.
 
-    A refusal is an `InputError` of one line that ends with a full stop and has the words of its
-    case and `names`, say the path of the file; words are looked for whatever their capitals.
+    A refusal is an `InputError` of one line that is a sentence and has the words of its case and
+    `names`, say the path of the file; words are looked for whatever their capitals.
     """
     problems = []
     for value, words in cases:
@@ -23,7 +23,7 @@ def assert_each_refused(
             use(value)
         except InputError as refused:
             text = str(refused)
-            if "\n" in text or not text.endswith("."):
+            if "\n" in text or text[-1:] not in (".", "?"):
                 problems.append(f"{shown}: no sentence: {text!r:.300}")
             problems += [
                 f"{shown}: no {part!r} in {text!r:.300}"

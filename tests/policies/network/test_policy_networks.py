@@ -149,20 +149,6 @@ def attention() -> CausalAttention:
     return made
 
 
-def test_a_changed_observation_changes_the_sixteen_latents_from_it_on_and_no_other():
-    made, changed, steps = attention(), 9, 40
-    tokens = torch.randn(1, steps, 5)
-    other = tokens.clone()
-    other[0, changed] += 1.0
-    present = torch.ones(1, steps, dtype=torch.bool)
-    with torch.inference_mode():
-        difference = (made(tokens, present, steps) - made(other, present, steps)).abs().amax(-1)
-    moved = (difference[0] > 1e-4).nonzero()[:, 0].tolist()
-    assert moved == list(range(changed, changed + 16))
-    assert float(difference[0, :changed].max()) < 1e-6
-    assert float(difference[0, changed + 16 :].max()) < 1e-6
-
-
 def test_acting_step_by_step_a_transformer_sees_sixteen_observations_as_in_a_sequence():
     made, steps = attention(), 40
     series = torch.randn(steps, 2, 5)
@@ -185,29 +171,6 @@ def test_acting_step_by_step_a_transformer_sees_sixteen_observations_as_in_a_seq
         other[steps - 1 - age] += 1.0
         moved = (walk(other)[0] - walked)[:, -1].abs().max()
         assert bool(moved > 1e-4) is matters, age
-
-
-def test_a_transformer_remembers_nothing_from_before_its_episode():
-    actor, _ = networks("transformer")
-    fresh, _ = networks("transformer")
-    generator = torch.Generator().manual_seed(5)
-    with torch.inference_mode():
-        for _ in range(20):
-            actor(observations(2, generator))
-        actor.reset(torch.tensor([True, False]))
-        for _ in range(CONTEXT + 2):
-            seen = observations(2, generator)
-            new, old = fresh(seen), actor(seen)
-            torch.testing.assert_close(old[0], new[0], atol=1e-6, rtol=0)
-            fresh_context, old_context = fresh.get_hidden_state(), actor.get_hidden_state()
-    torch.testing.assert_close(fresh_context, old_context)  # after sixteen steps robot 1, too
-
-
-def test_only_the_network_with_past_actions_sees_them():
-    for kind in ALL_KINDS:
-        actor, critic = networks(kind)
-        assert actor.obs_groups == ["policy"] + ["actions"] * (kind == "mlp-actions")
-        assert critic.obs_groups == ["policy", "noise", "privileged"]
 
 
 # ------------------------------------------------------------------------------ other files

@@ -12,7 +12,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import LEGS
 from pupper_sysid.policies.network.hyperparameters import Hyperparameters
 from pupper_sysid.policies.train.learner import Learner
-from pupper_sysid.policies.train.mirror import MirrorImages, mirrored
+from pupper_sysid.policies.train.mirror import mirrored
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.mini_pupper import foot_position
 from pupper_sysid.sim.walking.config import Observation, Randomisation, Walking
@@ -64,15 +64,6 @@ def test_the_image_of_an_image_is_the_original():
         if values.shape[1] in (60, PRIVILEGED_SIZE, 12, 12 * HISTORY):
             assert torch.equal(mirrored(mirrored(values, name), name), values)
             assert not torch.equal(mirrored(values, name), values)
-
-
-def test_a_minibatch_is_followed_by_its_image():
-    seen = observations(5, torch.Generator().manual_seed(0)).exclude("privileged")
-    actions = torch.randn(5, 12)
-    both, acted = MirrorImages._both(None, seen, actions)
-    assert torch.equal(both["policy"][:5], seen["policy"]) and both.batch_size[0] == 10
-    assert torch.equal(acted[5:], mirrored(actions))
-    assert torch.equal(both["actions"][5:, 12:24], mirrored(seen["actions"][:, 12:24]))
 
 
 def learner(kind: str) -> Learner:

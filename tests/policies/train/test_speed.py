@@ -55,11 +55,8 @@ def test_a_ratio_is_the_median_over_slices_with_their_middle_half():
     own, bare = np.array([2.0, 4.0, 10.0, 4.0, 4.0]), np.array([1.0, 3.0, 5.0, 3.0, 3.0])
     times = np.stack([np.stack([own, own], 1), np.stack([bare, 0.5 * bare], 1)], axis=1)
     found = speed.ratios(times)
-    assert (found["env_ratio_low"], found["env_ratio"], found["env_ratio_high"]) == (
-        0.5,
-        0.75,
-        0.75,
-    )
+    quartiles = (found["env_ratio_low"], found["env_ratio"], found["env_ratio_high"])
+    assert quartiles == (0.5, 0.75, 0.75)
     assert found["env_processor_ratio"] == 0.375
     assert found["env_steps_per_s"] == pytest.approx(1 / 4)
 

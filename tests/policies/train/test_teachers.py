@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.checkpoint import read_checkpoint
@@ -24,18 +24,14 @@ from pupper_sysid.policies.train.run_file import (
     save_run,
     teacher_of,
 )
-from pupper_sysid.policies.train.teachers import (
-    LearnedTeacher,
-    TrotTeacher,
-    load_teacher,
-    lowest,
-)
+from pupper_sysid.policies.train.teachers import LearnedTeacher, TrotTeacher, load_teacher
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.observation import PRIVILEGED_PARTS
 from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
 from support.checkpoints import different, stop_after
+from support.refusals import assert_each_refused
 from support.tiny_training import tiny_run
 
 # ------------------------------------------------------------------------------ the trot
@@ -100,19 +96,6 @@ def test_the_teachers_commands_are_corrected_until_the_policy_walks_at_the_given
     assert (error() < 0.2 * before).all()
 
 
-def test_speeds_count_from_a_second_after_a_new_command_on():
-    env = make_env(tiny_run(environments=1, task=Walking()), Ranks())
-    teacher = TrotTeacher(WalkingVecEnv(env))
-    env.command[:], env.episode_step[:] = (0.1, 0.0, 0.0), 1
-    env._strides.velocity[:] = (0.05, 0.0, 0.0)
-    for _ in range(50):
-        teacher.watch()
-    assert sum(len(e) for e in teacher._errors) == 0
-    for _ in range(2):
-        teacher.watch()
-    np.testing.assert_allclose(teacher._errors[-1], [[0.25, 0.0, 0.0]])
-
-
 def test_imitation_brings_the_policy_nearer_to_the_trot():
     rounds = 6
     run = tiny_run(
@@ -166,10 +149,6 @@ def learned_teacher(folder, env: WalkingVecEnv) -> LearnedTeacher:
     return LearnedTeacher(env, load_teacher(folder, BEST, tiny_run(), env.get_observations()))
 
 
-def test_a_teacher_is_no_policy_for_a_robot(taught):
-    assert not list(taught.glob("policy_*"))
-
-
 class Circle(torch.nn.Module):
     """A gait: joints follow the clock, each later than the one before, as far as commanded."""
 
@@ -198,13 +177,6 @@ def test_a_learned_teacher_continues_its_gait_from_the_last_two_actions():
     found = LearnedTeacher(env, Circle()).actions(seen)  # pyright: ignore[reportArgumentType]
     torch.testing.assert_close(found, Circle.at(phase + step, forward), atol=0.01, rtol=0)
     assert all(torch.equal(seen[k], before[k]) for k in seen.keys())
-
-
-def test_the_lowest_of_a_cycle_lies_between_its_points():
-    phase = torch.tensor([0.02, 1.0, 6.2])
-    grid = torch.arange(56) * (2 * np.pi / 56)
-    found = lowest(-torch.cos(grid - phase[:, None]))
-    torch.testing.assert_close(torch.cos(found - phase), torch.ones(3), atol=1e-6, rtol=0)
 
 
 def test_a_learned_teacher_follows_the_corrected_command():
@@ -245,7 +217,8 @@ def test_a_run_from_nothing_trains_its_teacher_first_and_resumes_in_the_midst_of
     train(whole, run, lambda now: phases.append(now.phase))
     assert phases == ["teacher"] * 3 + ["imitation"] * 2 + ["ppo"] * 3
     assert load_run(whole / "teacher").architecture.privileged_actor
-    assert (whole / "policy_best").is_dir() and not (whole / "teacher" / "policy_best").exists()
+    assert (whole / "policy_best").is_dir()
+    assert not list((whole / "teacher").glob("policy_*")), "a teacher is no policy for a robot"
     for where in (("teacher", 2), ("imitation", 1), ("ppo", 1)):
         resumed = (parts / "run.yaml").exists()
         train(parts, None if resumed else run, stop_after(*where))
@@ -253,78 +226,54 @@ def test_a_run_from_nothing_trains_its_teacher_first_and_resumes_in_the_midst_of
     train(parts, None)
     for name in ("teacher/last.pt", LAST):
         assert different(read_checkpoint(whole / name), read_checkpoint(parts / name)) == []
+    run_s, teacher_s = (
+        read_checkpoint(whole / name)["more"]["elapsed_s"] for name in (LAST, f"teacher/{LAST}")
+    )
+    assert run_s > teacher_s > 0, "the time of a teacher is part of its run's"
 
 
-def test_the_time_of_a_teacher_is_part_of_its_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "teacher_of", lambda run: tiny_teacher(seed=run.seed))
-    run = tiny_run(imitation=replace(tiny_run().imitation, teacher="own"))
-    train(tmp_path, run)
-    whole, own = (read_checkpoint(tmp_path / f)["more"] for f in (LAST, f"teacher/{LAST}"))
-    assert whole["elapsed_s"] > own["elapsed_s"] > 0
-
-
-def test_a_teacher_of_a_runs_own_is_of_its_robot_and_its_seed():
+def test_a_teacher_of_a_runs_own_has_its_robot_seed_actions_and_clock(tmp_path):
     run = replace(preset("fast", "lstm", "scratch"), actuator="paper", seed=5, threads=1)
+    rewards = replace(run.task.rewards, clock_hz=3.0)
+    task = replace(run.task, action_scale=0.4, knee="serial", rewards=rewards)
+    run = replace(run, task=task)
     own = teacher_of(run)
     assert (own.actuator, own.seed, own.threads) == ("paper", 5, 1)
     assert own.minutes < run.minutes
     assert own.architecture.kind == "mlp" and own.architecture.privileged_actor
     for name in ("action_scale", "control_step_s", "knee"):
-        assert getattr(own.task, name) == getattr(run.task, name)
+        assert getattr(own.task, name) == getattr(task, name)
     for name in CLOCK:
-        assert getattr(own.task.rewards, name) == getattr(run.task.rewards, name)
-
-
-def test_a_teacher_of_a_runs_own_has_the_runs_actions_and_clock(tmp_path):
-    run = preset("fast", "lstm", "scratch")
-    rewards = replace(run.task.rewards, clock_hz=3.0)
-    task = replace(run.task, action_scale=0.4, knee="serial", rewards=rewards)
-    run = replace(run, task=task)
-    save_run(tmp_path, teacher_of(run))
-    assert check_teacher(tmp_path, run).task.knee == "serial"
+        assert getattr(own.task.rewards, name) == getattr(rewards, name)
+    save_run(tmp_path, own)
+    assert check_teacher(tmp_path, run) == own
     # 0.025 s are no whole number of the teacher's steps of 4 ms
     slower = replace(run, task=replace(task, control_step_s=0.025, physics_step_s=0.0025))
     assert teacher_of(slower).task.physics_step_s == 0.0025
 
 
-def test_a_run_that_is_no_teacher_is_refused_as_one(tmp_path, taught):
-    train(tmp_path, tiny_run(iterations=1))
-    env = WalkingVecEnv(make_env(tiny_run(), Ranks()))
-    with pytest.raises(InputError, match=r"is not a teacher.*--start teacher"):
-        learned_teacher(tmp_path, env)
-
-
-def test_a_run_that_is_refused_for_its_teacher_leaves_its_name_free(tmp_path, taught):
-    broken = tmp_path / "teacher"
-    shutil.copytree(taught, broken)
+def test_what_cannot_teach_a_run_is_refused_and_leaves_its_name_free(tmp_path, taught):
+    train(tmp_path / "policy", tiny_run(imitation=Imitation(iterations=0), iterations=1))
+    broken, other = (Path(shutil.copytree(taught, tmp_path / name)) for name in ("broken", "other"))
     (broken / BEST).write_bytes(b"not a checkpoint")
-    run = tiny_run(imitation=Imitation(iterations=1, rollouts=1, teacher=str(broken)))
-    with pytest.raises(InputError, match="damaged"):
-        train(tmp_path / "run", run)
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_teacher_that_sees_something_else_is_refused(tmp_path, taught):
-    other = tmp_path / "teacher"
-    shutil.copytree(taught, other)
     content = torch.load(other / BEST, weights_only=True)
     first = content["actor_state_dict"]["mlp.0.weight"]
     content["actor_state_dict"]["mlp.0.weight"] = torch.cat([first, first[:, :3]], dim=1)
     torch.save(content, other / BEST)
-    run = tiny_run(imitation=Imitation(iterations=1, rollouts=1, teacher=str(other)))
-    with pytest.raises(InputError, match="see something else. Train one with this version"):
-        train(tmp_path / "run", run)
 
+    def learn(case):
+        folder, task = case
+        changes = {"task": task} if task else {}
+        teacher = Imitation(iterations=1, rollouts=1, teacher=str(folder))
+        train(tmp_path / "run", tiny_run(imitation=teacher, **changes))
 
-@pytest.mark.parametrize(
-    ("task", "words"),
-    [
-        (Walking(action_scale=0.25), r"task\.action_scale 0\.5.*this run has 0\.25"),
-        (Walking(rewards=Rewards(clock_hz=3.0)), r"clock_hz 3\.6.*this run has 3\.0"),
-    ],
-)
-def test_a_teacher_with_other_actions_or_another_clock_is_refused(taught, task, words):
-    run = tiny_run(task=task)
-    seen = WalkingVecEnv(make_env(run, Ranks())).get_observations()
-    with pytest.raises(InputError, match=words):
-        load_teacher(taught, BEST, run, seen)
+    cases = [
+        ((tmp_path / "policy", None), "is not a teacher"),
+        ((tmp_path / "policy", None), "--start teacher"),
+        ((broken, None), "damaged"),
+        ((other, None), "see something else. Train one with this version"),
+        ((taught, Walking(action_scale=0.25)), "task.action_scale 0.5"),
+        ((taught, Walking(rewards=Rewards(clock_hz=3.0))), "clock_hz 3.6"),
+    ]
+    assert_each_refused(cases, learn)
+    assert not (tmp_path / "run").exists()

@@ -17,7 +17,7 @@ from pupper_sysid.policies.walks.conditions import (
     evaluation_task,
     random_commands,
 )
-from pupper_sysid.policies.walks.together import _shares, walk_together
+from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
@@ -132,17 +132,6 @@ def test_random_commands_are_new_every_five_seconds_and_within_their_ranges():
         assert command[..., axis].min() == pytest.approx(ends[0], rel=0.02)
         assert command[..., axis].max() == pytest.approx(ends[1], rel=0.02)
     np.testing.assert_array_equal(command[:, :5], random_commands(200, 1000, 0.02, 0)[:, :5])
-
-
-def test_work_is_shared_evenly_with_one_environment_per_ground():
-    given = [Condition(TASK, 100), *[Condition(TASK, 20)] * 7, *[Condition(ROUGH, 50)] * 5]
-    shares = _shares(given)
-    assert sorted(i for share in shares for chosen in share for i in chosen) == list(range(13))
-    robots = [sum(given[i].robots for chosen in share for i in chosen) for share in shares]
-    assert len(robots) == 2 and abs(robots[0] - robots[1]) <= 20
-    for share in shares:
-        tasks = [given[chosen[0]].task for chosen in share]
-        assert len(tasks) == len({t.terrain for t in tasks})
 
 
 def test_robots_walk_on_the_learned_servos_that_were_given(monkeypatch, tmp_path):
