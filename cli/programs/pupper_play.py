@@ -26,7 +26,6 @@ from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress,
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, replacing
-from pupper_sysid.policies.deploy.commands import checked_command
 from pupper_sysid.sim.robot.terrain import Terrain
 
 DESCRIPTION = """Watch a policy walk in the simulator it was trained in.
@@ -72,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: Play) -> None:
     need_positive("--seconds", options.seconds)
+    from pupper_sysid.policies.deploy.commands import checked_command
+
     command = checked_command(options.command)
     if options.video:
         if options.video.suffix.lower() != ".mp4":

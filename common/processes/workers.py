@@ -65,7 +65,7 @@ class Workers:
     ----------
     count : int
         Processes. With one, or where processes cannot be forked, the work is done in this one.
-    modules : str
+    *modules : str
         Modules to import once, in the server; those of what is submitted first are as well.
     option : str
         Argument of the caller that set `count`, for messages.

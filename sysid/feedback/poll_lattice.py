@@ -365,6 +365,10 @@ def _with_segments(
     if sure is None and motions is not None:
         sure = moves(trials, motions, noise)
     loss, polls = count_loss(trials, phases, sure or (), known=motions is not None)
+    if loss >= 1:
+        # no poll that counts brought a new value: a joint that moves by less than a few steps of
+        # its reading per poll shows no failures, and the readings that change are of other polls
+        loss, polls = math.nan, 0.0
     return replace(
         lattice, poll_period_s=period, poll_period_sd_s=error, loss=loss,
         loss_sd=math.sqrt(max(loss * (1 - loss), 1.0 / polls) / polls) if polls else math.nan,

@@ -40,10 +40,6 @@ def count_loss(
 ) -> tuple[float, float]:
     """Share of failed polls, and the number of independent polls that this was counted from.
 
-    NaN and 0 where none of the polls that count brought a new value: a joint that moves by less
-    than a few steps of its reading per poll shows no failures, and readings that change at other
-    polls only belong to another motion.
-
     Parameters
     ----------
     trials : sequence of Trial
@@ -54,7 +50,7 @@ def count_loss(
         Whether it is from `moves`.
     """
     successes, polls = _count(trials, phases, sure)
-    if not successes:
+    if not polls:
         return math.nan, 0.0
     return max(1.0 - successes / polls, 0.0), polls if known else polls / _OVERDISPERSION
 

@@ -93,8 +93,8 @@ def long_training():
 
 def robot():
     end_politely()
-    begin()
     try:
+        begin()
         time.sleep(60)
     finally:
         time.sleep(1.2)  # longer than a program may take without a robot

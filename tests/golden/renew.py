@@ -5,9 +5,9 @@
     .venv/bin/python tests/golden/renew.py --only proxy --stages doctor lag
 
 Exits 1 if a figure differs by more than the tolerance of `support.golden` and nothing is renewed.
-With `--exact` every stored digit counts. Stages are written one by one, so that a run can be
-stopped and continued with `--only` and `--stages`. All of them take about 15 minutes of processor
-time, the emulated ones two.
+With `--exact` every stored digit counts. Each joint is written when it is computed, so that a run
+can be stopped, and continued with `--missing`. All of them take about 15 minutes of processor time,
+the emulated ones two.
 """
 
 from __future__ import annotations

@@ -24,8 +24,9 @@ import math
 import re
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,7 @@ FLOORS = {
 """Absolute tolerance by unit, the ending of a figure's name; `1` for names without one."""
 SEED = 0
 
+Place = tuple[str, ...]
 Figures = dict[str, Any]
 """Nested figures: dicts by name of dicts, lists, texts, numbers and None."""
 
@@ -74,6 +76,14 @@ def figures_of(name: str, stages: Sequence[str] = STAGES) -> Figures:
     stages : sequence of str
         Of `STAGES`.
     """
+    figures: Figures = {}
+    for place, compute in pieces(name, stages):
+        _put(figures, place, compute())
+    return figures
+
+
+def pieces(name: str, stages: Sequence[str]) -> list[tuple[Place, Callable[[], Any]]]:
+    """Places in the figures of one recording, and what computes each."""
     joints: Sequence[str] | None = None
     if name in EMULATED:
         recordings = [EMULATED[name].record()]
@@ -82,16 +92,16 @@ def figures_of(name: str, stages: Sequence[str] = STAGES) -> Figures:
         recordings, joints = REAL[name].record(), REAL[name].calibrated
         head, origin = REAL[name].head(recordings), REAL[name].origin()
     every = chosen_joints(recordings)
-    found: Figures = {"recording": origin}
+    parts: list[tuple[Place, Callable[[], Any]]] = [(("recording",), lambda: origin)]
     if "doctor" in stages:
-        found["doctor"] = _doctor(recordings)
+        parts.append((("doctor",), partial(_doctor, recordings)))
     if "lag" in stages:
-        found["lag"] = {joint: _or_refusal(_lag, recordings, joint) for joint in every}
+        parts += [(("lag", j), partial(_or_refusal, _lag, recordings, j)) for j in every]
     if "calibrate" in stages:
-        found["calibrate"] = {
-            joint: _or_refusal(_calibrate, head, joint) for joint in joints or every
-        }
-    return found
+        parts += [
+            (("calibrate", j), partial(_or_refusal, _calibrate, head, j)) for j in joints or every
+        ]
+    return parts
 
 
 def is_absent(name: str) -> bool:
@@ -363,6 +373,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--renew", action="store_true", help="write the figures")
     parser.add_argument("--only", nargs="+", default=[], help="parts of recordings' names")
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES)
+    parser.add_argument("--missing", action="store_true", help="only figures that are not frozen")
     parser.add_argument("--exact", action="store_true", help="every stored digit counts")
     parser.add_argument("--reverse", action="store_true", help="the last recording first")
     options = parser.parse_args(arguments)
@@ -374,17 +385,34 @@ def main(arguments: list[str] | None = None) -> int:
         if is_absent(name):
             print(f"{name}: not here, left as it is", file=sys.stderr)
             continue
-        for stage in options.stages:
+        for place, compute in pieces(name, options.stages):
+            if options.missing and _at(read(), (name, *place)) is not None:
+                continue
             started = time.process_time()
-            after = figures_of(name, [stage])
+            after = compute()
             frozen = read()  # now, so that two runs may share the work
-            before = frozen.get(name, {})
             # a renewed figure counts as changed where its stored digits are
             exact = options.exact or options.renew
-            changes += differences({key: before.get(key) for key in after}, after, exact, name)
+            before = _at(frozen, (name, *place))
+            changes += differences(before, after, exact, " / ".join((name, *place)))
             if options.renew:
-                write(frozen | {name: before | after})
+                _put(frozen, (name, *place), after)
+                write(frozen)
             spent = time.process_time() - started
-            print(f"{name}, {stage}: {spent:.1f} s of processor time", file=sys.stderr)
+            print(f"{' / '.join((name, *place))}: {spent:.1f} s of processor time", file=sys.stderr)
     print(table(changes) if changes else "No figure differs.")
     return 1 if changes and not options.renew else 0
+
+
+def _at(figures: Figures, place: Place) -> Any:
+    """The figures at a place; None where there are none."""
+    for name in place:
+        figures = (figures or {}).get(name)
+    return figures
+
+
+def _put(figures: Figures, place: Place, value: Any) -> None:
+    *way, last = place
+    for name in way:
+        figures = figures.setdefault(name, {})
+    figures[last] = value

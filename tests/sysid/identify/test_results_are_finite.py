@@ -17,7 +17,6 @@ from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, q
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
-from pupper_sysid.sysid.feedback.poll_loss import count_loss
 from pupper_sysid.sysid.identify.calibration_file import to_calibration
 from pupper_sysid.sysid.identify.candidates.models import candidate_model
 from pupper_sysid.sysid.identify.posterior import Posterior
@@ -111,17 +110,6 @@ def test_what_uses_a_lattice_s_loss_gets_a_number_or_leaves_it_out(lag, lattice)
     HeldFeedback(lattice.poll_period_s, lattice.assumed_loss)
     runs = hold_runs([(0, 20, 10, 5)], [0.019], lattice)
     assert runs.expected is None and runs.count.sum() == 35
-
-
-def test_polls_that_never_succeed_where_they_count_tell_no_loss(slow, lattice):
-    trials = slow.trials(made_recordings.JOINT)
-    rows = {k: read for k, read in enumerate(trials[0].read_time_s)}
-
-    def only_at_an_end(time, period_s):
-        return np.abs(time - rows[len(rows) - 1]) < period_s  # at rest by then
-
-    loss, polls = count_loss(trials, lattice.phases, [only_at_an_end] * len(trials))
-    assert math.isnan(loss) and polls == 0
 
 
 @settings(max_examples=60)
