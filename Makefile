@@ -14,11 +14,11 @@ demo: setup
 	$(BIN)/pupper-sysid calibrate $(DEMO)/sweep.csv --out $(DEMO)/calibrated.yaml --force
 	$(BIN)/pupper-sysid report $(DEMO)/sweep.csv --calibration $(DEMO)/calibrated.yaml --out $(DEMO)/report --force
 
-# 4 minutes on two cores
+# the quick tests
 test: setup
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 
-# 10 minutes on two cores: every page of the documentation and long campaigns besides
+# every page of the documentation and long campaigns besides
 test-all: setup
 	$(BIN)/python -m pytest -n 2
 
