@@ -131,7 +131,9 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
     debug = "--debug" in arguments
     _open_closed()
     streams = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = _Stream(sys.stdout, _OUTPUT), _Stream(sys.stderr, _ERRORS)
+    output: Any = _Stream(sys.stdout, _OUTPUT)
+    errors: Any = _Stream(sys.stderr, _ERRORS)
+    sys.stdout, sys.stderr = output, errors
     try:
         try:
             if "--version" in arguments:

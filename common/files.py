@@ -236,21 +236,25 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of a file system w
 def holding_outputs() -> Iterator[None]:
     """Within the block, hold the outputs that `refuse_overwrite` and `hold_output` name.
 
-    A lock file beside each output, `.NAME.lock`, holds the process id. It is locked by the system
-    for as long as the process lives, and removed at the end of the block. One that a killed process
-    has left behind is not locked, and does not count.
+    A lock file beside each output, `.NAME.lock`, holds the process id. It is locked (flock) for as
+    long as the process lives, and removed at the end of the block. One that a killed process has
+    left behind is not locked, and does not count.
     """
     if _held.get() is not None:  # a program within a program holds for both
         yield
         return
     locks: dict[Path, _Lock] = {}
     before = _held.set(locks)
+    if hasattr(os, "register_at_fork"):
+        # else a worker that outlives this process would keep its locks
+        os.register_at_fork(after_in_child=lambda: [lock.forget() for lock in locks.values()])
     try:
         yield
     finally:
         _held.reset(before)
         for lock in locks.values():
             lock.release()
+        locks.clear()
 
 
 def hold_output(path: Path) -> None:
@@ -288,20 +292,18 @@ def _lock_file(output: Path) -> Path:
 
 
 def _lock_or_refuse(descriptor: int, path: Path) -> None:
-    """Lock an open lock file without waiting.
-
-    The lock is the process's: a child does not inherit it, and cannot keep it.
-    """
+    """Lock an open lock file without waiting, unless this process holds it already."""
     try:
         import fcntl
     except ImportError:  # Windows
         return
     try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        if error.errno in _NO_LOCKS:
-            return
         holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
+        # a thread does not see what its process holds
+        if error.errno in _NO_LOCKS or holder == str(os.getpid()):
+            return
         raise InputError(
             f"{path} is being written by another process{f' ({holder})' if holder else ''}. Wait "
             "until it has ended, or choose another name."
@@ -312,7 +314,7 @@ class _Lock:
     """Lock of one output of this process."""
 
     def __init__(self, path: Path, output: Path):
-        self._file, self._process = _lock_file(output), os.getpid()
+        self._file = _lock_file(output)
         self._descriptor: int | None = None
         self._made: list[Path] = []
         try:
@@ -351,7 +353,7 @@ class _Lock:
             with suppress(OSError):  # so that another user's is no obstacle once it is left behind
                 os.fchmod(descriptor, 0o666)
             os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"{self._process}\n".encode(), 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         except BaseException:
             os.close(descriptor)
             raise
@@ -359,12 +361,18 @@ class _Lock:
 
     def release(self) -> None:
         """Remove the lock file, and the folders made for it that are still empty."""
-        if self._descriptor is None or os.getpid() != self._process:
+        if self._descriptor is None:
             return
         with suppress(OSError):
             os.unlink(self._file)
-        os.close(self._descriptor)
+        self.forget()
         self._remove_folders()
+
+    def forget(self) -> None:
+        """Close the lock file and leave it, as in a child process: its parent holds it."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
 
     def _remove_folders(self) -> None:
         with suppress(OSError):  # not empty: the output is there

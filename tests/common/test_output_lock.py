@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -23,20 +24,29 @@ from support.command_line import refused, run
 
 SWEEP = Path(__file__).parents[2] / "data/samples/sweep.csv"
 HOLDER = """
-import sys
+import os, sys, time
 from pathlib import Path
 from pupper_sysid.common.files import holding_outputs, refuse_overwrite
 with holding_outputs():
     refuse_overwrite(Path(sys.argv[1]), force=True)
     print("held", flush=True)
+    if sys.argv[2:]:
+        child = os.fork()
+        if not child:
+            time.sleep(60)
+            os._exit(0)
+        print(child, flush=True)
     sys.stdin.readline()
 """
 
 
-def held_elsewhere(path: Path) -> subprocess.Popen:
-    """Another process that holds `path` until a line or a signal reaches it."""
+def held_elsewhere(path: Path, forks: bool = False) -> subprocess.Popen:
+    """Another process that holds `path` until a line or a signal reaches it.
+
+    If it `forks`, it prints the id of its child.
+    """
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(path)],
+        [sys.executable, "-c", HOLDER, str(path), *["fork"] * forks],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None and process.stdout.readline() == "held\n"
@@ -128,14 +138,28 @@ def test_the_program_that_holds_an_output_writes_it_as_often_as_it_likes(tmp_pat
 
 def test_a_child_process_neither_keeps_nor_removes_the_lock(tmp_path):
     path = tmp_path / "out.csv"
-    with holding_outputs():
-        refuse_overwrite(path)
-        child = os.fork()
-        if not child:
-            os._exit(0)
-        os.waitpid(child, 0)
-        assert (tmp_path / ".out.csv.lock").exists()
+    process = held_elsewhere(path, forks=True)
+    child = int(process.stdout.readline())
+    try:
+        with pytest.raises(InputError, match=str(process.pid)):
+            refuse_overwrite(path)
+        process.kill()
+        process.wait()
+        os.kill(child, 0)  # it lives on, as a worker whose parent was killed may
+        with holding_outputs():
+            refuse_overwrite(path)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        process.communicate()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_thread_writes_what_its_process_holds(tmp_path):
+    path = tmp_path / "out.csv"
+    with holding_outputs(), ThreadPoolExecutor(1) as pool:
+        refuse_overwrite(path)
+        pool.submit(write_text, path, "from a thread").result()
+    assert path.read_text() == "from a thread"
 
 
 def test_a_folder_is_held_beside_it(tmp_path):
