@@ -19,29 +19,9 @@ hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("repeatable")
 
 
-UNSETTLED = {
-    "test_every_recording_has_figures_of_every_stage", "test_ctrl_c_saves_and_ends_well",
-    "test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed",
-    "test_a_viewer_gets_what_a_file_would_hold",
-    "test_a_run_that_was_stopped_and_resumed_is_bit_for_bit_the_run_that_was_not",
-    "test_a_checkpoint_is_not_replaced_by_one_whose_observations_are_no_numbers",
-    "test_ppo_begins_with_its_own_learning_rate_and_no_momentum_of_imitation",
-    "test_a_full_disk_leaves_the_checkpoint_before_and_is_said",
-    "test_two_processes_stop_at_the_same_update_though_one_alone_was_told_to",
-    "test_two_processes_learn_one_policy_from_different_robots",
-    "test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second",
-    "test_a_robot_is_parked_however_long_that_takes",
-    "test_ctrl_c_at_the_terminal_stops_a_calibration_whose_processes_start",
-}  # fmt: skip
-"""Tests that failed on a busy machine, not yet explained: each is to be mended and taken out."""
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The slowest file comes first: at the end one worker would wait for the other."""
     items.sort(key=lambda item: item.path.name != "test_docs.py")
-    for item in items:
-        if getattr(item, "originalname", item.name) in UNSETTLED:
-            item.add_marker(pytest.mark.xfail(reason="failed on a busy machine, not yet explained"))
 
 
 @pytest.fixture(scope="session")

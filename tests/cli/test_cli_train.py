@@ -182,7 +182,7 @@ def test_a_finished_run_can_be_resumed_and_stays_as_it_is(capsys, trained):
 
 
 def test_ctrl_c_saves_and_ends_well(tmp_path):
-    """A real process, a real signal: exit 0, a checkpoint, and the way to go on."""
+    """A real process, a real signal: exit 130, a checkpoint, and the way to go on."""
     process = subprocess.Popen(
         [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_train",
             *TINY, "--iterations", "100000",
@@ -200,7 +200,8 @@ def test_ctrl_c_saves_and_ends_well(tmp_path):
     finally:
         process.kill()
     whole = "".join(said) + rest
-    assert process.returncode == 0 and "Traceback" not in whole, whole
+    assert process.returncode == 130 and "Traceback" not in whole, whole
+    assert "finishing this iteration; again ends at once" in " ".join(whole.split())
     assert "pupper-train --resume" in " ".join(whole.split())
     folder = tmp_path / "runs" / "stopped"
     assert 1 <= read_checkpoint(folder / "last.pt")["iteration"] < 100000

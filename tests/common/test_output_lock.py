@@ -33,9 +33,9 @@ with holding_outputs():
     if sys.argv[2:]:
         child = os.fork()
         if not child:
+            print(os.getpid(), flush=True)  # from then on it has let go of the lock
             time.sleep(60)
             os._exit(0)
-        print(child, flush=True)
     sys.stdin.readline()
 """
 
@@ -43,7 +43,7 @@ with holding_outputs():
 def held_elsewhere(path: Path, forks: bool = False) -> subprocess.Popen:
     """Another process that holds `path` until a line or a signal reaches it.
 
-    If it `forks`, it prints the id of its child.
+    If it `forks`, its child prints its id.
     """
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(path), *["fork"] * forks],
