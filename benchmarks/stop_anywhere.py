@@ -48,12 +48,12 @@ COMMANDS: dict[str, tuple[float, tuple[str, ...]]] = {
     "delay": (3.0, ("pupper_sysid", "delay", SWEEP)),
     "calibrate": (3.0, ("pupper_sysid", "calibrate", SWEEP, "--out", "c.yaml")),
     "fleet": (3.0, ("pupper_sysid", "calibrate", "robots", "--jobs", "2")),
-    "fit-servo": (4.0, ("pupper_sysid", "fit-servo", SWEEP, "--arch", "mlp", "--out", "servo")),
+    "fit-servo": (6.0, ("pupper_sysid", "fit-servo", SWEEP, "--arch", "mlp", "--out", "servo")),
     "report": (3.0, ("pupper_sysid", "report", SWEEP, "--calibration", CALIBRATION, "--out",
                      "report")),
-    "pupper-train": (5.0, ("pupper_train", "--actuator", CALIBRATION, "--environments", "64",
+    "pupper-train": (15.0, ("pupper_train", "--actuator", CALIBRATION, "--environments", "64",
                            "--name", "run", "--threads", "1")),
-    "pupper-eval": (4.0, ("pupper_eval", POLICY, "--threads", "2")),
+    "pupper-eval": (6.0, ("pupper_eval", POLICY, "--threads", "2")),
 }  # fmt: skip
 """By name: processor time until the work has begun [s], and the command."""
 LATER_S = 5.0
