@@ -7,7 +7,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.sim.walking.config import PRESETS, Commands, Observation, Randomisation, Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
 from pupper_sysid.sim.walking.draws import at_rest
@@ -16,6 +15,7 @@ from pupper_sysid.sim.walking.held_readings import HeldReadings
 from pupper_sysid.sim.walking.imu import Imu
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.refusals import assert_each_refused
 
 MEASURED = "data/samples/calibrated.yaml"
 STILL = Randomisation(
@@ -43,7 +43,7 @@ def stand(env: PupperEnv, steps: int) -> np.ndarray:
 
 def test_a_wrong_zero_is_in_commands_and_readings_alike():
     env = make(joint_zero_rad=0.05)
-    seen = stand(env, 50)
+    seen = stand(env, 30)
     zero = env.robots.bodies.zero_rad
     assert np.abs(zero).max() <= 0.05 and zero.std() > 0.02  # of a uniform draw: 0.029
     wrong = env.robots.to_servo(env.robots.joints) - env.robots.to_servo(env.default)
@@ -79,15 +79,15 @@ def ramp(time_s: float) -> tuple[np.ndarray, np.ndarray]:
     return np.full((3, 3), time_s), np.tile([0.0, 0.0, -1.0], (3, 1))
 
 
-@pytest.mark.parametrize("latency_s", [0.0, 0.005, 0.02, 0.033])
-def test_a_late_imu_reports_what_was_so_much_earlier(latency_s):
-    own, rng = imu(imu_latency_s=(latency_s, latency_s)), np.random.default_rng(0)
-    own.reset(np.arange(3), *ramp(0.0), rng)
-    for k in range(1, 9):
-        own.advance(slice(0, 3), *ramp(k * SPAN))
-        rate, gravity = own.read(slice(None), *ramp(k * SPAN))
-        np.testing.assert_allclose(rate, max(k * SPAN - latency_s, 0.0), atol=1e-12)
-        np.testing.assert_allclose(gravity, ramp(0.0)[1])
+def test_a_late_imu_reports_what_was_so_much_earlier():
+    for latency_s in (0.0, 0.005, 0.02, 0.033):
+        own, rng = imu(imu_latency_s=(latency_s, latency_s)), np.random.default_rng(0)
+        own.reset(np.arange(3), *ramp(0.0), rng)
+        for k in range(1, 9):
+            own.advance(slice(0, 3), *ramp(k * SPAN))
+            rate, gravity = own.read(slice(None), *ramp(k * SPAN))
+            np.testing.assert_allclose(rate, max(k * SPAN - latency_s, 0.0), atol=1e-12)
+            np.testing.assert_allclose(gravity, ramp(0.0)[1])
 
 
 def test_samples_of_a_slow_imu_are_a_period_apart():
@@ -159,7 +159,7 @@ def test_the_centre_of_mass_moves_in_the_physics():
 
 def test_some_robots_have_no_effort_readings():
     env = make(count=200, without_effort=0.4)
-    effort = stand(env, 20)[:, PARTS["joint_effort"]]
+    effort = stand(env, 5)[:, PARTS["joint_effort"]]
     none = (effort == 0).all(axis=1)
     assert 0.23 < none.mean() < 0.57
     np.testing.assert_array_equal(none, env.robots.bodies.effort == 0)
@@ -252,9 +252,9 @@ def test_evaluated_robots_are_as_their_model():
     assert replace(Walking(), differences=TYPICAL).evaluated().differences == Differences()
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"missed_ticks": 1.5}, {"battery": (1.2, 0.8)}, {"joint_zero_rad": -0.1}]
-)
-def test_ranges_that_cannot_be_drawn_from_are_refused(wrong):
-    with pytest.raises(InputError, match="differences"):
-        Differences(**wrong)
+def test_ranges_that_cannot_be_drawn_from_are_refused():
+    wrong = ({"missed_ticks": 1.5}, {"battery": (1.2, 0.8)}, {"joint_zero_rad": -0.1})
+    assert_each_refused(
+        [(settings, "differences") for settings in wrong],
+        lambda settings: Differences(**settings),
+    )

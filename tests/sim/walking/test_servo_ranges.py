@@ -24,21 +24,17 @@ TORQUES = ("stiffness", "damping", "friction_loss", "armature", "effort_limit")
 
 def ranges_of(tmp_path, found: Calibration | None = None, **options) -> ServoRanges:
     path = tmp_path / "calibrated.yaml"
-    (found or calibration()).save(path)
+    (found or calibration()).save(path, force=True)
     return servo_ranges(path, **options)
 
 
-def test_an_interval_of_the_calibration_is_the_range(tmp_path):
+def test_an_interval_of_the_calibration_is_the_range_and_a_number_without_one_is_itself(tmp_path):
     ranges = ranges_of(tmp_path)
     # calibration_examples: delay 0.025 ± 10 %, identified
     assert ranges.low["dead_time_s"][0] == pytest.approx(0.0225)
     assert ranges.value["dead_time_s"][0] == 0.025
     assert ranges.high["dead_time_s"][0] == pytest.approx(0.0275)
     assert ranges.longest_dead_time_s == pytest.approx(0.0275)
-
-
-def test_a_number_without_an_interval_is_itself(tmp_path):
-    ranges = ranges_of(tmp_path)
     for field, value in (("stiffness", 11.0), ("effort_limit", 0.35), ("velocity_limit", 7.6)):
         for end in (ranges.low, ranges.value, ranges.high):
             np.testing.assert_array_equal(end[field], value)
@@ -53,22 +49,21 @@ def test_the_measured_sample_gives_its_own_intervals():
     np.testing.assert_array_equal(ranges.low["armature"], ranges.high["armature"])
 
 
-@pytest.mark.parametrize(
-    ("preset", "steps", "stiffness", "effort"),
+def test_presets_delays_are_their_whole_physics_steps():
     # facts/paper.md 2: 76 ms as 33 to 43 steps of 2 ms; released: 26 to 31 steps
-    [("paper", (33, 43), 70.0, 5.0), ("release", (26, 31), 80.0, 0.7)],
-)
-def test_presets_delays_are_their_whole_physics_steps(preset, steps, stiffness, effort):
-    ranges = servo_ranges(preset)
-    np.testing.assert_allclose(ranges.low["dead_time_s"], steps[0] * 0.002)
-    np.testing.assert_allclose(ranges.high["dead_time_s"], steps[1] * 0.002)
-    np.testing.assert_array_equal(ranges.value["stiffness"], stiffness)
-    np.testing.assert_array_equal(ranges.high["effort_limit"], effort)
-    assert ranges.fallbacks == {}
-    assert set(ranges.feedback) == {HeldFeedback()}
+    for preset, steps, stiffness, effort in (
+        ("paper", (33, 43), 70.0, 5.0), ("release", (26, 31), 80.0, 0.7),
+    ):  # fmt: skip
+        ranges = servo_ranges(preset)
+        np.testing.assert_allclose(ranges.low["dead_time_s"], steps[0] * 0.002)
+        np.testing.assert_allclose(ranges.high["dead_time_s"], steps[1] * 0.002)
+        np.testing.assert_array_equal(ranges.value["stiffness"], stiffness)
+        np.testing.assert_array_equal(ranges.high["effort_limit"], effort)
+        assert ranges.fallbacks == {}
+        assert set(ranges.feedback) == {HeldFeedback()}
 
 
-def test_joints_without_a_calibration_fall_back_on_their_own_kind(tmp_path):
+def test_joints_without_a_calibration_fall_back_on_their_kind_then_their_leg_then_any(tmp_path):
     joints = {
         "LF_hip": joint_calibration(5.0),
         "RB_thigh": joint_calibration(6.0),
@@ -82,18 +77,11 @@ def test_joints_without_a_calibration_fall_back_on_their_own_kind(tmp_path):
     assert ranges.fallbacks == {
         name: nearest[name.split("_")[1]] for name in JOINT_NAMES if name not in joints
     }
-
-
-def test_a_joint_whose_kind_was_not_calibrated_falls_back_on_its_own_leg(tmp_path):
-    joints = {"LF_hip": joint_calibration(5.0), "RB_thigh": joint_calibration(6.0)}
-    ranges = ranges_of(tmp_path, calibration(**joints))
-    assert ranges.fallbacks["LF_calf"] == "LF_hip"
-    assert ranges.fallbacks["RB_calf"] == "RB_thigh"
-
-
-def test_one_servo_on_a_bench_lends_to_all_joints(tmp_path):
-    ranges = ranges_of(tmp_path, calibration(bench=joint_calibration(5.0)))
-    assert ranges.fallbacks == dict.fromkeys(JOINT_NAMES, "bench")
+    del joints["LF_calf"]
+    fallbacks = ranges_of(tmp_path, calibration(**joints)).fallbacks
+    assert (fallbacks["LF_calf"], fallbacks["RB_calf"]) == ("LF_hip", "RB_thigh")
+    bench = ranges_of(tmp_path, calibration(bench=joint_calibration(5.0)))
+    assert bench.fallbacks == dict.fromkeys(JOINT_NAMES, "bench")
 
 
 def test_feedback_comes_with_the_calibration_and_can_be_exchanged(tmp_path):
@@ -115,17 +103,19 @@ def test_ideal_servos_are_immediate_and_free_of_friction_with_exact_feedback():
     assert set(ranges.feedback) == {HeldFeedback()}
 
 
-@pytest.mark.parametrize("actuator", ["paper", "ideal"])
-def test_later_moves_every_delay_and_nothing_else(actuator):
-    before = servo_ranges(actuator)
-    after = before.later(0.04)
-    for name in ("low", "value", "high"):
-        old, new = getattr(before, name), getattr(after, name)
-        np.testing.assert_allclose(new["dead_time_s"], old["dead_time_s"] + 0.04)
-        for field in old.keys() - {"dead_time_s"}:
-            np.testing.assert_array_equal(new[field], old[field])
-    assert after.longest_dead_time_s == pytest.approx(before.longest_dead_time_s + 0.04)
-    assert servo_ranges(actuator).longest_dead_time_s == before.longest_dead_time_s
+def test_later_moves_every_delay_and_nothing_else_and_none_becomes_negative():
+    for actuator in ("paper", "ideal"):
+        before = servo_ranges(actuator)
+        after = before.later(0.04)
+        for name in ("low", "value", "high"):
+            old, new = getattr(before, name), getattr(after, name)
+            np.testing.assert_allclose(new["dead_time_s"], old["dead_time_s"] + 0.04)
+            for field in old.keys() - {"dead_time_s"}:
+                np.testing.assert_array_equal(new[field], old[field])
+        assert after.longest_dead_time_s == pytest.approx(before.longest_dead_time_s + 0.04)
+        assert servo_ranges(actuator).longest_dead_time_s == before.longest_dead_time_s
+    ranges = servo_ranges("paper").later(-1.0)
+    assert not ranges.low["dead_time_s"].any() and not ranges.high["dead_time_s"].any()
 
 
 def test_drawn_numbers_fill_their_intervals_and_never_leave_them():
@@ -149,11 +139,7 @@ def test_the_torque_scale_is_one_factor_per_robot_on_all_torques_and_the_armatur
         np.testing.assert_allclose(drawn[field], factor * ranges.value[field], err_msg=field)
     np.testing.assert_array_equal(drawn["velocity_limit"], 10.5)
     assert drawn["dead_time_s"].max() <= 0.086
-
-
-def test_drawing_leaves_the_ranges_as_they_were():
-    ranges = servo_ranges("paper")
-    ranges.draw(3, (2.0, 2.0), np.random.default_rng(0))
+    # drawing leaves the ranges as they were
     np.testing.assert_array_equal(ranges.value["stiffness"], 70.0)
     np.testing.assert_array_equal(ranges.high["armature"], 0.005)
 
@@ -167,30 +153,18 @@ def test_the_nominal_servo_of_a_joint_is_the_middle_of_its_intervals(tmp_path):
         assert nominal[name].dead_time_s == 0.025
 
 
-@pytest.mark.parametrize("actuator", ["paper", "release", "ideal", "data/samples/calibrated.yaml"])
-def test_what_can_be_given_is_accepted(actuator):
-    check_actuator(actuator)
+def test_presets_and_calibrations_are_accepted_and_are_no_learned_servo_models():
+    for actuator in ("paper", "release", "ideal", "data/samples/calibrated.yaml"):
+        check_actuator(actuator)
+        assert servo_model_of(actuator, 0.02) is None
 
 
-def test_an_unknown_file_is_answered_with_what_can_be_given():
+def test_an_unknown_file_or_folder_is_refused_with_what_can_be_used(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.yaml.*no such file.*paper, release, ideal"):
         check_actuator("nowhere.yaml")
     with pytest.raises(InputError, match="does not exist"):
         servo_ranges("nowhere.yaml")
     with pytest.raises(InputError, match="does not exist"):
         servo_ranges("paper", feedback="nowhere.yaml")
-
-
-def test_a_calibration_is_not_a_learned_servo_model():
-    assert servo_model_of("paper", 0.02) is None
-    assert servo_model_of("data/samples/calibrated.yaml", 0.02) is None
-
-
-def test_a_folder_without_a_model_is_refused(tmp_path):
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match=tmp_path.name):
         servo_model_of(tmp_path, 0.02)
-
-
-def test_no_delay_becomes_negative():
-    ranges = servo_ranges("paper").later(-1.0)
-    assert not ranges.low["dead_time_s"].any() and not ranges.high["dead_time_s"].any()

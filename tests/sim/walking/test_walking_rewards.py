@@ -16,23 +16,12 @@ from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards, narrowed
 from pupper_sysid.sim.walking.step import Step
 
-SIZES = {
-    "command": 3,
-    "linear_velocity": 3,
-    "angular_velocity": 3,
-    "gravity": 3,
-    "stride_velocity": 3,
-    "clock": 3,
-    "contact": 4,
-    "air_s": 4,
-    "contact_s": 4,
-    "last_air_s": 4,
-    "last_contact_s": 4,
-    "landed": 4,
-    "lifted": 4,
-    "foot_height_m": 4,
-    "foot_speed_m_s": 4,
-}
+SIZES = dict.fromkeys(
+    ["command", "linear_velocity", "angular_velocity", "gravity", "stride_velocity", "clock"], 3
+) | dict.fromkeys(
+    ["contact", "air_s", "contact_s", "last_air_s", "last_contact_s", "landed", "lifted",
+     "foot_height_m", "foot_speed_m_s"], 4
+)  # fmt: skip
 P = Rewards()
 E1 = np.exp(-1.0)
 
@@ -72,14 +61,14 @@ def test_progress_is_how_much_nearer_to_the_command_than_standing():
     assert wr.turn_progress(step(stride_velocity=(0, 0, 1.0)), P)[0] == 0.0
 
 
-@pytest.mark.parametrize("too_fast", [1.5, 2.0])
-def test_going_too_fast_pays_no_more_than_going_too_slow(too_fast: float):
-    fast = step(command=(0.2, 0, 0.4), stride_velocity=(0.2 * too_fast, 0, 0.4 * too_fast))
-    slow = step(
-        command=(0.2, 0, 0.4), stride_velocity=(0.2 * (2 - too_fast), 0, 0.4 * (2 - too_fast))
-    )
-    for term in (wr.progress, wr.turn_progress):
-        assert term(fast, P)[0] == pytest.approx(term(slow, P)[0])
+def test_going_too_fast_pays_no_more_than_going_too_slow():
+    for too_fast in (1.5, 2.0):
+        fast = step(command=(0.2, 0, 0.4), stride_velocity=(0.2 * too_fast, 0, 0.4 * too_fast))
+        slow = step(
+            command=(0.2, 0, 0.4), stride_velocity=(0.2 * (2 - too_fast), 0, 0.4 * (2 - too_fast))
+        )
+        for term in (wr.progress, wr.turn_progress):
+            assert term(fast, P)[0] == pytest.approx(term(slow, P)[0])
 
 
 def on_paths(command, turns: float, **moved):
@@ -109,20 +98,21 @@ def test_feet_are_paid_to_rise_in_their_half_of_the_clock():
     assert wr.foot_paths(on_paths(FORWARD, 0.25, LF=(0.0, 0.0, 1.0)), p)[0] == -2.0
 
 
-@pytest.mark.parametrize(
-    ("command", "stroke"),
-    [((0.2, 0, 0), (1, 0, 0)), ((-0.2, 0, 0), (-1, 0, 0)), ((0, 0.2, 0), (0, 1, 0))],
-)
-def test_feet_are_paid_to_touch_down_ahead_by_half_of_what_they_pass(command, stroke):
-    # with the feet down for half of the time, the first pair touches down at half a turn
-    p = replace(P, clock_duty=0.5, clock_hz=4.0)
-    ahead = 0.2 * 0.5 / (2 * 4.0) * np.array(stroke)
-    moved = {LF: ahead, RB: ahead, RF: -ahead, LB: -ahead}
-    assert wr.foot_paths(on_paths(command, 0.5, **moved), p)[0] == pytest.approx(1.0)
-    assert wr.foot_paths(on_paths(command, 0.0, **moved), p)[0] < -1.0
-    # where all are, and how far to their sides, is free
-    wide = {leg: at + np.array([0.01, 0.005 * SIDE[leg], -0.01]) for leg, at in moved.items()}
-    assert wr.foot_paths(on_paths(command, 0.5, **wide), p)[0] == pytest.approx(1.0)
+def test_feet_are_paid_to_touch_down_ahead_by_half_of_what_they_pass():
+    for command, stroke in (
+        ((0.2, 0, 0), (1, 0, 0)),
+        ((-0.2, 0, 0), (-1, 0, 0)),
+        ((0, 0.2, 0), (0, 1, 0)),
+    ):
+        # with the feet down for half of the time, the first pair touches down at half a turn
+        p = replace(P, clock_duty=0.5, clock_hz=4.0)
+        ahead = 0.2 * 0.5 / (2 * 4.0) * np.array(stroke)
+        moved = {LF: ahead, RB: ahead, RF: -ahead, LB: -ahead}
+        assert wr.foot_paths(on_paths(command, 0.5, **moved), p)[0] == pytest.approx(1.0)
+        assert wr.foot_paths(on_paths(command, 0.0, **moved), p)[0] < -1.0
+        # where all are, and how far to their sides, is free
+        wide = {leg: at + np.array([0.01, 0.005 * SIDE[leg], -0.01]) for leg, at in moved.items()}
+        assert wr.foot_paths(on_paths(command, 0.5, **wide), p)[0] == pytest.approx(1.0)
 
 
 def test_in_a_turn_feet_are_paid_to_go_around():
@@ -148,11 +138,6 @@ def test_a_stance_costs_as_far_as_it_is_from_a_crouch_and_a_spread():
     asked[RB] -= [0.0, 0.0, 0.004]
     assert wr.stance(on_paths(FORWARD, 0.25, **asked), p)[0] == pytest.approx(0.0, abs=1e-9)
     assert wr.stance(on_paths((0, 0, 0), 0.25), p)[0] == 0.0
-
-
-def test_a_trunk_that_rises_or_falls_costs_its_speed():
-    assert wr.bounce(step(linear_velocity=(0.3, 0.2, -0.05)), P)[0] == pytest.approx(0.05)
-    assert wr.bounce(step(linear_velocity=(0.3, 0.2, 0.05)), P)[0] == pytest.approx(0.05)
 
 
 def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
@@ -187,16 +172,14 @@ def test_a_curriculum_fades_guides_and_progress_and_widens_what_tracks():
     assert wide.angular_sigma == 3 * p.angular_sigma and wide.progress == p.progress
 
 
-def test_speed_is_tracked_by_the_exponential_of_the_horizontal_error():
+def test_speed_is_tracked_by_the_horizontal_error_in_each_of_the_three_shapes():
     # error (0.06, 0.08) → 0.1 = σ; the vertical speed does not count
     s = step(command=FORWARD, linear_velocity=(0.14, -0.08, 5.0))
     assert wr.base_linear_velocity(s, EXPONENTIAL)[0] == pytest.approx(E1)
     far = step(command=FORWARD, linear_velocity=(0.0, 0.0, 0.0))
     assert wr.base_linear_velocity(far, EXPONENTIAL)[0] == pytest.approx(np.exp(-2))
     assert wr.base_linear_velocity(far, GAUSSIAN)[0] == pytest.approx(np.exp(-4))
-
-
-def test_linear_tracking_falls_by_the_error_over_its_width_down_to_minus_one():
+    # linear: falls by the error over its width down to minus one
     p = replace(P, tracking_shape="linear", linear_sigma=0.1)
     for speed, earns in ((0.2, 1.0), (0.15, 0.5), (0.1, 0.0), (0.05, -0.5), (-0.3, -1.0)):
         s = step(command=FORWARD, linear_velocity=(speed, 0, 0))
@@ -211,75 +194,50 @@ def test_fast_commands_earn_more_by_the_bonus_and_slow_ones_do_not_earn_less():
     assert wr.base_linear_velocity(slow, p)[0] == 1.0
 
 
-def test_turn_rate_is_tracked_by_the_error_about_the_vertical():
+def test_turn_rate_is_tracked_about_the_vertical_and_stride_terms_look_at_the_average():
     s = step(command=(0, 0, 0.3), angular_velocity=(9.0, 9.0, 0.5))
     assert wr.base_angular_velocity(s, EXPONENTIAL)[0] == pytest.approx(E1)
     assert wr.base_angular_velocity(s, GAUSSIAN)[0] == pytest.approx(E1)
-
-
-def test_stride_terms_look_at_the_average_and_not_at_the_instant():
     p = replace(EXPONENTIAL, stride_linear_sigma=0.05, stride_angular_sigma=0.2)
-    s = step(
-        command=(0.2, 0, 0.4), stride_velocity=(0.17, 0.04, 0.2), linear_velocity=(9.0, 9.0, 9.0)
-    )
+    moved = {"stride_velocity": (0.17, 0.04, 0.2), "linear_velocity": (9.0, 9.0, 9.0)}
+    s = step(command=(0.2, 0, 0.4), **moved)
     assert wr.stride_linear_velocity(s, p)[0] == pytest.approx(E1)
     assert wr.stride_angular_velocity(s, p)[0] == pytest.approx(E1)
 
 
-def test_being_alive_is_one():
-    assert wr.alive(step(), P)[0] == 1.0
-
-
-def test_air_time_pays_for_swings_and_stances_up_to_the_longest_while_moving():
+def test_air_time_pays_for_steps_while_moving_and_for_feet_on_the_ground_while_standing():
     p = replace(P, air_time_most=0.25)
     s = step(command=FORWARD, air_s=(0.1, 0, 0.3, 0), contact_s=(0, 0.2, 0, 0.25))
     # 0.1 + 0.2; a swing of 0.3 and a stance of 0.25 are too long to count
     assert wr.air_time(s, p)[0] == pytest.approx(0.3)
-
-
-def test_air_time_pays_for_feet_on_the_ground_while_standing():
-    p = replace(P, air_time_most=0.25)
     s = step(air_s=(0.1, 0, 0.9, 0), contact_s=(0, 0.2, 0, 5.0))
     assert wr.air_time(s, p)[0] == pytest.approx(-0.1 + 0.2 - 0.25 + 0.25)
+    assert wr.alive(s, p)[0] == 1.0
 
 
-def test_a_perfect_trot_earns_the_whole_gait_reward():
+def test_gait_pays_for_a_trot_and_falls_by_the_differences_of_the_feets_times():
+    trot = {"air_s": (0.1, 0, 0, 0.1), "contact_s": (0, 0.1, 0.1, 0)}
     # LF and RB in the air for as long as RF and LB have been on the ground
-    s = step(command=FORWARD, air_s=(0.1, 0, 0, 0.1), contact_s=(0, 0.1, 0.1, 0))
-    assert wr.gait(s, P)[0] == pytest.approx(1.0)
-
-
-def test_a_bound_earns_little_of_the_gait_reward():
+    assert wr.gait(step(command=FORWARD, **trot), P)[0] == pytest.approx(1.0)
     p = replace(P, gait_sigma=0.08, gait_most=0.15)
     s = step(command=FORWARD, air_s=(0.1, 0.1, 0, 0), contact_s=(0, 0, 0.1, 0.1))
-    # two pairs that should be together: (0.1² + 0.1²) each; of the four that should alternate,
-    # the two sides do, the two ends (LF-RF, RB-LB) differ by 0.1² + 0.1² each
+    # a bound: two pairs that should be together: (0.1² + 0.1²) each; of the four that should
+    # alternate, the two sides do, the two ends (LF-RF, RB-LB) differ by 0.1² + 0.1² each
     assert wr.gait(s, p)[0] == pytest.approx(np.exp(-4 * 0.02 / 0.08))
-
-
-def test_differences_of_times_beyond_the_longest_do_not_count_more():
-    p = replace(P, gait_sigma=0.08, gait_most=0.15)
+    # times beyond the longest do not count more: LF against RB, RF and LB: 0.15² in each pair
     s = step(command=FORWARD, air_s=(9.0, 0, 0, 0))
-    # LF against RB, RF and LB: 0.15² once in each of three pairs
     assert wr.gait(s, p)[0] == pytest.approx(np.exp(-3 * 0.15**2 / 0.08))
-
-
-def test_a_robot_that_stands_as_told_earns_no_gait_reward():
-    trot = {"air_s": (0.1, 0, 0, 0.1), "contact_s": (0, 0.1, 0.1, 0)}
+    # a robot that stands as commanded earns nothing, one that moves without a command does
     assert wr.gait(step(**trot), P)[0] == 0.0
-    # but one that moves faster than the threshold without a command does
     moving = step(**trot, linear_velocity=(0.0, 0.16, 0.0))
     assert wr.gait(moving, replace(P, gait_threshold=0.1))[0] == pytest.approx(1.0)
 
 
-def test_foot_clearance_counts_the_error_of_moving_feet():
+def test_foot_clearance_counts_the_error_of_moving_feet_and_swing_height_what_is_missing():
     p = replace(P, clearance_height=0.03, clearance_sigma=0.05, clearance_speed=2.0)
     s = step(foot_height_m=(0.03, 0.0, 0.0, 0.13), foot_speed_m_s=(9.0, 0.0, 0.5, 1e6))
     error = 0.03**2 * np.tanh(1.0) + 0.1**2
     assert wr.foot_clearance(s, p)[0] == pytest.approx(np.exp(-error / 0.05))
-
-
-def test_swing_height_counts_only_what_is_missing():
     p = replace(P, clearance_height=0.015)
     s = step(foot_height_m=(0.005, 0.015, 0.1, 0.0), foot_speed_m_s=(0.5, 1.0, 1.0, 2.0))
     assert wr.swing_height(s, p)[0] == pytest.approx(0.01**2 * 0.5 + 0.015**2 * 2.0)
@@ -303,15 +261,15 @@ def test_air_time_variance_is_over_feet_of_times_up_to_half_a_second():
     assert wr.air_time_variance(s, P)[0] == pytest.approx(4 * 0.1**2 / 3)
 
 
-def test_base_motion_is_bouncing_and_rocking():
+def test_base_motion_is_bouncing_and_rocking_and_orientation_the_sine_of_the_tilt():
     s = step(linear_velocity=(9.0, 9.0, 0.5), angular_velocity=(1.0, -2.0, 9.0))
     assert wr.base_motion(s, P)[0] == pytest.approx(0.8 * 0.25 + 0.2 * 3.0)
-
-
-def test_base_orientation_is_the_sine_of_the_tilt():
     tilt = np.radians(30)
     s = step(gravity=(np.sin(tilt), 0.0, -np.cos(tilt)))
     assert wr.base_orientation(s, P)[0] == pytest.approx(0.5)
+    # a trunk that rises or falls costs its speed
+    for rise in (-0.05, 0.05):
+        assert wr.bounce(step(linear_velocity=(0.3, 0.2, rise)), P)[0] == pytest.approx(0.05)
 
 
 def test_only_feet_on_the_ground_slip():
@@ -319,28 +277,22 @@ def test_only_feet_on_the_ground_slip():
     assert wr.foot_slip(s, P)[0] == pytest.approx(0.5)
 
 
-def test_the_distance_from_the_default_pose_counts_more_while_standing():
+def test_the_distance_from_the_default_pose_counts_more_while_standing_or_of_the_hips_only():
     p, pose = replace(P, standing_factor=10.0), joints(j1=0.3, j2=-0.4)
     assert wr.joint_position(step(position_relative=pose), p)[0] == pytest.approx(5.0)
-    told = step(position_relative=pose, command=FORWARD)
-    assert wr.joint_position(told, p)[0] == pytest.approx(0.5)
-
-
-def test_hip_abduction_looks_at_the_hips_only():
+    moving = step(position_relative=pose, command=FORWARD)
+    assert wr.joint_position(moving, p)[0] == pytest.approx(0.5)
     s = step(position_relative=joints(j0=0.3, j9=0.4, j1=9.0, j11=9.0))
     assert wr.hip_abduction(s, P)[0] == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(
-    ("term", "field"),
-    [
-        ("joint_torques", "torque"),
-        ("joint_acceleration", "acceleration"),
+def test_effort_terms_are_norms_over_all_joints():
+    for term, field in (
+        ("joint_torques", "torque"), ("joint_acceleration", "acceleration"),
         ("joint_velocity", "velocity"),
-    ],
-)
-def test_effort_terms_are_norms_over_all_joints(term, field):
-    assert TERMS[term](step(**{field: joints(j2=6.0, j7=-8.0)}), P)[0] == pytest.approx(10.0)
+    ):  # fmt: skip
+        s = step(**{field: joints(j2=6.0, j7=-8.0)})
+        assert TERMS[term](s, P)[0] == pytest.approx(10.0), term
 
 
 def test_every_robot_is_judged_by_its_own_numbers():
@@ -365,22 +317,16 @@ def only(**given: Any) -> Rewards:
     return Rewards(**(none | given))
 
 
-def test_a_weight_of_zero_leaves_the_term_out():
+def test_a_term_counts_with_its_weight_penalties_with_their_factor_and_none_without():
+    assert set(TERMS) <= {field.name for field in fields(DEFAULT)}
     assert weighted(step(), only()) == {}
     assert list(weighted(step(), only(alive=0.5))) == ["alive"]
     assert set(weighted(step(), RELEASE)) == {k for k, v in weights(RELEASE).items() if v}
-
-
-def test_a_term_counts_with_its_weight_and_penalties_with_their_factor():
     s = step(action=joints(j0=2.0))
     found = weighted(s, only(alive=0.5, action_rate=-0.1), penalties=0.25)
     assert found["alive"][0] == 0.5
     assert found["action_rate"][0] == pytest.approx(-0.1 * 0.25 * 4.0)
     assert weighted(s, only(action_rate=-0.1))["action_rate"][0] == pytest.approx(-0.4)
-
-
-def test_every_term_has_a_weight():
-    assert set(TERMS) <= {field.name for field in fields(DEFAULT)}
 
 
 def weights(rewards: Rewards) -> dict[str, float]:
@@ -389,54 +335,26 @@ def weights(rewards: Rewards) -> dict[str, float]:
 
 # facts/paper.md section 3: weights of the released training configuration
 PUBLISHED = {
-    "base_linear_velocity": 15.0,
-    "base_angular_velocity": 10.0,
-    "air_time": 5.0,
-    "foot_clearance": 1.0,
-    "gait": 10.0,
-    "action_smoothness": -2.0,
-    "air_time_variance": -1.0,
-    "base_motion": -2.0,
-    "base_orientation": -5.0,
-    "foot_slip": -0.5,
-    "joint_position": -3.0,
-    "hip_abduction": -2.5,
-    "joint_torques": -5e-4,
-    "joint_acceleration": -2.5e-4,
+    "base_linear_velocity": 15.0, "base_angular_velocity": 10.0, "air_time": 5.0,
+    "foot_clearance": 1.0, "gait": 10.0, "action_smoothness": -2.0, "air_time_variance": -1.0,
+    "base_motion": -2.0, "base_orientation": -5.0, "foot_slip": -0.5, "joint_position": -3.0,
+    "hip_abduction": -2.5, "joint_torques": -5e-4, "joint_acceleration": -2.5e-4,
     "joint_velocity": -1e-2,
-}
+}  # fmt: skip
 PARAMETERS = {
-    "tracking_shape": "exponential",
-    "linear_sigma": 0.1,
-    "angular_sigma": 0.2,
-    "fast_bonus": 0.5,
-    "fast_above": 0.15,
-    "air_time_most": 0.25,
-    "clearance_height": 0.03,
-    "clearance_sigma": 0.05,
-    "clearance_speed": 2.0,
-    "gait_sigma": 0.08,
-    "gait_most": 0.15,
-    "standing_factor": 10.0,
-    "moving_threshold": 0.15,
-    "gait_threshold": 0.1,
-}
+    "tracking_shape": "exponential", "linear_sigma": 0.1, "angular_sigma": 0.2, "fast_bonus": 0.5,
+    "fast_above": 0.15, "air_time_most": 0.25, "clearance_height": 0.03, "clearance_sigma": 0.05,
+    "clearance_speed": 2.0, "gait_sigma": 0.08, "gait_most": 0.15, "standing_factor": 10.0,
+    "moving_threshold": 0.15, "gait_threshold": 0.1,
+}  # fmt: skip
 # the paper's text: smoothness -1.0, joint position -0.7 (orientation and slip as released)
 PAPERS_OWN = {"action_smoothness": -1.0, "joint_position": -0.7}
 
 
-def test_the_released_weights_are_the_published_ones_and_no_others():
-    assert {k: v for k, v in weights(RELEASE).items() if v} == PUBLISHED
-    assert {k: getattr(RELEASE, k) for k in PARAMETERS} == PARAMETERS
-
-
-def test_the_papers_weights_are_its_own_where_it_gives_any_and_else_the_released_ones():
-    found = {k: v for k, v in weights(PAPER).items() if v}
-    assert found == {**PUBLISHED, **PAPERS_OWN}
-    assert {k: getattr(PAPER, k) for k in PARAMETERS} == PARAMETERS
-
-
-def test_the_presets_use_these_weights():
+def test_presets_have_the_released_weights_but_those_of_the_paper_where_it_states_any():
+    for rewards, published in ((RELEASE, PUBLISHED), (PAPER, PUBLISHED | PAPERS_OWN)):
+        assert {k: v for k, v in weights(rewards).items() if v} == published
+        assert {k: getattr(rewards, k) for k in PARAMETERS} == PARAMETERS
     assert PRESETS["paper"].rewards == PAPER
     assert PRESETS["release"].rewards == RELEASE
     assert PRESETS["fast"].rewards == DEFAULT

@@ -165,17 +165,12 @@ def test_a_limp_servo_ignores_goals_and_holds_where_it_is_when_switched_on_again
     assert robot.angle(HIP, 3.0) > 0.25
 
 
-def test_a_delay_too_short_for_the_emulator_is_refused():
-    servos = draw_robot(np.random.default_rng(0))
-    short = replace(servos.servos[4].actuator, dead_time_s=0.0015)
-    wrong = replace(
-        servos,
-        servos=tuple(
-            replace(s, actuator=short) if i == 4 else s for i, s in enumerate(servos.servos)
-        ),
-    )
+def test_a_delay_too_short_for_the_emulator_is_refused_with_the_joint():
+    drawn = draw_robot(np.random.default_rng(0))
+    servos = list(drawn.servos)
+    servos[4] = replace(servos[4], actuator=replace(servos[4].actuator, dead_time_s=0.0015))
     with pytest.raises(InputError, match="RF_thigh: dead_time_s"):
-        WalkingRobot(wrong, np.random.default_rng(0))
+        WalkingRobot(replace(drawn, servos=tuple(servos)), np.random.default_rng(0))
 
 
 # ---- the IMU ----
@@ -276,7 +271,7 @@ def test_the_same_seed_walks_the_same_way():
 # ---- walking ----
 
 
-def test_the_guard_lets_a_trotting_robot_walk_for_twenty_seconds():
+def test_the_guard_lets_a_trotting_robot_walk():
     bus = make_bus()
     guard = GuardedBus(bus)
     force, upright = [], []
@@ -287,10 +282,10 @@ def test_the_guard_lets_a_trotting_robot_walk_for_twenty_seconds():
         # over all of a tick: commands come in steps, and each part of a tick has its own jerk
         force.extend(bus.robot.imu(bus.now() + s) for s in np.arange(0.002, 0.018, 1 / 235))
 
-    walk(guard, 20.0, look=look)
+    walk(guard, 8.0, look=look)
     trunk = bus.robot.trunk(bus.now())
     # 0.15 m/s with some slip
-    assert trunk.position_m[0] > 0.85 * 0.15 * 20.0
+    assert trunk.position_m[0] > 0.85 * 0.15 * 8.0
     assert min(upright) > 0.98
     mean = np.mean([s.acceleration_m_s2 for s in force if s], axis=0)
     # without flight or fall the mean specific force is g
@@ -317,11 +312,11 @@ def test_it_walks_behind_the_robots_proxy_in_real_time(path):
         guard = GuardedBus(bus)
         # the proxy knows of no position until it has polled
         assert wait_until(lambda: bool(np.isfinite(guard.read().position_rad).all()))
-        walk(guard, 5.0, look=lambda: samples.append(bus.imu()))
+        walk(guard, 3.0, look=lambda: samples.append(bus.imu()))
         trunk = robot.trunk(server.now())
         guard.park()
         bus.close()
-    assert trunk.upright > 0.98 and trunk.position_m[0] > 0.4
+    assert trunk.upright > 0.98 and trunk.position_m[0] > 0.25
     read = [s for s in samples if s]
     assert len(read) > 0.9 * len(samples)
     assert max(abs(s.rate_rad_s).max() for s in read) > 0.3

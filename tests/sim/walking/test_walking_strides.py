@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.weights import Rewards
@@ -30,10 +29,10 @@ def steps_of(rates: np.ndarray, seconds: float, start: float = 0.0) -> tuple[Str
     return strides, np.array(seen[-100:])
 
 
-@pytest.mark.parametrize("start", [0.0, 0.2, 0.4, 0.7])
-def test_the_clock_falls_into_step_with_a_trot_of_its_rate(start: float):
-    _, in_time = steps_of(np.array([3.6, 3.4, 3.8]), 8.0, start)
-    assert (in_time.mean(axis=0) > [0.95, 0.7, 0.7]).all()
+def test_the_clock_falls_into_step_with_a_trot_of_its_rate():
+    for start in (0.0, 0.2, 0.4, 0.7):
+        _, in_time = steps_of(np.array([3.6, 3.4, 3.8]), 8.0, start)
+        assert (in_time.mean(axis=0) > [0.95, 0.7, 0.7]).all()
 
 
 def test_feet_of_other_rates_are_not_in_time():
