@@ -36,12 +36,9 @@ def fit(walk) -> ServoFit:
     return fit_servo(walk, arch="fir", split=Split.by_trials([0, 1], [2]), readings="all")
 
 
-def test_one_recording_is_a_sequence_of_one(walk, fit):
+def test_a_fit_is_plain_data_and_its_table_has_the_same_numbers(walk, fit):
     again = fit_servo([walk], [JOINT], "fir", split=Split.by_trials([0, 1], [2]), readings="all")
-    assert again.to_dict() == fit.to_dict()
-
-
-def test_a_fit_is_plain_data_and_its_table_has_the_same_numbers(fit):
+    assert again.to_dict() == fit.to_dict(), "one recording is a sequence of one"
     data = json.loads(json.dumps(fit.to_dict()))
     assert data["split"] == "trained on loops 0,1, tested on 2" and data["arch"] == "fir"
     assert data["rmse_free_run_rad"]["value"] == data["mean"]["rmse_free_run_rad"]

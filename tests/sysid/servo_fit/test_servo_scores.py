@@ -51,11 +51,6 @@ def made(**arrays) -> Errors:
 # ------------------------------------------------------------------------------- by hand
 
 
-def test_rms_by_hand():
-    assert rms([3.0, -4.0, 0.0, 0.0]) == pytest.approx(2.5)
-    assert np.isnan(rms([]))
-
-
 def test_persistence_is_the_rms_of_the_moves_and_none_reaches_over_a_pause():
     first = trial(0, 0.0, ramp(4), [0.0, 0.3, 0.3, -0.1])
     second = trial(1, 9.0, ramp(3), [5.0, 5.2, 5.2])
@@ -73,16 +68,12 @@ def test_repeatability_is_the_difference_of_equal_trials_over_root_two():
     assert repeatability(data, everything)[JOINT] == pytest.approx(0.06 / np.sqrt(2))
     alone = repeatability(data, lambda number, elapsed, group: number == 2)
     assert np.isnan(alone[JOINT])
-
-
-def test_repeatability_of_a_noisy_robot_is_its_noise():
+    # loops without a pause: 1500 independent differences, 0.01 to within 2 % (1 sd)
     rng = np.random.default_rng(0)
     loops = [
         trial(n, n * 300 * P, sine(300), sine(300) + 0.01 * rng.normal(size=300)) for n in range(6)
     ]
     data = servo_data([recording(*loops)], [JOINT], "all")
-    assert len(data.runs[JOINT]) == 1
-    # 1500 independent differences: 0.01 to within 2 % (1 sd)
     assert repeatability(data, everything)[JOINT] == pytest.approx(0.01, rel=0.06)
 
 
@@ -177,7 +168,7 @@ def test_joints_recorded_together_share_stretches_and_others_do_not():
 # ------------------------------------------------------------------------------- from theory
 
 
-def test_the_interval_covers_the_true_rms_as_often_as_it_says():
+def test_the_interval_covers_the_true_rms_as_often_as_it_says_and_is_as_wide_as_theory_says():
     sd, covered = 0.01, 0
     for seed in range(200):
         noise = sd * np.random.default_rng([7, seed]).normal(size=600)
@@ -187,13 +178,14 @@ def test_the_interval_covers_the_true_rms_as_often_as_it_says():
     # 90 % less a little for 60 stretches, give or take 3 sd of 200 draws
     assert LEVEL == 0.90
     assert 0.82 <= covered / 200 <= 0.96
-
-
-def test_the_interval_is_as_wide_as_theory_says():
-    noise = 0.01 * np.random.default_rng(3).normal(size=6000)
-    found = interval({JOINT: made(free_run=noise)}, 0)
     # an RMS of n Gaussian errors has a standard deviation of sd / sqrt(2 n)
-    assert found.high - found.low == pytest.approx(2 * 1.645 * 0.01 / np.sqrt(12000), rel=0.15)
+    noise = made(free_run=sd * np.random.default_rng(3).normal(size=6000))
+    found = interval({JOINT: noise}, 0)
+    assert found.high - found.low == pytest.approx(2 * 1.645 * sd / np.sqrt(12000), rel=0.15)
+    # a joint without test readings changes nothing
+    np.testing.assert_allclose(
+        astuple(interval({JOINT: noise, "RF_hip": made()}, 0)), astuple(found)
+    )
 
 
 def test_errors_that_last_make_the_interval_wider():
@@ -218,35 +210,17 @@ def test_the_difference_of_models_is_known_better_than_either():
     np.testing.assert_allclose(astuple(interval(theirs, 0, theirs)), 0, atol=1e-12)
 
 
-def test_a_joint_without_test_readings_does_not_stop_the_interval():
-    noise = made(free_run=np.random.default_rng(6).normal(size=600))
-    with_empty = interval({JOINT: noise, "RF_hip": made()}, 0)
-    np.testing.assert_allclose(astuple(with_empty), astuple(interval({JOINT: noise}, 0)))
-
-
-def test_the_band_finds_noise_and_timing():
+def test_the_band_finds_noise_and_timing_and_is_not_widened_by_one_outlier():
     rng = np.random.default_rng(7)
     speed = np.abs(3.0 * np.sin(np.linspace(0, 40, 6000)))
-    noise, timing = 0.004, 0.005
-    found = noise * rng.normal(size=6000) + timing * speed * rng.normal(size=6000)
-    assert band(made(free_run=found, speed=speed)) == pytest.approx((noise, timing), rel=0.15)
-
-
-def test_a_band_without_a_timing_error_has_none():
-    rng = np.random.default_rng(8)
-    speed = np.abs(3.0 * np.sin(np.linspace(0, 40, 6000)))
-    noise, timing = band(made(free_run=0.004 * rng.normal(size=6000), speed=speed))
-    assert noise == pytest.approx(0.004, rel=0.05)
-    assert timing < 0.0006  # 3 sd of what 6000 readings can tell
-
-
-def test_one_outlier_does_not_widen_the_band():
-    found = 0.004 * np.random.default_rng(9).normal(size=1000)
-    found[500] = 1.0
-    noise, _ = band(made(free_run=found))
+    noise, timing = 0.004 * rng.normal(size=6000), 0.005 * speed * rng.normal(size=6000)
+    found = band(made(free_run=noise + timing, speed=speed))
+    assert found == pytest.approx((0.004, 0.005), rel=0.15)
+    floor, jitter = band(made(free_run=noise, speed=speed))
+    assert floor == pytest.approx(0.004, rel=0.05)
+    assert jitter < 0.0006  # 3 sd of what 6000 readings can tell
+    outlier = noise[:1000].copy()
+    outlier[500] = 1.0
     # capped at 5 sd it adds 25 to a sum of 1000 squares
-    assert noise == pytest.approx(0.004 * np.sqrt(1.025), rel=0.06)
-
-
-def test_too_few_readings_have_no_band():
+    assert band(made(free_run=outlier))[0] == pytest.approx(0.004 * np.sqrt(1.025), rel=0.06)
     assert np.isnan(band(made(free_run=np.ones(4)))).all()
