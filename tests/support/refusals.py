@@ -23,7 +23,7 @@ def assert_each_refused(
             use(value)
         except InputError as refused:
             text = str(refused)
-            if "\n" in text or text[-1:] not in (".", "?"):
+            if "\n" in text or not text.endswith((".", "?", ".)")):
                 problems.append(f"{shown}: no sentence: {text!r:.300}")
             problems += [
                 f"{shown}: no {part!r} in {text!r:.300}"

@@ -1,20 +1,21 @@
-"""Predicted readings: the age and the offset of a recording's readings, by one rule for all."""
+"""Comparisons: the age and the offset of a recording's readings, by one rule for all models."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.sysid.compare import four_way as four_way_module
 from pupper_sysid.sysid.compare.compare import LINEAR, compare
+from pupper_sysid.sysid.compare.comparison import Comparison
 from pupper_sysid.sysid.compare.readings import (
     ReadingRule,
     ages,
     calibrated_run,
-    reading_rules,
     run_with_offset,
     with_ages,
 )
@@ -22,19 +23,19 @@ from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import servo_data
-from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
+from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split, fit_servo
 from support.package import ROOT
-from support.servo_recordings import JOINT, everything, recording, trial
+from support.servo_recordings import JOINT, recording, trial
 
 POLL_S, LOSS = 0.027, 0.4
 SAMPLES = ROOT / "data/samples"
 
 
-def calibration(offset_rad: float = 0.0) -> Calibration:
+def calibration(poll_s: float = POLL_S) -> Calibration:
     """The sample's, its hip with this poll and with an offset of its recording."""
     made = load_calibration(SAMPLES / "calibrated.yaml")
     own = made.joint(JOINT)
-    numbers = {"poll_period_s": POLL_S, "loss": LOSS, "offset_rad": offset_rad}
+    numbers = {"poll_period_s": poll_s, "loss": LOSS, "offset_rad": -0.78}
     feedback = own.feedback.model_copy(
         update={
             k: getattr(own.feedback, k).model_copy(update={"value": v, "low": None, "high": None})
@@ -45,9 +46,10 @@ def calibration(offset_rad: float = 0.0) -> Calibration:
     return made.model_copy(update={"joints": joints, "inputs": ()})
 
 
-def walk(zero_rad: float = 0.0, seed: int = 0, loop_s: float = 0.04, old=None) -> Recording:
+@cache
+def walk(zero_rad: float = 0.0, seed: int = 0, old: float | None = None) -> Recording:
     """A servo of `calibration` under a gait, polled behind a loop too slow to show the poll."""
-    rng = np.random.default_rng(seed)
+    rng, loop_s = np.random.default_rng(seed), 0.04
     rows = round(12 / loop_s)
     t = loop_s * np.arange(rows)
     command = 0.2 * np.sin(2 * np.pi * 0.9 * t) + 0.1 * np.sin(2 * np.pi * 2.1 * t + 1.0)
@@ -69,23 +71,35 @@ def walk(zero_rad: float = 0.0, seed: int = 0, loop_s: float = 0.04, old=None) -
     return Recording.from_frame(table, metadata={"start_pose_rad": {JOINT: 0.0}})
 
 
-def raw(found, name: str) -> float:
+@cache
+def learned() -> ServoFit:
+    """A filter of the rows of another walk, as they were logged."""
+    return fit_servo(walk(seed=1), arch="fir", readings="all")
+
+
+@cache
+def compared(zero_rad: float = 0.0, poll_s: float = POLL_S) -> Comparison:
+    """The true servo, a preset and a learned model on one walk."""
+    return compare(walk(zero_rad), [calibration(poll_s), "paper", learned()])
+
+
+def raw(found: Comparison, name: str) -> float:
     return found.models[name].joints[JOINT].rmse_raw_rad
 
 
-@pytest.mark.parametrize(("period", "loss"), [(0.027, 0.0), (0.027, 0.42), (0.008, 0.8)])
-def test_ages_are_those_of_a_polled_bus(period, loss):
-    rng = np.random.default_rng(0)
-    polls = period * np.arange(200_000)
-    good = polls[rng.random(len(polls)) >= loss]
-    read = rng.uniform(good[0], good[-1], 100_000)
-    simulated = read - good[np.searchsorted(good, read, side="right") - 1]
-    found = ages(period, loss, 200)
-    assert found.mean() == pytest.approx(HeldFeedback(period, loss).mean_age_s)
-    share = np.linspace(0.05, 0.9, 18)
-    np.testing.assert_allclose(
-        np.quantile(found, share), np.quantile(simulated, share), atol=0.03 * found.mean()
-    )
+def test_ages_are_those_of_a_polled_bus():
+    for period, loss in ((0.027, 0.0), (0.027, 0.42), (0.008, 0.8)):
+        rng = np.random.default_rng(0)
+        polls = period * np.arange(200_000)
+        good = polls[rng.random(len(polls)) >= loss]
+        read = rng.uniform(good[0], good[-1], 100_000)
+        simulated = read - good[np.searchsorted(good, read, side="right") - 1]
+        found = ages(period, loss, 200)
+        assert found.mean() == pytest.approx(HeldFeedback(period, loss).mean_age_s)
+        share = np.linspace(0.05, 0.9, 18)
+        np.testing.assert_allclose(
+            np.quantile(found, share), np.quantile(simulated, share), atol=0.03 * found.mean()
+        )
 
 
 def test_a_tone_read_at_a_random_phase_of_the_poll_is_smaller_and_later_as_theory_says():
@@ -103,28 +117,25 @@ def test_a_tone_read_at_a_random_phase_of_the_poll_is_smaller_and_later_as_theor
 
 
 def test_the_age_of_readings_is_predicted_where_the_recording_does_not_show_its_poll():
-    found = compare(walk(), [calibration()])
+    found, logged = compared(), compared(poll_s=0.0)
     rule = found.readings[JOINT]
     assert (rule.rule, rule.poll_period_s, rule.loss) == ("expected", POLL_S, LOSS)
-    data = servo_data([walk()], [JOINT], "all")
-    track, _ = run_with_offset(calibrated_run(calibration(), data), data)
-    as_position = scores.rms(scores.errors(None, track, data, everything)[JOINT].raw)
+    assert any("does not show its poll" in note for note in found.reading_notes())
     # the servo is the true one: what is left is that the age of each reading is not known
-    assert raw(found, "DelayedPD") < 0.75 * as_position
+    assert raw(found, "DelayedPD") < 0.75 * raw(logged, "DelayedPD")
     spread = found.models["DelayedPD"].age_spread_rad[JOINT]
     # over 12 walks their ratio is 0.99 ± 0.12
     assert raw(found, "DelayedPD") == pytest.approx(spread, rel=0.3)
-    assert any("does not show its poll" in note for note in found.reading_notes())
 
 
 def test_without_a_calibration_of_the_bus_readings_are_compared_as_logged_and_a_note_says_so():
-    found = compare(walk(), ["paper"])
-    assert found.readings[JOINT].rule == "as logged"
-    assert any("name a calibration" in note for note in found.reading_notes())
-    # with one, every model is judged by the same bus
-    both = compare(walk(), ["paper", calibration()])
-    assert both.readings[JOINT].rule == "expected"
-    assert raw(both, "DelayedPD (paper)") != raw(found, "DelayedPD (paper)")
+    found, logged = compared(), compared(poll_s=0.0)
+    assert logged.readings[JOINT].rule == "as logged"
+    assert any("name a calibration" in note for note in logged.reading_notes())
+    # with one, every model is judged by the same bus, but for one of rows as they were logged
+    assert raw(found, "DelayedPD (paper)") != raw(logged, "DelayedPD (paper)")
+    assert raw(found, "FIR") == raw(logged, "FIR")
+    assert found.models["FIR"].age_spread_rad[JOINT] == 0.0
 
 
 def test_live_readings_have_no_age():
@@ -135,32 +146,24 @@ def test_live_readings_have_no_age():
     assert raw(found, "DelayedPD") < 1.5e-3
 
 
+def test_the_poll_of_a_recording_comes_before_that_of_a_calibration(hip):
+    found = compare(load(hip), [calibration()])
+    rule = found.readings[JOINT]
+    assert (rule.rule, rule.source) == ("own dates", "hip")
+    assert rule.mean_age_s == pytest.approx(found.data.lattices[JOINT].mean_age_s)
+
+
 def test_the_zero_of_a_recording_is_no_error_of_any_model():
-    zero_rad = 0.78
-    learned = fit_servo(walk(seed=1), arch="fir", readings="all")
-    models = [calibration(offset_rad=-0.78), "paper", learned]
-    here, there = compare(walk(), models), compare(walk(zero_rad), models)
+    here, there = compared(), compared(0.78)
     for name, model in here.models.items():
         assert raw(there, name) == pytest.approx(raw(here, name), rel=1e-3), name
         if name != LINEAR:
             moved = there.models[name].offset_rad[JOINT] - model.offset_rad[JOINT]
-            assert moved == pytest.approx(zero_rad, abs=1e-6)
+            assert moved == pytest.approx(0.78, abs=1e-6)
     assert here.models["DelayedPD"].offset_rad[JOINT] == pytest.approx(0.0, abs=3e-3)
-
-
-def test_where_the_start_is_unknown_it_is_the_first_reading_less_the_offset():
-    away = walk(0.78)
-    unknown = Recording.from_frame(away.table, metadata={})
-    known = compare(away, [calibration()])
-    found = compare(unknown, [calibration()])
-    assert raw(found, "DelayedPD") == pytest.approx(raw(known, "DelayedPD"), rel=0.02)
-
-
-def test_a_model_of_rows_as_logged_gets_no_age_on_top():
-    learned = fit_servo(walk(seed=1), arch="fir", readings="all")
-    alone, beside = compare(walk(), [learned]), compare(walk(), [learned, calibration()])
-    assert raw(alone, "FIR") == raw(beside, "FIR")
-    assert beside.models["FIR"].age_spread_rad[JOINT] == 0.0
+    # where the start is unknown it is the first reading less the offset
+    unknown = compare(Recording.from_frame(walk(0.78).table, metadata={}), [calibration()])
+    assert raw(unknown, "DelayedPD") == pytest.approx(raw(there, "DelayedPD"), rel=0.02)
 
 
 def test_an_offset_is_estimated_from_the_given_part_only():
@@ -176,12 +179,21 @@ def test_an_offset_is_estimated_from_the_given_part_only():
     assert np.median(errors) == pytest.approx(-0.2, abs=0.02)
 
 
-def test_the_poll_of_a_recording_comes_before_that_of_a_calibration():
-    data = servo_data([load(SAMPLES / "sweep.csv")], [JOINT])
-    (rule,) = reading_rules(data, "sweep", {"other": calibration()}).values()
-    assert (rule.rule, rule.source) == ("own dates", "sweep")
-    lattice = data.lattices[JOINT]
-    assert rule.mean_age_s == pytest.approx(lattice.mean_age_s)
-    hidden = replace(data, lattices={JOINT: replace(lattice, kind="unresolved")})
-    (rule,) = reading_rules(hidden, "sweep", {"other": calibration()}).values()
-    assert (rule.rule, rule.source) == ("expected", "other")
+def test_ctrl_c_ends_a_comparison_of_networks_and_the_bar_of_both_fits_runs_once(monkeypatch):
+    """Networks trained to different ends are not compared; `fit-servo` keeps the best so far."""
+    fitted, shares = [], []
+
+    def fit(recording, joints, arch, *, split, seed, progress, keep_unfinished):
+        fitted.append(arch)
+        assert not keep_unfinished
+        for share in (0.0, 0.5, 1.0):
+            progress(arch, share)
+        progress("DelayedPD", 0.0)
+        if arch == "mlp":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(four_way_module, "fit_servo", fit)
+    with pytest.raises(KeyboardInterrupt):
+        four_way_module.four_way(walk(), [JOINT], 0, lambda what, share: shares.append(share))
+    assert fitted == ["lstm", "mlp"]
+    assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0
