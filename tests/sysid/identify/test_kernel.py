@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.delay_line import fractional_shift
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
-from pupper_sysid.sysid.identify.candidates.models import CANDIDATE_MODELS
+from pupper_sysid.sysid.identify.candidates.models import CANDIDATE_MODELS, candidate_model
 from pupper_sysid.sysid.identify.candidates.simulation import (
     TrialData,
     free_run,
@@ -76,6 +76,15 @@ def test_every_model_moves_as_its_reference_does(model):
     np.testing.assert_allclose(
         residuals(model, values, TRIALS), np.concatenate(error, axis=1), atol=1e-12
     )
+
+
+def test_the_fitted_delayed_pd_is_the_one_that_simulators_run():
+    values = np.array([0.0273, 12000.0, 100.0, 150.0, 450.0, 6.5, 0.1])
+    (track,) = free_run(candidate_model("delayed_pd"), values, TRIALS[:1])
+    names = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit")
+    numbers = dict(zip(names, values[1:6], strict=True)) | {"armature": 1.0}
+    model = DelayedPD(DelayedPDParameters(dead_time_s=values[0], **numbers))
+    np.testing.assert_allclose(track[1:] - 0.1, model.rollout(TRIALS[0].command), atol=1e-12)
 
 
 @pytest.mark.parametrize("model", MODELS[3:6], ids=lambda m: m.name)
