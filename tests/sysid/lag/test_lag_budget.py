@@ -1,74 +1,69 @@
 """The lag, its budget and the poll lattice, on signals whose truth is known."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.feedback.poll_lattice import (
     find_poll_lattice,
     fresh_rows,
     quantum,
     readings,
 )
-from pupper_sysid.sysid.lag.lag_budget import lag_budget
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.lag.phase_slope import tone_lags
 from pupper_sysid.sysid.lag.tone import tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
+from support.refusals import assert_each_refused
 from support.synthetic import LOOP_S, held_trial, tone_trials
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.3, 0.5])
-def test_hold_aware_lag_is_unbiased_whatever_share_of_the_reads_is_lost(loss):
-    errors = []
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        trials = tone_trials(0.040, rng, loss=loss)
-        errors.append(lag_budget("LF_hip", trials, rng).lag_s.value - 0.040)
+@cache
+def budget(loss: float, seed: int) -> LagBudget:
+    """Of tones of 1 to 4 Hz that are answered after 40 ms."""
+    rng = np.random.default_rng(seed)
+    return lag_budget("LF_hip", tone_trials(0.040, rng, loss=loss), rng)
+
+
+def test_hold_aware_lag_is_unbiased_whatever_share_of_the_reads_is_lost():
+    errors = [budget(loss, n).lag_s.value - 0.040 for loss in (0.0, 0.42) for n in (0, 1)]
     assert abs(np.mean(errors)) < 0.5e-3
     assert np.max(np.abs(errors)) < 1.5e-3
 
 
-def test_the_parts_of_the_budget_are_those_of_the_theory():
-    rng = np.random.default_rng(0)
-    b = lag_budget("LF_hip", tone_trials(0.040, rng), rng)
+def test_the_poll_is_found_and_the_parts_of_the_budget_are_those_of_the_theory():
+    b = budget(0.42, 0)
+    assert b.feedback.kind == "lattice" and b.feedback.z_score > 4
+    assert b.feedback.poll_period_s == pytest.approx(0.02685, abs=1e-4)
+    assert b.feedback.loss == pytest.approx(0.42, abs=3 * b.feedback.loss_sd)
     age_s = 0.02685 * (0.5 + 0.42 / 0.58)  # mean age of a held reading: T (1/2 + p / (1 - p))
     assert b.command_hold_s == pytest.approx(LOOP_S / 2, abs=2e-4)
     assert b.stale_lag_s == pytest.approx(age_s, abs=5e-3)
     assert b.raw_lag_s.value == pytest.approx(0.040 + LOOP_S / 2 + age_s, abs=5e-3)
+    # fresh readings show the true gain where all rows show attenuation
+    at_4_hz = b.by_frequency[3]
+    assert at_4_hz.gain == pytest.approx(1.0, abs=0.03) and at_4_hz.raw_gain < 0.95
 
 
 def test_lags_beyond_a_period_of_the_highest_tone_come_out_whole():
     rng = np.random.default_rng(1)
-    trials = tone_trials(0.160, rng, frequencies=(1.0, 2.0, 4.0, 6.0, 8.0, 10.0), amplitude=0.1)
+    trials = tone_trials(0.160, rng, frequencies=(1.0, 3.0, 6.0, 10.0), amplitude=0.1)
     b = lag_budget("LF_hip", trials, rng)
     assert b.lag_s.value == pytest.approx(0.160, abs=1.5e-3)
-    assert [round(f.lag_s.value, 2) for f in b.by_frequency] == [0.16] * 6
+    assert [round(f.lag_s.value, 2) for f in b.by_frequency] == [0.16] * 4
 
 
-def test_tone_lags_follow_a_lag_that_grows_with_frequency():
+def test_tone_lags_follow_a_lag_that_grows_with_frequency_and_no_period_is_slipped():
     frequency = np.arange(1.0, 11.0)
     lags = 0.03 + 0.01 * frequency
     response = np.exp(-2j * np.pi * frequency * lags)
     np.testing.assert_allclose(tone_lags(response, frequency), lags, atol=1e-12)
-
-
-def test_fresh_readings_show_the_true_gain_where_all_rows_show_attenuation():
-    rng = np.random.default_rng(2)
-    (b,) = [lag_budget("LF_hip", tone_trials(0.04, rng, (1.0, 4.0), gain=1.0), rng)]
-    at_4_hz = b.by_frequency[1]
-    assert at_4_hz.gain == pytest.approx(1.0, abs=0.03)
-    assert at_4_hz.raw_gain < 0.95
-
-
-def test_the_poll_lattice_is_found_with_its_loss():
-    rng = np.random.default_rng(3)
-    lattice = find_poll_lattice(tone_trials(0.04, rng), np.random.default_rng(0))
-    assert lattice.kind == "lattice"
-    assert lattice.poll_period_s == pytest.approx(0.02685, abs=1e-4)
-    assert lattice.loss == pytest.approx(0.42, abs=3 * lattice.loss_sd)
-    assert lattice.z_score > 4
+    # two trials of one fast tone do not move the lag by a period
+    frequency = np.array([3.0, 3.004, 3.009])
+    response = np.exp(-2j * np.pi * frequency * 0.05 + 0.05j * np.array([1, -1, 1]))
+    assert tone_lags(response, frequency) == pytest.approx([0.05] * 3, abs=5e-3)
 
 
 def test_no_lattice_is_claimed_where_readings_change_at_random():
@@ -83,13 +78,12 @@ def test_no_lattice_is_claimed_where_readings_change_at_random():
     assert find_poll_lattice(trials, np.random.default_rng(0)).kind == "unresolved"
 
 
-@pytest.mark.parametrize("share", [0.05, 0.1])
-def test_reads_that_are_answered_at_once_and_sometimes_lost_make_no_poll(share):
+def test_reads_that_are_answered_at_once_and_sometimes_lost_make_no_poll():
     rng = np.random.default_rng(11)
     trials = []
     for trial in tone_trials(0.04, rng, period_s=0.0, quantum_rad=0.001):
         position = trial.position_rad.copy()
-        for k in np.flatnonzero(rng.random(len(position)) < share):
+        for k in np.flatnonzero(rng.random(len(position)) < 0.1):
             position[k] = position[k - 1] if k else position[k]
         trials.append(replace(trial, position_rad=position))
     b = lag_budget("LF_hip", trials, rng)
@@ -109,24 +103,16 @@ def test_when_readings_were_taken_is_part_of_the_interval():
         assert b.lag_s.high - b.lag_s.low == pytest.approx(a.lag_s.high - a.lag_s.low + 0.0008)
 
 
-@pytest.mark.parametrize("rows_per_period", [3, 4, 6])
-def test_a_harmonic_that_the_rows_cannot_tell_from_the_tone_is_left_out(rows_per_period):
-    rng = np.random.default_rng(12)
-    time = np.arange(0.0, 6.0, 1 / 30)
-    f = 30 / rows_per_period
-    command = 0.3 * np.sin(2 * np.pi * f * time + 0.4)
-    position = 0.3 * np.sin(2 * np.pi * f * (time - 0.02) + 0.4)
-    trial = Trial("LF_hip", 0, f, time, time, command, position, None, 0.0)
-    tone = tone_response(trial, readings(trial, find_poll_lattice([trial], rng)), rng)
-    assert tone is not None
-    late = -np.angle(tone.fresh / tone.command_rows) / (2 * np.pi * f)
-    assert late == pytest.approx(0.02, abs=1e-4)
-
-
-def test_two_trials_of_one_fast_tone_do_not_move_the_lag_by_a_period():
-    frequency = np.array([3.0, 3.004, 3.009])
-    response = np.exp(-2j * np.pi * frequency * 0.05 + 0.05j * np.array([1, -1, 1]))
-    assert tone_lags(response, frequency) == pytest.approx([0.05] * 3, abs=5e-3)
+def test_a_harmonic_that_the_rows_cannot_tell_from_the_tone_is_left_out():
+    rng, time = np.random.default_rng(12), np.arange(0.0, 6.0, 1 / 30)
+    for f in (10.0, 7.5, 5.0):  # 3, 4 and 6 rows a period
+        command = 0.3 * np.sin(2 * np.pi * f * time + 0.4)
+        position = 0.3 * np.sin(2 * np.pi * f * (time - 0.02) + 0.4)
+        trial = Trial("LF_hip", 0, f, time, time, command, position, None, 0.0)
+        tone = tone_response(trial, readings(trial, find_poll_lattice([trial], rng)), rng)
+        assert tone is not None
+        late = -np.angle(tone.fresh / tone.command_rows) / (2 * np.pi * f)
+        assert late == pytest.approx(0.02, abs=1e-4)
 
 
 def test_readings_that_are_never_held_are_dated_to_the_read():
@@ -151,24 +137,13 @@ def test_fresh_readings_are_dated_to_the_poll_that_made_them():
     assert np.sqrt(np.mean(wrong[settled] ** 2)) < 0.015  # 2 ms at 7.5 rad/s
 
 
-def test_quantum_is_the_greatest_common_divisor_of_the_changes():
+def test_quantum_is_the_greatest_common_divisor_of_the_changes_and_missing_readings_are_not_fresh():
     trials = tone_trials(0.04, np.random.default_rng(7), quantum_rad=np.pi / 550)
     assert quantum(trials) == pytest.approx(np.pi / 550, rel=1e-6)
-
-
-def test_fresh_rows_skip_missing_readings():
-    trial = tone_trials(0.04, np.random.default_rng(8), (2.0,))[0]
-    position = trial.position_rad.copy()
+    trial, position = trials[1], trials[1].position_rad.copy()
     position[10:20] = np.nan
-    gap = type(trial)(**{**vars(trial), "position_rad": position})
+    gap = replace(trial, position_rad=position)
     assert not np.isin(fresh_rows(gap), np.arange(10, 20)).any()
-
-
-def test_a_servo_that_is_stuck_has_no_lag():
-    rng = np.random.default_rng(13)
-    stuck = tone_trials(0.04, rng, gain=0.02, quantum_rad=0.0, noise_rad=0.003)
-    with pytest.raises(InputError, match="moved by at most 2 % of its command"):
-        lag_budget("LF_hip", stuck, rng)
 
 
 def test_one_frequency_is_said_to_leave_the_period_open():
@@ -193,8 +168,10 @@ def test_motion_without_tones_still_has_a_lag():
     assert b.raw_lag_s.value > b.fresh_lag_s.value > b.lag_s.value
 
 
-def test_a_joint_that_does_not_move_is_refused():
-    still = lambda t: np.zeros_like(t)  # noqa: E731
-    trial = held_trial(still, lambda t: np.sin(t), np.random.default_rng(0))
-    with pytest.raises(InputError, match="too few to measure a lag"):
-        lag_budget("LF_hip", [trial], np.random.default_rng(0))
+def test_a_joint_that_does_not_move_or_is_stuck_has_no_lag():
+    still = held_trial(np.zeros_like, np.sin, np.random.default_rng(0))
+    stuck = tone_trials(
+        0.04, np.random.default_rng(13), (1.0, 3.0), gain=0.02, quantum_rad=0.0, noise_rad=0.003
+    )
+    cases = [([still], "too few to measure a lag"), (stuck, "moved by at most 2 % of its command")]
+    assert_each_refused(cases, lambda t: lag_budget("LF_hip", t, np.random.default_rng(0)))

@@ -54,11 +54,11 @@ def test_ripple_of_a_fast_loop_is_next_to_nothing():
         assert f.lag_s.value == pytest.approx(tone_lag(f.frequency_hz), abs=2e-4)
 
 
-@pytest.mark.parametrize(("tones", "lag_s"), [((2.0, 3.0, 4.0), 0.7), ((2.0,), 0.6)])
-def test_lags_longer_than_the_lowest_tones_period_come_out_whole(tones, lag_s):
-    trials = swept(tones, dead_time_s=lag_s, time_constant_s=1e-4, loop_s=0.01)
-    b = lag_budget("LF_hip", trials, np.random.default_rng(1))
-    assert b.lag_s.value == pytest.approx(lag_s, abs=0.01)
+def test_lags_longer_than_the_lowest_tones_period_come_out_whole():
+    for tones, lag_s in (((2.0, 3.0, 4.0), 0.7), ((2.0,), 0.6)):
+        trials = swept(tones, dead_time_s=lag_s, time_constant_s=1e-4, loop_s=0.01)
+        b = lag_budget("LF_hip", trials, np.random.default_rng(1))
+        assert b.lag_s.value == pytest.approx(lag_s, abs=0.01)
 
 
 def test_the_lag_seen_otherwise_settles_the_period_of_fast_tones():

@@ -1,19 +1,20 @@
 """Lag of recordings without tones: the staircase, its impulse response and the time shift."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, past_tones
-from pupper_sysid.sysid.lag.lag_budget import lag_budget
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.lag.step_response import _SIZES, ImpulseResponse, _evidence
 from pupper_sysid.sysid.lag.time_shift import command_hold, shift_draws
 from pupper_sysid.sysid.recordings.recording import Trial
+from support.refusals import assert_each_refused
 from support.synthetic import first_order_trial, held_trial, random_levels
 
 
@@ -89,16 +90,16 @@ def true_lag(trial, dead_time_s, time_constant_s):
     return 1e-3 * (1 + int(np.argmax(score)))
 
 
-@pytest.mark.parametrize(("loop_s", "widest_s"), [(1 / 30, 0.02), (1 / 80, 0.012)])
-def test_a_slow_servo_without_tones_has_an_interval_that_holds(loop_s, widest_s):
+def test_a_slow_servo_without_tones_has_an_interval_that_holds():
     inside = 0
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        command = (random_levels(rng, 0.25), minimum_jerk(rng))[seed % 2]
-        trial = first_order_trial(command, 0.02, 0.05, loop_s=loop_s)
-        lag = lag_budget("LF_hip", [trial], rng).lag_s
-        inside += lag.low - 0.001 <= true_lag(trial, 0.02, 0.05) <= lag.high + 0.001
-        assert 1e-4 < lag.high - lag.low < widest_s
+    for loop_s, widest_s in ((1 / 30, 0.02), (1 / 80, 0.012)):
+        for seed in range(2):
+            rng = np.random.default_rng(seed)
+            command = (random_levels(rng, 0.25), minimum_jerk(rng))[seed]
+            trial = first_order_trial(command, 0.02, 0.05, loop_s=loop_s)
+            lag = lag_budget("LF_hip", [trial], rng).lag_s
+            inside += lag.low - 0.001 <= true_lag(trial, 0.02, 0.05) <= lag.high + 0.001
+            assert 1e-4 < lag.high - lag.low < widest_s
     assert inside >= 3
 
 
@@ -115,10 +116,16 @@ def test_slow_motion_of_coarse_counts_behind_a_poll_is_not_taken_for_a_leading_j
     assert b.lag_s.high - b.lag_s.low < 0.03
 
 
-def test_parts_without_tones_add_up_and_live_readings_add_nothing():
+@cache
+def fast_loop() -> LagBudget:
+    """Of a slow servo without tones, read live every 10 ms."""
     rng = np.random.default_rng(1)
     trial = first_order_trial(minimum_jerk(rng), 0.02, 0.05, loop_s=0.01)
-    b = lag_budget("LF_hip", [trial], rng)
+    return lag_budget("LF_hip", [trial], rng)
+
+
+def test_parts_without_tones_add_up_and_live_readings_add_nothing():
+    b = fast_loop()
     assert b.feedback.readings == "live"
     assert b.stale_lag_s == pytest.approx(0.0, abs=1e-9)
     assert b.command_hold_s == pytest.approx(0.005, abs=1e-6)
@@ -129,13 +136,13 @@ def test_motion_that_is_no_answer_to_its_command_is_refused():
     rng = np.random.default_rng(2)
     trial = first_order_trial(random_levels(rng, 0.2), 0.02, 0.03)
     noise = replace(trial, position_rad=rng.standard_normal(len(trial.position_rad)))
-    with pytest.raises(InputError, match="explains . % of the motion"):
-        lag_budget("LF_hip", [noise], rng, find_poll_lattice([trial], rng))
-    with pytest.raises(InputError, match="moves against its command"):
-        lag_budget("LF_hip", [replace(trial, position_rad=-trial.position_rad)], rng)
     still = replace(trial, command_rad=np.zeros_like(trial.command_rad), initial_command_rad=0.0)
-    with pytest.raises(InputError, match="its command does not move"):
-        lag_budget("LF_hip", [still], rng)
+    lattice = find_poll_lattice([trial], rng)
+    cases = [
+        ((noise, lattice), "% of the motion"), ((still, None), "its command does not move"),
+        ((replace(trial, position_rad=-trial.position_rad), None), "moves against its command"),
+    ]  # fmt: skip
+    assert_each_refused(cases, lambda case: lag_budget("LF_hip", [case[0]], rng, case[1]))
 
 
 def test_a_lag_beyond_the_search_range_is_said_to_be_at_its_end():
@@ -167,8 +174,7 @@ def test_draws_that_begin_at_different_times_do_not_lose_the_lag_they_share():
 
 
 def test_dynamics_below_zero_are_said_to_be_so():
-    rng = np.random.default_rng(6)
-    b = lag_budget("LF_hip", [first_order_trial(minimum_jerk(rng), 0.02, 0.05, loop_s=0.01)], rng)
+    b = fast_loop()
     fits = b.with_dead_time(Interval(0.02, 0.018, 0.022), 0.0)
     assert fits.warnings == b.warnings
     late = b.lag_s.value + 0.01
