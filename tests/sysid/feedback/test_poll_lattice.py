@@ -8,7 +8,14 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, fresh_rows, readings
+from pupper_sysid.sysid.feedback.poll_kernel import log_likelihood, most_hits
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    PollLattice,
+    find_poll_lattice,
+    fresh_rows,
+    readings,
+)
+from pupper_sysid.sysid.feedback.poll_search import Phase
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import LOOP_S, tone_trials
 
@@ -56,12 +63,6 @@ def test_readings_that_cannot_be_told_are_in_doubt_by_half_a_loop():
     assert found.time_doubt_s == pytest.approx(LOOP_S / 2)
 
 
-def test_a_lattice_leaves_no_doubt_and_means_polled():
-    rng = np.random.default_rng(3)
-    found = find_poll_lattice(tone_trials(0.04, rng), rng)
-    assert (found.kind, found.readings, found.time_doubt_s) == ("lattice", "polled", 0.0)
-
-
 def test_live_trials_beside_polled_ones_are_dated_at_their_reads():
     rng = np.random.default_rng(4)
     polled = tone_trials(0.04, rng)
@@ -69,5 +70,83 @@ def test_live_trials_beside_polled_ones_are_dated_at_their_reads():
         tone_trials(0.04, rng, frequencies=(2.0,), period_s=0.0)[0], number=9, readings="live"
     )
     found = find_poll_lattice([*polled, live], rng)
-    assert found.kind == "lattice" and 9 not in {p.trial for p in found.phases}
+    # a lattice leaves no doubt and means polled
+    assert (found.kind, found.readings, found.time_doubt_s) == ("lattice", "polled", 0.0)
+    assert 9 not in {p.trial for p in found.phases}
     np.testing.assert_array_equal(readings(live, found).time_s, live.read_time_s)
+
+
+# ----------------------------------------------------- times of readings on a known lattice
+
+ROWS = np.arange(100)
+READ = 0.02 * ROWS + 0.001
+MIDDLE = READ - 0.01
+"""Between the read before and this one."""
+
+
+def times(*phases: Phase) -> np.ndarray:
+    """Times of readings that change in every row, on these stretches of a lattice."""
+    trial = Trial("LF_hip", 0, 1.0, READ - 0.001, READ, 0.01 * ROWS, 0.01 * ROWS, None, 0.0)
+    found = readings(trial, PollLattice(kind="lattice", fresh_fraction=1.0, phases=phases))
+    assert found.rows[-3:].tolist() == [97, 98, 99]
+    full = np.full(len(ROWS), np.nan)
+    full[found.rows] = found.time_s
+    return full[1:]  # the first row has no read before it
+
+
+def test_readings_within_a_stretch_are_dated_to_its_instants_and_others_to_the_middle():
+    # instants at 0.009 + 0.02 n: 2 ms before the middle
+    dated = times(Phase(0, 0.5, 1.0, 0.02, 0.009, 1e-4))
+    inside = (READ >= 0.5) & (READ <= 1.0)
+    np.testing.assert_allclose(dated, np.where(inside, MIDDLE - 0.002, MIDDLE)[1:], atol=1e-12)
+
+
+def test_a_reading_without_an_instant_between_two_reads_is_dated_to_the_middle():
+    # instants at 0.013, 0.113, 0.213 …: in the rows 1, 6, 11 …, 2 ms after the middle
+    dated = times(Phase(0, 0.0, 2.0, 0.1, 0.013, 1e-4))
+    polled = ROWS % 5 == 1
+    np.testing.assert_allclose(dated, np.where(polled, MIDDLE + 0.002, MIDDLE)[1:], atol=1e-12)
+
+
+def test_phases_of_another_trial_date_nothing():
+    np.testing.assert_allclose(times(Phase(1, 0.0, 2.0, 0.02, 0.009, 1e-4)), MIDDLE[1:])
+
+
+def test_the_mean_age_is_half_a_poll_and_one_more_for_each_that_is_lost_on_the_way():
+    # of polls that fail with 0.5, one is lost before a good one on average
+    lattice = PollLattice(kind="lattice", poll_period_s=0.02, loss=0.5, fresh_fraction=0.5)
+    assert lattice.mean_age_s == pytest.approx(0.03)
+
+
+# ----------------------------------------------------- the compiled search
+
+
+def intervals(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Reads every 19 ms of a bus polled every 26.8 ms, some a little late."""
+    end = 0.019 * np.arange(1, 120) + rng.normal(0, 1e-4, 119)
+    return end - 0.019, end
+
+
+def test_hits_are_counted_over_all_phases():
+    begin, end = intervals(np.random.default_rng(0))
+    periods = np.array([0.0201, 0.0268, 0.0533])
+    first = np.floor((begin / periods[:, None] % 1.0) * 64).astype(int)
+    span = np.round((end - begin) / periods[:, None] * 64).astype(int)
+    phase = np.arange(64)
+    inside = (phase[:, None, None] - first) % 64 < np.minimum(span, 64)
+    found = most_hits(begin, end, periods, 64)
+    np.testing.assert_array_equal(found, inside.sum(axis=2).max(axis=0))
+
+
+def test_likelihood_is_that_of_intervals_with_blurred_edges():
+    rng = np.random.default_rng(1)
+    begin, end = intervals(rng)
+    periods, phases = np.array([0.0265, 0.0268]), np.linspace(-0.5, 0.5, 16, endpoint=False)
+    blur, inside, outside = 0.0025, 0.97, rng.uniform(0.01, 0.03, len(begin))
+    away = (0.5 * (begin + end) / periods[:, None])[:, None] - phases[:, None] + 0.5
+    distance = np.abs(away % 1.0 - 0.5) * periods[:, None, None]
+    share = np.clip((0.5 * (end - begin) - distance) / blur + 0.5, 0.0, 1.0)
+    np.testing.assert_allclose(
+        log_likelihood(begin, end, periods, phases, blur, inside, outside),
+        np.log(inside * share + outside).sum(axis=2), rtol=1e-12,
+    )  # fmt: skip
