@@ -1,6 +1,5 @@
 """Damaged and oversized logs of every layout: read, or refused in a printable sentence."""
 
-import io
 import json
 import random
 import shutil
@@ -14,6 +13,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
+from support.refusals import assert_each_refused
 
 TIME = 0.02 * np.arange(60)
 WAVE = 0.3 * np.sin(3 * TIME)
@@ -73,7 +73,7 @@ def test_damage_is_refused_in_a_sentence_that_can_be_printed(tmp_path, write):
     load(source / "log")
     rng = random.Random(write.__name__)
     refused = 0
-    for _ in range(40):
+    for _ in range(20):
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(source, work)
         chosen = rng.choice([path for path in work.rglob("*") if path.is_file()])
@@ -92,34 +92,30 @@ def test_damage_is_refused_in_a_sentence_that_can_be_printed(tmp_path, write):
         except InputError as error:
             refused += 1
             assert str(error).isprintable() and str(error).endswith(".")
-    assert refused > 5
+    assert refused > 2
 
 
-def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
+def test_logs_beyond_the_limits_are_refused_before_they_are_unpacked(tmp_path, monkeypatch):
     (tmp_path / "log.json").write_text('{"entries": ' + "[" * 100_000)
-    with pytest.raises(InputError, match="100,001 levels of nesting"):
-        load(tmp_path / "log.json")
-
-
-def test_an_archive_that_unpacks_to_more_than_the_budget_is_not_unpacked(tmp_path):
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         for k in range(6):
-            archive.writestr(f"a{k}.npy", bytes(100_000_000))
-    (tmp_path / "bomb.npz").write_bytes(packed.getvalue())
-    with pytest.raises(InputError, match="unpacked, has 600 MB; at most 500 MB"):
-        load(tmp_path / "bomb.npz")
-
-
-def test_a_table_of_too_many_columns_or_rows_is_refused(tmp_path, monkeypatch):
+            archive.writestr(f"a{k}.npy", bytes(100_000))
+    with zipfile.ZipFile(tmp_path / "text.npz", "w") as archive:
+        archive.writestr("x.txt", b"hello")
     names = ",".join(f"joint_{k}_command,joint_{k}_position" for k in range(1500))
-    (tmp_path / "log.csv").write_text(f"time,{names}\n" + ",".join(["0"] * 3001) + "\n")
-    with pytest.raises(InputError, match="3,001 columns; at most 2,000"):
-        load(tmp_path / "log.csv")
-    monkeypatch.setattr("pupper_sysid.common.reading.csv_table.MOST_CELLS", 100)
+    (tmp_path / "wide.csv").write_text(f"time,{names}\n" + ",".join(["0"] * 3001) + "\n")
     table().to_csv(tmp_path / "rows.csv", index=False)
-    with pytest.raises(InputError, match="cells; at most 100 cells"):
-        load(tmp_path / "rows.csv")
+    table().assign(time_s=1e12 * TIME).drop(columns="time").to_csv(tmp_path / "t.csv", index=False)
+    importers = "pupper_sysid.sysid.recordings.importers"
+    monkeypatch.setattr(f"{importers}.numpy_file.LARGEST_BYTES", 500_000)
+    cases = [
+        ("log.json", "100,001 levels of nesting"), ("text.npz", "no column is a command"),
+        ("bomb.npz", "unpacked, has 600,000 bytes; at most 500,000"),
+        ("wide.csv", "3,001 columns; at most 2,000"), ("t.csv", "times reach"),
+    ]  # fmt: skip
+    assert_each_refused(cases, lambda name: load(tmp_path / name))
+    monkeypatch.setattr("pupper_sysid.common.reading.csv_table.MOST_CELLS", 100)
+    assert_each_refused([("rows.csv", "at most 100 cells")], lambda name: load(tmp_path / name))
 
 
 def test_joints_with_strange_names_are_called_by_letters_and_digits(tmp_path):
@@ -135,13 +131,6 @@ def test_a_parquet_file_without_the_library_names_the_extra(tmp_path, monkeypatc
         load(tmp_path / "log")
 
 
-def test_an_archive_without_arrays_is_refused(tmp_path):
-    with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
-        archive.writestr("x.txt", b"hello")
-    with pytest.raises(InputError, match="no column is a command"):
-        load(tmp_path / "log.npz")
-
-
 def test_names_of_joints_in_parquet_take_the_memory_of_the_names_alone(tmp_path):
     pa = pytest.importorskip("pyarrow")
     from pyarrow import parquet as files
@@ -151,21 +140,12 @@ def test_names_of_joints_in_parquet_take_the_memory_of_the_names_alone(tmp_path)
                "position": np.repeat(WAVE[:60], 2)}  # fmt: skip
     files.write_table(pa.table(columns | {"joint": names}), tmp_path / "two.parquet")
     assert load(tmp_path / "two.parquet").joints == ["hip", "knee"]
-    count = 10**6
-    names = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["x" * 10**6])
+    count = 10**5
+    names = pa.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["x" * 10**5])
     columns = {name: np.zeros(count) for name in columns}
     files.write_table(pa.table(columns | {"joint": names}), tmp_path / "long.parquet")
     tracemalloc.start()
     with pytest.raises(InputError):
         load(tmp_path / "long.parquet")
-    assert tracemalloc.get_traced_memory()[1] < 200e6
+    assert tracemalloc.get_traced_memory()[1] < 20e6
     tracemalloc.stop()
-
-
-def test_times_that_are_no_seconds_are_refused(tmp_path):
-    made = table()
-    made["time_s"] = 1e12 * TIME
-    made = made.drop(columns=[c for c in made.columns if c in ("t", "time")])
-    made.to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(InputError, match="times reach"):
-        load(tmp_path / "log.csv")

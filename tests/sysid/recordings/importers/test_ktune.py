@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
 from support.real_recordings import real_folder
+from support.refusals import assert_each_refused
 
 
 def log(tmp_path, **config):
@@ -29,20 +29,16 @@ def test_degrees_become_radians_and_gains_are_kept(tmp_path):
     assert trial.read_time_doubt_s == pytest.approx(0.005)
 
 
-def test_a_gain_in_words_and_a_torn_row_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"config.kp is high"):
-        load(log(tmp_path, kp="high"))
-    path = log(tmp_path)
-    path.write_text(path.read_text()[:-50])
-    with pytest.raises(InputError, match="is not JSON"):
-        load(path)
-
-
-def test_json_of_another_layout_names_what_is_missing(tmp_path):
-    path = tmp_path / "other.json"
-    path.write_text('{"samples": []}')
-    with pytest.raises(InputError, match=r"has samples. BAM or K-Scale: entries missing; ktune"):
-        load(path)
+def test_what_is_no_ktune_log_is_refused(tmp_path):
+    (tmp_path / "other.json").write_text('{"samples": []}')
+    cases = [("other.json", "has samples. BAM or K-Scale: entries missing; ktune")]
+    for name, text, says in (
+        ("torn.json", log(tmp_path).read_text()[:-50], "is not JSON"),
+        ("high.json", log(tmp_path, kp="high").read_text(), "config.kp is high"),
+    ):
+        (tmp_path / name).write_text(text)
+        cases.append((name, says))
+    assert_each_refused(cases, lambda name: load(tmp_path / name))
 
 
 def test_five_joints_of_a_leg_are_read():

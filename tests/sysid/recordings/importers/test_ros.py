@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+import sys
 import time
 
 import numpy as np
@@ -11,6 +12,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.ros_messages import decode
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from support.refusals import assert_each_refused
 
 writer = pytest.importorskip("mcap_ros2.writer")
 
@@ -125,23 +127,24 @@ def written(path, found, compression=None):
     return path
 
 
-@pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
-def test_an_mcap_of_a_ros_2_library_comes_back_to_1e_9(tmp_path, compression):
+def test_an_mcap_of_a_ros_2_library_comes_back_to_1e_9_whatever_its_compression(tmp_path):
     from mcap.writer import CompressionType
 
-    recording = load(written(tmp_path / "a.mcap", messages(), CompressionType[compression]))
-    recording.save(tmp_path / "a.csv")
-    for found in (recording, load(tmp_path / "a.csv")):
-        for j, joint in enumerate(JOINTS):
-            (trial,) = found.trials(joint)
-            np.testing.assert_allclose(trial.command_rad, COMMANDS[:, j], rtol=0, atol=1e-9)
-            np.testing.assert_allclose(trial.position_rad, POSITIONS[:, j], rtol=0, atol=1e-9)
-            read = 1e-9 * np.arange(COUNT) * STEP_NS
-            np.testing.assert_allclose(trial.read_time_s, read, rtol=0, atol=1e-9)
-            np.testing.assert_allclose(
-                trial.read_time_s - trial.send_time_s, 1e-9 * READ_LATE_NS, rtol=0, atol=1e-9
-            )
-    assert recording.metadata["times"] == ["/joint_commands: header", "/joint_states: header"]
+    for compression in ("NONE", "LZ4", "ZSTD"):
+        path = tmp_path / f"{compression}.mcap"
+        recording = load(written(path, messages(), CompressionType[compression]))
+        recording.save(tmp_path / "a.csv", force=True)
+        for found in (recording, load(tmp_path / "a.csv")):
+            for j, joint in enumerate(JOINTS):
+                (trial,) = found.trials(joint)
+                read = 1e-9 * np.arange(COUNT) * STEP_NS
+                for ours, theirs in (
+                    (trial.command_rad, COMMANDS[:, j]), (trial.position_rad, POSITIONS[:, j]),
+                    (trial.read_time_s, read),
+                    (trial.read_time_s - trial.send_time_s, 1e-9 * READ_LATE_NS),
+                ):  # fmt: skip
+                    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+        assert recording.metadata["times"] == ["/joint_commands: header", "/joint_states: header"]
 
 
 def test_a_command_without_a_header_is_dated_by_the_log(tmp_path):
@@ -219,10 +222,7 @@ def test_commands_that_no_reading_saw_are_said(tmp_path):
     assert any("% of the commands were replaced" in text for text in recording.warnings)
     recording = load(written(tmp_path / "b.mcap", whole))
     assert not any("replaced" in text for text in recording.warnings)
-
-
-def test_a_trajectory_of_several_points_is_said(tmp_path):
-    recording = load(written(tmp_path / "a.mcap", messages(points=3)))
+    recording = load(written(tmp_path / "c.mcap", messages(points=3)))
     assert any("several points" in text for text in recording.warnings)
 
 
@@ -246,16 +246,16 @@ def bag(folder, found):
     return folder
 
 
-@pytest.mark.parametrize("kind", ["JointTrajectory", "Float64MultiArray"])
-def test_a_bag_in_sqlite_is_read_like_mcap(tmp_path, kind):
-    name = next(k for k in DEFINITIONS if k.endswith(kind))
-    found = list(messages(name))
-    folder, file = bag(tmp_path / "bag", found), written(tmp_path / "a.mcap", found)
-    for path in (folder, folder / "bag_0.db3"):
-        for joint in JOINTS:
-            (ours,), (wanted,) = load(path).trials(joint), load(file).trials(joint)
-            np.testing.assert_array_equal(ours.command_rad, wanted.command_rad)
-            np.testing.assert_array_equal(ours.read_time_s, wanted.read_time_s)
+def test_a_bag_in_sqlite_is_read_like_mcap(tmp_path):
+    for kind in ("JointTrajectory", "Float64MultiArray"):
+        name = next(k for k in DEFINITIONS if k.endswith(kind))
+        found = list(messages(name))
+        folder, file = bag(tmp_path / kind, found), written(tmp_path / f"{kind}.mcap", found)
+        for path in (folder, folder / "bag_0.db3"):
+            for joint in JOINTS:
+                (ours,), (wanted,) = load(path).trials(joint), load(file).trials(joint)
+                np.testing.assert_array_equal(ours.command_rad, wanted.command_rad)
+                np.testing.assert_array_equal(ours.read_time_s, wanted.read_time_s)
 
 
 def test_a_bag_of_mcap_files_is_one_log(tmp_path):
@@ -277,30 +277,30 @@ def test_a_file_that_was_cut_short_is_read_up_to_there(tmp_path):
     assert any("cut short" in text for text in recording.warnings)
 
 
-def test_a_log_without_positions_or_commands_says_what_it_has(tmp_path):
-    only = [m for m in messages() if m[0] == "/joint_commands"]
-    with pytest.raises(InputError, match="no topic has positions. It has /joint_commands"):
-        load(written(tmp_path / "a.mcap", only))
-    only = [m for m in messages() if m[0] == "/joint_states"]
-    with pytest.raises(InputError, match="no joint of /joint_states has a command"):
-        load(written(tmp_path / "b.mcap", only))
+def test_logs_that_are_damaged_too_large_or_without_joints_are_refused(tmp_path, monkeypatch):
+    def only(name, topic):
+        return written(tmp_path / name, [m for m in messages() if m[0] == topic])
 
-
-def test_damaged_and_other_databases_are_refused(tmp_path):
-    path = tmp_path / "bag.db3"
-    with sqlite3.connect(path) as database:
+    with sqlite3.connect(tmp_path / "bag.db3") as database:
         database.execute("CREATE TABLE photographs(id INTEGER)")
-    with pytest.raises(InputError, match="no readable rosbag2 database"):
-        load(path)
-    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\x01" * 500)
-    with pytest.raises(InputError, match=r"MCAP|joints"):
-        load(tmp_path / "a.mcap")
-
-
-def test_a_chunk_that_unpacks_to_more_than_the_budget_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "d.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\x01" * 500)
+    changing = [
+        (topic, kind, log_ns, content | {"name": [f"j{k}", f"k{k}"]})
+        for k, (topic, kind, log_ns, content) in enumerate(messages("sensor_msgs/msg/JointState"))
+    ]
+    whole, many = written(tmp_path / "w.mcap", messages()), written(tmp_path / "j.mcap", changing)
+    cases = [
+        (only("a.mcap", "/joint_commands"), "no topic has positions. It has /joint_commands"),
+        (only("b.mcap", "/joint_states"), "no joint of /joint_states has a command"),
+        (tmp_path / "bag.db3", "no readable rosbag2 database"), (tmp_path / "d.mcap", "MCAP"),
+        (many, "has 200 joints; at most 50 joints are read"),
+    ]  # fmt: skip
+    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros.MOST_JOINTS", 50)
+    assert_each_refused(cases, load)
     monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros_files.LARGEST_BYTES", 2e4)
-    with pytest.raises(InputError, match="unpacked, has more than 20,000 bytes"):
-        load(written(tmp_path / "a.mcap", messages()))
+    assert_each_refused([(whole, "unpacked, has more than 20,000 bytes")], load)
+    monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
+    assert_each_refused([(whole, "Install pupper-sysid[logs]")], load)
 
 
 def test_no_length_in_a_message_is_believed_beyond_its_bytes():
@@ -316,13 +316,6 @@ def test_big_endian_messages_are_read():
     data = b"\x00\x00\x00\x00" + struct.pack(">II", 0, 0) + struct.pack(">I", 2)
     data += b"\0" * (-(len(data) - 4) % 8) + struct.pack(">dd", 1.5, -2.5)
     assert decode("std_msgs/Float64MultiArray", data).positions == (1.5, -2.5)
-
-
-def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch):
-    path = written(tmp_path / "a.mcap", messages())
-    monkeypatch.setitem(__import__("sys").modules, "mcap.stream_reader", None)
-    with pytest.raises(InputError, match=r"Install pupper-sysid\[logs\]"):
-        load(path)
 
 
 TOPICS = """CREATE TABLE topics(id INTEGER, name TEXT, type TEXT);
@@ -371,13 +364,3 @@ def test_a_database_that_takes_too_many_steps_is_given_up(tmp_path, monkeypatch)
     monkeypatch.setattr(f"{where}_STEPS", 100)
     with pytest.raises(InputError, match="interrupted"):
         load(tmp_path / "bag.db3")
-
-
-def test_another_joint_in_each_message_is_refused(tmp_path, monkeypatch):
-    found = [
-        (topic, kind, log_ns, content | {"name": [f"j{k}", f"k{k}"]})
-        for k, (topic, kind, log_ns, content) in enumerate(messages("sensor_msgs/msg/JointState"))
-    ]
-    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros.MOST_JOINTS", 50)
-    with pytest.raises(InputError, match="has 200 joints; at most 50 joints are read"):
-        load(written(tmp_path / "a.mcap", found))

@@ -11,6 +11,7 @@ from pupper_sysid.sysid.recordings.importers.recognise import logs_in
 from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.package import ROOT
+from support.refusals import assert_each_refused
 
 TIME = 0.02 * np.arange(60)
 COMMAND = {"knee": 0.3 * np.sin(TIME), "ankle": 0.2 * np.cos(TIME)}
@@ -36,46 +37,33 @@ def agrees(recording, joints=("knee", "ankle")):
         np.testing.assert_allclose(np.diff(trial.send_time_s), 0.02)
 
 
-@pytest.mark.parametrize(
-    ("command", "position"),
-    [
-        ("{joint}_command", "{joint}_position"),
-        ("{joint}_command_rad", "{joint}_position_rad"),
-        ("action.{joint}", "observation.state.{joint}"),
-        ("action.{joint}.pos", "observation.state.{joint}.pos"),
-        ("{joint}.goal", "{joint}.pos"),
-        ("cmd_{joint}", "pos_{joint}"),
-        ("target[{joint}]", "actual[{joint}]"),
-        ("goal_position_{joint}", "present_position_{joint}"),
-        ("{joint} target (rad)", "{joint} measured (rad)"),
-        ("/q_des/{joint}", "/q/{joint}"),
-    ],
-)
-def test_a_joint_is_what_stands_beside_the_words(tmp_path, command, position):
-    if command.startswith("/"):
-        command, position = command[1:], position[1:]
-    table(command, position).to_csv(tmp_path / "log.csv", index=False)
-    agrees(load(tmp_path / "log.csv"))
+def test_a_joint_is_what_stands_beside_the_words_and_an_ending_names_the_unit():
+    for command, position, scale in (
+        ("{joint}_command", "{joint}_position", 1.0),
+        ("{joint}_command_rad", "{joint}_position_rad", 1.0),
+        ("{joint}_command_deg", "{joint}_position_deg", 180 / np.pi),
+        ("action.{joint}", "observation.state.{joint}", 1.0),
+        ("action.{joint}.pos", "observation.state.{joint}.pos", 1.0),
+        ("{joint}.goal", "{joint}.pos", 1.0),
+        ("cmd_{joint}", "pos_{joint}", 1.0),
+        ("target[{joint}]", "actual[{joint}]", 1.0),
+        ("goal_position_{joint}", "present_position_{joint}", 1.0),
+        ("{joint} target (rad)", "{joint} measured (rad)", 1.0),
+        ("q_des/{joint}", "q/{joint}", 1.0),
+    ):
+        agrees(Recording.from_frame(table(command, position, scale=scale)))
 
 
-@pytest.mark.parametrize(("ending", "scale"), [("_deg", 180 / np.pi), ("_rad", 1.0)])
-def test_an_ending_names_the_unit(tmp_path, ending, scale):
-    made = table("{joint}_command" + ending, "{joint}_position" + ending, scale=scale)
-    made.to_csv(tmp_path / "log.csv", index=False)
-    agrees(load(tmp_path / "log.csv"))
-
-
-@pytest.mark.parametrize(
-    ("name", "scale", "guessed"),
-    [("time_ms", 1e3, False), ("timestamp_us", 1e6, False), ("t", 1e3, True), ("stamp", 1e9, True)],
-)
-def test_times_are_seconds_by_their_ending_or_their_distance(tmp_path, name, scale, guessed):
-    made = table("{joint}_cmd", "{joint}_pos", name)
-    made[name] *= scale
-    made.to_csv(tmp_path / "log.csv", index=False)
-    recording = load(tmp_path / "log.csv")
-    agrees(recording)
-    assert guessed == any("names no unit" in text for text in recording.warnings)
+def test_times_are_seconds_by_their_ending_or_their_distance():
+    for name, scale, guessed in (
+        ("time_ms", 1e3, False), ("timestamp_us", 1e6, False), ("t", 1e3, True),
+        ("stamp", 1e9, True),
+    ):  # fmt: skip
+        made = table("{joint}_cmd", "{joint}_pos", name)
+        made[name] *= scale
+        recording = Recording.from_frame(made)
+        agrees(recording)
+        assert guessed == any("names no unit" in text for text in recording.warnings), name
 
 
 def test_a_table_with_a_row_per_joint_is_read(tmp_path):
@@ -226,37 +214,24 @@ def test_an_unknown_table_names_every_layout_and_what_is_missing(tmp_path):
         assert words in text
 
 
-def test_an_imus_log_is_answered_in_a_sentence(tmp_path):
-    names = ["timestamp", "gx", "gy", "gz", "ax", "ay", "az"]
-    pd.DataFrame({n: TIME for n in names}).to_csv(tmp_path / "imu.csv", index=False)
-    with pytest.raises(InputError, match="IMU's readings"):
-        load(tmp_path / "imu.csv")
+def test_tables_that_are_no_log_are_refused_with_the_way_out(tmp_path):
+    def file(name, made):
+        made.to_csv(tmp_path / name, index=False)
+        return tmp_path / name
 
-
-def test_a_cell_of_text_in_a_column_that_is_needed_is_named(tmp_path):
-    made = table("{joint}_command", "{joint}_position").astype(object)
-    made.loc[7, "knee_command"] = "up"
-    made["note"] = "fine"
-    made.to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(InputError, match="line 9, column knee_command: 'up' is not a number"):
-        load(tmp_path / "log.csv")
-
-
-def test_degrees_that_are_taken_for_radians_are_refused_with_the_way_out(tmp_path):
-    table("{joint}_command", "{joint}_position", scale=180 / np.pi).to_csv(
-        tmp_path / "log.csv", index=False
-    )
-    with pytest.raises(InputError, match="import --unit deg"):
-        load(tmp_path / "log.csv")
-    agrees(load(tmp_path / "log.csv", LogOptions(unit="deg")))
-
-
-def test_two_joints_that_would_be_called_alike_are_refused(tmp_path):
-    made = pd.DataFrame({"time": TIME, "a-b_command": 0.0, "a-b_position": 0.1, "a b_command": 0.0,
-                         "a b_position": 0.1})  # fmt: skip
-    made.to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(InputError, match="two joints would be called a_b"):
-        load(tmp_path / "log.csv")
+    degrees = file("deg.csv", table("{joint}_command", "{joint}_position", scale=180 / np.pi))
+    worded = table("{joint}_command", "{joint}_position").astype(object).assign(note="fine")
+    worded.loc[7, "knee_command"] = "up"
+    imu = pd.DataFrame(dict.fromkeys(["timestamp", "gx", "gy", "gz", "ax", "ay", "az"], TIME))
+    alike = pd.DataFrame({"time": TIME, "a-b_command": 0.0, "a-b_position": 0.1,
+                          "a b_command": 0.0, "a b_position": 0.1})  # fmt: skip
+    cases = [
+        (degrees, "import --unit deg"), (file("imu.csv", imu), "IMU's readings"),
+        (file("up.csv", worded), "line 9, column knee_command: 'up' is not a number"),
+        (file("alike.csv", alike), "two joints would be called a_b"),
+    ]  # fmt: skip
+    assert_each_refused(cases, load)
+    agrees(load(degrees, LogOptions(unit="deg")))
 
 
 def test_the_mapping_file_of_the_documentation_is_one(tmp_path):
