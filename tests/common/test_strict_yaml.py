@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import MAX_DEPTH, StrictLoader, dump, load
+from support.refusals import assert_each_refused
 
 SCALARS = (
     st.none()
@@ -35,20 +36,20 @@ def plain(data) -> bool:
     return data is None or type(data) in (str, int, float, bool)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(DATA)
 def test_plain_data_that_is_written_reads_back_with_its_types(data):
     found, _ = load(dump(data))
     assert found == data and repr(found) == repr(data)
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(st.dictionaries(st.text(), SCALARS))
 def test_an_ordinary_reader_sees_the_same_data(data):
     assert yaml.safe_load(dump(data)) == data
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(SIGNS | st.text())
 def test_any_text_is_plain_data_or_refused_in_one_line(text):
     try:
@@ -59,31 +60,21 @@ def test_any_text_is_plain_data_or_refused_in_one_line(text):
         assert plain(data) and lines[()] >= 1
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["!!python/object/apply:os.mkdir [made]", "!!python/name:os.system", "a: !!python/tuple [1]",
-     "a: !!set {b}", "a: !!timestamp 2026-01-31", "a: !!binary aGk="],
-)  # fmt: skip
-def test_no_tag_builds_an_object(text):
-    with pytest.raises(InputError, match="uses a YAML tag"):
-        load(text)
+def test_no_tag_builds_an_object():
+    texts = ("!!python/object/apply:os.mkdir [made]", "!!python/name:os.system",
+             "a: !!python/tuple [1]", "a: !!set {b}", "a: !!timestamp 2026-01-31",
+             "a: !!binary aGk=")  # fmt: skip
+    assert_each_refused([(text, "uses a YAML tag") for text in texts], load)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
+def test_scalars_follow_yaml_1_2():
+    for text, value in (
         ("yes", "yes"), ("no", "no"), ("on", "on"), ("true", True), ("~", None), ("", None),
         ("1e-3", 1e-3), ("010", 10), ("0x10", "0x10"), ("1_000", "1_000"), ("1:30", "1:30"),
         (".inf", math.inf), ("-.inf", -math.inf), ("2026-01-31", "2026-01-31"), ("'7'", "7"),
-        ("=", "="), ("<<", "<<"), ("9" * 25, float("9" * 25)),
-    ],
-)  # fmt: skip
-def test_scalars_follow_yaml_1_2(text, value):
-    assert load(f"a: {text}")[0] == {"a": value}
-
-
-def test_merge_keys_are_keys_like_any_other():
-    assert load("a: {<<: {b: 1}, c: 2}")[0] == {"a": {"<<": {"b": 1}, "c": 2}}
+        ("=", "="), ("<<", "<<"), ("9" * 25, float("9" * 25)), ("{<<: {b: 1}}", {"<<": {"b": 1}}),
+    ):  # fmt: skip
+        assert load(f"a: {text}")[0] == {"a": value}
 
 
 def test_each_place_has_its_line():
@@ -102,11 +93,7 @@ def test_the_loader_serves_pyyaml_s_own_functions():
         yaml.load("legs: 4\nlegs: 6", StrictLoader)
 
 
-@pytest.mark.parametrize("depth", [MAX_DEPTH, MAX_DEPTH + 1, MAX_DEPTH + 2, 200_000])
-def test_nesting_is_refused_from_the_first_level_that_is_too_deep(depth):
-    text = "[" * depth + "]" * depth
-    if depth <= MAX_DEPTH + 1:  # the file itself is level 0
-        assert plain(load(text)[0])
-    else:
-        with pytest.raises(InputError, match=f"more than {MAX_DEPTH} levels of nesting"):
-            load(text)
+def test_nesting_is_refused_from_the_first_level_that_is_too_deep():
+    assert plain(load("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1))[0])  # the file is level 0
+    words = f"more than {MAX_DEPTH} levels of nesting"
+    assert_each_refused([("[" * n + "]" * n, words) for n in (MAX_DEPTH + 2, 200_000)], load)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import InputError
@@ -70,6 +70,7 @@ def loaded_or_refused(path: Path) -> None:
         assert isinstance(found, Calibration)
 
 
+@settings(max_examples=40)
 @given(calibrations())
 def test_any_calibration_that_is_saved_reads_back(path, made):
     made.save(path, force=True)
@@ -78,6 +79,7 @@ def test_any_calibration_that_is_saved_reads_back(path, made):
     assert found.joints == made.joints
 
 
+@settings(max_examples=40)
 @given(place=st.sampled_from(PLACES), value=JUNK)
 def test_a_file_with_another_value_anywhere_is_read_or_refused(path, place, value):
     data: Any = load(dump(EXAMPLE))[0]
@@ -89,6 +91,7 @@ def test_a_file_with_another_value_anywhere_is_read_or_refused(path, place, valu
     loaded_or_refused(path)
 
 
+@settings(max_examples=40)
 @given(place=st.sampled_from([p for p in PLACES if isinstance(p[-1], str)]), name=TEXT)
 def test_a_file_with_a_key_renamed_is_read_or_refused(path, place, name):
     data: Any = load(dump(EXAMPLE))[0]
@@ -100,6 +103,7 @@ def test_a_file_with_a_key_renamed_is_read_or_refused(path, place, name):
     loaded_or_refused(path)
 
 
+@settings(max_examples=40)
 @given(start=st.integers(0, 10**6), length=st.integers(0, 30), new=st.binary(max_size=5))
 def test_a_file_damaged_anywhere_is_read_or_refused(path, start, length, new):
     content = calibration().to_yaml().encode()

@@ -14,6 +14,7 @@ from pupper_sysid.common.reading import csv_table
 from pupper_sysid.common.reading.budget import reading_up_to
 from pupper_sysid.common.reading.csv_table import column_names, comments_of, read_table
 from pupper_sysid.common.reading.numbers import decimal, whole
+from support.refusals import assert_each_refused
 
 
 def strictly(monkeypatch, text: str, **options):
@@ -41,7 +42,7 @@ cells = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150)
 @given(rows=st.lists(st.lists(cells, min_size=1, max_size=3), max_size=6), end=st.booleans())
 @example(rows=[["1", "2"], ["4_1", "2"]], end=True)
 @example(rows=[["1", "a"], ["2"]], end=False)
@@ -113,28 +114,23 @@ def test_line_ends_of_other_systems_are_line_ends():
         assert table.numbers["b"].tolist() == [2, 4] and table.line.tolist() == [3, 4]
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (",".join(f"c{k}" for k in range(10**6)), "1,000,000 columns; at most 2,000"),
-        ("a\n" + "1\n" * 5_100_000, "rows|lines"),
+def test_limits_are_said_with_the_way_to_raise_them(monkeypatch):
+    monkeypatch.setattr(csv_table, "MOST_CELLS", 1_000_000)
+    cases = [
+        (",".join(f"c{k}" for k in range(10**5)), "100,000 columns; at most 2,000"),
+        ("a\n" + "1\n" * 1_100_000, "at most 1,000,000"),
         ("x" * 200_000 + ",b\n1,2", "a cell has 200,000 characters"),
         ("a,b\n" + "1,2\n" * 3 + "x" * 200_000 + ",2\n", "line 5: a cell has 200,000 characters"),
         ("# a\n" * 11_000 + "a\n1\n", "more than 10,000 lines before"),
         ("a\n1\n" + "# a\n" * 11_000, "more than 10,000 comment lines"),
         ("# " + "a" * 2_000_000 + "\na\n1\n", "line 1 has 2,000,002 characters"),
         ("\n" * 20_000 + "a\n1\n", "more than 10,000 lines before"),
-    ],
-)
-def test_limits_are_said_with_the_way_to_raise_them(text, says):
-    with pytest.raises(InputError, match=says) as refusal:
-        read_table("log", text)
-    assert "`read_limit=" in str(refusal.value)
+    ]  # fmt: skip
+    assert_each_refused(cases, lambda text: read_table("log", text), names="`read_limit=")
 
 
 def test_a_raised_limit_reads_what_was_refused():
     text = ",".join(f"c{k}" for k in range(3000)) + "\n" + ",".join(["1"] * 3000) + "\n"
-    text += "x" * 0
     with reading_up_to(2):
         assert len(read_table("log", text).numbers) == 3000
         long = "joint\n" + "x" * 150_000 + "\n"
@@ -157,8 +153,8 @@ def test_any_text_is_a_number_in_ascii_or_none(text):
         assert value == plain(text) or math.isnan(value)
 
 
-@pytest.mark.parametrize("text", ["4_1", "٣", "１２", "1e5_0", "", "1.2.3", "0x10", "ınf", "1 2"])
-def test_misprints_are_no_numbers(text):
-    for read in (decimal, whole):
-        with pytest.raises(ValueError, match="not a"):
-            read(text)
+def test_misprints_are_no_numbers():
+    for text in ("4_1", "٣", "１２", "1e5_0", "", "1.2.3", "0x10", "ınf", "1 2"):
+        for read in (decimal, whole):
+            with pytest.raises(ValueError, match="not a"):
+                read(text)
