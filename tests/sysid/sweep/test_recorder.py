@@ -144,7 +144,9 @@ def test_a_late_tick_is_counted_and_the_tone_keeps_its_phase(tmp_path):
     np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-3, err_msg="the schedule drifted")
 
 
-@pytest.mark.parametrize("raises", [KeyboardInterrupt(), BusError("cable out")])
+@pytest.mark.parametrize(
+    "raises", [KeyboardInterrupt(), BusError("cable out"), SafetyStop("10 deadlines in a row")]
+)
 def test_an_interrupted_recording_keeps_its_rows_and_switches_the_torque_off(tmp_path, raises):
     at_rest = round(REST_S / PERIOD + 0.5)  # written before the trial, not recorded
     bus = ScriptedBus(POSE, fail_at=at_rest + 60, raises=raises)
@@ -156,46 +158,30 @@ def test_an_interrupted_recording_keeps_its_rows_and_switches_the_torque_off(tmp
     assert len(recording.table) == 60
     if isinstance(raises, KeyboardInterrupt):
         np.testing.assert_allclose(bus.written[-1][1], POSE, atol=1e-12)
+    if isinstance(raises, SafetyStop):
+        assert len(bus.written) == at_rest + 60, "it was driven on after the stop"
 
 
-def test_a_sweep_that_nobody_controls_goes_limp_where_it_is(tmp_path):
-    at = round(REST_S / PERIOD + 0.5) + 20
-    bus = ScriptedBus(POSE, fail_at=at, raises=SafetyStop("the loop missed 10 deadlines in a row"))
-    with pytest.raises(SafetyStop):
-        record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=PERIOD)
-    assert len(bus.written) == at, "it was driven on after the stop"
-    assert bus.calls[-2:] == ["torque False", "close"]
-
-
-def test_nothing_moves_if_the_file_exists_already(tmp_path):
-    (tmp_path / "a.csv").write_text("precious")
-    bus = ScriptedBus(POSE)
-    with pytest.raises(FileExistsRefusal):
-        record(bus, short_sweep(), tmp_path / "a.csv")
-    assert bus.written == [] and bus.calls == ["close"]
-    assert (tmp_path / "a.csv").read_text() == "precious"
-    record(ScriptedBus(POSE), short_sweep(), tmp_path / "a.csv", force=True)
-    assert len(load(tmp_path / "a.csv").table) > 100
-
-
-def test_a_plan_for_joints_that_the_bus_has_not_is_refused(tmp_path):
-    bus = ScriptedBus(POSE)
-    with pytest.raises(InputError, match="tail"):
-        record(bus, plan("sine", ["tail"], [1.0]), tmp_path / "a.csv")
-    with pytest.raises(InputError, match="no trials"):
-        record(bus, Plan(()), tmp_path / "a.csv")
-    with pytest.raises(InputError, match="loop_period_s"):
-        record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=0.0)
-    assert bus.calls == ["close"] * 3 and not list(tmp_path.iterdir())
-
-
-def test_a_robot_that_never_says_where_it_is_is_not_moved(tmp_path):
+def test_nothing_moves_before_file_plan_and_pose_are_known(tmp_path):
+    taken, free = tmp_path / "a.csv", tmp_path / "b.csv"
+    taken.write_text("precious")
     silent = POSE.copy()
     silent[3] = np.nan
-    bus = ScriptedBus(silent)
-    with pytest.raises(BusError, match="RF_hip"):
-        record(bus, short_sweep(), tmp_path / "a.csv")
-    assert bus.written == [] and bus.calls == ["close"]
+    for start, made, path, raises, says in (
+        (POSE, short_sweep(), taken, FileExistsRefusal, "a.csv"),
+        (POSE, plan("sine", ["tail"], [1.0]), free, InputError, "tail"),
+        (POSE, Plan(()), free, InputError, "no trials"),
+        (silent, short_sweep(), free, BusError, "RF_hip"),
+    ):
+        bus = ScriptedBus(start)
+        with pytest.raises(raises, match=says):
+            record(bus, made, path)
+        assert bus.written == [] and bus.calls == ["close"]
+    with pytest.raises(InputError, match="loop_period_s"):
+        record(ScriptedBus(POSE), short_sweep(), free, loop_period_s=0.0)
+    assert taken.read_text() == "precious" and not free.exists()
+    record(ScriptedBus(POSE), short_sweep(), taken, force=True)
+    assert len(load(taken).table) > 100
 
 
 def test_progress_runs_from_nothing_to_the_whole(tmp_path):
