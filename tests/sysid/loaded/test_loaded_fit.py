@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,7 @@ from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.calibration.under_load import RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
-from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.loaded import search
-from pupper_sysid.sysid.loaded.calibrate import loaded_joints
-from pupper_sysid.sysid.loaded.runs import prepare
-from pupper_sysid.sysid.loaded.structures import Scales, Structure
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit.fit import fit_servo
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
@@ -33,6 +29,7 @@ TRUE = LoadedServoParameters(
 STEP_S, LOOP_S = 0.002, 0.01
 
 
+@cache
 def recording(gain: float, seed: int = 0, steps: int = 300) -> Recording:
     """Random steps, then a drop, of the true servo; rows every 10 ms, readings in counts."""
     rng = np.random.default_rng(seed)
@@ -92,36 +89,25 @@ def calibration(gains: tuple[float, ...] = (8.0, 32.0)) -> Calibration:
     return preset.model_copy(update={"joints": {"knee": own}})
 
 
-def test_numbers_in_newton_metres_follow_from_a_known_load():
-    trials = tuple(t for g in (8.0, 32.0) for t in recording(g, int(g)).trials("knee"))
-    lattice = find_poll_lattice(trials, np.random.default_rng(0))
-    runs = tuple(r for t in trials if (r := prepare(t, lattice)) is not None)
-    scales = Scales(MASS_KG * 9.81 * LENGTH_M, MASS_KG * LENGTH_M**2, 8.0, True, True)
-    structure = Structure((), scales)
-    problem = search.Problem(structure, runs, (1e-3,) * len(runs))
-    rng = np.random.default_rng(0)
-    best = search.evolve(problem, search.search(problem, rng), rng)
-    found = structure.servo(structure.decode(best.point))
-    for name, tolerance in (
-        ("stall_torque", 0.05), ("armature", 0.05), ("friction_loss", 0.05), ("back_emf", 0.05),
-    ):  # fmt: skip
-        assert getattr(found, name) == pytest.approx(getattr(TRUE, name), rel=tolerance), name
-    assert found.dead_time_s == pytest.approx(TRUE.dead_time_s, abs=1e-3)
-
-
-def test_a_known_load_several_gains_or_torque_off_make_a_loaded_joint():
-    knee = {"knee": recording(8.0).trials("knee")}
-    assert loaded_joints(knee) == ["knee"]
-
-
-def test_errors_on_runs_left_out_of_a_fit_under_load_have_names_of_their_own():
+def test_a_known_load_gives_numbers_in_newton_metres_and_left_out_runs_have_errors_of_their_own():
     def short(whole: Recording) -> Recording:
         return replace(whole, table=whole.table[whole.table.send_time_s < 1.5])
 
-    found = calibrate([short(recording(8.0)), short(recording(32.0, 3))])
-    result, joint = found["knee"], found.calibration.joint("knee")
-    assert joint.under_load is not None and joint.scores.rmse_leave_one_frequency_out_rad is None
+    fit = calibrate([short(recording(8.0)), short(recording(32.0, 3))])
+    result, joint = fit["knee"], fit.calibration.joint("knee")
+    block = joint.under_load
+    assert block is not None
+    for quantity, truth in (
+        (block.stall_torque_nm, TRUE.stall_torque), (block.armature_kg_m2, TRUE.armature),
+        (block.friction_loss_nm, TRUE.friction_loss), (block.back_emf_nm_s_per_rad, TRUE.back_emf),
+    ):  # fmt: skip
+        assert quantity.value == pytest.approx(truth, rel=0.05)
+        assert quantity.low <= truth <= quantity.high
+    dead_time = joint.actuator.dead_time_s
+    assert dead_time.value == pytest.approx(TRUE.dead_time_s, abs=1e-3)
+    assert dead_time.low <= TRUE.dead_time_s <= dead_time.high
     scores = result.delayed_pd.scores
+    assert joint.scores.rmse_leave_one_frequency_out_rad is None
     assert np.isnan(scores.rmse_leave_one_frequency_out_rad)
     unseen = joint.scores.rmse_unseen_runs_rad
     assert unseen == scores.rmse_unseen_runs_rad == scores.rmse_unseen_rad
@@ -130,21 +116,27 @@ def test_errors_on_runs_left_out_of_a_fit_under_load_have_names_of_their_own():
     # the chosen structure's mean absolute error is below its RMS error on the same rows
     mean = models[joint.selection.model].mae_unseen_runs_rad
     assert mean is not None and unseen is not None and mean < unseen
-    dead_time = joint.actuator.dead_time_s
-    assert dead_time.low is not None and dead_time.high is not None
-    assert dead_time.low <= TRUE.dead_time_s <= dead_time.high
 
 
-def test_a_calibration_predicts_a_gain_it_has_not_seen(tmp_path: Path):
-    path = tmp_path / "knee.yaml"
-    calibration().save(path)
-    found = compare([recording(16.0, 1), recording(16.0, 2)], [path], "knee")
-    label, linear = found.models
-    assert "knee.yaml" in label and linear == LINEAR
+def test_a_calibration_predicts_a_gain_it_has_not_seen_and_one_of_a_single_gain_does_not(
+    tmp_path: Path,
+):
+    known = calibration()
+    alone = known.model_copy(
+        update={"joints": {"knee": known.joint("knee").model_copy(update={"under_load": None})}}
+    )
+    known.save(tmp_path / "any.yaml")
+    alone.save(tmp_path / "one.yaml")
+    found = compare(recording(24.0, 1), [tmp_path / "any.yaml", tmp_path / "one.yaml"], "knee")
+    label = "servo under load (any.yaml)"
+    assert list(found.models) == [label, "DelayedPD (one.yaml)", LINEAR]
     plain = found.to_dict()["models"][label]
     for part in (plain["mean"], plain["joints"]["knee"]):
         for name in ("mae_raw_rad", "mae_held_rad", "rmse_raw_rad", "rmse_held_rad"):
             assert part[name] < 1.5e-3, name  # a count is 1.5 mrad
+    assert (
+        plain["mean"]["mae_raw_rad"] < 0.1 * found.models["DelayedPD (one.yaml)"].mean.mae_raw_rad
+    )
     assert any("lies between recorded gains, 8 and 32" in note for note in found.notes)
 
 
@@ -175,18 +167,6 @@ def test_runs_of_several_rates_have_no_linear_filter_and_a_note_says_why(tmp_pat
     found = compare([recording(16.0, 1), slow], [tmp_path / "knee.yaml"], "knee")
     assert LINEAR not in found.models
     assert any("No linear filter" in n and "different rates" in n for n in found.notes)
-
-
-def test_a_calibration_of_one_gain_is_told_from_one_of_any(tmp_path: Path):
-    known = calibration()
-    alone = known.model_copy(
-        update={"joints": {"knee": known.joint("knee").model_copy(update={"under_load": None})}}
-    )
-    known.save(tmp_path / "any.yaml")
-    alone.save(tmp_path / "one.yaml")
-    found = compare(recording(32.0, 3), [tmp_path / "any.yaml", tmp_path / "one.yaml"], "knee")
-    errors = {name: m.mean.mae_raw_rad for name, m in found.models.items()}
-    assert errors["servo under load (any.yaml)"] < 0.1 * errors["DelayedPD (one.yaml)"]
 
 
 def test_the_file_keeps_the_servo_under_load(tmp_path: Path):

@@ -10,12 +10,7 @@ from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.cards.numbers import LoadedLoop, stated
 from pupper_sysid.servo_models.loaded_servo import LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
-from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.loaded import search
-from pupper_sysid.sysid.loaded.preparation import scales_of
-from pupper_sysid.sysid.loaded.ramps import EitherWay, settled
-from pupper_sysid.sysid.loaded.runs import Run, prepare
-from pupper_sysid.sysid.loaded.structures import Structure
+from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
 
 LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.002, 0.02, 600
@@ -63,56 +58,22 @@ def recording(
     return Recording.from_frame(table, metadata=header, name=motion)
 
 
-def found(*recordings: Recording) -> tuple[float, tuple[Run, ...]]:
-    """Limit and runs as `fit_loaded_joint` settles them."""
-    trials = tuple(t for r in recordings for t in r.trials("j"))
-    lattice = find_poll_lattice(trials, np.random.default_rng(0))
-    runs = tuple(r for t in trials if (r := prepare(t, lattice)) is not None)
-    structure, noise = Structure(("load friction",), scales_of(trials, runs)), (0.01,) * len(runs)
-    rng = np.random.default_rng(1)
-    rough = search.search(search.Problem(structure, runs, noise), rng)[0]
-    scales, runs, _ = settled(rough, structure, runs, noise, 5e-4, rng)
-    return scales.acceleration_rad_s2, runs
-
-
-@pytest.mark.parametrize("seed", [2, pytest.param(6, marks=pytest.mark.slow)])
-def test_a_limit_is_found_in_the_chirp_that_has_it_and_not_in_jumps_without(seed: int):
-    limit, (chirp, jumps) = found(
-        recording(CHIRP, LIMIT_RAD_S2, seed), recording(JUMPS, np.inf, seed)
-    )
-    assert limit == pytest.approx(LIMIT_RAD_S2, rel=0.05)
-    assert chirp.ramp_share == 1.0 and np.isinf(jumps.ramp_share)
+@pytest.mark.slow
+def test_a_limit_is_found_in_the_chirp_that_has_it_and_not_in_jumps_without():
+    fit = calibrate([recording(CHIRP, LIMIT_RAD_S2, 2), recording(JUMPS, np.inf, 2)])
+    limit = fit.calibration.joint("j").under_load.acceleration_limit_rad_s2
+    assert limit.identified == "yes" and limit.value == pytest.approx(LIMIT_RAD_S2, rel=0.05)
+    assert limit.low <= LIMIT_RAD_S2 <= limit.high
 
 
 @pytest.mark.slow
-def test_a_recording_with_a_larger_limit_gets_a_share_of_its_own():
-    limit, (chirp, jumps) = found(
-        recording(CHIRP, LIMIT_RAD_S2, 6), recording(JUMPS, 8 * LIMIT_RAD_S2, 6)
-    )
-    assert limit == pytest.approx(LIMIT_RAD_S2, rel=0.05)
-    assert chirp.ramp_share == 1.0 and jumps.ramp_share == 8.0
-
-
-@pytest.mark.slow
-def test_no_limit_is_found_where_there_is_none():
-    limit, runs = found(recording(CHIRP, np.inf, 3), recording(JUMPS, np.inf, 3))
-    assert np.isnan(limit)
-    assert all(r.ramp_share == 1.0 for r in runs)
-
-
-def test_a_register_that_the_recording_states_decides():
-    recordings = (
-        recording(CHIRP, LIMIT_RAD_S2, 4),
-        recording(JUMPS, LIMIT_RAD_S2, 4, {"acceleration": 0}),
-    )
-    trials = tuple(t for r in recordings for t in r.trials("j"))
-    lattice = find_poll_lattice(trials, np.random.default_rng(0))
-    runs = tuple(r for t in trials if (r := prepare(t, lattice)) is not None)
-    assert [r.ramp_known for r in runs] == [False, True]
-    structure = Structure(("acceleration",), scales_of(trials, runs))
-    point = structure.encode(structure.decode(structure.prior[0]))
-    given = EitherWay(structure, runs, (0.01,) * 2).settle(search.Fit(point, 0.0))
-    assert np.isinf(given[1].ramp_share)  # though the motion of this run says otherwise
+def test_no_limit_is_found_where_there_is_none_or_where_a_register_says_so():
+    for recordings in (
+        (recording(CHIRP, np.inf, 3), recording(JUMPS, np.inf, 3)),
+        (recording(JUMPS, np.inf, 4), recording(JUMPS, LIMIT_RAD_S2, 4, {"acceleration": 0})),
+    ):
+        block = calibrate(recordings).calibration.joint("j").under_load
+        assert block is None or block.acceleration_limit_rad_s2 is None
 
 
 def test_a_model_with_a_limit_moves_without_it_where_the_readings_say_so(tmp_path):
