@@ -203,7 +203,6 @@ def test_pages_name_commands_and_options_that_exist():
                 option = word.split("=")[0]
                 assert re.search(rf"{option}(?![\w-])", shown), f"{page.name}: {line}: {option}"
 
-
     shown = docs_conf.help_text("pupper_sysid", "sweep")
     assert "--amplitude" in shown and "--no-such-option" not in shown
 

@@ -9,6 +9,7 @@ import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,9 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.results import plain
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.report import report
 from support.command_line import refused, run, run_program
+from support.json_keys import DOCUMENTED, key_line
 
 ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ROOT / "data" / "samples" / "sweep.csv"
@@ -30,16 +33,17 @@ def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def test_delay_json_is_one_object_with_the_documented_keys(capsys, hip):
-    code, out, _ = run(capsys, "delay", hip, "--json")
-    joint = json.loads(out)["joints"]["LF_hip"]
-    assert code == 0
-    assert {
-        "raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s", "dynamics_s", "stale_lag_s",
-        "command_hold_s", "quantum_rad", "offset_rad", "feedback", "by_frequency", "estimators_s",
-    } <= set(joint)  # fmt: skip
-    assert {"poll_period_s", "loss", "mean_age_s"} <= set(joint["feedback"])
-    assert {"frequency_hz", "gain", "phase_deg", "lag_s"} <= set(joint["by_frequency"][0])
+def asked(capsys, *arguments) -> dict:
+    """JSON object of a command."""
+    code, out, err = run(capsys, *arguments, "--json")
+    assert code == 0, err
+    return json.loads(out)
+
+
+def test_delay_json_has_the_documented_keys_and_parts_that_add_up_in_order(capsys, hip):
+    found = asked(capsys, "delay", hip)
+    assert key_line(found) == DOCUMENTED["delay"]
+    joint = found["joints"]["LF_hip"]
     lags = [joint[k]["value"] for k in ("raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s")]
     assert lags == sorted(lags, reverse=True)
 
@@ -65,26 +69,24 @@ def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys, h
     assert Path("c.yaml").read_bytes() == before
 
 
-def test_doctor_json_has_the_documented_keys(capsys):
-    code, out, _ = run(capsys, "doctor", SWEEP, "--json")
-    joint = json.loads(out)["joints"]["LF_thigh"]
-    assert code == 0 and joint["verdict"] == "use"
-    assert {
-        "verdict", "reasons", "loop_period_s", "jitter_s", "fresh_fraction", "poll_period_s",
-        "loss", "quantum_rad", "reading_minus_command_rad",
-    } <= set(joint)  # fmt: skip
+def test_doctor_json_has_the_documented_keys_and_finds_the_polls(capsys, hip):
+    found = asked(capsys, "doctor", hip)
+    assert key_line(found) == DOCUMENTED["doctor"]
+    joint = found["joints"]["LF_hip"]
+    assert joint["verdict"] == "use"
     assert joint["poll_period_s"] == pytest.approx(0.02685, abs=1.5e-4)
     assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)
 
 
-def test_bode_shows_that_the_servo_follows_where_raw_rows_say_it_does_not(capsys):
-    code, out, _ = run(capsys, "bode", SWEEP, "--joints", "LF_hip", "--json", "--plot", "b.png")
-    tones = json.loads(out)["joints"]["LF_hip"]["by_frequency"]
-    assert code == 0 and Path("b.png").stat().st_size > 10_000
+def test_bode_shows_that_the_servo_follows_where_raw_rows_say_it_does_not(capsys, hip):
+    found = asked(capsys, "bode", hip, "--plot", "b.png")
+    assert key_line(found) == DOCUMENTED["bode"]
+    tones = found["joints"]["LF_hip"]["by_frequency"]
+    assert Path("b.png").stat().st_size > 10_000
     assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["raw_gain"] < 0.75
 
 
-def test_sweep_records_calibrates_and_repeats_under_its_seed(capsys):
+def test_a_sweep_repeats_under_its_seed(capsys):
     for name in ("a.csv", "b.csv"):
         code, _, err = run(capsys, "sweep", "--freqs", "1,3", "--joints", "RB_calf", "--duration",
                            "2", "--seed", "4", "--out", name)  # fmt: skip
@@ -109,11 +111,10 @@ def test_export_of_presets_calibrations_and_recordings(capsys):
     assert code == 2 and "--force" in err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
+def test_bad_input_ends_with_2_and_names_what_is_wrong(capsys):
+    for arguments, expected in (
         (("delay", "nothing.csv"), "does not exist"),
-        (("delay",), "no recording|none in recordings|No recording was named"),
+        (("delay",), "No recording was named"),
         (("delay", SWEEP, "--joints", "LF_hipp"), "Did you mean LF_hip"),
         (("sweep", "--freqs", "10-1"), "10-1"),
         (("sweep", "--freqs", "abc"), "abc"),
@@ -124,14 +125,8 @@ def test_export_of_presets_calibrations_and_recordings(capsys):
         (("export", "x.docx"), "neither"),
         (("export", "missing.yaml"), "missing.yaml"),
         (("nonsense",), "nonsense"),
-    ],
-)
-def test_bad_input_ends_with_2_and_a_sentence(capsys, arguments, expected):
-    import re
-
-    code, out, err = run(capsys, *arguments)
-    assert code == 2 and out == ""
-    assert re.search(expected, err.replace("\n", " ")) and "Traceback" not in err
+    ):
+        assert expected in refused(capsys, pupper_sysid, *arguments), arguments
 
 
 def table_with(tmp_path, change):
@@ -148,20 +143,15 @@ def swap(table):
     return table.assign(command_rad=table.position_rad, position_rad=table.command_rad)
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
+def test_doctor_refuses_logs_that_cannot_be_used_and_says_why(capsys, tmp_path):
+    for change, expected in (
         (lambda t: t.assign(position_rad=0.1), "reading does not"),
         (lambda t: t.assign(command_rad=0.1), "command never changes"),
         (swap, "swapped"),
-    ],
-)
-def test_doctor_refuses_logs_that_cannot_be_used_and_says_why(capsys, tmp_path, change, expected):
-    path = table_with(tmp_path, change)
-    code, out, _ = run(capsys, "doctor", path, "--json")
-    joint = json.loads(out)["joints"]["LF_hip"]
-    assert code == 0 and joint["verdict"] == "do not use"
-    assert any(expected in reason for reason in joint["reasons"])
+    ):
+        joint = asked(capsys, "doctor", table_with(tmp_path, change))["joints"]["LF_hip"]
+        assert joint["verdict"] == "do not use"
+        assert any(expected in reason for reason in joint["reasons"]), expected
 
 
 def test_constant_feedback_is_answered_in_a_sentence_by_every_command(capsys, tmp_path):
@@ -180,7 +170,7 @@ def test_one_frequency_is_calibrated_with_a_warning(capsys, tmp_path):
     assert any("one frequency only" in w for w in joint["warnings"])
 
 
-def test_a_sweep_killed_half_way_leaves_a_file_that_every_command_reads(capsys, tmp_path):
+def test_a_sweep_killed_half_way_leaves_a_file_that_is_read(capsys, tmp_path):
     path = tmp_path / "killed.csv"
     sweep = subprocess.Popen(
         [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
@@ -194,8 +184,8 @@ def test_a_sweep_killed_half_way_leaves_a_file_that_every_command_reads(capsys, 
     sweep.send_signal(signal.SIGKILL)
     sweep.wait()
     assert len(load(path).table) > 150
-    for command in (["doctor"], ["delay"], ["bode"], ["export"]):
-        code, _, err = run(capsys, *command, path)
+    for command in ("doctor", "export"):
+        code, _, err = run(capsys, command, path)
         assert code == 0, err
     assert any("not recorded to its end" in w for w in load(path).warnings)
 
@@ -220,12 +210,12 @@ PROGRAMS = ("pupper_sysid", "pupper_train", "pupper_play", "pupper_eval", "puppe
             "pupper_analyze")  # fmt: skip
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_every_program_prints_its_version(capsys, name):
-    module = importlib.import_module(f"pupper_sysid.cli.programs.{name}")
-    code, out, _ = run_program(capsys, module, "--version")
-    assert code == 0
-    assert out.startswith(f"{name.replace('_', '-')} {version('pupper-sysid')} (numpy ")
+def test_every_program_prints_its_version(capsys):
+    for name in PROGRAMS:
+        module = importlib.import_module(f"pupper_sysid.cli.programs.{name}")
+        code, out, _ = run_program(capsys, module, "--version")
+        assert code == 0
+        assert out.startswith(f"{name.replace('_', '-')} {version('pupper-sysid')} (numpy ")
 
 
 def test_completion_is_written_where_bash_looks_for_it(capsys, tmp_path, monkeypatch):
@@ -239,16 +229,10 @@ def test_completion_is_written_where_bash_looks_for_it(capsys, tmp_path, monkeyp
     assert "fish" in refused(capsys, pupper_sysid, "--install-completion")
 
 
-def test_a_report_opens_in_the_browser_that_there_is(capsys, tmp_path, monkeypatch):
-    opened = []
+def test_a_report_opens_in_the_browser_that_there_is(capsys, tmp_path, monkeypatch, hip):
+    opened, page = [], tmp_path / "page/report.html"
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or False)
-    sweep = tmp_path / "s.csv"
-    code, _, err = run_program(
-        capsys, pupper_sysid, "sweep", "--freqs", "2,4", "--joints", "LF_hip",
-        "--duration", "2", "--out", sweep,
-    )  # fmt: skip
-    assert code == 0, err
-    page = tmp_path / "page"
-    code, _, err = run_program(capsys, pupper_sysid, "report", sweep, "--out", page, "--open")
+    monkeypatch.setattr(report, "write_report", lambda *_, **__: SimpleNamespace(path=page))
+    code, _, err = run(capsys, "report", hip, "--out", page.parent, "--open")
     assert code == 0 and "No browser could be started" in err
-    assert opened == [(page / "report.html").resolve().as_uri()]
+    assert opened == [page.resolve().as_uri()]

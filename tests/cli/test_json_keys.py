@@ -14,9 +14,6 @@ COMMANDS = {
     "sweep": ("--freqs", "4", "--joints", "LF_hip"),
     "plan": (SAMPLE.with_name("calibrated.yaml"), "--joints", "LF_hip"),
     "import": (HIP,),
-    "doctor": (HIP,),
-    "delay": (HIP,),
-    "bode": (HIP,),
     "export": ("paper", "--to", "csv"),
     "compare": (HIP, "--models", "paper"),
 }
