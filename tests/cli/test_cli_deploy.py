@@ -72,7 +72,7 @@ def test_a_script_is_followed(capsys, here):
 
 def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
     code, _, err = run_program(
-        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 1,
+        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 0.1,
         "--name", "slow",
     )  # fmt: skip
     assert code == 0 and "0.50 times as fast" in err
@@ -81,7 +81,7 @@ def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
 def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(capsys, here):
     code, _, err = run_program(
         capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--observer",
-        "published-pd", "--seconds", 1, "--name", "paper",
+        "published-pd", "--seconds", 0.1, "--name", "paper",
     )  # fmt: skip
     assert code == 0 and "warning" in err and "Hz" in err
     # a row per kind of joint and whole hertz, rounded; the published resonance is in it
@@ -101,27 +101,18 @@ def late(here) -> Path:
     return Path("late.yaml")
 
 
-@pytest.mark.parametrize("stack", ["closed-loop", "mlp-observer"])
-def test_a_robot_unlike_the_one_of_the_training_is_told_before_the_start(capsys, late, stack):
-    code, _, err = run_program(
-        capsys, pupper_deploy, POLICY, "--actuator", late, "--stack", stack, "--seconds", 0.1,
-        "--name", "late",
-    )  # fmt: skip
-    assert code == 0 and "60 ms later than the trained actuator" in err
-    said = " ".join(err.split())
-    assert "late.yaml is not what the policy was trained for" in said
-    assert re.search(
-        r"Dead time \(\w+\): [\d.]+ ms, [5-6]\d(\.\d)? ms more than in the training", said
-    )
-
-
 def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here, late):
     arguments = (POLICY, "--seconds", 0.1, "--name", "walk", "--force", "--json")
     code, out, err = run_program(capsys, pupper_deploy, *arguments, "--actuator", CALIBRATION)
     found = json.loads(out)
     assert code == 0 and found["servo_match"]["outside"] == []
     assert "within the ranges that the policy was trained for" in err
-    code, out, _ = run_program(capsys, pupper_deploy, *arguments, "--actuator", late)
+    code, out, err = run_program(capsys, pupper_deploy, *arguments, "--actuator", late)
+    assert code == 0 and "60 ms later than the trained actuator" in err
+    assert "late.yaml is not what the policy was trained for" in err
+    assert re.search(
+        r"Dead time \(\w+\): [\d.]+ ms, [5-6]\d(\.\d)? ms more than in the training", err
+    )
     found = json.loads(out)
     worst = found["servo_match"]["outside"]
     assert {one["quantity"] for one in worst} == {"dead time"} and len(worst) == 12
@@ -129,6 +120,7 @@ def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here
     assert read_walk(Path(found["log"])).header["servo_match"] == found["servo_match"]
     code, out, err = run_program(capsys, pupper_deploy, *arguments)
     assert code == 0 and json.loads(out)["servo_match"] is None  # no robot was named
+    assert "warning" not in err and "the servos' own readings" in err
 
 
 def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys, late):
@@ -145,30 +137,23 @@ def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys,
     assert "was not compared with it" in err and "moves like the trained" not in err
 
 
-def test_the_shipped_policies_are_tried_from_any_folder(capsys, here):
-    code, _, err = run_program(capsys, pupper_deploy, POLICY, "--seconds", 0.1, "--name", "walk")
-    assert code == 0 and "warning" not in err and "the servos' own readings" in err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
+def test_bad_input_is_answered_in_a_sentence(capsys, here):
+    known = (POLICY, "--actuator", CALIBRATION)
+    for arguments, says in (
         ((), "No policy was named"),
         (("nowhere",), "neither a run nor a policy"),
         ((POLICY, "--actuator", "nowhere.yaml"), "no such file"),
-        ((POLICY, "--actuator", CALIBRATION, "--bus", "feetech:/dev/none"), "no IMU"),
-        ((POLICY, "--actuator", CALIBRATION, "--bus", "serial"), "bus serial"),
-        ((POLICY, "--actuator", CALIBRATION, "--stack", "lstm-servo"), "--servo"),
-        ((POLICY, "--actuator", CALIBRATION, "--command", "9", "0", "0"), "--command"),
-        ((POLICY, "--actuator", CALIBRATION, "--lowpass-hz", "40"), "half the rate"),
-        ((POLICY, "--actuator", CALIBRATION, "--keyboard"), "terminal"),
+        ((*known, "--bus", "feetech:/dev/none"), "no IMU"),
+        ((*known, "--bus", "serial"), "bus serial"),
+        ((*known, "--stack", "lstm-servo"), "--servo"),
+        ((*known, "--command", "9", "0", "0"), "--command"),
+        ((*known, "--lowpass-hz", "40"), "half the rate"),
+        ((*known, "--keyboard"), "terminal"),
         ((POLICY, "--replay", "nowhere.csv"), "does not exist"),
         ((POLICY, "--seconds", "-1"), "--seconds"),
         ((POLICY, "--seed", "-1"), "--seed is -1"),
-    ],
-)
-def test_bad_input_is_answered_in_a_sentence(capsys, here, arguments, says):
-    assert says in refused(capsys, pupper_deploy, *arguments)
+    ):
+        assert says in refused(capsys, pupper_deploy, *arguments), arguments
 
 
 # ------------------------------------------------------------------------------ pupper-analyze
@@ -225,10 +210,8 @@ def test_a_quick_look_is_smaller_and_says_so(capsys, here, monkeypatch):
     assert common._QUICK[0] < common._FULL[0] and common._QUICK[1] < common._FULL[1]
     monkeypatch.setattr(common, "_QUICK", (1, 0.5))
     arguments = ("terrain", POLICY, "--actuator", CALIBRATION, "--quick")
-    code, out, _ = run_program(capsys, pupper_analyze, *arguments, "--json")
-    found = json.loads(out)
-    assert code == 0 and (found["quick"], found["robots"], found["seconds"]) == (True, 1, 0.5)
-    code, out, _ = run_program(capsys, pupper_analyze, *arguments, "--force")
+    code, out, _ = run_program(capsys, pupper_analyze, *arguments)
+    assert code == 0
     assert "On other ground (1 robots, 0.5 s each; a quick look)" in " ".join(out.split())
 
 
@@ -243,18 +226,15 @@ def test_two_policies_of_one_name_are_not_merged(capsys, here):
 
 def test_a_walk_too_short_for_a_gait_or_an_orbit_is_told_so(capsys, here):
     for what, says in (("gait", "No robot walked for 7 s"), ("attractor", "there is no orbit")):
-        arguments = (what, POLICY, "--robots", 1, "--seconds", 3)
+        arguments = (what, POLICY, "--robots", 1, "--seconds", 1)
         assert says in refused(capsys, pupper_analyze, *arguments)
 
 
-@pytest.mark.parametrize(
-    ("module", "program"),
-    [(pupper_deploy, "deploy"), (pupper_analyze, "analyze"), (pupper_eval, "eval"),
-     (pupper_play, "play")],
-)  # fmt: skip
-def test_help_shows_an_example(capsys, module, program):
-    code, out, _ = run_program(capsys, module, "--help")
-    assert code == 0 and f"Example: pupper-{program} " in " ".join(out.split())
+def test_help_shows_an_example(capsys):
+    for module in (pupper_deploy, pupper_analyze, pupper_eval, pupper_play):
+        code, out, _ = run_program(capsys, module, "--help")
+        program = module.__name__.split(".")[-1].replace("_", "-")
+        assert code == 0 and f"Example: {program} " in " ".join(out.split())
 
 
 def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):

@@ -21,7 +21,6 @@ from pupper_sysid.policies.train.checkpoint import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset, save_run
 from pupper_sysid.policies.walks.film import SIZE
 from pupper_sysid.sim.walking import env
-from support.browser import looks_right
 from support.command_line import refused
 from support.command_line import run_program as run
 from support.json_keys import DOCUMENTED, key_line
@@ -69,8 +68,7 @@ def test_training_leaves_a_run_with_settings_curves_checkpoint_and_policy(traine
     assert found["iteration"] == 2 and found["more"]["imitated"] == 2
 
 
-@pytest.mark.parametrize("name", ["fast", "paper", "release"])
-@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+@pytest.mark.parametrize(("name", "kind"), [("fast", "lstm"), ("paper", "mlp"), ("release", "mlp")])
 def test_all_settings_can_be_printed_and_are_those_of_the_preset(capsys, name, kind):
     arguments = ("--print-config", "--preset", name, f"--policy={kind}", "--seed", "7")
     code, out, err = run(capsys, pupper_train, *arguments)
@@ -127,21 +125,17 @@ def test_a_calibration_with_an_unknown_joint_is_refused_by_name(capsys, here):
     assert "wing.yaml" in said and "LF_wing" in said
 
 
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
+def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here):
+    for arguments, word in (
         (("--policy", "perceptron"), "perceptron"), (("--policy=perceptron",), "perceptron"),
         (("--policy",), "policy"), (("--preset", "quick"), "quick"),
         (("--environment-count", "3"), "--environment-count"), (("--environments", "x"), "x"),
-    ],
-)  # fmt: skip
-def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here, arguments, word):
-    assert word in refused(capsys, pupper_train, *arguments)
+    ):  # fmt: skip
+        assert word in refused(capsys, pupper_train, *arguments), arguments
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
+def test_sizes_that_cannot_be_are_refused(capsys, here):
+    for arguments, words in (
         (("--environments", "0"), "environments is 0; it must be from 1 to"),
         (("--learner.minibatches", "0"), "minibatches is 0"),
         (("--architecture.hidden", "0"), "at least 1"),
@@ -154,10 +148,8 @@ def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here, arguments, 
         (("--task.randomisation.friction", "1", "0.3"), "randomisation.friction is 1 to 0.3"),
         (("--task.randomisation.friction", "-1", "0.3"), "from 0 on"),
         (("--task.commands.yaw-rad-s", "0.5", "-0.5"), "commands.yaw_rad_s is 0.5 to -0.5"),
-    ],
-)
-def test_sizes_that_cannot_be_are_refused(capsys, here, arguments, words):
-    assert words in refused(capsys, pupper_train, *TINY, *arguments)
+    ):
+        assert words in refused(capsys, pupper_train, *TINY, *arguments), arguments
 
 
 def test_a_run_is_not_begun_in_the_folder_of_another(capsys, trained, monkeypatch):
@@ -214,12 +206,12 @@ def test_ctrl_c_saves_and_ends_well(tmp_path):
 def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
     code, out, _ = run(
         capsys, pupper_eval, trained, "--json", "--episodes", "5", "--threads", "1",
-        "--seconds", "2", "--terrain", "flat", "--extra-delay-ms", "0", "20",
+        "--seconds", "0.5", "--terrain", "flat", "--extra-delay-ms", "0", "20",
     )  # fmt: skip
     assert code == 0
     found = json.loads(out)
     assert found["actuator"] == CALIBRATION and found["feedback"] == "held"
-    assert not found["quick"] and not found["battery"] and found["episode_s"] == 2
+    assert not found["quick"] and not found["battery"] and found["episode_s"] == 0.5
     names = [row["name"] for row in found["conditions"]]
     # flat ground and no added dead time are those of the random commands
     assert names[:2] == ["random commands", "forward"] and names[-1] == "dead time +20 ms"
@@ -296,7 +288,7 @@ def test_an_evaluation_elsewhere_says_where(capsys, trained):
     code, out, _ = run(
         capsys, pupper_eval, trained / "policy_last", "--json", "--episodes", "1",
         "--actuator", "ideal", "--feedback", "ideal", "--terrain", "flat", "--extra-delay-ms", "0",
-        "--threads", "1", "--seconds", "2",
+        "--threads", "1", "--seconds", "0.2",
     )  # fmt: skip
     found = json.loads(out)
     assert code == 0 and (found["actuator"], found["feedback"]) == ("ideal", "ideal")
@@ -305,7 +297,7 @@ def test_an_evaluation_elsewhere_says_where(capsys, trained):
 def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
     arguments = (
         trained, "--episodes", "1", "--terrain", "rough", "--extra-delay-ms", "0", "--threads", "1",
-        "--seconds", "2", "--report", tmp_path / "report",
+        "--seconds", "0.3", "--report", tmp_path / "report",
     )  # fmt: skip
     code, out, err = run(capsys, pupper_eval, *arguments)
     assert code == 0, err
@@ -316,15 +308,13 @@ def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, traine
     assert "standing, random" in out and "How it was trained" in text
     assert "learner.epochs" in text and CALIBRATION in text
     assert (tmp_path / "report" / "figures" / "training.png").stat().st_size > 2000
-    if shutil.which("chromium"):
-        looks_right(page, tmp_path, 375, dark=True)
     assert "walking.html exists already" in refused(capsys, pupper_eval, *arguments)
 
 
-@pytest.mark.parametrize("extra", ["-40", "nan"])
-def test_servos_cannot_be_made_quicker_than_they_are(capsys, trained, extra):
-    said = refused(capsys, pupper_eval, trained, "--extra-delay-ms", "0", extra)
-    assert f"--extra-delay-ms is {extra}" in said
+def test_servos_cannot_be_made_quicker_than_they_are(capsys, trained):
+    for extra in ("-40", "nan"):
+        said = refused(capsys, pupper_eval, trained, "--extra-delay-ms", "0", extra)
+        assert f"--extra-delay-ms is {extra}" in said
 
 
 def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
@@ -336,7 +326,7 @@ def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
     contract.write_text(contract.read_text().replace('"feedback": "held"', '"feedback": "ideal"'))
     code, out, _ = run(
         capsys, pupper_eval, alone, "--json", "--episodes", "1", "--actuator", CALIBRATION,
-        "--seconds", "2", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+        "--seconds", "0.2", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
     )  # fmt: skip
     assert code == 0 and json.loads(out)["feedback"] == "ideal"
 
@@ -447,16 +437,13 @@ def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):
     assert "No window could be opened (no display)" in said and "--video" in said
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
+def test_what_cannot_be_played_is_refused(capsys, trained, here):
+    (here / "there.mp4").write_text("kept")
+    for arguments, words in (
         (("--seconds", "0"), "--seconds is 0.0; it must be a positive number"),
         (("--seconds", "nan"), "must be a positive number"),
         (("--video", "walk.gif"), "ends in .mp4"),
         (("--video", "there.mp4"), "exists already"),
-    ],
-)
-def test_what_cannot_be_played_is_refused(capsys, trained, here, arguments, words):
-    (here / "there.mp4").write_text("kept")
-    assert words in refused(capsys, pupper_play, trained, *arguments)
+    ):
+        assert words in refused(capsys, pupper_play, trained, *arguments), arguments
     assert (here / "there.mp4").read_text() == "kept"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pupper_sysid.cli.programs import pupper_deploy, pupper_sysid, pupper_train
-from support.command_line import refused, run
+from support.command_line import refused
 
 SWEEP = Path(__file__).parents[2] / "data/samples/sweep.csv"
 COMMANDS = Path(__file__).parents[2] / "data/samples/walk_commands.csv"
@@ -33,27 +33,25 @@ def test_a_file_beyond_a_limit_names_the_option_that_reads_it(capsys, tmp_path):
         assert "columns are read" not in refused(capsys, pupper_sysid, "import", path, *words)
 
 
-@pytest.mark.parametrize("value", ["0", "0.5", "1001", "nan", "inf", "x", "4_1", "٣", ""])
-def test_the_limit_of_reading_is_a_number_from_1_to_1000(capsys, value):
-    assert "--read-limit" in refused(capsys, pupper_sysid, "doctor", SWEEP, "--read-limit", value)
-
-
-def test_the_limit_of_reading_needs_a_value(capsys):
+def test_the_limit_of_reading_is_a_number_from_1_to_1000(capsys):
+    for value in ("0", "0.5", "1001", "nan", "inf", "x", "4_1", "٣", ""):
+        words = ("doctor", SWEEP, "--read-limit", value)
+        assert "--read-limit" in refused(capsys, pupper_sysid, *words), value
     assert "--read-limit needs a number" in refused(
         capsys, pupper_sysid, "doctor", SWEEP, "--read-limit"
     )
 
 
-@pytest.mark.parametrize("number", ["4_1", "٤١", "１０", "0x10", "1e", "4,1"])
-@pytest.mark.parametrize("option", ["--rate", "--duration", "--seed", "--loops"])
-def test_numbers_of_options_are_numerals_in_ascii(capsys, option, number):
-    code, out, err = run(capsys, "sweep", option, number)
-    assert code == 2 and out == "" and "is not a" in err
+def test_numbers_of_options_are_numerals_in_ascii(capsys):
+    for number in ("4_1", "٤١", "１０", "0x10", "1e", "4,1"):
+        for option in ("--rate", "--seed"):  # of a number with a fraction, and a whole one
+            said = refused(capsys, pupper_sysid, "sweep", option, number)
+            assert "is not a" in said, (option, number)
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
+def test_a_sweep_that_cannot_be_meant_is_refused_before_it_begins(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for words, says in (
         (("--duration", "1e12"), "--duration is 1e+12 s; it must be from 0.1 to 86400 s"),
         (("--duration", "nan"), "--duration is nan"),
         (("--rate", "1e12"), "--rate is 1e+12 Hz; it must be from 1 to 1000 Hz"),
@@ -64,32 +62,26 @@ def test_numbers_of_options_are_numerals_in_ascii(capsys, option, number):
         (("--until", ""), "--until is empty"),
         (("--joints", ""), "--joints is empty"),
         (("--playback", "/dev/zero"), "/dev/zero is not a file"),
-    ],
-)
-def test_a_sweep_that_cannot_be_meant_is_refused_before_it_begins(
-    capsys, monkeypatch, tmp_path, words, says
-):
-    monkeypatch.chdir(tmp_path)
-    assert says in refused(capsys, pupper_sysid, "sweep", *words)
+    ):
+        assert says in refused(capsys, pupper_sysid, "sweep", *words), words
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("ids", ["1-999999999999", "5-1", "٣", "", "1,", "0"])
-def test_ids_of_an_emulated_line_are_those_of_its_servos(capsys, ids):
-    assert "--ids" in refused(capsys, pupper_sysid, "emulate", "feetech", "--ids", ids)
+def test_ids_of_an_emulated_line_are_those_of_its_servos(capsys):
+    for ids in ("1-999999999999", "5-1", "٣", "", "1,", "0"):
+        words = ("emulate", "feetech", "--ids", ids)
+        assert "--ids" in refused(capsys, pupper_sysid, *words), ids
 
 
-@pytest.mark.parametrize("words", [("--environments", "9" * 30), ("--minutes", "nan")])
-def test_a_training_that_cannot_be_meant_is_refused(capsys, words):
-    said = refused(capsys, pupper_train, "--actuator", "paper", *words)
-    assert f"{words[0].removeprefix('--')} is" in said
+def test_a_training_that_cannot_be_meant_is_refused(capsys):
+    for option, value in (("--environments", "9" * 30), ("--minutes", "nan")):
+        said = refused(capsys, pupper_train, "--actuator", "paper", option, value)
+        assert f"{option.removeprefix('--')} is" in said
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-@pytest.mark.parametrize(
-    "words", [["sweep", "--help"], ["--help"], ["servo", "list"], ["servo", "list", "--json"]]
-)
-def test_help_that_cannot_be_printed_is_an_error_too(words):
+@pytest.mark.parametrize("words", [["sweep", "--help"], ["servo", "list"]])
+def test_help_or_a_table_that_cannot_be_printed_is_an_error_too(words):
     with open("/dev/full", "w") as full:
         ended = command(words, stdout=full, stderr=subprocess.PIPE, text=True)
     assert ended.returncode == 2
@@ -98,17 +90,19 @@ def test_help_that_cannot_be_printed_is_an_error_too(words):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="streams are closed by a shell")
-@pytest.mark.parametrize("words", [["sweep", "--help"], ["servo", "list"], ["doctor", "none.csv"]])
-def test_a_program_whose_streams_are_closed_ends_as_ever(tmp_path, words):
-    expected = 2 if "none.csv" in words else 0
-    for closed in ((0, 1, 2), (1,), (2,)):
+def test_a_program_whose_streams_are_closed_ends_as_ever(tmp_path):
+    for words, closed, expected in (
+        (["sweep", "--help"], (0, 1, 2), 0),
+        (["servo", "list"], (1,), 0),
+        (["doctor", "none.csv"], (2,), 2),
+    ):
 
         def close(streams=closed) -> None:
             for stream in streams:
                 os.close(stream)
 
         ended = command(words, cwd=tmp_path, preexec_fn=close)
-        assert ended.returncode == expected, closed
+        assert ended.returncode == expected, (words, closed)
 
 
 def command(words, **how):
@@ -122,13 +116,10 @@ def test_a_script_or_log_that_never_ends_is_refused_at_once(capsys):
         assert "is not a file" in refused(capsys, pupper_deploy, *words, option, "/dev/zero")
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
+def test_an_emulated_line_that_cannot_be_is_refused(capsys):
+    for words, says in (
         (("--baud", "0"), "--baud 0: choose"),
         (("--load", "none", "--backlash", "1e9"), "--backlash is 1e+09 degrees; it must be from 0"),
         (("--load", "none", "--backlash", "-1"), "--backlash is -1 degrees"),
-    ],
-)
-def test_an_emulated_line_that_cannot_be_is_refused(capsys, words, says):
-    assert says in refused(capsys, pupper_sysid, "emulate", "feetech", *words)
+    ):
+        assert says in refused(capsys, pupper_sysid, "emulate", "feetech", *words), words

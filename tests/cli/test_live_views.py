@@ -52,6 +52,11 @@ def hold(bus: GuardedBus, views, ticks: int) -> float:
     return max(took)
 
 
+def little_room(views) -> None:
+    """Leave space for a few ticks only between the loop and its writer."""
+    views._process.here.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+
+
 def same_as_recording(found, recording, name) -> None:
     """Every channel of the recording is in what was found, at its times."""
     for channel in channels(recording):
@@ -100,8 +105,9 @@ def test_a_writer_that_stands_still_delays_no_tick_and_what_it_missed_is_counted
     bus = emulated()
     with live_views(bus, Wanted(None, tmp_path / "a.mcap")) as views:
         os.kill(views._process.process.pid, signal.SIGSTOP)
+        little_room(views)
         bus.torque(True)
-        assert hold(bus, views, 4000) < 0.01
+        assert hold(bus, views, 300) < 0.01
         assert views.dropped > 0
         process, began = views._process.process, time.monotonic()
     assert time.monotonic() - began < 15 and process.returncode is not None
@@ -113,24 +119,26 @@ def test_ticks_that_were_dropped_are_counted_and_the_others_are_whole(tmp_path, 
     with live_views(bus, Wanted(None, tmp_path / "a.mcap")) as views:
         bus.torque(True)
         os.kill(views._process.process.pid, signal.SIGSTOP)
-        hold(bus, views, 4000)
+        little_room(views)
+        hold(bus, views, 300)
         os.kill(views._process.process.pid, signal.SIGCONT)
-        dropped = views.dropped
+        assert (dropped := views.dropped) > 0
         time.sleep(0.5)
-        hold(bus, views, 20)
+        hold(bus, views, 2)
     topics, _ = topics_of(tmp_path / "a.mcap")
     time_s, _ = topics["LF_hip", "position_rad"]
-    assert len(time_s) == 4020 - dropped
+    assert len(time_s) == 302 - dropped
     assert f"{dropped} ticks were dropped" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_bus_in_virtual_time_waits_for_the_writer(tmp_path):
     bus = emulated()
     with live_views(bus, Wanted(None, tmp_path / "a.mcap"), waits=True) as views:
+        little_room(views)
         bus.torque(True)
-        hold(bus, views, 3000)
+        hold(bus, views, 300)
         assert views.dropped == 0
-    assert len(topics_of(tmp_path / "a.mcap")[0]["LF_hip", "position_rad"][0]) == 3000
+    assert len(topics_of(tmp_path / "a.mcap")[0]["LF_hip", "position_rad"][0]) == 300
 
 
 def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
@@ -162,7 +170,9 @@ def test_unknown_commands_and_silent_servos_are_left_out(tmp_path):
     assert topics["LF_thigh", "position_rad"][1] == [0.1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL]
+)
 def test_the_files_are_whole_however_the_sweep_ends(tmp_path, number):
     words = (*SWEEP, "--duration", "30", "--real-time", "--mcap", "a.mcap", "--rerun", "a.rrd")
     process = subprocess.Popen(
@@ -210,8 +220,11 @@ def test_what_is_there_is_not_replaced_and_what_is_missing_is_named(tmp_path, mo
         assert code == 2 and sentence in err
     assert [p.name for p in tmp_path.iterdir()] == ["mine.mcap"]
     assert Path("mine.mcap").read_text() == "mine"
-    code, _, err = run(capsys, *SWEEP, "--mcap", "mine.mcap", "--force")
-    assert code == 0 and topics_of(tmp_path / "mine.mcap")[0]
+    bus = emulated()
+    with live_views(bus, Wanted(None, Path("mine.mcap"), force=True), waits=True) as views:
+        bus.torque(True)
+        hold(bus, views, 1)
+    assert topics_of(tmp_path / "mine.mcap")[0]
 
 
 @pytest.mark.parametrize("missing", ["mcap_ros2", "rerun"])
@@ -278,7 +291,7 @@ def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
 ):
     monkeypatch.chdir(tmp_path)
     policy = str(Path(__file__).parents[2] / "data/samples/policies/mlp")
-    words = (policy, "--seconds", "3", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
+    words = (policy, "--seconds", "1.5", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
     code, _, err = run_program(capsys, pupper_deploy, *words)
     assert code == 0 and "Wrote w.mcap." in err and "dropped" not in err
     topics, texts = topics_of(tmp_path / "w.mcap")

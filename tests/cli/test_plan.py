@@ -1,11 +1,16 @@
 """`plan`, `sweep --plan` and `sweep --until`, as typed."""
 
+import io
 import json
 import re
+import shutil
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import pytest
+import yaml
 
+from pupper_sysid.cli.programs.pupper_sysid import main
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings import joints
 from pupper_sysid.sysid.recordings.files import load
@@ -40,12 +45,29 @@ def documented(command: str) -> str:
     return keys
 
 
-def planned(capsys, *arguments) -> None:
-    code, _, err = run(
-        capsys, "plan", "--joints", "LF_hip,LF_thigh", "--seconds", "6.4", "--out", "plan.yaml",
-        *arguments,
-    )  # fmt: skip
-    assert code == 0, err
+@pytest.fixture(scope="module")
+def first(tmp_path_factory) -> Path:
+    """Folder of a plan of two joints, its sweep, and what the sweep printed."""
+    folder = tmp_path_factory.mktemp("planned")
+    with chdir(folder), redirect_stdout(io.StringIO()) as printed:
+        main("plan --joints LF_hip,LF_thigh --seconds 6.4 --out plan.yaml".split())
+        printed.truncate(printed.seek(0))
+        main("sweep --plan plan.yaml --out a.csv --json".split())
+    (folder / "printed.json").write_text(printed.getvalue())
+    return folder
+
+
+@pytest.fixture
+def planned(first) -> None:
+    """The same, in the folder of a test."""
+    shutil.copytree(first, ".", dirs_exist_ok=True)
+
+
+def change_plan() -> None:
+    """Halve the first amplitude of the plan."""
+    plan = yaml.safe_load(Path("plan.yaml").read_text())
+    plan["trials"][0]["amplitude_rad"] /= 2
+    Path("plan.yaml").write_text(yaml.safe_dump(plan))
 
 
 def cut(path: Path, share: float) -> None:
@@ -55,13 +77,10 @@ def cut(path: Path, share: float) -> None:
     path.write_text("".join(lines[: rows[int(share * len(rows))]]))
 
 
-def test_a_first_sweep_is_planned_and_executed_trial_by_trial(capsys):
-    planned(capsys)
+def test_a_first_sweep_is_planned_and_executed_trial_by_trial(planned):
     plan = load_plan(Path("plan.yaml"))
     assert plan.joints == ["LF_hip", "LF_thigh"] and plan.made_from == ()
-    code, out, err = run(capsys, "sweep", "--plan", "plan.yaml", "--out", "a.csv", "--json")
-    assert code == 0, err
-    found = json.loads(out)
+    found = json.loads(Path("printed.json").read_text())
     assert found["trials"] == len(plan.trials) and found["joints"] == plan.joints
     recording = load("a.csv")
     assert recording.metadata["excitation"]["kind"] == "plan"
@@ -70,9 +89,7 @@ def test_a_first_sweep_is_planned_and_executed_trial_by_trial(capsys):
     assert [t.frequency_hz for t in recording.trials("LF_hip")][: len(tones)] == tones
 
 
-def test_a_planned_sweep_that_was_cut_short_is_continued(capsys):
-    planned(capsys)
-    run(capsys, "sweep", "--plan", "plan.yaml", "--out", "a.csv")
+def test_a_planned_sweep_that_was_cut_short_is_continued(capsys, planned):
     whole = load("a.csv").table.groupby(["joint", "trial"]).size()
     cut(Path("a.csv"), 0.6)
     code, _, err = run(capsys, "sweep", "--resume", "a.csv")
@@ -82,26 +99,21 @@ def test_a_planned_sweep_that_was_cut_short_is_continued(capsys):
     assert "completed" in again.metadata
 
 
-def test_a_plan_that_has_changed_since_is_not_continued(capsys):
-    planned(capsys)
-    run(capsys, "sweep", "--plan", "plan.yaml", "--out", "a.csv")
+def test_a_plan_that_has_changed_since_is_not_continued(capsys, planned):
     cut(Path("a.csv"), 0.6)
-    planned(capsys, "--seed", "5", "--force")
+    change_plan()
     code, _, err = run(capsys, "sweep", "--resume", "a.csv")
     assert code == 2 and "another plan" in err
 
 
-def test_the_emulated_robot_does_not_repeat_its_noise_in_a_planned_sweep(capsys):
-    planned(capsys)
-    run(capsys, "sweep", "--plan", "plan.yaml", "--joints", "LF_hip", "--out", "a.csv")
-    planned(capsys, "--force", "--seed", "1")
+def test_the_emulated_robot_does_not_repeat_its_noise_in_a_planned_sweep(capsys, planned):
+    change_plan()
     run(capsys, "sweep", "--plan", "plan.yaml", "--joints", "LF_hip", "--out", "b.csv")
     a, b = (load(name).table["position_rad"][:10].to_numpy() for name in ("a.csv", "b.csv"))
     assert (a != b).any()  # both still at rest
 
 
-def test_what_cannot_be_planned_or_executed_is_refused(capsys):
-    planned(capsys)
+def test_what_cannot_be_planned_or_executed_is_refused(capsys, planned):
     Path("other.yaml").write_text("schema: other\n")
     for arguments, sentence in (
         (("plan", "--seconds", "-1"), "--seconds"),
