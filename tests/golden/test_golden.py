@@ -1,7 +1,8 @@
 """Figures of the frozen recordings, held to 1 %; `renew.py` is the command that renews them.
 
 A part is quick: the lag of one emulated recording of every servo class and motion and of a real
-sweep, and the calibration of one servo. The rest is slow: everything, the SO-101's joints by minutes each.
+sweep, and the calibration of one servo. The rest is slow: everything, the SO-101's joints by
+minutes each.
 """
 
 from __future__ import annotations
