@@ -14,7 +14,7 @@ import pytest
 import pupper_sysid
 from support.package import MODULES, PROJECT, public_names
 
-validate = pytest.importorskip("numpydoc.validate").validate
+numpydoc = pytest.importorskip("numpydoc.validate")
 
 CHECKS = set(PROJECT["tool"]["numpydoc_validation"]["checks"])
 COMPLETE = CHECKS | {"PR01", "PR07", "RT01", "RT03", "YD01"}
@@ -24,7 +24,7 @@ FRONT_DOOR = sorted(getattr(pupper_sysid, "__all__", []))
 def violations(name: str, checks: set[str]) -> list[str]:
     """Sentences of numpydoc's validation of one name, for these checks only."""
     try:
-        found = validate(name)
+        found = numpydoc.validate(name)
     except StopIteration:  # a module without `def` and `class` is too small for it
         summary = (import_module(name).__doc__ or "").split("\n")[0]
         return [] if summary.endswith(".") else [f"{name}: SS03 {summary}"]
@@ -33,7 +33,10 @@ def violations(name: str, checks: set[str]) -> list[str]:
     return [f"{name}: {code} {text}" for code, text in found["errors"] if code in wanted]
 
 
-def test_public_docstrings_are_clean():
+def test_public_docstrings_are_clean(monkeypatch):
+    # half of the time goes into line numbers and comments that switch a check off: neither is used
+    monkeypatch.setattr(numpydoc, "extract_ignore_validation_comments", lambda *_, **__: {})
+    monkeypatch.setattr(numpydoc.Validator, "source_file_def_line", None)
     names = [name for module in MODULES for name in public_names(module)]
     assert [v for name in names for v in violations(name, CHECKS)] == []
 
