@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -17,11 +17,12 @@ from pupper_sysid.sysid.sweep.waveforms import after, strokes
 PERIOD_S = 0.02
 
 
+@cache
 def stroked(
     seed: int,
     backlash_deg: float,
     dead_zone: int,
-    gains: Sequence[int] = (8, 32),
+    gains: tuple[int, ...] = (8, 32),
     mass_kg: float = 0.1,
 ) -> tuple[Recording, PendulumServoParameters]:
     """Strokes at several gains of a servo that is drawn, and its true numbers."""

@@ -7,26 +7,31 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.backlash.measure import backlash
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
-from support.package import ROOT
+from support.refusals import assert_each_refused
 from support.strokes import stroked
 
 
-@pytest.fixture(scope="module")
-def two_degrees():
-    return stroked(3, 2.0, 0)
+@cache
+def measured(seed: int, degrees: float, zone: int):
+    """Backlash of a servo with this play and dead zone, and its true numbers."""
+    recording, true = stroked(seed, degrees, zone)
+    return backlash(recording)["bench"], true
 
 
-def test_hysteresis_is_twice_friction_over_stiffness_at_each_gain(two_degrees):
-    recording, true = two_degrees
-    for own in backlash(recording)["bench"].gains:
+TWO_DEGREES = (3, 2.0, 0)
+
+
+def test_hysteresis_is_twice_friction_over_stiffness_at_each_gain():
+    found, true = measured(*TWO_DEGREES)
+    for own in found.gains:
         width = 2 * true.friction_nm / (true.torque_nm * true.duty_per_rad * own.p_gain)
         assert own.hysteresis_rad.value == pytest.approx(width, abs=true.count_rad / 4)
         # back-EMF over stiffness, dead time, and half a period of the held command
@@ -35,36 +40,33 @@ def test_hysteresis_is_twice_friction_over_stiffness_at_each_gain(two_degrees):
         assert own.lag_s.value == pytest.approx(lag, rel=0.06)
 
 
-@pytest.mark.parametrize(("degrees", "zone"), [(0.0, 0), (0.7, 5), (1.3, 1)])
+@pytest.mark.parametrize(
+    ("degrees", "zone"), [(0.0, 1), (0.7, 5), pytest.param(1.3, 1, marks=pytest.mark.slow)]
+)
 def test_play_is_measured_whatever_the_dead_zone(degrees, zone):
-    recording, _ = stroked(7, degrees, zone)
-    found = backlash(recording)["bench"].backlash_rad
-    assert found is not None
-    truth = np.radians(degrees)
-    assert found.value == pytest.approx(truth, abs=0.0012 + 0.05 * truth)
-    assert found.low - 1e-3 <= truth <= found.high + 1e-3
-
-
-def test_two_degrees_of_play_are_told_from_none(two_degrees):
-    play = backlash(two_degrees[0])["bench"].backlash_rad
+    play, truth = measured(7, degrees, zone)[0].backlash_rad, np.radians(degrees)
+    assert play is not None
+    assert play.value == pytest.approx(truth, abs=0.0012 + 0.05 * truth)
+    assert play.low - 1e-3 <= truth <= play.high + 1e-3
+    play = measured(*TWO_DEGREES)[0].backlash_rad
     assert play is not None and 0.025 < play.low < np.radians(2.0) < play.high < 0.045
 
 
 def test_a_dead_zone_shows_where_friction_no_longer_hides_it():
-    recording, true = stroked(7, 0.0, 5)
-    zone = backlash(recording)["bench"].dead_zone_rad
+    (shown, true), (hidden, _) = measured(7, 0.7, 5), measured(7, 0.0, 1)
+    zone = shown.dead_zone_rad
     assert zone is not None and zone.low <= 5 * true.count_rad <= zone.high
     assert zone.high - zone.low < 2 * true.count_rad
-    hidden, _ = stroked(7, 0.0, 1)
-    found = backlash(hidden)["bench"]
-    assert found.dead_zone_rad is not None and found.dead_zone_rad.value == 0.0
-    assert found.dead_zone_rad.high > true.count_rad
-    assert "at most half" in found.notes[0]
+    assert hidden.dead_zone_rad is not None and hidden.dead_zone_rad.value == 0.0
+    assert hidden.dead_zone_rad.high > true.count_rad
+    assert "at most half" in hidden.notes[0]
 
 
 def test_one_gain_cannot_tell_friction_from_a_dead_zone_and_says_so():
-    recording, true = stroked(5, 1.0, 2, gains=[8])
-    found = backlash(recording)["bench"]
+    recording, true = stroked(*TWO_DEGREES)
+    table = recording.table
+    alone = replace(recording, table=table[table["p_gain"] == 8].reset_index(drop=True))
+    found = backlash(alone)["bench"]
     assert found.dead_zone_rad is None and len(found.gains) == 1
     assert "two or more gains" in found.notes[0] and "dead time" in found.notes[1]
     # the dead time is unknown: a wider interval, which still holds the truth
@@ -73,29 +75,28 @@ def test_one_gain_cannot_tell_friction_from_a_dead_zone_and_says_so():
 
 
 def test_without_a_load_backlash_is_not_given():
-    recording, _ = stroked(5, 1.0, 1, gains=[8, 32], mass_kg=0.0)
+    recording, _ = stroked(5, 1.0, 1, gains=(32,), mass_kg=0.0)
     found = backlash(recording)["bench"]
     assert found.backlash_rad is None and found.gains[0].hysteresis_rad.value > 0
     assert any("cannot be told from friction" in note for note in found.notes)
 
 
-def test_other_recordings_are_refused():
-    with pytest.raises(InputError, match="no slow strokes at two speeds"):
-        backlash(load(ROOT / "data/samples/sweep.csv"))
+def test_other_recordings_are_refused(hip):
+    assert_each_refused([(load(hip), "no slow strokes at two speeds")], backlash)
 
 
-def test_a_shift_of_the_zero_changes_nothing(two_degrees):
-    recording, _ = two_degrees
+def test_a_shift_of_the_zero_changes_nothing():
+    recording, _ = stroked(*TWO_DEGREES)
     table = recording.to_frame()
     table["position_rad"] += 0.01
-    moved = backlash(replace(recording, table=table))["bench"]
-    play, before = moved.backlash_rad, backlash(recording)["bench"].backlash_rad
+    play = backlash(replace(recording, table=table))["bench"].backlash_rad
+    before = measured(*TWO_DEGREES)[0].backlash_rad
     assert play is not None and before is not None
     assert play.value == pytest.approx(before.value, abs=1e-3)
 
 
-def test_the_command_prints_numbers_and_documented_keys(two_degrees, tmp_path, capsys):
-    two_degrees[0].save(tmp_path / "a.csv")
+def test_the_command_prints_numbers_and_documented_keys(tmp_path, capsys):
+    stroked(*TWO_DEGREES)[0].save(tmp_path / "a.csv")
     code, out, _ = run(capsys, "backlash", tmp_path / "a.csv", "--json")
     own = json.loads(out)["joints"]["bench"]
     assert code == 0 and own["backlash_rad"]["value"] == pytest.approx(np.radians(2), rel=0.1)
