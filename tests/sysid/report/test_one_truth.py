@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.results import plain
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.identify.calibrate import CalibrationResult, calibrate
@@ -18,6 +19,8 @@ from pupper_sysid.sysid.identify.dead_time import lag
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import report
+from pupper_sysid.sysid.report.figure_data import tracks
+from pupper_sysid.sysid.report.recall import can_recall, recall
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
 
@@ -129,3 +132,24 @@ def test_what_is_identified_is_not_called_unidentified(folder, made):
         own.ratios_to_armature.friction_loss.identified == "no"
     )
     assert "cannot be identified" not in page and "cannot be seen" not in page
+
+
+def test_what_is_shown_of_the_file_of_a_calibration_is_what_its_fit_found(swept, made, tmp_path):
+    made.save(tmp_path / "made.yaml")
+    known = load_calibration(tmp_path / "made.yaml")
+    assert can_recall(known.joint(JOINT))
+    fitted, found = made[JOINT], recall(known, swept, [JOINT])[JOINT]
+    assert (found.model, found.simulated_model) == (fitted.model, fitted.simulated_model)
+    assert found.dead_time_s == fitted.dead_time_s and found.warnings == fitted.warnings
+    for name in ("lag_s", "raw_lag_s", "fresh_lag_s", "stale_lag_s", "command_hold_s"):
+        assert getattr(found.lag, name) == getattr(fitted.lag, name), name
+    assert list(found.candidate_models) == list(fitted.candidate_models)
+    for name, fit in fitted.candidate_models.items():
+        again = found.candidate_models[name]
+        assert again.values == pytest.approx(fit.values)
+        for score in ("rmse_fresh_rad", "rmse_held_rad", "rmse_leave_one_frequency_out_rad"):
+            own, other = getattr(fit.scores, score), getattr(again.scores, score)
+            assert own == pytest.approx(other, nan_ok=True), (name, score)
+    assert found.delayed_pd.values == pytest.approx(fitted.delayed_pd.values)
+    for before, after in zip(tracks(fitted), tracks(found), strict=True):
+        np.testing.assert_allclose(after.model_rad, before.model_rad, atol=1e-9)
