@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.backlash.measure import backlash
     from pupper_sysid.sysid.compare.compare import compare
     from pupper_sysid.sysid.doctor.examination import examine
-    from pupper_sysid.sysid.identify.calibrate import calibrate
-    from pupper_sysid.sysid.identify.dead_time import lag
+    from pupper_sysid.sysid.fit.calibrate import calibrate
+    from pupper_sysid.sysid.fit.dead_time import lag
     from pupper_sysid.sysid.lag.frequency_response import frequency_response
     from pupper_sysid.sysid.recordings.files import load
     from pupper_sysid.sysid.recordings.recording import Recording
@@ -44,10 +44,10 @@ _MODULES = {
     "load": "sysid.recordings.files",
     "Recording": "sysid.recordings.recording",
     "examine": "sysid.doctor.examination",
-    "lag": "sysid.identify.dead_time",
+    "lag": "sysid.fit.dead_time",
     "frequency_response": "sysid.lag.frequency_response",
     "backlash": "sysid.backlash.measure",
-    "calibrate": "sysid.identify.calibrate",
+    "calibrate": "sysid.fit.calibrate",
     "sparse_equations": "sysid.sparse.equations",
     "fit_servo": "sysid.servo_fit.fit",
     "compare": "sysid.compare.compare",

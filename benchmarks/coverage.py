@@ -9,7 +9,7 @@
 `motion`: the same robots under chirps, multisines, steps and pseudo-random binary commands, half
 polled and half live; the recording does not state which, and the lag is that of the motion.
 `pendulum`: servos with a pendulum at three P gains, stepped by MuJoCo at 1 kHz, with counts, a dead
-zone and a minimum start force, through `sysid.loaded`.
+zone and a minimum start force, through `sysid.fit`.
 `strokes`: servos with play of 0 to 2° and dead zones of 0 to 5 counts, through `sysid.backlash`.
 """
 
@@ -43,9 +43,9 @@ from pupper_sysid.sim.emulator.servos.pendulum import PendulumServo, PendulumSer
 from pupper_sysid.sysid.backlash.measure import backlash
 from pupper_sysid.sysid.compare.truth import truth_table
 from pupper_sysid.sysid.feedback.staleness import staleness
-from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.joint_fit import fit_joint
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.loaded.joint_fit import fit_loaded_joint
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
 
@@ -153,7 +153,7 @@ def loaded(seed: int) -> Iterator[Row]:
                       "loads": {"servo": load}, "joints": ["servo"]}  # fmt: skip
             table = pendulum_run(servo, gain, kind, rng)
             trials += Recording.from_frame(table, metadata=header).trials("servo")
-    fit = fit_loaded_joint("servo", trials, 0)
+    fit = fit_joint("servo", trials, 0)
     for quantity, (name, true_name) in LOADED.items():
         yield row(quantity, fit.numbers[name], getattr(servo, true_name))
 

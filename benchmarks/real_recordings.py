@@ -19,7 +19,7 @@ import json
 import os
 import subprocess
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,23 +30,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
-from pupper_sysid.servo_models.loaded_servo import COLUMNS
 from pupper_sysid.sysid.compare.compare import compare
-from pupper_sysid.sysid.compare.readings import (
-    as_rows,
-    calibrated_run,
-    reading_rules,
-    run_with_offset,
-    with_ages,
-)
-from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, fit_loaded_joint
-from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
-from pupper_sysid.sysid.loaded.runs import Run, at_steps, prepare, simulate
+from pupper_sysid.sysid.compare.four_way import calibrated_run
+from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.joint_fit import fit_joint
+from pupper_sysid.sysid.fit.kernel import COLUMNS
+from pupper_sysid.sysid.fit.predict import rule_of
+from pupper_sysid.sysid.fit.results import LoadedFit
+from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate
+from pupper_sysid.sysid.fit.structure import loaded_columns
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
+from pupper_sysid.sysid.servo_fit.readings import FreeRun, as_rows, run_with_offset, with_ages
 from pupper_sysid.sysid.servo_fit.scores import LINEAR, Tracks, errors, rms, stacked
 from pupper_sysid.sysid.servo_fit.windows import everything
 
@@ -113,14 +110,12 @@ def sweep(seed: int) -> None:
     result = calibrate([load(REAL / name) for name in SWEEPS], seed=seed)
     joints = list(result.joints)
     data = as_rows(servo_data([recording], joints, "all"), joints)
-    rules = reading_rules(data, "the walk", {"the sweeps": result.calibration})
-    aged = with_ages(data, rules)
-    offsets = {j: result.calibration.joint(j).feedback.offset_rad.value for j in joints}
+    known = {"the sweeps": result.calibration}
+    aged = with_ages(data, {j: rule_of(j, data.lattices[j], "the walk", known) for j in joints})
+    offset = [result.calibration.joint(j).feedback.offset_rad.value for j in data.joints]
     calibrated = calibrated_run(result.calibration, data)
-    moved = {
-        joint: [track + offsets[joint] for track in tracks]
-        for joint, tracks in calibrated(stacked(data)[1]).items()
-    }
+    tracks = calibrated(np.zeros(stacked(data)[1].shape) + offset)
+    moved = {j: [t + own for t in tracks[j]] for j, own in zip(data.joints, offset, strict=True)}
     lines = {
         "calibration: position, offset of the sweep": rows_error(moved, data),
         **by_rule("calibration", calibrated, data, aged),
@@ -145,7 +140,7 @@ def rows_error(tracks: Tracks, data: ServoData) -> dict[str, float]:
 
 
 def by_rule(
-    name: str, run: Callable[[NDArray[np.float64]], Tracks], data: ServoData, aged: ServoData
+    name: str, run: FreeRun, data: ServoData, aged: ServoData
 ) -> dict[str, dict[str, float]]:
     """Errors with the walk's offset, of positions and of readings with their age."""
     return {
@@ -157,20 +152,26 @@ def by_rule(
 # ------------------------------------------------------------------------------- servos under load
 
 
+def loaded_fit(joint: str, trials: Sequence[Trial], seed: int) -> LoadedFit:
+    """Fit a servo under load, whether or not its trials tell of one."""
+    fit = fit_joint(joint, trials, seed, free_air=False).loaded
+    assert fit is not None
+    return fit
+
+
 def row_errors(fit: LoadedFit, trial: Trial) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Model minus reading of every row [rad], and its time [s]."""
     run = prepare(trial, fit.lattice, fit.reference_voltage_v)
-    assert run is not None
     return at_steps(track(fit, run), run.row_step) - run.row_rad, run.row_step * run.step_s
 
 
 def track(fit: LoadedFit, run: Run) -> NDArray[np.float64]:
-    """Positions that a fitted servo predicts at the edges of the steps of a run [rad]."""
-    servo, row = fit.servo.arrays(), np.zeros((1, WIDTH))
-    row[0, : len(COLUMNS)] = [float(servo[name]) for name in COLUMNS]
-    for column, name in ((-2, "gravity_nm"), (-1, "hanging_rad"), (0, "offset_rad")):
-        row[0, OFFSET + column] = fit.numbers[name].value if name in fit.numbers else 0.0
-    return simulate(row, np.array([float(servo["dead_time_s"])]), run)[:, 0]
+    """Readings that a fitted servo predicts at the edges of the steps of a run [rad]."""
+    columns = loaded_columns(fit.servo)
+    for name in ("gravity_nm", "hanging_rad", "offset_rad"):
+        if name in fit.numbers:
+            columns[COLUMNS.index(name)] = fit.numbers[name].value
+    return simulate(columns[None], np.array([fit.numbers["dead_time_s"].value]), run)[:, 0]
 
 
 def dead_time(fit: LoadedFit) -> str:
@@ -186,7 +187,7 @@ def xl330(seed: int, bam: str | None, bam_trials: int) -> None:
     fitted, scored = ([f for f in files if (gain[f] == 200) is unseen] for unseen in (False, True))
 
     def rows() -> Iterable[list[str]]:
-        fit = fit_loaded_joint("xl330", [t for f in fitted for t in load(f).trials("xl330")], seed)
+        fit = loaded_fit("xl330", [t for f in fitted for t in load(f).trials("xl330")], seed)
         trials = [load(f).trials("xl330")[0] for f in scored]
         values = {f"pupper-sysid, dead time {dead_time(fit)} ms": [
             float(np.mean(np.abs(row_errors(fit, trial)[0]))) for trial in trials
@@ -212,7 +213,7 @@ def so101(seed: int) -> None:
     def rows() -> Iterable[list[str]]:
         for joint in JOINTS:
             trials = {m: r.trials(joint)[0] for m, r in recordings.items()}
-            fit = fit_loaded_joint(joint, [first(trials[m]) for m in MOTIONS[:3]], seed)
+            fit = loaded_fit(joint, [first(trials[m]) for m in MOTIONS[:3]], seed)
             values = []
             for motion, trial in trials.items():
                 error, time_s = row_errors(fit, trial)

@@ -27,12 +27,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from real_recordings import FITTED_S, JOINTS, MOTIONS, REAL, first, track
+from real_recordings import FITTED_S, JOINTS, MOTIONS, REAL, first, loaded_fit, track
 
 from pupper_sysid.servo_models.cards.card import Gains, ServoCard, Source
 from pupper_sysid.sysid.export.servo_card import to_card, to_drive_card
-from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, fit_loaded_joint
-from pupper_sysid.sysid.loaded.runs import at_steps
+from pupper_sysid.sysid.fit.results import LoadedFit
+from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -43,7 +43,7 @@ def xl330(seed: int) -> ServoCard:
     """Dynamixel XL330-M288 on a pendulum, four P gains."""
     recordings = [load(path) for path in sorted((REAL / "bam_xl330").glob("*.json"))]
     (joint,) = recordings[0].joints
-    fit = fit_loaded_joint(joint, [t for r in recordings for t in r.trials(joint)], seed)
+    fit = loaded_fit(joint, [t for r in recordings for t in r.trials(joint)], seed)
     return to_card(
         "xl330-m288", "Dynamixel XL330-M288", {"servo": fit}, recordings,
         Source(
@@ -55,24 +55,22 @@ def xl330(seed: int) -> ServoCard:
     )  # fmt: skip
 
 
-REGISTERS = {"chirp_sweep": 254, "prbs_excitation": None, "step_response": 254}
-"""Register `acceleration` of the SO-101's recordings, which they do not state: 254 is what LeRobot
-writes, and whole recordings say where it was in force (docs/which_sts3215.md). None: the fit finds
-how much larger the limit was."""
+ACCELERATION = 254
+"""Register `acceleration` of the SO-101's servos, which the recordings do not state: what LeRobot
+writes. One limit for all motions."""
 
 
 def so101(seed: int) -> ServoCard:
     """STS3215 of an SO-101 arm at P 16, five joints."""
-    recordings = [load(REAL / "sage_so101" / name) for name in REGISTERS]
+    recordings = [load(REAL / "sage_so101" / name) for name in MOTIONS[:3]]
     fits = {}
     for joint in JOINTS:
         trials = []
-        for recording, units in zip(recordings, REGISTERS.values(), strict=True):
+        for recording in recordings:
             (trial,) = recording.trials(joint)
-            registers = {} if units is None else {"acceleration": units}
-            setup = trial.servo.model_copy(update={"registers": registers})
+            setup = trial.servo.model_copy(update={"registers": {"acceleration": ACCELERATION}})
             trials.append(replace(first(trial), servo=setup))
-        fits[joint] = fit_loaded_joint(joint, trials, seed)
+        fits[joint] = loaded_fit(joint, trials, seed)
     return to_card(
         "sts3215-12v", "Feetech STS3215", fits, recordings,
         Source(
@@ -82,11 +80,10 @@ def so101(seed: int) -> ServoCard:
         ),
         "the arm itself, its other joints moving, too", supply_v=12.0, gains=Gains(i=0.0, d=32.0),
         notes=(
-            f"Fitted to the first {FITTED_S:g} s of {', '.join(REGISTERS)}. The rest of them, and "
-            f"all of {MOTIONS[3]}, is left out, for scores.",
+            f"Fitted to the first {FITTED_S:g} s of {', '.join(MOTIONS[:3])}. The rest of them, "
+            f"and all of {MOTIONS[3]}, is left out, for scores.",
             "The limit on the set-point's acceleration is that of the register `acceleration` at "
-            "254, which LeRobot writes. The recordings do not state it. Whole recordings move as "
-            "if it was larger in prbs_excitation.",
+            f"{ACCELERATION}, which LeRobot writes. The recordings do not state it.",
         ),
     )  # fmt: skip
 
@@ -112,7 +109,7 @@ def robstride(kind: str, seed: int) -> ServoCard:
         (trial,) = recordings[-1].trials(joint)
         lead = config["kd"] / config["kp"] * np.gradient(trial.command_rad, trial.send_time_s)
         led = replace(trial, command_rad=trial.command_rad + lead)
-        fits[joint] = fit_loaded_joint(joint, [led], seed)
+        fits[joint] = loaded_fit(joint, [led], seed)
         drives[joint] = config["kp"], config["max_torque"]
         reported = np.array([row["torque"] for row in log["data"]])
         slope, together = torques(fits[joint], led, config["kp"], reported)

@@ -30,7 +30,7 @@ from pupper_sysid.policies.twin.actuators import Actuator, of_calibration, robot
 from pupper_sysid.policies.twin.figures import draw_bars, draw_joint
 from pupper_sysid.policies.twin.twin import ActuatorTwin, Condition, Twin, twin
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
-from pupper_sysid.sysid.identify.calibrate import calibrate
+from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit.fit import fit_servo

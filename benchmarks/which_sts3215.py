@@ -10,8 +10,7 @@ Every model is a servo card. It runs freely from the first reading on, at the re
 where the card knows its own, at the card's supply voltage, and with the arm as its load: inertia
 and gravity of each joint, which no recording states, and the offset are fitted to the first 40 s of
 three motions, for every model alike. Scored is what was not fitted: the rest of these, and
-`frequency_sweep`. The limit on the set-point's acceleration, which our card has, may be another in
-the PRBS: the share that suits its first 40 s best.
+`frequency_sweep`. The limit on the set-point's acceleration is the card's, in every motion.
 
 What is wrong with a model is asked in three ways: what the best shift in time and the best gain
 leave of its error; which lag per speed and which dead band it shows in slow motion, beside the
@@ -35,17 +34,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 from real_recordings import FITTED_S, HERE, JOINTS, MOTIONS, REAL, first
-from scipy.optimize import least_squares
 
 from pupper_sysid.servo_models.cards.card import ServoCard
 from pupper_sysid.servo_models.cards.files import load_card
-from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE
-from pupper_sysid.servo_models.loaded_servo import COLUMNS
-from pupper_sysid.sysid.compare.under_load import slewed
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
-from pupper_sysid.sysid.loaded import kernel
-from pupper_sysid.sysid.loaded.kernel import OFFSET, WIDTH
-from pupper_sysid.sysid.loaded.runs import RAMP_SHARES, Run, at_steps, prepare, simulate
+from pupper_sysid.sysid.fit.kernel import COLUMNS
+from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate
+from pupper_sysid.sysid.fit.search import Problem, evolve, local
+from pupper_sysid.sysid.fit.structure import Parameter, Structure, loaded_columns
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -72,12 +68,13 @@ SLOW_UNTIL_S = 60.0
 """Up to where `frequency_sweep` is below 0.6 Hz."""
 SHOWN = "Wrist_Roll"
 """Joint of the picture's jump."""
-DUTY, DUTY_S, STALL, EMF, ARMATURE, DRY = range(6)
-RAMP = COLUMNS.index("acceleration_limit")
-TORQUE_LIMIT = COLUMNS.index("torque_limit")
-QUADRATIC = COLUMNS.index("load_friction_quadratic")
-OTHER_RAMP = "prbs_excitation"
-"""Where the set-point's acceleration has another limit, as whole recordings show."""
+AT = {name: place for place, name in enumerate(COLUMNS)}
+NOISE_RAD, ITERATIONS, DIFFERENCE = 0.005, 25, 0.005
+"""Where the loss of the arm's fit bends, and its local fit."""
+GRAVITY_NM = 50.0
+"""Unit of the gravity: the local fit moves what is no logarithm by 0.02 in a step, so 1 N·m."""
+LEAST_DEAD_TIME_S = 1e-4
+"""For cards without one: the fits of the engine take its logarithm."""
 TITLES = {
     "frequency_sweep": "frequency sweep", "prbs_excitation": "PRBS after 40 s",
     "step_response": "steps after 40 s", "chirp_sweep": "chirp after 40 s",
@@ -88,52 +85,47 @@ TERMS = ("stiffness", "inertia", "damping", "friction", "largest torque", "dead 
 
 @dataclass(frozen=True)
 class Model:
-    """A servo with its load, as the kernel takes it.
+    """A servo with its load at the P gain of the recordings.
 
     Attributes
     ----------
-    row : ndarray, shape (WIDTH,)
-        Columns of the kernel; gravity, hanging position and offset are the arm's.
-    dead_time_s, p_gain, slew_rad_s : float
+    columns : ndarray, shape (columns,)
+        `sysid.fit.kernel.COLUMNS`, the stiffness in N·m/rad.
+    dead_time_s : float
     """
 
-    row: np.ndarray
+    columns: np.ndarray
     dead_time_s: float
-    p_gain: float
-    slew_rad_s: float
 
     @property
     def stiffness(self) -> float:
         """[N·m/rad]."""
-        return float(self.row[DUTY] * self.p_gain * self.row[STALL])
+        return float(self.columns[AT["stiffness"]])
 
-    def on(self, run: Run) -> Run:
-        """A run as this model moves it: its own P gain and rate of the set-point."""
-        held = run.held
-        if np.isfinite(self.slew_rad_s):
-            held = held.copy()
-            held[0] = slewed(held[0], self.slew_rad_s * run.step_s, float(held[0, 0]))
-        return replace(run, p_gain=self.p_gain, held=held)
+    def changed(self, **values: float) -> Model:
+        """The model with other values in some columns."""
+        columns = self.columns.copy()
+        for name, value in values.items():
+            columns[AT[name]] = value
+        return replace(self, columns=columns)
 
     def track(self, run: Run) -> np.ndarray:
         """Positions at the edges of the steps [rad]."""
-        return simulate(self.row[None], np.array([self.dead_time_s]), self.on(run))[:, 0]
+        return simulate(self.columns[None], np.array([self.dead_time_s]), run)[:, 0]
 
 
 def card_model(name: str, joint: str) -> Model:
     """A card's numbers for one joint, without a load."""
     card = load_card(name)
     specimen = next((s for s in (joint, SPECIMENS[joint]) if s in card.specimens), card.default)
-    servo, gain = card.loaded(specimen)
+    servo, own_gain = card.loaded(specimen)
     numbers = card.specimens[specimen]
-    values, row = servo.arrays(), np.zeros(WIDTH)
-    row[: len(COLUMNS)] = [float(values[column]) for column in COLUMNS]
-    slew = getattr(numbers, "velocity_limit_rad_s", None)
-    return Model(
-        row, float(values["dead_time_s"]),
-        gain if numbers.model == "delayed_pd" else P_GAIN,
-        np.inf if slew is None else slew.value,
-    )  # fmt: skip
+    gain = own_gain if numbers.model == "delayed_pd" else P_GAIN
+    dead_time_s = max(float(np.asarray(servo.dead_time_s)), LEAST_DEAD_TIME_S)
+    model = Model(loaded_columns(servo), dead_time_s)
+    slowest = getattr(numbers, "velocity_limit_rad_s", None)
+    limit = np.inf if slowest is None else slowest.value
+    return model.changed(stiffness=gain * model.stiffness, velocity_limit=limit)
 
 
 def with_load(
@@ -147,93 +139,72 @@ def with_load(
 
     Parameters
     ----------
+    model : Model
+        Its gravity and offset are where the fit starts.
+    runs : sequence of Run
     inertia : bool
         Whether inertia is added to the armature.
     stiffness : bool
         Whether the stiffness is fitted, too.
+    starts : int
+        Up to 3, of inertia and stiffness.
     """
-    factors = [name for name, on in (("inertia", inertia), ("stiffness", stiffness)) if on]
-    scale = max(0.2, float(model.row[OFFSET - 2]))
-    moved = [model.on(r) for r in runs]
+    own = {name: model.columns[place] for name, place in AT.items()}
+    arm = [
+        Parameter("dead_time_s", *[model.dead_time_s] * 3),  # the card's
+        Parameter("gravity_sin", 0.0, -np.inf, np.inf),
+        Parameter("gravity_cos", 0.0, -np.inf, np.inf),
+        *([Parameter("inertia", 1e-4, 1e-6, 10.0)] if inertia else []),
+        *([Parameter("stiffness", 1.0, 1e-4, 20.0)] if stiffness else []),
+        Parameter("offset_rad", 0.0, -1.0, 1.0),
+    ]
+    names = [p.name for p in arm]
 
-    def models(x: np.ndarray) -> np.ndarray:
-        rows = np.repeat(model.row[None], len(x), axis=0)
-        rows[:, OFFSET - 2] = np.hypot(x[:, 0], x[:, 1]) * scale
-        rows[:, OFFSET - 1] = np.arctan2(x[:, 1], x[:, 0])
-        rows[:, OFFSET] = 0.05 * x[:, 2]
-        for n, name in enumerate(factors, 3):
-            if name == "inertia":
-                rows[:, ARMATURE] += np.exp(np.clip(x[:, n], -12, 2))
-            else:
-                rows[:, DUTY] *= np.exp(np.clip(x[:, n], -9, 3))
-        return rows
+    def columns_of(values: np.ndarray) -> np.ndarray:
+        by_name = dict(zip(names, values.T, strict=True))
+        columns = np.repeat(model.columns[None], len(values), axis=0)
+        gravity = GRAVITY_NM * (by_name["gravity_sin"] + 1j * by_name["gravity_cos"])
+        columns[:, AT["gravity_nm"]] = np.abs(gravity)
+        columns[:, AT["hanging_rad"]] = np.angle(gravity)
+        columns[:, AT["offset_rad"]] = by_name["offset_rad"]
+        columns[:, AT["armature"]] += by_name.get("inertia", 0.0)
+        columns[:, AT["stiffness"]] *= by_name.get("stiffness", 1.0)
+        return columns
 
-    def left(x: np.ndarray) -> np.ndarray:
-        rows, found = models(x), []
-        for run in moved:
-            out = np.empty((len(rows), len(run.sample_step)))
-            steps = np.full(len(rows), model.dead_time_s / run.step_s)
-            kernel.residuals(
-                rows, steps, run.held, run.p_gain, run.load, run.ramp_share, run.start_rad,
-                run.sample_step, run.sample_rad, run.rest, run.step_s, -FRICTION_IMPEDANCE, out,
-            )  # fmt: skip
-            found.append(out)
-        return np.concatenate(found, axis=1) / 0.005
-
-    def jacobian(x: np.ndarray) -> np.ndarray:
-        step = 1e-3 * np.eye(len(x))
-        both = left(np.concatenate([x + step, x - step]))
-        return ((both[: len(x)] - both[len(x) :]) / 2e-3).T
-
-    own = model.row
-    gravity = own[OFFSET - 2] / scale, own[OFFSET - 1], own[OFFSET] / 0.05
-    base = [gravity[0] * np.cos(gravity[1]), gravity[0] * np.sin(gravity[1]), gravity[2]]
-    first_guess = {"inertia": (-9.0, -6.0, -4.0), "stiffness": (0.0, -1.5, -3.0)}
-    best = None
-    for n in range(starts):
-        x0 = np.array(base + [first_guess[name][n] for name in factors])
-        found = least_squares(
-            lambda x: left(x[None])[0],
-            x0,
-            jac=jacobian,  # pyright: ignore[reportArgumentType]
-            loss="soft_l1",
-            max_nfev=25,
-            x_scale="jac",
-        )
-        best = found if best is None or found.cost < best.cost else best
-    assert best is not None
-    return replace(model, row=models(best.x[None])[0])
+    gravity = own["gravity_nm"] / GRAVITY_NM * np.exp(1j * own["hanging_rad"])
+    first = np.array([model.dead_time_s, gravity.real, gravity.imag, own["offset_rad"]])
+    guesses = {"inertia": (1e-4, 2.5e-3, 0.02), "stiffness": (1.0, 0.22, 0.05)}
+    start = np.repeat(first[None], starts, axis=0)
+    for name, guess in guesses.items():
+        if name in names:
+            start = np.insert(start, -1, guess[:starts], axis=1)
+    structure = Structure("arm", tuple(arm), columns_of=columns_of)
+    problem = Problem(structure, tuple(runs), (NOISE_RAD,) * len(runs))
+    fits = local(problem, structure.encode(start), ITERATIONS, DIFFERENCE)
+    fit, _ = evolve(problem, fits, np.random.default_rng(0), short=True)
+    best = structure.decode(fit.point)
+    return replace(model, columns=columns_of(best[None])[0])
 
 
 def exchanged(model: Model, ours: Model, term: str) -> Model:
     """The model with one of our terms, per stiffness."""
     if term == "dead time":
-        return replace(model, dead_time_s=ours.dead_time_s, slew_rad_s=np.inf)
-    row, own, share = model.row.copy(), ours.row, model.stiffness / ours.stiffness
-    inside = row[DUTY_S] * row[STALL]
+        return replace(model.changed(velocity_limit=np.inf), dead_time_s=ours.dead_time_s)
+    own, share = dict(zip(COLUMNS, ours.columns, strict=True)), model.stiffness / ours.stiffness
+    if term == "friction":  # with the gravity: it rubs with the load
+        plain = ("stribeck_speed", "load_friction_motor", "load_friction_load",
+                 "load_friction_static", "dead_zone_rad", "start_duty", "hanging_rad")  # fmt: skip
+        scaled = ("friction_loss", "stribeck_friction", "gravity_nm")
+        quadratic = own["load_friction_quadratic"] / share
+        values = {"load_friction_quadratic": quadratic} | {name: own[name] for name in plain}
+        return model.changed(**values, **{name: own[name] * share for name in scaled})
     if term == "ramp":
-        row[RAMP] = own[RAMP]
-    elif term == "inertia":
-        row[ARMATURE] = own[ARMATURE] * share
-    elif term == "damping":
-        row[DUTY_S] = own[DUTY_S] * own[STALL] * share / row[STALL]
-        row[EMF] = own[EMF] * share
-    elif term == "friction":
-        torques = (DRY, COLUMNS.index("stribeck_friction"))
-        plain = (
-            "stribeck_speed", "load_friction_motor", "load_friction_load", "load_friction_static",
-            "dead_zone_rad", "start_duty",
-        )  # fmt: skip
-        row[list(torques)] = own[list(torques)] * share
-        same = [COLUMNS.index(name) for name in plain]
-        row[same] = own[same]
-        row[QUADRATIC] = own[QUADRATIC] / share
-        row[OFFSET - 2 : OFFSET] = own[OFFSET - 2] * share, own[OFFSET - 1]  # it rubs with the load
-    elif term == "largest torque":
-        stiffness = model.stiffness
-        row[STALL], row[TORQUE_LIMIT] = own[STALL] * share, own[TORQUE_LIMIT] * share
-        row[DUTY], row[DUTY_S] = stiffness / (model.p_gain * row[STALL]), inside / row[STALL]
-    return replace(model, row=row)
+        return model.changed(acceleration_limit=own["acceleration_limit"])
+    scaled = {
+        "inertia": ("armature",), "damping": ("damping", "back_emf"),
+        "largest torque": ("effort_limit", "torque_limit"), "stiffness": (),
+    }[term]  # fmt: skip
+    return model.changed(**{name: own[name] * share for name in scaled})
 
 
 def rms(values: np.ndarray) -> float:
@@ -287,12 +258,8 @@ def evaluate(joint: str) -> dict:
     trials = {m: load(REAL / "sage_so101" / m).trials(joint)[0] for m in MOTIONS}
     lattice = find_poll_lattice(tuple(trials.values()), np.random.default_rng(0))
     runs = {m: _run(t, lattice) for m, t in trials.items()}
-    early = {m: _run(first(trials[m]), lattice) for m in MOTIONS[:3]}
+    fitted = [_run(first(trials[m]), lattice) for m in MOTIONS[:3]]
     bare = {name: card_model(card, joint) for name, card in MODELS.items()}
-    share = ramp_share(bare[OURS], early)
-    for found in (early, runs):
-        found[OTHER_RAMP] = replace(found[OTHER_RAMP], ramp_share=share)
-    fitted = list(early.values())
     loaded = {name: with_load(model, fitted) for name, model in bare.items()}
     ours, sweep = loaded[OURS], runs[MOTIONS[3]]
     still = {m: rms((_command(r) - r.row_rad)[scored(r, m)]) for m, r in runs.items()}
@@ -300,25 +267,14 @@ def evaluate(joint: str) -> dict:
     for name, model in loaded.items():
         if name != OURS:
             models[name]["terms"] = terms(model, bare[name], ours, fitted, runs)
-    free = np.where(np.arange(WIDTH) == RAMP, np.inf, bare[OURS].row)
+    free = bare[OURS].changed(acceleration_limit=np.inf)
     return {
         "command": still,
         "robot": slow_motion(sweep, sweep.row_rad),
-        "without ramp": score(with_load(replace(bare[OURS], row=free), fitted), runs),
+        "without ramp": score(with_load(free, fitted), runs),
         "models": models,
         "jump": jump(loaded, runs["prbs_excitation"]) if joint == SHOWN else None,
     }
-
-
-def ramp_share(model: Model, early: Mapping[str, Run]) -> float:
-    """Limit of `OTHER_RAMP` over that of the model which leaves the least of the fitted part."""
-    left = []
-    for share in RAMP_SHARES:
-        own = {**early, OTHER_RAMP: replace(early[OTHER_RAMP], ramp_share=share)}
-        fitted = with_load(model, list(own.values()), starts=1)
-        run = own[OTHER_RAMP]
-        left.append(rms(at_steps(fitted.track(run), run.row_step) - run.row_rad))
-    return RAMP_SHARES[int(np.argmin(left))]
 
 
 def described(model: Model, runs: Mapping[str, Run]) -> dict:
@@ -339,13 +295,12 @@ def terms(
     """Errors with one term exchanged, the load fitted again; and the stiffness fitted to it."""
     found = {}
     for term in TERMS:
-        changed = exchanged(model, ours, term)
-        if term == "inertia":
-            changed = with_load(changed, fitted, inertia=False, starts=1)
-        else:
-            row = changed.row.copy()
-            row[ARMATURE] = bare.row[ARMATURE]
-            changed = with_load(replace(changed, row=row), fitted, stiffness=term == "stiffness")
+        changed, fit_stiffness = exchanged(model, ours, term), term == "stiffness"
+        if term != "inertia":
+            changed = changed.changed(armature=bare.columns[AT["armature"]])
+        changed = with_load(
+            changed, fitted, term != "inertia", fit_stiffness, 3 if fit_stiffness else 1
+        )
         found[term] = score(changed, runs)
         if term == "stiffness":
             found["best stiffness"] = changed.stiffness
@@ -367,15 +322,13 @@ def jump(models: Mapping[str, Model], run: Run) -> dict:
 
 
 def _run(trial: Trial, lattice: PollLattice) -> Run:
-    run = prepare(trial, lattice)
-    assert run is not None
-    return run
+    """A run of unit P gain: the stiffness of the models holds at that of the recordings."""
+    return replace(prepare(trial, lattice), p_gain=1.0)
 
 
 def _command(run: Run) -> np.ndarray:
     """Command at the time of each row."""
-    command = run.held[0, run.rest :]
-    return command[np.minimum(run.row_step.astype(int), len(command) - 1)]
+    return run.command[np.minimum(run.row_step.astype(int), run.steps - 1)]
 
 
 def _plain(value: object) -> object:

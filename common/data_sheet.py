@@ -159,6 +159,27 @@ def data_sheet(model: str | int) -> DataSheet | None:
     return next((s for s in _SHEETS if s.name in plain), None)
 
 
+_FACTORY_P_GAINS = {
+    "STS3215": (32.0, "the default that LeRobot's settings name"),
+    "XL330": (400.0, "Robotis e-Manual of the XL330, Position P Gain (84)"),
+    "SCS0009": (15.0, "register of a servo as delivered"),
+}
+"""P gain registers as servos leave the factory, by family, and their sources."""
+
+
+def factory_p_gain(model: str | int) -> tuple[float, str] | None:
+    """P gain of a servo model as it leaves the factory, and its source; None if it is not known.
+
+    Examples
+    --------
+    >>> factory_p_gain("Feetech STS3215")[0], factory_p_gain("xl330")[0], factory_p_gain("MG90S")
+    (32.0, 400.0, None)
+    """
+    sheet = data_sheet(model)
+    name = sheet.name if sheet else str(model).upper().replace(" ", "").replace("-", "")
+    return next((known for family, known in _FACTORY_P_GAINS.items() if family in name), None)
+
+
 def counts_of(model: str | int) -> float | None:
     """Readings per turn of a servo model; None if it is not known."""
     sheet = data_sheet(model)

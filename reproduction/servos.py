@@ -11,7 +11,7 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.compare.comparison import Comparison
 from pupper_sysid.sysid.compare.four_way import FITTED, PUBLISHED, four_way
 from pupper_sysid.sysid.doctor.examination import JointExamination, examine
-from pupper_sysid.sysid.identify.dead_time import lag
+from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
 from reproduction.claims import Claim, Finding, NotTestable, claim, holds

@@ -163,9 +163,6 @@ _LIMITS_BEYOND = {
     "torque_limit": "a torque limit below the stall torque at speed",
 }
 
-COLUMNS = tuple(f.name for f in fields(LoadedServoParameters) if f.name != "dead_time_s")
-"""Order of the numbers in `sysid.loaded.kernel`, without the dead time."""
-
 
 @dataclass(frozen=True)
 class Load:

@@ -32,11 +32,11 @@ from numpy.typing import NDArray
 from random_robots import SweptRobot, sweep_random_robot
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
-from pupper_sysid.sysid.identify.scores import rms, score
-from pupper_sysid.sysid.identify.search import leave_one_out_folds
+from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
+from pupper_sysid.sysid.fit.scores import rms, score
+from pupper_sysid.sysid.fit.search import folds_of
+from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -59,7 +59,7 @@ SLOW = {"BAM 1.0.2, M4", "PACE's fit (CMA-ES)"}
 
 @dataclass(frozen=True)
 class Case:
-    """One joint's recording; `motion` (per trial, on step edges, relative to rest) if known."""
+    """One joint's recording; `motion` (per trial, on step edges [rad]) if known."""
 
     name: str
     recording: Recording
@@ -98,18 +98,19 @@ def emulated(seed: int) -> Case:
     for trial in robot.recording.trials(robot.joint):
         steps = int(np.ceil((trial.read_time_s[-1] - trial.send_time_s[0]) / TIME_STEP_S)) + 3
         edges = trial.send_time_s[0] + TIME_STEP_S * np.arange(steps)
-        motion.append(np.interp(edges, bus.time, bus.position) - trial.initial_command_rad)
+        motion.append(np.interp(edges, bus.time, bus.position))
     return Case(f"robot {seed}", robot.recording, robot.joint, motion, robot)
 
 
-def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:
+def ours(case: Case) -> tuple[Outcome, tuple[Run, ...]]:
     """Through `calibrate`, as the command does it."""
     began = time.perf_counter()
     result = calibrate([case.recording], [case.joint], workers=1)[case.joint]
     seconds = time.perf_counter() - began
-    pd, dead = result.candidate_models["delayed_pd"], result.dead_time_s
-    values = np.array([pd.values[p] for p in candidate_model("delayed_pd").names])
-    tracks = free_run(candidate_model("delayed_pd"), values, result.trials)
+    pd, dead = result.candidate_models[PREFERRED], result.dead_time_s
+    structure = candidate(PREFERRED)
+    values = np.array([pd.values[name] for name in structure.names])
+    tracks = free_run(structure, values, result.runs)
     true = case.dead_time_s(TIME_STEP_S)
     outcome = Outcome(
         OURS, case.name, pd.scores.rmse_raw_rad, pd.scores.rmse_held_rad,
@@ -117,7 +118,7 @@ def ours(case: Case) -> tuple[Outcome, tuple[TrialData, ...]]:
         off_truth(tracks, case), dead.value - true,
         dead.low <= true <= dead.high if case.motion else None, dead.high - dead.low, seconds,
     )  # fmt: skip
-    return outcome, result.trials
+    return outcome, result.runs
 
 
 def off_truth(tracks: list[NDArray], case: Case) -> float:
@@ -131,14 +132,14 @@ def off_truth(tracks: list[NDArray], case: Case) -> float:
     return rms(parts)
 
 
-def peer_trials(case: Case, data: tuple[TrialData, ...], retimed: bool) -> list[PeerTrial]:
+def peer_trials(case: Case, data: tuple[Run, ...], retimed: bool) -> list[PeerTrial]:
     """The joint's trials as a peer gets them; `retimed`: fresh readings at the times we found."""
     trials = joint_trials([case.recording], case.joint)
     given = []
     for trial, one in zip(trials, data, strict=True):
         start, seen = trial.send_time_s[0], np.isfinite(trial.position_rad)
         if retimed:
-            moments, angles = TIME_STEP_S * one.sample_step, one.sample_rad + one.rest_rad
+            moments, angles = TIME_STEP_S * one.sample_step, one.sample_rad
             moments, first = np.unique(moments, return_index=True)
             angles = angles[first]
         else:
@@ -146,19 +147,19 @@ def peer_trials(case: Case, data: tuple[TrialData, ...], retimed: bool) -> list[
         given.append(
             PeerTrial(
                 one.rest_rad, trial.send_time_s - start, trial.command_rad, moments, angles,
-                len(one.command),
+                one.steps,
             )
         )  # fmt: skip
     return given
 
 
 def theirs(
-    method: str, script: str, environment: str, case: Case, data: tuple[TrialData, ...]
+    method: str, script: str, environment: str, case: Case, data: tuple[Run, ...]
 ) -> Outcome:
     """Through a peer, in its own environment."""
-    folds = leave_one_out_folds(data)
+    folds = folds_of(data)
     fits = [list(range(len(data)))]
-    fits += [[i for i, used in enumerate(use) if used] for use in folds.values()]
+    fits += [np.flatnonzero(~out).tolist() for out in folds.values()]
     answer = subprocess.run(
         [HERE / environment / "bin" / "python", HERE / script],
         input=dump(peer_trials(case, data, method == RETIMED), fits),
@@ -169,12 +170,12 @@ def theirs(
     answers = json.loads(answer.stdout.splitlines()[-1])
     tracks = [track_of(a["positions_rad"], data) for a in answers]
     held_out = {}
-    for (name, use), track in zip(folds.items(), tracks[1:], strict=True):
+    for (name, out), track in zip(folds.items(), tracks[1:], strict=True):
         held_out[name] = np.concatenate(
             [
-                look_up(position, one.sample_step) - one.sample_rad
-                for position, one, used in zip(track, data, use, strict=True)
-                if not used
+                at_steps(position, one.sample_step) - one.sample_rad
+                for position, one, gone in zip(track, data, out, strict=True)
+                if gone
             ]
         )
     scores = score(tracks[0], data, held_out)
@@ -190,11 +191,11 @@ def theirs(
     )  # fmt: skip
 
 
-def track_of(positions_rad: list[list[float]], data: tuple[TrialData, ...]) -> list[NDArray]:
-    """A peer's positions as the scores want them: relative to rest, to the end of each trial."""
+def track_of(positions_rad: list[list[float]], data: tuple[Run, ...]) -> list[NDArray]:
+    """A peer's positions as the scores want them: to the end of each trial."""
     return [
-        np.pad(np.array(p) - t.rest_rad, (0, max(0, len(t.command) + 1 - len(p))), mode="edge")
-        for p, t in zip(positions_rad, data, strict=True)
+        np.pad(np.array(p), (0, max(0, run.steps + 1 - len(p))), mode="edge")
+        for p, run in zip(positions_rad, data, strict=True)
     ]
 
 

@@ -18,8 +18,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import Replayed, replay
 from pupper_sysid.sim.walking.config import Randomisation
-from pupper_sysid.sysid.compare.readings import on_ticks, received
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData
+from pupper_sysid.sysid.servo_fit.readings import on_ticks, received
 from pupper_sysid.sysid.servo_fit.scores import Tracks
 
 if TYPE_CHECKING:

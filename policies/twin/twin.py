@@ -3,7 +3,7 @@
 `twin` gives the commands of a recording to the whole simulated robot, with the servos of one or of
 several actuators, in the air (its trunk fixed) and on the ground. Each predicts the readings that
 the recording's bus would have shown of it: their age, and an offset per joint
-(`sysid.compare.readings`, as in `compare`). Errors per joint stand beside the robot's repeatability
+(`sysid.servo_fit.readings`). Errors per joint stand beside the robot's repeatability
 and persistence, and readings say whether the robot was on the ground (`policies.twin.evidence`).
 
 On the ground several copies move, which differ in friction and payload; the prediction is the mean
@@ -27,17 +27,12 @@ from pupper_sysid.policies.twin.evidence import STRONGER, Case, Evidence, Verdic
 from pupper_sysid.policies.twin.gyro import STEP_S, Gyro, spectrum
 from pupper_sysid.policies.twin.playing import Played, play, sequences
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
-from pupper_sysid.sysid.compare.readings import (
-    ReadingRule,
-    in_words,
-    offsets,
-    reading_rules,
-    with_ages,
-)
+from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.joints import chosen_joints
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.readings import offsets, with_ages
 from pupper_sysid.sysid.servo_fit.scores import Errors, Tracks
 from pupper_sysid.sysid.servo_fit.windows import Part, everything
 
@@ -209,7 +204,7 @@ def twin(
     joints = chosen_joints(recording)
     data = servo_data([recording], joints, "auto", seed)
     known = {n: a.calibration for n, a in actuators.items() if a.calibration} | dict(feedback or {})
-    rules = reading_rules(data, recording.name, known)
+    rules = {j: rule_of(j, data.lattices[j], recording.name, known) for j in data.joints}
     data = with_ages(data, rules)
     test, rest, scored = _parts(recording, test_loops)
     given = sequences(data, robot)

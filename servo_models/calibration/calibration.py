@@ -161,6 +161,13 @@ class Calibration(Part):
             )
         return self.joints[name]
 
+    def operating_points(self) -> dict[str, list[str]]:
+        """P gain, armature and load that the numbers hold for, in words, and the joints of each."""
+        joints: dict[str, list[str]] = {}
+        for name, joint in self.joints.items():
+            joints.setdefault(str(joint.holds_at), []).append(name)
+        return joints
+
     def at_p_gain(self, p_gain: float) -> Calibration:
         """The calibration of the same servos at another P gain of their position loops.
 

@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from pupper_sysid.common.errors import InputError, refuse_outside
+from pupper_sysid.servo_models.calibration.operating_point import OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import (
     AGE,
     LAG,
@@ -90,7 +91,8 @@ class Actuator(Part):
     friction_loss_nm: Annotated[Quantity, TORQUE]
     """Dry (Coulomb) friction [N·m]."""
     armature_kg_m2: Annotated[Quantity, AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))]
-    """Reflected inertia and load at the joint [kg·m²]."""
+    """Reflected inertia at the joint [kg·m²]; `operating_point.armature` says whether with the
+    load."""
     effort_limit_nm: Annotated[Quantity, TORQUE]
     """Largest torque [N·m]."""
     velocity_limit_rad_s: Annotated[
@@ -232,6 +234,8 @@ class Selection(Part):
 class JointCalibration(Part):
     """Calibration of one joint."""
 
+    operating_point: OperatingPoint | None = None
+    """What the numbers of `actuator` hold for; null in older files, see `holds_at`."""
     actuator: Actuator
     """From command to motion."""
     under_load: UnderLoad | None = None
@@ -246,6 +250,19 @@ class JointCalibration(Part):
     """Errors of the chosen model."""
     warnings: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Reasons for distrust, in sentences."""
+
+    @property
+    def holds_at(self) -> OperatingPoint:
+        """What the numbers of `actuator` hold for; of an older file, as far as it says."""
+        if self.operating_point is not None:
+            return self.operating_point
+        block = self.under_load
+        if block is None:
+            return OperatingPoint(armature="servo and load")
+        return OperatingPoint(
+            p_gain=block.p_gain,
+            armature="servo" if block.known_load else "servo and load",
+        )
 
     def at_p_gain(self, p_gain: float) -> JointCalibration:
         """The same servo at another P gain: its stiffness is in proportion.
@@ -278,5 +295,6 @@ class JointCalibration(Part):
             update={
                 "actuator": own.model_copy(update=stiffness),
                 "under_load": self.under_load.model_copy(update={"p_gain": float(p_gain)}),
+                "operating_point": self.holds_at.at_p_gain(p_gain),
             }
         )

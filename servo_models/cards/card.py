@@ -23,6 +23,11 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
+from pupper_sysid.servo_models.calibration.operating_point import (
+    NOT_STATED,
+    Armature,
+    OperatingPoint,
+)
 from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
     P_GAINS,
@@ -127,6 +132,8 @@ class ServoCard(Part):
     """Gains at which the numbers hold."""
     load: _Text
     """What the servo moved when it was measured."""
+    armature: Armature = "servo"
+    """What the armature includes: `servo` is motor and gears alone."""
     published: bool
     """Whether the numbers are cited from others; false for a fit of this project."""
     source: Source
@@ -214,6 +221,15 @@ class ServoCard(Part):
         assert gain is not None
         return numbers.loaded(), gain
 
+    @property
+    def operating_point(self) -> OperatingPoint:
+        """P gain, armature and load that the numbers hold for."""
+        known = self.gains.p is not None
+        return OperatingPoint(
+            p_gain=self.gains.p, p_gain_source=f"card {self.name}" if known else NOT_STATED,
+            armature=self.armature, load=self.load,
+        )  # fmt: skip
+
     def calibration(self) -> Calibration:
         """The card as a calibration that fits every joint name."""
         return CardCalibration(
@@ -275,6 +291,7 @@ class ServoCard(Part):
         }
         counts = counts_of(self.servo)
         return JointCalibration(
+            operating_point=self.operating_point,
             actuator=Actuator(
                 model="delayed_pd",
                 stiffness_nm_per_rad=torques["stiffness"],

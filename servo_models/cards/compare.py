@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, derived
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.calibration.operating_point import ARMATURES, Armature
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, PARAMETER_KEYS
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.files import is_card, load_card
@@ -25,10 +26,19 @@ class Servo(Result):
     """Joint or specimen, or None where there is only one."""
     p_gain: float | None
     """P gain at which the numbers hold, where it is known."""
+    any_gain: bool
+    """Whether the numbers follow for any P gain; otherwise they hold at their own."""
+    armature: Armature
+    """What the armature includes."""
     supply_v: float | None
     """Supply voltage [V], where it is known."""
     pd: TorquePD
     """The numbers."""
+
+    @property
+    def title(self) -> str:
+        """Name and part."""
+        return self.name if self.part is None else f"{self.name} {self.part}"
 
 
 @dataclass(frozen=True)
@@ -43,17 +53,40 @@ class Difference(Result):
     """Of the first; None where it states none."""
     second: Quantity | None
     """Of the second."""
+    comparable: bool = True
+    """Whether both mean the same; otherwise there is no ratio."""
 
     @derived
     def ratio(self) -> float | None:
-        """Second over first; None where one is missing or 0."""
+        """Second over first; None where one is missing or 0, or they are not comparable."""
         one, other = (0.0 if q is None else q.value for q in (self.first, self.second))
-        return other / one if one and other else None
+        return other / one if one and other and self.comparable else None
 
     @property
     def distance(self) -> float:
         """Size of the difference: |log ratio|."""
         return abs(math.log(self.ratio)) if self.ratio else 0.0
+
+
+@dataclass(frozen=True)
+class Comparison(Result):
+    """Two servos at one P gain, as far as both know theirs.
+
+    Attributes
+    ----------
+    first, second : Servo
+    differences : tuple of Difference
+    p_gain : float or None
+        Of both; None where they could not be brought to one.
+    notes : tuple of str
+        What is compared at which gain, and what is not comparable, in sentences.
+    """
+
+    first: Servo
+    second: Servo
+    differences: tuple[Difference, ...]
+    p_gain: float | None
+    notes: tuple[str, ...]
 
 
 def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = None) -> Servo:
@@ -66,30 +99,102 @@ def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = 
         Joint of a calibration or specimen of a card; by default the first of the one, the default
         of the other.
     p_gain : float, optional
-        P gain, for a card of a position loop.
+        Another P gain than the numbers' own.
 
     Raises
     ------
     InputError
-        If it cannot be read, or has no such joint.
+        If it cannot be read, has no such joint, or holds at its own P gain only.
     """
     name = Path(path_or_name).name
     if is_card(path_or_name):
         card = load_card(path_or_name)
-        several = len(card.specimens) > 1
-        own = part if part in card.specimens else card.default
-        gain = card.gains.p if p_gain is None else p_gain
-        return Servo(name, own if several else None, gain, card.supply_v, card.pd(own, p_gain))
-    if p_gain is not None and Path(path_or_name).suffix.lower() not in (".yaml", ".yml"):
-        raise InputError(f"`p_gain` is for servo cards; {path_or_name} is none.")
+        specimen = part if part in card.specimens else card.default
+        return Servo(
+            name, specimen if len(card.specimens) > 1 else None,
+            card.gains.p if p_gain is None else p_gain,
+            not isinstance(card.specimens[specimen], TorquePD), card.armature, card.supply_v,
+            card.pd(specimen, p_gain),
+        )  # fmt: skip
     calibration = load_calibration(path_or_name)
-    joint = part or calibration.joint_names[0]
-    actuator = calibration.joint(joint).actuator
+    part = part or calibration.joint_names[0]
+    joint = calibration.joint(part)
+    if p_gain is not None and p_gain != joint.holds_at.p_gain:
+        if joint.under_load is None:
+            raise InputError(
+                f"`p_gain`: {path_or_name} holds at {joint.holds_at.gain_text} only, so there are "
+                "no numbers for another. Leave `p_gain` out."
+            )
+        joint = joint.at_p_gain(p_gain)
+    actuator, point = joint.actuator, joint.holds_at
     keys = [key for key in PARAMETER_KEYS.values() if key in TorquePD.model_fields]
     numbers = {key: getattr(actuator, key) for key in keys}
     if numbers["velocity_limit_rad_s"].value >= NO_SPEED_LIMIT_RAD_S:
         numbers["velocity_limit_rad_s"] = None
-    return Servo(name, joint, None, None, TorquePD(model="delayed_pd", **numbers))
+    pd = TorquePD(model="delayed_pd", **numbers)
+    any_gain = joint.under_load is not None and point.p_gain is not None
+    return Servo(name, part, point.p_gain, any_gain, point.armature, None, pd)
+
+
+def compared(
+    first: str, second: str, part: str | None = None, p_gain: float | None = None
+) -> Comparison:
+    """Two servos at equal P gain, number by number.
+
+    The gain is `p_gain`; else that of a servo whose numbers hold at no other; else the first's own.
+    Where one does not state its gain, or two fixed ones differ, each stays as it is, and numbers
+    that depend on the gain are not compared.
+
+    Parameters
+    ----------
+    first, second : str
+        As for `servo_of`.
+    part : str, optional
+        As for `servo_of`, of both.
+    p_gain : float, optional
+
+    Raises
+    ------
+    InputError
+        As `servo_of`.
+    """
+    names, notes = (first, second), []
+    servos = [servo_of(name, part) for name in names]
+    fixed = [s.p_gain for s in servos if not s.any_gain]
+    common = p_gain
+    if common is None and all(s.p_gain is not None for s in servos) and len(set(fixed)) < 2:
+        common = fixed[0] if fixed else servos[0].p_gain
+    if common is not None:
+        for n, (name, servo) in enumerate(zip(names, servos, strict=True)):
+            if servo.any_gain or servo.p_gain is not None:
+                servos[n] = servo_of(name, part, common)
+    one, other = servos
+    equal = one.p_gain is not None and one.p_gain == other.p_gain
+    if equal:
+        notes.append(f"Both at P gain {one.p_gain:g}.")
+    else:
+        stated = "; ".join(f"{s.title}: {_gain(s)}" for s in servos)
+        notes.append(f"Not at one P gain ({stated}), so stiffness and damping are not compared.")
+    alike = one.armature == other.armature
+    if not alike:
+        stated = "; ".join(f"{s.title}: {ARMATURES[s.armature]}" for s in servos)
+        notes.append(f"The armatures differ in what they include ({stated}); not compared.")
+    not_comparable = (set() if equal else _AT_GAIN) | (set() if alike else {"armature"})
+    return Comparison(
+        one, other,
+        tuple(
+            replace(d, comparable=d.quantity not in not_comparable)
+            for d in differences(one, other)
+        ),
+        one.p_gain if equal else None, tuple(notes),
+    )  # fmt: skip
+
+
+_AT_GAIN = {"stiffness", "damping"}
+
+
+def _gain(servo: Servo) -> str:
+    return "not stated" if servo.p_gain is None else f"P {servo.p_gain:g}"
 
 
 def differences(first: Servo, second: Servo) -> list[Difference]:

@@ -7,7 +7,13 @@ import json
 from pupper_sysid.common.files import versions
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.delayed_pd import whole_steps
-from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, TORQUE_KEYS, delays_at_step, step_note
+from pupper_sysid.sim.export.shared import (
+    FEEDBACK_KEYS,
+    TORQUE_KEYS,
+    delays_at_step,
+    operating_points,
+    step_note,
+)
 
 SCHEMA = "pupper-actuators"
 SCHEMA_VERSION = 2
@@ -28,6 +34,7 @@ def to_json(calibration: Calibration, physics_step_s: float) -> str:
         low, high = whole_steps(delays[name].low, delays[name].high, physics_step_s)
         keys = (*TORQUE_KEYS, "velocity_limit_rad_s", "dead_time_s")
         joints[name] = {
+            "operating_point": joint.holds_at.model_dump(mode="json"),
             "actuator": {key: getattr(a, key).model_dump(mode="json") for key in keys}
             | {"delay_steps_min": low, "delay_steps_max": high},
             "feedback": {key: getattr(f, key).model_dump(mode="json") for key in FEEDBACK_KEYS},
@@ -39,7 +46,8 @@ def to_json(calibration: Calibration, physics_step_s: float) -> str:
             "created": calibration.created, "exported_by": versions(),
             "inputs": [f.model_dump(mode="json") for f in calibration.inputs],
             "notes": [
-                *calibration.notes, "Delays in steps are rounded outward.",
+                *calibration.notes, *operating_points(calibration),
+                "Delays in steps are rounded outward.",
                 *step_note(calibration, delays, physics_step_s),
             ],
             "units": calibration.units, "physics_step_s": physics_step_s, "joints": joints,

@@ -95,7 +95,19 @@ def origin(calibration: Calibration) -> Iterator[str]:
     scales = {j.actuator.scale.source: j.actuator.scale for j in calibration.joints.values()}
     for source, scale in scales.items():
         yield f"Torques are scaled by {scale.anchor} {scale.value_nm:g} N·m: {source}."
+    yield from operating_points(calibration)
     yield from _beyond(calibration)
+
+
+def operating_points(calibration: Calibration) -> Iterator[str]:
+    """P gain, armature and load that the numbers hold for, joints alike in one sentence."""
+    for point, names in calibration.operating_points().items():
+        yield f"Numbers of {', '.join(names)} are for {point}."
+    if any(j.holds_at.armature == "servo and load" for j in calibration.joints.values()):
+        yield (
+            "An armature with the link and load counts their inertia twice in a model whose bodies "
+            "have it, too: take it off the armature there."
+        )
 
 
 def _beyond(calibration: Calibration) -> Iterator[str]:

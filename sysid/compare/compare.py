@@ -1,16 +1,17 @@
 """Compare servo models on recordings: the same free run, the same readings, side by side.
 
-Models are folders of `fit-servo` and calibrations. Each predicts the readings of the recording's
-bus, their age and their offset (`sysid.compare.readings`), by one rule for all. Beside them stand a
-linear filter fitted to the recording's other groups, persistence, and the robot's repeatability. A
-note names models that were fitted to a recording they are compared on.
+Models are folders of `fit-servo`, calibrations and servo cards. A calibration predicts each run as
+its file says (`sysid.fit.predict`), whatever stands beside it. Models of `fit-servo` know neither
+gain nor load: each run is predicted from its commands alone. Beside them stand a linear filter
+fitted to the recording's other groups, persistence, and the robot's repeatability. A note names
+models that were fitted to a recording they are compared on.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,23 +28,22 @@ from pupper_sysid.servo_models.calibration.calibration import (
 from pupper_sysid.servo_models.cards.files import card_names
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
-from pupper_sysid.sysid.compare.comparison import (
-    ComparedModel,
-    Comparison,
-)
-from pupper_sysid.sysid.compare.readings import (
-    age_spread_rad,
-    as_rows,
-    calibrated_run,
-    reading_rules,
-    run_with_offset,
-    shown,
-    with_ages,
-)
-from pupper_sysid.sysid.compare.runs import RunComparison, compare_runs, refuse_missing_joints
-from pupper_sysid.sysid.compare.under_load import needs_runs
+from pupper_sysid.sysid.compare.comparison import ComparedModel, Comparison
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.fit.predict import (
+    ComparedRun,
+    Prediction,
+    compared_runs,
+    persistence,
+    poll_of,
+    predict,
+    rule_of,
+)
+from pupper_sysid.sysid.fit.predict import (
+    notes as run_notes,
+)
+from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -55,6 +55,7 @@ from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
+from pupper_sysid.sysid.servo_fit.readings import as_rows, learned_run, run_with_offset
 from pupper_sysid.sysid.servo_fit.result import ServoFit
 from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
@@ -73,10 +74,10 @@ def compare(
     Parameters
     ----------
     recordings : Recording or sequence of Recording
-        At one rate.
+        Of any rates, gains and loads; models of `fit-servo` need one rate.
     models : sequence of str, Path, Calibration or ServoFit
-        Models, or names of servo model folders, calibration files and presets. Where the
-        recordings do not show the poll of their bus, that of the first calibration is used.
+        Models, or names of servo model folders, calibration files, servo cards and presets. The
+        score of each does not depend on the others.
     joints : str or sequence of str, optional
         By default all that were recorded.
     readings : {"auto", "fresh", "all"}
@@ -99,88 +100,172 @@ def compare(
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
     calibrations = _calibrations(models)
     for name, calibration in calibrations.items():  # before the work, not after it
-        refuse_missing_joints(calibration, name, names)
+        _refuse_missing_joints(calibration, name, names)
     trials = usable_trials(recordings, names)
-    if needs_runs(recordings, names, list(calibrations.values())):
-        found = compare_runs(recordings, calibrations, names, seed, lattices)
-        return _with_learned(found, recordings, models, names, readings, seed, lattices)
-    data = merged_groups(servo_data(recordings, names, readings, seed, lattices))
-    opened, fitted_to = _opened(models, data, recordings)
-    notes = [text for joint in names for text in cautions(joint, trials[joint])] + fitted_to
-    if presets := [str(given) for given in models if str(given) in PRESETS]:
+    learned = [m for m in models if isinstance(m, ServoFit) or _is_folder(m)]
+    notes = [text for joint in names for text in cautions(joint, trials[joint])]
+    polls = {joint: poll_of(recordings, joint, seed, lattices) for joint in names}
+    runs = {joint: compared_runs(recordings, joint, polls[joint]) for joint in names}
+    source = ", ".join(r.name for r in recordings)
+    predictions: dict[str, dict[str, Prediction]] = {}
+    for name, calibration in calibrations.items():
+        predictions[name] = {
+            joint: predict(
+                calibration, joint, runs[joint],
+                rule_of(joint, polls[joint], source, {name: calibration}), readings,
+            )
+            for joint in names
+        }  # fmt: skip
+    notes += [*_fitted_here(calibrations, recordings), *run_notes(calibrations, runs)]
+    made = {name: _scored(own, seed) for name, own in predictions.items()}
+    data, tracks, bands = None, {}, {}
+    try:
+        data = merged_groups(servo_data(recordings, names, readings, seed, polls))
+        opened, fitted_to = _opened(learned, data, recordings)
+        notes += fitted_to
+        for name, own in opened.items():
+            rows = as_rows(data, own.of_rows)
+            track, offset = run_with_offset(learned_run(own.model, rows), rows)
+            errors = scores.errors(own.model, track, rows, everything)
+            made[name] = ComparedModel.scored(ModelScores.of(errors, seed), offset, {})
+            tracks[name] = track
+        bands = {name: own.band for name, own in opened.items() if own.band}
+        tracks[LINEAR], errors = _linear(data, seed)
+        made[LINEAR] = ComparedModel.scored(ModelScores.of(errors, seed), {}, {})
+        for name, own in predictions.items():
+            tracks[name] = {j: _on_ticks(data, j, runs[j], p.tracks) for j, p in own.items()}
+    except InputError as error:
+        if learned:
+            raise
+        notes.append(f"No linear filter beside, it cannot be fitted to these runs: {error}")
+    if learned and _loaded(runs):
+        folders = ", ".join(n for n in made if n not in predictions and n != LINEAR)
+        notes.append(f"{folders}: knows neither the load nor the P gain of a run.")
+    if presets := [str(m) for m in models if str(m) in PRESETS]:
         notes.append(
             f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
             "age of readings, too, that age counts twice here."
         )
-    known = {name: found.calibration for name, found in opened.items() if found.calibration}
-    rules = reading_rules(data, ", ".join(r.name for r in recordings), known)
-    data = with_ages(data, rules)
-    made, tracks = _scored(opened, data, seed)
-    tracks[LINEAR], errors = _linear(data, seed)
-    made[LINEAR] = ComparedModel.scored(ModelScores.of(errors, seed), {}, {})
+    shown = iter(n for n in made if n not in predictions and n != LINEAR)
+    named = iter(predictions)
+    order = [next(shown if any(m is one for one in learned) else named) for m in models]  # as given
+    made = {name: made[name] for name in (*order, *([LINEAR] if LINEAR in made else []))}
+    nan, period = float("nan"), float(np.median([r.loop_period_s for r in recordings]))
+    rules = {joint: rule_of(joint, polls[joint], source) for joint in names}
     return Comparison(
         models=made,
         readings=rules,
-        persistence_rmse_rad=scores.persistence(data, everything),
-        repeatability_rad=scores.repeatability(data, everything),
-        time_step_s=data.period_s, notes=tuple(notes), data=data, tracks=tracks,
-        bands={name: found.band for name, found in opened.items() if found.band},
+        persistence_rmse_rad=scores.persistence(data, everything) if data is not None else {
+            joint: persistence(own) for joint, own in runs.items()
+        },
+        repeatability_rad=scores.repeatability(data, everything) if data is not None else (
+            dict.fromkeys(names, nan)
+        ),
+        time_step_s=period,
+        notes=tuple(notes),
+        data=data if data is not None else ServoData(tuple(names), period, {}, (), {}, polls),
+        tracks=tracks,
+        bands=bands,
+        runs=runs,
+        run_tracks={
+            name: {joint: p.tracks for joint, p in own.items()}
+            for name, own in predictions.items()
+        },
     )  # fmt: skip
 
 
-def _with_learned(
-    found: RunComparison,
-    recordings: Sequence[Recording],
-    models: Sequence[str | Path | Calibration | ServoFit],
-    joints: Sequence[str],
-    readings: str,
-    seed: int,
-    lattices: Mapping[str, PollLattice] | None,
-) -> RunComparison:
-    """A comparison under load with the models of fit-servo and the linear filter beside.
+def _scored(predictions: Mapping[str, Prediction], seed: int) -> ComparedModel:
+    """Scores of a calibration's predictions by joint."""
+    errors = {}
+    for joint, own in predictions.items():
+        e = own.errors()
+        nothing = np.zeros(len(e["counted"]))
+        errors[joint] = scores.Errors(
+            e["counted"], own.one_step(), nothing, own.blocks(), e["held"], e["raw"]
+        )
+    return ComparedModel.scored(
+        ModelScores.of(errors, seed),
+        {joint: own.offset_rad for joint, own in predictions.items()},
+        {joint: own.age_spread_rad() for joint, own in predictions.items()},
+        {joint: own.rule for joint, own in predictions.items()},
+    )
 
-    They know neither gain nor load: each run is predicted from its commands alone.
-    """
-    learned = [m for m in models if isinstance(m, ServoFit) or _is_folder(m)]
+
+def _fitted_here(
+    calibrations: Mapping[str, Calibration], recordings: Sequence[Recording]
+) -> list[str]:
+    """Which calibrations were fitted to one of the recordings, in sentences."""
+    inputs, sentences = {r.sha256: r.name for r in recordings}, []
+    for name, calibration in calibrations.items():
+        fitted = [inputs[f.sha256] for f in calibration.inputs if f.sha256 in inputs]
+        if fitted:
+            which = ", ".join(fitted) if len(fitted) < 4 else f"{len(fitted)} of these recordings"
+            sentences.append(
+                f"{name} was fitted to {which}: its errors here are too small. Its file holds "
+                "those on unseen data."
+            )
+    return sentences
+
+
+def _loaded(runs: Mapping[str, Sequence[ComparedRun]]) -> bool:
+    """Whether runs differ in gain, or carry a load."""
+    return any(
+        own.trial.load is not None or own.run.p_gain != every[0].run.p_gain
+        for every in runs.values()
+        for own in every
+    )
+
+
+def _on_ticks(
+    data: ServoData,
+    joint: str,
+    runs: Sequence[ComparedRun],
+    tracks: Sequence[NDArray[np.float64]],
+) -> list[NDArray[np.float64]]:
+    """Tracks of physics steps at the ticks of the data's runs, which may join trials."""
+    place = {(own.recording, own.trial.number): n for n, own in enumerate(runs)}
+    made = []
+    for run in data.runs[joint]:
+        position = np.full(len(run.command_rad) + 1, np.nan)
+        for number in np.unique(run.number):
+            rows = np.flatnonzero(run.number == number)
+            n = place.get((run.recording, int(number)))
+            if n is None:
+                continue
+            step = run.elapsed_s[rows] / runs[n].run.step_s
+            position[rows] = at_steps(tracks[n], step)
+            last = step[-1] + data.period_s / runs[n].run.step_s
+            position[rows[-1] + 1] = at_steps(tracks[n], np.array([last]))[0]
+        made.append(position)
+    return made
+
+
+def _refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence[str]) -> None:
+    """Refuse to compare on joints that a calibration does not have."""
+    missing = [j for j in joints if not _has(calibration, j)]
+    if missing:
+        common = [j for j in joints if j not in missing]
+        advice = f" Compare on {', '.join(common)} only (`joints`)." if common else ""
+        raise InputError(
+            f"{name} has no joint {', '.join(missing)}; it has "
+            f"{', '.join(calibration.joints)}.{advice}"
+        )
+
+
+def _has(calibration: Calibration, joint: str) -> bool:
     try:
-        data = merged_groups(servo_data(recordings, joints, readings, seed, lattices))
-        baseline = _linear(data, seed)[1]
-    except InputError as error:
-        if learned:
-            raise
-        note = f"No linear filter beside, it cannot be fitted to these runs: {error}"
-        return replace(found, notes=(*found.notes, note))
-    opened, notes = _opened(learned, data, recordings)
-    if learned and needs_runs(recordings, joints, []):
-        notes.append(f"{', '.join(opened)}: knows neither the load nor the P gain of a run.")
-    made, _ = _scored(opened, data, seed)
-    made[LINEAR] = ComparedModel.scored(ModelScores.of(baseline, seed), {}, {})
-    return replace(found, models=found.models | made, notes=(*found.notes, *notes))
+        calibration.joint(joint)  # a servo card has every joint
+    except InputError:
+        return False
+    return True
 
 
 def _is_folder(given: str | Path | Calibration) -> bool:
     return not isinstance(given, Calibration) and Path(given).is_dir()
 
 
-def _scored(
-    opened: Mapping[str, _Opened], data: ServoData, seed: int
-) -> tuple[dict[str, ComparedModel], dict[str, scores.Tracks]]:
-    """Scores and free runs of models on the same readings."""
-    made: dict[str, ComparedModel] = {}
-    tracks: dict[str, scores.Tracks] = {}
-    for name, found in opened.items():
-        own = as_rows(data, found.of_rows)
-        track, offset = run_with_offset(found.run(own), own)
-        errors = scores.errors(found.model, track, own, everything)
-        made[name] = ComparedModel.scored(
-            ModelScores.of(errors, seed), offset, age_spread_rad(track, own)
-        )
-        tracks[name] = shown(track, own)
-    return made, tracks
-
-
 def _opened(
-    models: Sequence[str | Path | Calibration | ServoFit],
+    models: Sequence[str | Path | ServoFit],
     data: ServoData,
     recordings: Sequence[Recording],
 ) -> tuple[dict[str, _Opened], list[str]]:
@@ -233,45 +318,31 @@ def _is_calibration(given: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class _Opened:
-    """A model to compare: a learned one, or a calibration."""
+    """A learned model to compare."""
 
     name: str
     fitted_to: list[str]  # hashes
-    model: ServoModel | None = None
-    calibration: Calibration | None = None
+    model: ServoModel
     band: dict[str, scores.Band] = field(default_factory=dict)
     of_rows: tuple[str, ...] = ()  # joints fitted to rows as logged
 
-    def run(self, data: ServoData) -> Callable[[NDArray[np.float64]], scores.Tracks]:
-        """From where each run starts to the model's tracks."""
-        if self.calibration:
-            return calibrated_run(self.calibration, data)
-        model = self.model
-        assert model is not None
-        return lambda start: scores.tracks(model, data, start)
 
-
-def _open(given: str | Path | Calibration | ServoFit, data: ServoData) -> _Opened:
+def _open(given: str | Path | ServoFit, data: ServoData) -> _Opened:
     if isinstance(given, ServoFit):
         if missing := [j for j in data.joints if j not in given.joints]:
             raise InputError(f"The {given.arch} model has no joint {', '.join(missing)}.")
         with TemporaryDirectory() as folder:
             given.save(folder, force=True)
             return _open(folder, data)
-    if isinstance(given, Calibration):
-        return _calibrated(given, "DelayedPD", data)
-    path = Path(given)
-    if path.is_dir():
-        saved: SavedModel = load_servo_model(path, data.joints, data.period_s)
-        contract = saved.contract
-        name = contract.arch.upper() if contract.arch in ("mlp", "lstm", "fir") else contract.arch
-        name += " (paper)" if contract.preset == "paper" else ""
-        return _Opened(
-            name, [r.sha256 for r in contract.recordings], saved.model,
-            band={j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()},
-            of_rows=tuple(j for j, mode in contract.readings_counted.items() if mode == "all"),
-        )  # fmt: skip
-    return _calibrated(load_calibration(given), f"DelayedPD ({path.name})", data)
+    saved: SavedModel = load_servo_model(Path(given), data.joints, data.period_s)
+    contract = saved.contract
+    name = contract.arch.upper() if contract.arch in ("mlp", "lstm", "fir") else contract.arch
+    name += " (paper)" if contract.preset == "paper" else ""
+    return _Opened(
+        name, [r.sha256 for r in contract.recordings], saved.model,
+        band={j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()},
+        of_rows=tuple(j for j, mode in contract.readings_counted.items() if mode == "all"),
+    )  # fmt: skip
 
 
 def _unknown(given: str | Path) -> str:
@@ -287,11 +358,6 @@ def _unknown(given: str | Path) -> str:
         f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor a servo card "
         f"(`pupper-sysid servo list`), nor one of the presets {', '.join(PRESETS)}. {advice}"
     )
-
-
-def _calibrated(calibration: Calibration, name: str, data: ServoData) -> _Opened:
-    refuse_missing_joints(calibration, name, data.joints)
-    return _Opened(name, [f.sha256 for f in calibration.inputs], calibration=calibration)
 
 
 def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores.Errors]]:

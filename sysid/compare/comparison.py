@@ -11,10 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import Result, internal
-from pupper_sysid.sysid.compare.readings import (
-    ReadingRule,
-    in_words,
-)
+from pupper_sysid.sysid.fit.predict import ComparedRun, ReadingRule, in_words, run_figure
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
@@ -50,6 +47,8 @@ class ComparedModel(ModelScores):
     age_spread_rad : dict of str to float
         By joint, the part of the raw error that the unknown age of readings makes: a perfect model
         would have it. 0 where readings are dated.
+    readings : dict of str to ReadingRule
+        By joint, when a calibration says that readings were measured.
     """
 
     # as for the errors, with more numbers
@@ -57,12 +56,17 @@ class ComparedModel(ModelScores):
     mean: ComparedScores
     offset_rad: dict[str, float] = field(default_factory=dict)
     age_spread_rad: dict[str, float] = field(default_factory=dict)
+    readings: dict[str, ReadingRule] = field(default_factory=dict)
 
     @classmethod
     def scored(
-        cls, own: ModelScores, offset_rad: dict[str, float], age_spread_rad: dict[str, float]
+        cls,
+        own: ModelScores,
+        offset_rad: dict[str, float],
+        age_spread_rad: dict[str, float],
+        readings: dict[str, ReadingRule] | None = None,
     ) -> ComparedModel:
-        """The scores with the offset and the spread that belong to them."""
+        """The scores with the offset, the spread and the rules that belong to them."""
         joints = {
             joint: ComparedScores(
                 **vars(found),
@@ -76,6 +80,7 @@ class ComparedModel(ModelScores):
             **vars(own) | more,  # pyright: ignore[reportArgumentType]
             offset_rad=offset_rad,
             age_spread_rad=age_spread_rad,
+            readings=readings or {},
         )
 
 
@@ -98,6 +103,10 @@ class Comparison(Result):
         Readings of each model in free run.
     bands : dict of str to (dict of str to Band)
         By model, of those that have a predictive band, then joint.
+    runs : dict of str to list of ComparedRun
+        By joint.
+    run_tracks : dict of str to (dict of str to list of ndarray)
+        By calibration, then joint: predicted readings at the steps of each run.
     """
 
     models: dict[str, ComparedModel]
@@ -109,6 +118,8 @@ class Comparison(Result):
     data: ServoData = internal()
     tracks: dict[str, scores.Tracks] = internal()
     bands: dict[str, dict[str, scores.Band]] = internal()
+    runs: dict[str, list[ComparedRun]] = internal(default_factory=dict)
+    run_tracks: dict[str, dict[str, list[NDArray[np.float64]]]] = internal(default_factory=dict)
 
     def to_frame(self) -> pd.DataFrame:
         """Scores, one row per joint and model."""
@@ -123,7 +134,7 @@ class Comparison(Result):
                     | {
                         "offset_rad": model.offset_rad.get(joint, nan),
                         "age_spread_rad": model.age_spread_rad.get(joint, nan),
-                        "readings": self.readings[joint].rule,
+                        "readings": model.readings.get(joint, self.readings[joint]).rule,
                         "persistence_rmse_rad": self.persistence_rmse_rad[joint],
                         "repeatability_rad": self.repeatability_rad[joint],
                         "band_noise_rad": noise, "band_timing_s": timing,
@@ -132,8 +143,15 @@ class Comparison(Result):
         return pd.DataFrame(rows).set_index(["joint", "model"])
 
     def reading_notes(self) -> list[str]:
-        """How readings were predicted, one sentence per rule, and the rule of the offset."""
-        return [OFFSET_RULE, *in_words(self.readings)]
+        """How readings were predicted, one sentence per rule, and which offsets were taken out."""
+        known = [j for j, own in self.runs.items() if all(r.offset_known for r in own)]
+        said = [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
+        if len(known) < len(self.data.joints):
+            said.append(OFFSET_RULE)
+        rules = [self.readings, *(m.readings for m in self.models.values() if m.readings)]
+        if len(rules) > 1:  # calibrations say when readings were measured
+            rules = rules[1:]
+        return list(dict.fromkeys([*said, *(text for own in rules for text in in_words(own))]))
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the models in free run beside commands and readings, a panel per joint.
@@ -145,6 +163,10 @@ class Comparison(Result):
         """
         from pupper_sysid.sysid.servo_fit.figures import free_run_figure
 
+        every = [own for runs in self.runs.values() for own in runs]
+        gains, loads = {own.run.p_gain for own in every}, [own.trial.load for own in every]
+        if not self.data.runs or len(gains) > 1 or any(loads):
+            return run_figure(self.runs, self.run_tracks, joints)
         errors = {name: model.errors for name, model in self.models.items()}
         drawn = {name: track for name, track in self.tracks.items() if name != LINEAR}
         return free_run_figure(self.data, drawn, errors, self.bands, joints)

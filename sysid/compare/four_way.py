@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.sysid.compare.comparison import ComparedModel, Comparison
-from pupper_sysid.sysid.compare.readings import (
-    age_spread_rad,
-    calibrated_run,
-    reading_rules,
-    run_with_offset,
-    shown,
-    with_ages,
-)
+from pupper_sysid.sysid.fit.predict import rule_of, track_of
+from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
+from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
+from pupper_sysid.sysid.servo_fit.readings import FreeRun, run_with_offset
 from pupper_sysid.sysid.servo_fit.result import ServoFit
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
@@ -32,7 +30,6 @@ def four_way(
     joints: Sequence[str],
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
-    calibration: Calibration | None = None,
 ) -> Comparison:
     """Compare published DelayedPD, one fitted here, an MLP and an LSTM.
 
@@ -48,8 +45,6 @@ def four_way(
     seed : int
     progress : callable, optional
         Called with what is being done and the share of it that is done.
-    calibration : Calibration, optional
-        Of the same bus; its poll is used where the recording does not show one.
 
     Raises
     ------
@@ -67,10 +62,8 @@ def four_way(
         )
     mlp = fits["mlp"]
     assert split.train is not None and split.test is not None
-    rules = reading_rules(
-        mlp.data, recording.name, {"calibration": calibration} if calibration else {}
-    )
-    data = with_ages(mlp.data, rules)
+    data = mlp.data
+    rules = {j: rule_of(j, data.lattices[j], recording.name) for j in data.joints}
     run = calibrated_run(load_calibration("paper"), data)
     track, offset = run_with_offset(run, data, split.train)
     errors = scores.errors(None, track, data, split.test)
@@ -78,7 +71,7 @@ def four_way(
     fitted = {FITTED: mlp.scored["delayed-pd"], LINEAR: mlp.scored["linear"]}
     fitted |= {arch.upper(): fit.scored[arch] for arch, fit in fits.items()}
     return Comparison(
-        models={PUBLISHED: ComparedModel.scored(published, offset, age_spread_rad(track, data))}
+        models={PUBLISHED: ComparedModel.scored(published, offset, {})}
         | {name: ComparedModel.scored(own, {}, {}) for name, own in fitted.items()},
         readings=rules,
         persistence_rmse_rad={j: s.persistence_rmse_rad for j, s in mlp.joints.items()},
@@ -86,10 +79,30 @@ def four_way(
         time_step_s=mlp.time_step_s,
         notes=mlp.notes,
         data=mlp.data,
-        tracks={PUBLISHED: shown(track, data)}
-        | {arch.upper(): fit.tracks for arch, fit in fits.items()},
+        tracks={PUBLISHED: track} | {arch.upper(): fit.tracks for arch, fit in fits.items()},
         bands={},
     )
+
+
+def calibrated_run(calibration: Calibration, data: ServoData) -> FreeRun:
+    """Free run of a calibration's servos on the runs of learned models, several times per tick."""
+
+    def run(offset: NDArray[np.float64]) -> scores.Tracks:
+        tracks: scores.Tracks = {}
+        for n, joint in enumerate(data.joints):
+            tracks[joint] = []
+            for e, own in enumerate(data.runs[joint]):
+                physics = own.on_physics(np.ones(len(own.tick), bool))
+                track = track_of(calibration, joint, physics, offset[e, n]) - offset[e, n]
+                per_tick = max(1, math.ceil(data.period_s / physics.step_s))
+                send = own.trial.send_time_s - own.trial.send_time_s[0]
+                edges = np.append(send, send[-1] + data.period_s)
+                ticks = np.arange(per_tick * len(send) + 1) / per_tick
+                step = np.interp(ticks, np.arange(len(edges)), edges) / physics.step_s
+                tracks[joint].append(at_steps(track, step))
+        return tracks
+
+    return run
 
 
 def _part_of(

@@ -5,13 +5,17 @@
 whether the interval holds it. Torques are compared as ratios to the armature, because a recording
 in free air determines no more. The true lag is measured on the true servo's motion under the
 recording's own commands, with the weights of the recording's tones.
+
+Both sides have the calibration's definitions (`defined_as`): its P gain, its armature (motor and
+gears alone where it was made under a known load, else with the load), and the dead time that gives
+the true lag in its physics steps.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,13 +28,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.operating_point import OperatingPoint
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import delay_at_step
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
-from pupper_sysid.sysid.identify.calibrate import CalibrationResult
-from pupper_sysid.sysid.identify.candidates.simulation import whole_counts
+from pupper_sysid.sysid.fit.calibrate import CalibrationResult
+from pupper_sysid.sysid.fit.run import whole_counts
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
 from pupper_sysid.sysid.lag.phase_slope import tone_lags, tone_weights
 from pupper_sysid.sysid.lag.tone import tone_response
@@ -59,6 +64,10 @@ class _Joint(BaseModel):
     """Numbers of the servo: stiffness, damping, friction_loss, armature, dead_time_s, …"""
     feedback: dict[str, float]
     """Numbers of its readings: poll_period_s, loss, quantum_rad, offset_rad, mean_age_s."""
+    loaded_servo: dict[str, float] | None = None
+    """Of a servo on a bench, its own numbers, without the load, and the load's."""
+    registers: dict[str, int] | None = None
+    """Registers that `actuator` holds for; `p` is its P gain."""
 
 
 class _Truth(BaseModel):
@@ -104,10 +113,13 @@ class TruthTable(Result):
     ----------
     quantities : tuple of TruthRow
         By joint, in the order of the calibration.
+    definitions : tuple of str
+        P gain, armature and load that the numbers of both sides are for, a sentence per joint.
     notes : tuple of str
     """
 
     quantities: tuple[TruthRow, ...]
+    definitions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[TruthRow]:
@@ -199,19 +211,22 @@ def truth_table(
             + ": no joint in common."
         )
     rows: list[TruthRow] = []
+    definitions = []
     for joint in both:
         found, true = calibration.joint(joint), truth["joints"][joint]
-        actuator, feedback = true["actuator"], true["feedback"]
-        stepped = _in_steps_of(actuator, true, found.actuator.physics_step_s)
+        feedback, point = true["feedback"], found.holds_at
+        stepped = defined_as(point, true, found.actuator.physics_step_s)
+        definitions.append(f"{joint}: {point}.")
         if recordings is not None and found.lag.lag_s is not None:
             trials = joint_trials(recordings, joint)
-            rows.append(_row(joint, "lag_s", found.lag.lag_s, true_lag_s(trials, true, seed)))
+            moved = true | {"actuator": _at_gain(true, trials[0].p_gain)}
+            rows.append(_row(joint, "lag_s", found.lag.lag_s, true_lag_s(trials, moved, seed)))
         for name, (where, value) in QUANTITIES.items():
             quantity, known = where(found), value(stepped, feedback)
             # a part that neither servo has, and a limit that is infinite, are nothing to find
             if np.isfinite(known) and (known or quantity.value):
                 rows.append(_row(joint, name, quantity, known))
-    return TruthTable(quantities=tuple(rows))
+    return TruthTable(quantities=tuple(rows), definitions=tuple(definitions))
 
 
 def read_truth(recording: Path) -> dict[str, Any]:
@@ -237,7 +252,7 @@ def read_truth(recording: Path) -> dict[str, Any]:
             "them."
         )
     data, lines = read_yaml(path)
-    return validated(_Truth, data, path, lines).model_dump()
+    return validated(_Truth, data, path, lines).model_dump(exclude_none=True)
 
 
 def true_lag_s(trials: Sequence[Trial], truth: Mapping[str, Any], seed: int = 0) -> float:
@@ -303,13 +318,42 @@ def _parameters(actuator: _Numbers) -> DelayedPDParameters:
     return DelayedPDParameters(**{k: v for k, v in actuator.items() if k in known})
 
 
-def _in_steps_of(
-    actuator: _Numbers, joint: Mapping[str, Any], physics_step_s: float
+def defined_as(
+    point: OperatingPoint, truth: Mapping[str, Any], physics_step_s: float
 ) -> dict[str, float]:
-    """True actuator with the dead time that gives its lag in the calibration's physics steps."""
-    step = joint.get("physics_step_s", _EMULATOR_STEP_S)
+    """Numbers of the true actuator by the definitions of a calibration.
+
+    The dead time is the one that gives the true lag, with the load, in the calibration's physics
+    steps.
+
+    Parameters
+    ----------
+    point : OperatingPoint
+        Of the calibration.
+    truth : mapping
+        Of the joint.
+    physics_step_s : float
+        Of the calibration.
+    """
+    actuator = _at_gain(truth, math.nan if point.p_gain is None else point.p_gain)
+    step = truth.get("physics_step_s", _EMULATOR_STEP_S)
     dead_time = float(delay_at_step(_parameters(actuator), physics_step_s, step)[0])
-    return dict(actuator) | {"dead_time_s": dead_time}
+    bench = truth.get("loaded_servo")
+    if bench is not None and point.armature == "servo":
+        actuator["armature"] = bench["armature_kg_m2"]
+    return actuator | {"dead_time_s": dead_time}
+
+
+def _at_gain(truth: Mapping[str, Any], p_gain: float) -> dict[str, float]:
+    """The true actuator at a P gain; as it is where that is not known, or it has no such register.
+
+    The bench's derivative gain is a register of its own, so its damping does not change.
+    """
+    actuator = dict(truth["actuator"])
+    own = (truth.get("registers") or {}).get("p")
+    if own and np.isfinite(p_gain):
+        actuator["stiffness"] *= p_gain / own
+    return actuator
 
 
 def _row(joint: str, name: str, found: Quantity, truth: float) -> TruthRow:
@@ -341,4 +385,4 @@ def compared_with_truth(
         f"The calibration was made from {names}, so its lag, which depends on the commands, is "
         "not compared."
     )
-    return TruthTable(quantities=table.quantities, notes=(note,))
+    return replace(table, notes=(note,))

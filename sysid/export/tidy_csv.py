@@ -56,6 +56,9 @@ def to_csv(source: Calibration | Recording, path: Path | None = None, force: boo
 
 def _calibration(calibration: Calibration) -> str:
     header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
+    header["operating_points"] = {
+        name: joint.holds_at.model_dump(mode="json") for name, joint in calibration.joints.items()
+    }
     buffer = io.StringIO()
     buffer.write(comments("pupper-sysid calibration table", header))
     # text is quoted: a '#' in a sentence must not begin a comment

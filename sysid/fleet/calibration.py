@@ -35,8 +35,8 @@ from pupper_sysid.common.processes.workers import Workers
 from pupper_sysid.common.reading.budget import read_limit, reading_up_to
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.calibration_file import GIVEN_TORQUE
+from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE
 from pupper_sysid.sysid.recordings.files import load
 
 TABLE = "fleet.csv"

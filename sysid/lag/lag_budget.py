@@ -4,7 +4,7 @@
     servo lag = dead time + dynamics
 
 `lag_budget` measures the raw lag and its three parts; the dead time needs a model
-(`sysid.identify.joint_fit`). Only the dead time is the servo's own: the lag moves with gain,
+(`sysid.fit.joint_fit`). Only the dead time is the servo's own: the lag moves with gain,
 amplitude and load.
 
 * Tones (`sysid.lag.tone`): the phase slope of fresh rows at their measurement times, against the

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, prepare
+from pupper_sysid.sysid.fit.run import Run, prepare
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.sweep.excitation import (
     HIGHEST_HZ,
@@ -97,7 +97,7 @@ class Candidate:
     frequency_hz, amplitude_rad : float
     duration_s : float
         Without the lead-in.
-    data : TrialData
+    run : Run
         Its command, and the times of its readings.
     """
 
@@ -105,7 +105,7 @@ class Candidate:
     frequency_hz: float
     amplitude_rad: float
     duration_s: float
-    data: TrialData
+    run: Run
 
 
 def candidates(setup: Setup, duration_s: float) -> list[Candidate]:
@@ -116,12 +116,12 @@ def candidates(setup: Setup, duration_s: float) -> list[Candidate]:
             kind, ["joint"], [frequency], amplitude, duration_s, setup.loop_period_s,
             setup.speed_limit_rad_s, setup.poll_rate_hz,
         )  # fmt: skip
-        data = recorded(made.trials[0], setup)
-        found.append(Candidate(kind, frequency, amplitude, duration_s, data))
+        run = recorded(made.trials[0], setup)
+        found.append(Candidate(kind, frequency, amplitude, duration_s, run))
     return found
 
 
-def recorded(trial: TrialPlan, setup: Setup) -> TrialData:
+def recorded(trial: TrialPlan, setup: Setup) -> Run:
     """A trial on the physics clock, as the recorder and the guard would send it; it reads zeros."""
     sent_s = np.arange(0.0, trial.duration_s, setup.loop_period_s)
     wanted = trial.offset(sent_s)

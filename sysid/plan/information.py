@@ -20,17 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sysid.identify.candidates.models import CandidateModel
-from pupper_sysid.sysid.identify.candidates.simulation import (
-    TrialData,
-    free_run,
-    look_up,
-    residuals,
-)
-
-SHIFT_SD_S = 0.0003
-"""Standard deviation of the time shift common to a tone's readings [s], about that of the phase of
-a poll estimated from a few seconds."""
+from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, residuals
+from pupper_sysid.sysid.fit.structure import Structure
 
 _STEP = 0.03  # of the sensitivities: the slope over a likely error, not of one kink
 _LINEAR_STEP = 3e-4
@@ -62,13 +54,13 @@ class Hypothesis:
 
     Attributes
     ----------
-    model : CandidateModel
+    model : Structure
     values : ndarray, shape (parameters,)
     known : ndarray, shape (parameters, parameters)
         Information about the fitted coordinates so far, the prior included.
     """
 
-    model: CandidateModel
+    model: Structure
     values: NDArray[np.float64]
     known: NDArray[np.float64]
 
@@ -101,7 +93,7 @@ class Response:
 
 def without_shift(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Information of a tone's trials, summed, about the parameters whatever its shift in time."""
-    shift, own = information[:-1, -1], information[-1, -1] + SHIFT_SD_S**-2
+    shift, own = information[:-1, -1], information[-1, -1] + PHASE_SD_S**-2
     return information[:-1, :-1] - np.outer(shift, shift) / own
 
 
@@ -115,19 +107,19 @@ def pooled(
     return sum((without_shift(total) for total in by_tone.values()), start=0.0)
 
 
-def prior_information(model: CandidateModel) -> NDArray[np.float64]:
+def prior_information(model: Structure) -> NDArray[np.float64]:
     """Of the model's prior, shape (parameters, parameters); a wide one where it has none."""
     sd = np.array([min(p.prior_sd, 2.0 if p.logarithmic else 1.0) for p in model.parameters])
     return np.diag(sd**-2.0)
 
 
-def respond(hypothesis: Hypothesis, trial: TrialData, noise: Noise, seen: float = 1.0) -> Response:
+def respond(hypothesis: Hypothesis, trial: Run, noise: Noise, seen: float = 1.0) -> Response:
     """Simulate one trial and its sensitivities.
 
     Parameters
     ----------
     hypothesis : Hypothesis
-    trial : TrialData
+    trial : Run
         Command, and the times of the readings; their positions are ignored.
     noise : Noise
     seen : float
@@ -139,20 +131,20 @@ def respond(hypothesis: Hypothesis, trial: TrialData, noise: Noise, seen: float 
     centre = np.array([float(p.encode(v)) for p, v in zip(par, values, strict=True)])
     cloud = np.concatenate([centre + np.diag(step), centre - np.diag(step)])
     ends = np.stack([p.decode(cloud[:, j]) for j, p in enumerate(par)], axis=-1)
-    off = residuals(model, ends, [trial])
+    off = residuals(model, ends, [trial])[0]
     track = free_run(model, values, [trial])[0]
-    speed = look_up(np.gradient(track) / trial.step_s, trial.sample_step)
+    speed = at_steps(np.gradient(track) / trial.step_s, trial.sample_step)
     slope = (off[: len(par)] - off[len(par) :]).T / (2 * step)
     shift = slope[:, :1] / values[0]  # of the logarithm: a tone's shift is a dead time of its own
     return Response(
-        look_up(track, trial.sample_step),
+        at_steps(track, trial.sample_step),
         seen * noise.weights(speed),
         np.hstack([slope, shift]),
     )
 
 
 def fitted_noise(
-    model: CandidateModel, values: NDArray, trials: Sequence[TrialData], least_rad: float
+    model: Structure, values: NDArray, trials: Sequence[Run], least_rad: float
 ) -> Noise:
     """Noise that explains the residuals of a fit, tone by tone.
 
@@ -161,9 +153,9 @@ def fitted_noise(
 
     Parameters
     ----------
-    model : CandidateModel
+    model : Structure
     values : ndarray, shape (parameters,)
-    trials : sequence of TrialData
+    trials : sequence of Run
     least_rad : float
         Smallest floor.
     """
@@ -171,7 +163,7 @@ def fitted_noise(
 
     square, speed = [], []
     for trial, track in zip(trials, free_run(model, values, trials), strict=True):
-        off = look_up(track, trial.sample_step) - trial.sample_rad
+        off = at_steps(track, trial.sample_step) - trial.sample_rad
         bound = 4 * 1.4826 * np.median(np.abs(off)) + 1e-12  # an upset is not the noise
         square.append(np.mean(np.clip(off, -bound, bound) ** 2))
         speed.append(np.mean(np.gradient(track) ** 2) / trial.step_s**2)
@@ -196,7 +188,7 @@ def separation(
     for true, wrong in zip(truth, rival, strict=True):
         off = (wrong.position_rad - true.position_rad)[:, None]
         push, information = wrong.inner(wrong.sensitivity, off)[:, 0], wrong.information
-        own = information[-1, -1] + SHIFT_SD_S**-2
+        own = information[-1, -1] + PHASE_SD_S**-2
         total += wrong.inner(off, off).item() - push[-1] ** 2 / own
         pull += push[:-1] - information[:-1, -1] * push[-1] / own
         curvature += without_shift(information)

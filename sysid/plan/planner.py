@@ -18,7 +18,7 @@ from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result
-from pupper_sysid.sysid.identify.posterior import STEPPING_SD_S
+from pupper_sysid.sysid.fit.posterior import STEPPING_SD_S
 from pupper_sysid.sysid.plan.candidates import Candidate, Setup, candidates, trial_seconds
 from pupper_sysid.sysid.plan.information import (
     Hypothesis,
@@ -195,7 +195,7 @@ class _World:
     def __init__(self, servo: Servo, choice: Sequence[Candidate], seen: float):
         self.servo = servo
         self.responses = [
-            [respond(h, c.data, servo.noise, seen) for c in choice] for h in servo.hypotheses
+            [respond(h, c.run, servo.noise, seen) for c in choice] for h in servo.hypotheses
         ]
         self.information = [[r.information for r in own] for own in self.responses]
         self.tones = [(c.kind, c.frequency_hz) for c in choice]
@@ -256,7 +256,7 @@ def _followed(worlds: Sequence[_World], candidate: Candidate, number: int) -> bo
     """Whether most servos follow a tone at all: where a limit clips it, `delay` leaves it out."""
     if candidate.kind != "sine":
         return True
-    commanded = np.std(candidate.data.command[len(candidate.data.command) // 4 :])
+    commanded = np.std(candidate.run.command[len(candidate.run.command) // 4 :])
     moved = [
         min(np.std(own[number].position_rad[len(own[number].position_rad) // 4 :])
             for own in world.responses)

@@ -15,8 +15,8 @@ import numpy as np
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.joint_fit import fit_joint
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.joint_fit import fit_joint
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import LARGEST_RAD, Setup
 from pupper_sysid.sysid.plan.planner import JointPlan, PlannedTrial, Prediction, propose
 from pupper_sysid.sysid.plan.servos import (
@@ -222,7 +222,7 @@ def plan_first_sweep(
     """Plan a first sweep of servos of which nothing is known.
 
     The trials are the best on average over servos drawn from the prior of
-    `sysid.identify.candidates.models`.
+    `sysid.fit.structure`.
 
     Parameters
     ----------

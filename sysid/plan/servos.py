@@ -12,10 +12,9 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.sysid.identify.candidates.models import CandidateModel, Parameter, candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData
-from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
-from pupper_sysid.sysid.identify.search import SIMULATED
+from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.fit.run import Run
+from pupper_sysid.sysid.fit.structure import SIMULATED, Parameter, Structure, candidate
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.plan.candidates import Setup
 from pupper_sysid.sysid.plan.information import (
@@ -43,12 +42,12 @@ def fitted_servo(result: JointCalibrationResult) -> Servo:
     Parameters
     ----------
     result : JointCalibrationResult
-        Of `sysid.identify.joint_fit.fit_joint`.
+        Of `sysid.fit.joint_fit.fit_joint`.
     """
-    trials, nats = result.trials, result.structure_nats
+    trials, nats = result.runs, result.structure_nats
     best = result.candidate_models[min(nats, key=lambda name: nats[name])]
     least = max(result.lag.quantum_rad / math.sqrt(12), _LEAST_NOISE_RAD)
-    noise = fitted_noise(candidate_model(best.model), _values(best), trials, least)
+    noise = fitted_noise(candidate(best.model), _values(best), trials, least)
     # the carried structure first: its value is the one that is reported
     names = sorted(nats, key=lambda name: name != result.simulated_model)
     hypotheses, inflations = [], []
@@ -62,14 +61,12 @@ def fitted_servo(result: JointCalibrationResult) -> Servo:
     )  # fmt: skip
 
 
-def _fitted(
-    fit: CandidateFit, trials: tuple[TrialData, ...], noise: Noise
-) -> tuple[Hypothesis, float]:
+def _fitted(fit: CandidateFit, trials: tuple[Run, ...], noise: Noise) -> tuple[Hypothesis, float]:
     """A fit as a hypothesis as uncertain as its intervals, and the inflation which that takes.
 
     The information of the trials gives the correlations, the fit's intervals the scales.
     """
-    model = candidate_model(fit.model)
+    model = candidate(fit.model)
     bare = Hypothesis(model, _values(fit), prior_information(model))
     seen = pooled((round(t.frequency_hz, 2), respond(bare, t, noise).information) for t in trials)
     covariance = np.linalg.inv(bare.known + seen)
@@ -109,7 +106,7 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
     )
     found = []
     for name in SIMULATED:
-        model = candidate_model(name)
+        model = candidate(name)
         values = named.get(name) or (_preset(joint.actuator) if name == SIMULATED[0] else None)
         if values is not None and set(model.names) <= set(values):
             known = prior_information(model) + _interval_information(model, joint.actuator)
@@ -139,7 +136,7 @@ def unknown_servos(seed: int) -> list[Servo]:
     while len(found) < _DRAWS:
         hypotheses = []
         shared: dict[str, float] = {}
-        for model in map(candidate_model, SIMULATED):
+        for model in map(candidate, SIMULATED):
             for p in model.parameters:
                 centre, sd = float(p.encode(p.nominal)), min(p.prior_sd, 1.0) / 2
                 if p.name == "dead_time_s":
@@ -176,7 +173,7 @@ def calibrated_setup(joint: JointCalibration, setup: Setup) -> Setup:
 
 
 def _values(fit: CandidateFit) -> NDArray[np.float64]:
-    return np.array([fit.values[name] for name in candidate_model(fit.model).names])
+    return np.array([fit.values[name] for name in candidate(fit.model).names])
 
 
 def _preset(actuator: Actuator) -> dict[str, float]:
@@ -184,7 +181,7 @@ def _preset(actuator: Actuator) -> dict[str, float]:
     one = actuator.parameters.per_inertia()
     numbers = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
                one.velocity_limit, 0.0)  # fmt: skip
-    model = candidate_model(SIMULATED[0])
+    model = candidate(SIMULATED[0])
     boxed = []
     for p, number in zip(model.parameters, numbers, strict=True):
         boxed.append(float(np.clip(np.asarray(number, float), p.low, p.high)))
@@ -201,7 +198,7 @@ _QUANTITIES = {
 }
 
 
-def _interval_information(model: CandidateModel, actuator: Actuator) -> NDArray[np.float64]:
+def _interval_information(model: Structure, actuator: Actuator) -> NDArray[np.float64]:
     """What a calibration's intervals say about each parameter on its own."""
     precision = np.zeros(len(model.parameters))
     for k, p in enumerate(model.parameters):

@@ -18,7 +18,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.results import Result, derived
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds
 from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S
 from pupper_sysid.sysid.plan.proposal import Margins, SweepPlan, plan_from_fits, recorded_s
@@ -94,7 +94,7 @@ class Outcome(Result):
 
 
 Fit = Callable[[Sequence[Recording], list[str]], Mapping[str, JointCalibrationResult]]
-"""Fits joints to recordings, pooled (`sysid.identify.joint_fit.fit_joint`)."""
+"""Fits joints to recordings, pooled (`sysid.fit.joint_fit.fit_joint`)."""
 
 RecordNext = Callable[[SweepPlan, int], Path]
 """Records a plan as the round of this number, from 2, and returns the recording's file."""

@@ -15,7 +15,7 @@ import numpy as np
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
 
 _FEW_FREQUENCIES = 4
 _FAST_HZ = 5.0  # below it a servo of 20 ms dynamics looks like 20 ms more of dead time
@@ -65,8 +65,8 @@ def advice(
 def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
     """Sentences for one joint, without its name."""
     pd, lattice = result.delayed_pd, result.lag.feedback
-    tones = sorted({round(t.frequency_hz, 2) for t in result.trials if t.frequency_hz > 0})
-    fresh = sum(len(t.sample_step) for t in result.trials)
+    tones = sorted({round(t.frequency_hz, 2) for t in result.runs if t.frequency_hz > 0})
+    fresh = sum(len(t.sample_step) for t in result.runs)
     width = 1e3 * (result.dead_time_s.high - result.dead_time_s.low)
     found = []
     ratios = actuator.ratios_to_armature

@@ -16,9 +16,9 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
+from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 
 LONGEST_RUN = 12
@@ -68,28 +68,28 @@ def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Tra
     model : str, optional
         Name of a candidate model; by default the one that simulators run.
     """
-    if not result.trials:
+    if not result.runs:
         return []
     model = model or result.simulated_model
-    fitted = candidate_model(model)
+    fitted = candidate(model)
     values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
-    simulated = free_run(fitted, values, result.trials)
-    return [_track(*pair) for pair in zip(result.trials, simulated, strict=True)]
+    simulated = free_run(fitted, values, result.runs)
+    return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
 
 
-def _track(trial: TrialData, simulated: NDArray) -> Track:
-    steps = len(trial.command)
+def _track(run: Run, simulated: NDArray) -> Track:
+    steps, rest = run.steps, run.rest_rad
     # over a few steps: dry friction makes the speed of a single one jump
     smooth = np.convolve(np.pad(simulated, 2, mode="edge"), np.ones(5) / 5, mode="valid")
     speed = np.gradient(smooth, TIME_STEP_S)
     return Track(
-        trial.frequency_hz,
-        np.arange(steps) * np.float64(TIME_STEP_S), trial.command, simulated[:steps],
-        TIME_STEP_S * trial.sample_step, trial.sample_rad,
-        TIME_STEP_S * trial.row_step, trial.row_rad,
-        trial.sample_rad - look_up(simulated, trial.sample_step),
-        trial.row_rad - look_up(simulated, trial.row_step),
-        look_up(speed, trial.sample_step), look_up(speed, trial.row_step),
+        run.frequency_hz,
+        np.arange(steps) * np.float64(TIME_STEP_S), run.command - rest, simulated[:steps] - rest,
+        TIME_STEP_S * run.sample_step, run.sample_rad - rest,
+        TIME_STEP_S * run.row_step, run.row_rad - rest,
+        run.sample_rad - at_steps(simulated, run.sample_step),
+        run.row_rad - at_steps(simulated, run.row_step),
+        at_steps(speed, run.sample_step), at_steps(speed, run.row_step),
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from pupper_sysid.common.figure_style import (
     axes_grid,
     styled,
 )
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.report.figure_data import Track, some_tracks, tracks, window, within
 
 

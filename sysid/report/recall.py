@@ -16,14 +16,14 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import CandidateModel, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.sysid.identify.calibration_file import preset_parameters
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import free_run
-from pupper_sysid.sysid.identify.joint_fit import score_preset
-from pupper_sysid.sysid.identify.preparation import PreparedJoint, prepare_joint
-from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
-from pupper_sysid.sysid.identify.scores import Scores, score
-from pupper_sysid.sysid.identify.search import SIMULATED
+from pupper_sysid.sysid.fit.calibration_file import preset_parameters
+from pupper_sysid.sysid.fit.joint_fit import score_preset
+from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
+from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.fit.run import free_run
+from pupper_sysid.sysid.fit.scores import Scores, score
+from pupper_sysid.sysid.fit.structure import SIMULATED
+from pupper_sysid.sysid.fit.structure import candidate as structure
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.joints import Recordings, usable_trials
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -42,7 +42,7 @@ def recall(
     joints: Sequence[str],
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, JointCalibrationResult]:
-    """Results by joint, as `sysid.identify.calibrate.calibrate` made them.
+    """Results by joint, as `sysid.fit.calibrate.calibrate` made them.
 
     Intervals are those of the file: of the model that simulators run. Errors by left-out frequency
     are not in the file; the error over all of them is.
@@ -75,7 +75,7 @@ def _joint(
 ) -> JointCalibrationResult:
     values = {c.model: _values(c) for c in known.selection.candidate_models}
     carried, a = _carried(known), known.actuator
-    ready = prepare_joint(name, trials, seed, {carried: values[carried]})
+    ready = prepare_joint(name, trials, seed, True, {carried: values[carried]})
     fits = {
         c.model: _fit(c, values[c.model], ready, known if c.model == carried else None)
         for c in known.selection.candidate_models
@@ -89,9 +89,9 @@ def _joint(
         command_jitter_s=_interval(a.command_jitter_s),
         candidate_models=fits,
         lag=_lag(ready.lag, known),
-        presets={n: score_preset(parameters, ready.data) for n, parameters in presets.items()},
+        presets={n: score_preset(parameters, ready.runs) for n, parameters in presets.items()},
         warnings=known.warnings,
-        trials=ready.data,
+        runs=ready.runs,
     )
 
 
@@ -130,7 +130,7 @@ def _carried(joint: JointCalibration) -> str:
 
 
 def _values(candidate: CandidateModel) -> np.ndarray:
-    names = candidate_model(candidate.model).names
+    names = structure(candidate.model).names
     return np.array([candidate.parameters[name] for name in names])
 
 
@@ -141,7 +141,7 @@ def _fit(
     carried: JointCalibration | None,
 ) -> CandidateFit:
     """One candidate model; `carried` is the joint if simulators run this one."""
-    model = candidate_model(candidate.model)
+    model = structure(candidate.model)
     quantities = {} if carried is None else _quantities(carried)
     parameters = {
         name: _interval(quantities[name], value)
@@ -149,7 +149,7 @@ def _fit(
         else Interval(value, value, value)
         for name, value in candidate.parameters.items()
     }
-    scores = score(free_run(model, values, ready.data), ready.data, {})
+    scores = score(free_run(model, values, ready.runs), ready.runs)
     return CandidateFit(
         model=candidate.model,
         parameters=parameters,

@@ -15,8 +15,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.page import WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration, is_shipped
-from pupper_sysid.sysid.identify.calibrate import calibrate
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,

@@ -10,8 +10,8 @@ from pupper_sysid.common.files import versions
 from pupper_sysid.common.joints import share_sentences
 from pupper_sysid.common.page import Fold, Picture, Section, Table
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
-from pupper_sysid.sysid.identify.search import PREFERRED
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.structure import PREFERRED
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures, free_run_figures, tables
 from pupper_sysid.sysid.report.advice import advice

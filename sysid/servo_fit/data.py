@@ -9,7 +9,7 @@ Where the feedback is held (more than a fifth of the rows repeat the one before 
 moves), only fresh readings count, each at its own time; otherwise every row as logged.
 
 Every row has the instants at which its reading may have been measured (`Run.reading_tick`): the
-one found, where the poll lattice is known, else that of the read. `sysid.compare.readings` puts
+one found, where the poll lattice is known, else that of the read. `sysid.servo_fit.readings` puts
 the instants of a known bus in their place; a predicted reading is the mean of a model over them.
 
 Trials that follow each other without a pause, like the loops of a playback, are one run. Nothing is
@@ -33,7 +33,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     fresh_rows,
     readings,
 )
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, prepare, whole_counts
+from pupper_sysid.sysid.fit.run import Run as PhysicsRun
+from pupper_sysid.sysid.fit.run import prepare, whole_counts
 from pupper_sysid.sysid.recordings.joints import joint_rng, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
@@ -104,13 +105,13 @@ class Run:
         """Commands as the bus sent them, quantised [rad]."""
         return whole_counts(self.trial)
 
-    def trial_data(self, used: NDArray[np.bool_]) -> TrialData:
+    def on_physics(self, used: NDArray[np.bool_]) -> PhysicsRun:
         """The run on the clock of physics, with only the readings of `used`, shape (fresh,)."""
         r = self.readings
         kept = replace(
             r, rows=r.rows[used], time_s=r.time_s[used], position_rad=r.position_rad[used]
         )
-        return prepare(self.trial, kept)
+        return prepare(self.trial, kept).in_free_air()
 
 
 @dataclass(frozen=True)

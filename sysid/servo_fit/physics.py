@@ -1,7 +1,7 @@
 """DelayedPD and sparse equations, fitted to the same part of the data as the networks.
 
 Both are fitted in free run from rest to the part's readings at their own times
-(`sysid.identify.output_error`). The result is arrays per joint, ready for a servo model file.
+(`sysid.fit.search`). The result is arrays per joint, ready for a servo model file.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData
-from pupper_sysid.sysid.identify.output_error import Problem
-from pupper_sysid.sysid.identify.search import PREFERRED, fit_problems
+from pupper_sysid.sysid.fit.run import Run
+from pupper_sysid.sysid.fit.search import Problem, search
+from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen
 
@@ -36,26 +35,23 @@ def delayed_pd_fits(
     list of dict of str to ndarray, shape (joints,)
         Fields of `DelayedPDParameters` for an armature of 1, and `offset_rad`.
     """
-    model = candidate_model(PREFERRED)
-    problems, shifts = [], []
+    model = candidate(PREFERRED)
+    keep, final = (12, 3) if len(parts) * len(data.joints) <= _MANY else (6, 2)
+    fits = []
     for part in parts:
+        own = []
         for joint in data.joints:
-            trials = part_trials(data, joint, part)
-            noise = noise_scale(data, joint)
-            problems.append(Problem(trials, (True,) * len(trials), noise, {}))
-            shifts.append(_truncation_shift(data, joint))
-    rng = np.random.default_rng(seed)
-    keep, final = (12, 3) if len(problems) <= _MANY else (6, 2)
-    best = fit_problems(model, problems, rng, keep, final)
-    found = []
-    for n in range(len(parts)):
-        own = slice(n * len(data.joints), (n + 1) * len(data.joints))
-        v = np.array([f.values for f in best[own]]).T
-        found.append(
+            runs = part_runs(data, joint, part)
+            problem = Problem(model, runs, (noise_scale(data, joint),) * len(runs))
+            rng = np.random.default_rng(seed)
+            own.append(model.decode(search(problem, rng, keep=keep, final=final)[0].point))
+        v = np.array(own).T
+        shifts = np.array([_truncation_shift(data, joint) for joint in data.joints])
+        fits.append(
             dict(zip(_NAMES, v, strict=False))
-            | {"armature": np.ones_like(v[0]), "offset_rad": v[6] + np.array(shifts[own])}
+            | {"armature": np.ones_like(v[0]), "offset_rad": v[6] + shifts}
         )
-    return found
+    return fits
 
 
 def sindy_fits(
@@ -72,8 +68,8 @@ def sindy_fits(
 
     found = []
     for part in parts:
-        trials = {j: part_trials(data, j, part) for j in data.joints}
-        results = fit_equations(trials, {j: noise_scale(data, j) for j in data.joints}, seed)
+        runs = {j: part_runs(data, j, part) for j in data.joints}
+        results = fit_equations(runs, {j: noise_scale(data, j) for j in data.joints}, seed)
         names = [n for n in COEFFICIENTS if any(n in r.coefficients for r in results.values())]
         absent = {"saturation_error_rad": np.inf}
         values = {
@@ -88,10 +84,10 @@ def sindy_fits(
     return found
 
 
-def part_trials(data: ServoData, joint: str, part: Part) -> tuple[TrialData, ...]:
+def part_runs(data: ServoData, joint: str, part: Part) -> tuple[Run, ...]:
     """Runs of a joint on the clock of physics, with only the part's readings."""
     found = [(run, chosen(run, part)) for run in data.runs[joint]]
-    return tuple(run.trial_data(use) for run, use in found if use.any())
+    return tuple(run.on_physics(use) for run, use in found if use.any())
 
 
 def noise_scale(data: ServoData, joint: str) -> float:

@@ -6,7 +6,7 @@
    (`sysid.sparse.structure`). Its numbers are not used: derivatives of sparse readings
    bias stiffness and delay.
 3. *Numbers by output error.* Each proposed structure, dead time included, is fitted in free run
-   (`sysid.identify.output_error`).
+   (`sysid.fit.search`).
 4. *Sparsity by free-run cross-validation.* The structure that predicts left-out frequencies best is
    chosen; among those within 5 % the one with the fewest numbers. Structures one term away from it
    are tried too: a term stays only if the error on unseen frequencies needs it.
@@ -31,20 +31,14 @@ from pupper_sysid.servo_models.sparse_equation import (
     digits,
     equation,
     explain,
-    integrate,
 )
-from pupper_sysid.sysid.identify.candidates.models import CandidateModel, Parameter, candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run
-from pupper_sysid.sysid.identify.output_error import Fit, Problem
-from pupper_sysid.sysid.identify.preparation import prepare_joint
-from pupper_sysid.sysid.identify.scores import Scores, score
-from pupper_sysid.sysid.identify.search import (
-    PREFERRED,
-    best_of,
-    fit_with_folds,
-    held_out_residuals,
-    leave_one_out_folds,
-)
+from pupper_sysid.sysid.fit.kernel import SPARSE
+from pupper_sysid.sysid.fit.preparation import prepare_joint
+from pupper_sysid.sysid.fit.run import Run, free_run
+from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, score
+from pupper_sysid.sysid.fit.search import Fit, Problem, fit_folds, folds_of, refined, search
+from pupper_sysid.sysid.fit.structure import PREFERRED, Parameter, Structure
+from pupper_sysid.sysid.fit.structure import candidate as structure_called
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -57,7 +51,7 @@ from pupper_sysid.sysid.sparse.structure import PULLS, Support, ordered, propose
 _WITHIN = 1.05  # cross-validation errors this close are a tie: the sparser one wins
 
 _SATURATION = {PULLS[1], "saturation_error_rad"}
-_SHARED = {p.name: p for p in candidate_model(PREFERRED).parameters}
+_SHARED = {p.name: p for p in structure_called(PREFERRED).parameters}
 _PARAMETERS = {
     "stiffness_per_s2": _SHARED["stiffness_per_s2"],
     "saturated_stiffness_per_s2": replace(
@@ -183,7 +177,7 @@ def sparse_equations(
     """
     ready = each_joint(partial(prepare_joint, seed=seed), recordings, joints, workers)
     found = fit_equations(
-        {joint: r.data for joint, r in ready.items()},
+        {joint: r.runs for joint, r in ready.items()},
         {joint: r.noise_rad for joint, r in ready.items()},
         seed,
         workers,
@@ -198,7 +192,7 @@ def sparse_equations(
 
 
 def fit_equations(
-    trial_data: Mapping[str, tuple[TrialData, ...]],
+    runs: Mapping[str, tuple[Run, ...]],
     noise_rad: Mapping[str, float | tuple[float, ...]],
     seed: int = 0,
     workers: int = 1,
@@ -208,7 +202,7 @@ def fit_equations(
 
     Parameters
     ----------
-    trial_data : mapping of str to tuple of TrialData
+    runs : mapping of str to tuple of Run
         Per joint; only the fresh samples in it are fitted, so a caller may leave some out.
     noise_rad : mapping of str to (float or tuple of float)
         Per joint, the size of ordinary residuals [rad], of all trials or of each.
@@ -219,7 +213,7 @@ def fit_equations(
     progress : callable, optional
         Called with a joint's name when it is done.
     """
-    tasks = {joint: (data, noise_rad[joint]) for joint, data in trial_data.items()}
+    tasks = {joint: (data, noise_rad[joint]) for joint, data in runs.items()}
     return map_joints(partial(_fit_joint, seed=seed), tasks, workers, progress)
 
 
@@ -227,29 +221,32 @@ def fit_equations(
 
 
 def _fit_joint(
-    joint: str, task: tuple[tuple[TrialData, ...], float | tuple[float, ...]], seed: int
+    joint: str, task: tuple[tuple[Run, ...], float | tuple[float, ...]], seed: int
 ) -> EquationResult:
-    data, noise = task
-    folds = leave_one_out_folds(data)
-    pd = candidate_model(PREFERRED)
-    pd_fits = fit_with_folds(pd, data, folds, noise, joint_rng(seed, joint), {})
+    runs, noise = task
+    noise = noise if isinstance(noise, tuple) else (noise,) * len(runs)
+    folds = folds_of(runs)
+    pd = structure_called(PREFERRED)
+    pd_fits = _with_folds(Problem(pd, runs, noise), folds, joint_rng(seed, joint))
     tried: dict[Support, tuple[Candidate, list[Fit]]] = {}
     candidates: list[Candidate] = []
     chosen: Support = ()
-    wanted = propose(data, dict(zip(pd.names, pd_fits[0].values, strict=True)))
+    best = dict(zip(pd.names, pd.decode(pd_fits[0].point), strict=True))
+    wanted = propose(runs, best)
     while wanted:
         for support in wanted:
             model = equation_model(support)
-            near = np.array([_starts(model, f.values) for f in pd_fits])
-            fits = fit_with_folds(model, data, folds, noise, joint_rng(seed, joint), {}, near)
-            scores = _scores(model, fits, folds, data)
-            samples = sum(len(d.sample_step) for d in data)
+            near = [model.encode(np.array(_starts(model, pd.decode(f.point)))) for f in pd_fits]
+            problem = Problem(model, runs, noise)
+            fits = _with_folds(problem, folds, joint_rng(seed, joint), near)
+            scores = _scores(model, fits, folds, runs)
+            samples = problem.samples
             bic = 2 * samples * np.log(max(scores.rmse_fresh_rad, 1e-9))
             bic += len(model.parameters) * np.log(samples)
             candidate = Candidate(
                 terms=support,
                 rmse_fresh_rad=scores.rmse_fresh_rad,
-                rmse_leave_one_frequency_out_rad=scores.rmse_leave_one_frequency_out_rad,
+                rmse_leave_one_frequency_out_rad=scores.rmse_unseen_rad,
                 bic=float(bic),
             )
             tried[support] = candidate, fits
@@ -258,16 +255,16 @@ def _fit_joint(
         around = _neighbours(chosen) + _neighbours(candidates[0].terms)
         wanted = [s for s in dict.fromkeys(around) if s not in tried]
     model, fits = equation_model(chosen), tried[chosen][1]
-    everything = Problem(data, (True,) * len(data), noise, {})
     # the fit to all readings may start from the folds' fits, never the other way round
-    polished = best_of(model, [everything], np.array([[f.values for f in fits]]), 25)
-    scores = _scores(model, [*polished, *fits[1:]], folds, data)
+    ends = np.array([f.point for f in fits])
+    polished = refined(Problem(model, runs, noise), ends, len(ends))[0]
+    scores = _scores(model, [polished, *fits[1:]], folds, runs)
     candidates = [
         replace(c, rmse_fresh_rad=scores.rmse_fresh_rad) if c.terms == chosen else c
         for c in candidates
     ]
-    values = dict(zip(model.names, map(float, polished[0].values), strict=True))
-    every = np.array([f.values for f in [*polished, *fits[1:]]])
+    values = dict(zip(model.names, map(float, model.decode(polished.point)), strict=True))
+    every = model.decode(np.array([f.point for f in [polished, *fits[1:]]]))
     ranges = {
         name: (float(column.min()), float(column.max()))
         for name, column in zip(model.names, every.T, strict=True)
@@ -281,36 +278,30 @@ def _fit_joint(
         coefficients=values,
         leave_one_out_ranges=ranges,
         scores=scores,
-        delayed_pd=_scores(pd, pd_fits, folds, data),
+        delayed_pd=_scores(pd, pd_fits, folds, runs),
         candidates=tuple(candidates),
         warnings=(),
     )
     return replace(result, warnings=tuple(_warnings(result)))
 
 
-def equation_model(support: Support) -> CandidateModel:
-    """The structure as a model that `sysid.identify.output_error` can fit."""
-
-    def simulate(values: NDArray, track: NDArray) -> None:
-        rest = np.zeros(track.shape[1])
-        integrate(
-            track, (rest, rest), dict(zip(support, values, strict=True)), TIME_STEP_S, out=track
-        )
-
+def equation_model(support: Support) -> Structure:
+    """The structure as a model that `sysid.fit.search` can fit."""
     parameters = (
         _SHARED["dead_time_s"], *(_PARAMETERS[name] for name in support), _SHARED["offset_rad"]
     )  # fmt: skip
 
     def columns(values: NDArray) -> NDArray:
-        every = np.zeros((len(values), len(COEFFICIENTS)))
+        every = np.zeros((len(values), len(COEFFICIENTS) + 1))
         every[:, list(COEFFICIENTS).index("saturation_error_rad")] = np.inf
-        every[:, [list(COEFFICIENTS).index(name) for name in support]] = values
+        every[:, [list(COEFFICIENTS).index(name) for name in support]] = values[:, 1:-1]
+        every[:, -1] = values[:, -1]
         return every
 
-    return CandidateModel("sparse_equation", parameters, simulate, columns)
+    return Structure("sparse_equation", parameters, SPARSE, columns_of=columns)
 
 
-def _starts(model: CandidateModel, pd_values: NDArray) -> list[list[float]]:
+def _starts(model: Structure, pd_values: NDArray) -> list[list[float]]:
     """Starts of a structure from a fit of `DelayedPD` to the trials of the same fold."""
     pd = dict(zip(_SHARED, pd_values, strict=True))
     kp, effort, speed = (
@@ -337,14 +328,34 @@ def _starts(model: CandidateModel, pd_values: NDArray) -> list[list[float]]:
     return starts
 
 
+def _with_folds(
+    problem: Problem,
+    folds: Mapping[str, NDArray[np.bool_]],
+    rng: np.random.Generator,
+    near: Sequence[NDArray[np.float64]] | None = None,
+) -> list[Fit]:
+    """The best fit to all runs, then without each fold's, each from starts of its own.
+
+    `near` has further starts of each, in fitted coordinates. A fold does not start from the fit to
+    all runs.
+    """
+    whole = search(problem, rng, None if near is None else near[0])[0]
+    if near is None:
+        return [whole, *fit_folds(problem, folds, rng)]
+    fits = [whole]
+    for out, starts in zip(folds.values(), near[1:], strict=True):
+        fits.append(search(problem.only(~out), rng, starts)[0])
+    return fits
+
+
 def _scores(
-    model: CandidateModel,
+    model: Structure,
     fits: Sequence[Fit],
-    folds: dict[float, tuple[bool, ...]],
-    data: Sequence[TrialData],
+    folds: Mapping[str, NDArray[np.bool_]],
+    runs: Sequence[Run],
 ) -> Scores:
-    track = free_run(model, fits[0].values, data)
-    return score(track, data, held_out_residuals(model, fits[1:], folds, data))
+    track = free_run(model, model.decode(fits[0].point), runs)
+    return score(track, runs, held_out_residuals(model, fits[1:], folds, runs))
 
 
 def _choose(ranked: Sequence[Candidate]) -> Candidate:
@@ -381,7 +392,7 @@ def _warnings(r: EquationResult) -> list[str]:
         p = _PARAMETERS[name]
         if value <= p.low * 1.01 or value >= p.high / 1.01:
             found.append(f"{r.joint}: {name} is at the bound of its search, {digits(value)}.")
-    own, pd = (s.rmse_leave_one_frequency_out_rad for s in (r.scores, r.delayed_pd))
+    own, pd = (s.rmse_unseen_rad for s in (r.scores, r.delayed_pd))
     if own > _WITHIN * pd:
         found.append(
             f"{r.joint}: DelayedPD predicts unseen frequencies better ({1e3 * pd:.1f} against "

@@ -22,7 +22,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData
+from pupper_sysid.sysid.fit.run import Run
 
 Support = tuple[str, ...]
 """Names of the coefficients of one structure, in the order of `COEFFICIENTS`."""
@@ -39,12 +39,12 @@ _LONGEST_GAP_S = 0.15  # no spline across a stretch without readings
 _LEAST_PER_PERIOD = 4.0  # fresh readings per period, below which a spline invents the motion
 
 
-def propose(data: Sequence[TrialData], delayed_pd: Mapping[str, float]) -> list[Support]:
+def propose(data: Sequence[Run], delayed_pd: Mapping[str, float]) -> list[Support]:
     """Structures that pysindy finds in the derivatives, those found most often first.
 
     Parameters
     ----------
-    data : sequence of TrialData
+    data : sequence of Run
     delayed_pd : mapping of str to float
         Values of the fitted `DelayedPD`: its delay, offset, and the error at which it saturates.
 
@@ -61,7 +61,7 @@ def propose(data: Sequence[TrialData], delayed_pd: Mapping[str, float]) -> list[
         trials = []
         for trial, step, position, speed, acceleration in splines:
             middle = np.arange(len(trial.command)) + 0.5
-            late = np.interp(step - delay, middle, trial.command, left=0.0)
+            late = np.interp(step - delay, middle, trial.command, left=trial.rest_rad)
             trials.append((late - position, speed, acceleration))
         if not trials:
             break
@@ -78,7 +78,7 @@ def ordered(names: set[str]) -> Support:
     return tuple(name for name in COEFFICIENTS if name in names)
 
 
-def _dense(trial: TrialData) -> bool:
+def _dense(trial: Run) -> bool:
     """Whether a spline through the readings can follow the trial's tone."""
     if not trial.frequency_hz > 0 or len(trial.sample_step) < 8:
         return not trial.frequency_hz > 0
@@ -86,9 +86,7 @@ def _dense(trial: TrialData) -> bool:
     return len(trial.sample_step) >= _LEAST_PER_PERIOD * trial.frequency_hz * seconds
 
 
-def _motion(
-    trial: TrialData, offset_rad: float
-) -> list[tuple[TrialData, NDArray, NDArray, NDArray, NDArray]]:
+def _motion(trial: Run, offset_rad: float) -> list[tuple[Run, NDArray, NDArray, NDArray, NDArray]]:
     """The trial with steps, position, speed and acceleration of a spline through its readings."""
     step, first = np.unique(trial.sample_step, return_index=True)
     if len(step) < 8:

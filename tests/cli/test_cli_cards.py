@@ -58,10 +58,11 @@ def test_another_gain_and_the_file_itself(capsys, tmp_path):
 def test_a_difference_of_two_cards_and_of_a_card_and_a_calibration(capsys):
     lines = lines_of(capsys, "servo", "diff", "sts3215-kscale-m1", "sts3215-soarm100")
     assert max(map(len, lines)) <= 80
-    assert any("stiffness" in line and "42.5" in line for line in lines)
+    # 998.22 at P 16 against 23.458 · 16 / 32
+    assert any("stiffness" in line and "85.1" in line for line in lines)
     main(["servo", "diff", "sts3215-bam-m1", "paper", "--joint", "LF_thigh", "--json"])
     found = json.loads(capsys.readouterr().out)
-    assert found["second"]["part"] == "LF_thigh"
+    assert found["second"]["part"] == "LF_thigh" and found["p_gain"] is None
     stiffness = found["differences"][0]
     assert (stiffness["quantity"] == "stiffness" and stiffness["second"] == 70.0) or (
         stiffness["second"]["value"] == 70.0

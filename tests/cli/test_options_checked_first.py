@@ -12,8 +12,8 @@ from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.servo_models.calibration.parts import Actuator
 from pupper_sysid.servo_models.calibration.quantity import PlausibleRange
 from pupper_sysid.servo_models.cards.files import load_card
+from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fleet.calibration import Settings
-from pupper_sysid.sysid.identify.calibrate import calibrate
 from pupper_sysid.sysid.plan.proposal import plan_from_recordings
 from pupper_sysid.sysid.report.report import write_report
 from pupper_sysid.sysid.servo_fit.fit import Split

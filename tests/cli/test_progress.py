@@ -7,7 +7,7 @@ import io
 import pytest
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.sysid.identify import calibrate as module
+from pupper_sysid.sysid.fit import calibrate as module
 
 
 @pytest.fixture
@@ -31,10 +31,11 @@ def test_without_a_terminal_there_is_a_line_each_ten_seconds(lines):
 
 
 def test_a_joint_is_done_after_all_its_stages(monkeypatch):
-    monkeypatch.setattr(module, "prepare_joint", lambda joint, trials, seed: "ready")
-    monkeypatch.setattr(module, "fit_structure", lambda ready, name: name)
-    monkeypatch.setattr(module, "conclude", lambda joint, ready, own, presets: list(own))
+    monkeypatch.setattr(module, "prepare_joint", lambda joint, trials, seed, free_air: "ready")
+    monkeypatch.setattr(module, "stages", lambda ready: module.STAGES[1:-1])
+    monkeypatch.setattr(module, "fit_structures", lambda ready, name: name)
+    monkeypatch.setattr(module, "conclude", lambda ready, fitted, presets: list(fitted))
     told = []
-    made = module._one_by_one("LF_hip", (), 0, {}, lambda *stage: told.append(stage))
+    made = module._one_by_one("LF_hip", (), True, 0, {}, lambda *stage: told.append(stage))
     assert told == [("LF_hip", stage) for stage in module.STAGES]
     assert made == list(module.STAGES[1:-1])

@@ -99,7 +99,7 @@ def test_leaving_the_pool_ends_its_processes_in_the_midst_of_their_work():
 @linux
 def test_processes_are_forked_from_one_that_has_a_single_thread():
     """Python 3.12 and later warn of deadlocks where this is not so."""
-    with Workers(2, "pupper_sysid.sysid.identify.calibrate") as workers:
+    with Workers(2, "pupper_sysid.sysid.fit.calibrate") as workers:
         workers.submit("a", os.getppid)
         workers.submit("b", os.getppid)
         (server,) = set(dict(workers.results()).values())

@@ -10,13 +10,13 @@ import pytest
 
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, DelayedPD
 from pupper_sysid.servo_models.loaded_servo import (
-    COLUMNS,
     Load,
     LoadedServo,
     LoadedServoParameters,
 )
 from pupper_sysid.sim.robot.servo_mjcf import pendulum_xml, rest_at
-from pupper_sysid.sysid.loaded import kernel
+from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.sysid.fit.structure import loaded_columns
 from support.refusals import assert_each_refused
 
 STEP_S = 0.002
@@ -87,14 +87,10 @@ def test_the_compiled_servo_is_the_one_in_numpy(servo: LoadedServoParameters, ra
     held = np.ones((3, rest + steps))
     held[0, :rest], held[0, rest:] = start, commands(steps)
     held[1, rest:], held[2, rest:] = on, volts
-    row = np.zeros((1, kernel.WIDTH))
-    values = servo.arrays()
-    row[0, : len(COLUMNS)] = [float(values[name]) for name in COLUMNS]
-    out = np.empty((steps + 1, 1))
     load = np.array([LOAD.inertia_kg_m2, LOAD.gravity_nm, LOAD.hanging_rad])
-    kernel.positions(
-        row, np.array([0.0133 / STEP_S]), held, 16.0, load, 1.0, start, rest, STEP_S,
-        -FRICTION_IMPEDANCE, out,
+    out = kernel.positions(
+        kernel.SERVO, loaded_columns(servo)[None], np.array([0.0133 / STEP_S]), held, 16.0, load,
+        start, rest, STEP_S, -FRICTION_IMPEDANCE,
     )  # fmt: skip
     assert np.abs(out[1:, 0] - expected).max() < 1e-6
 

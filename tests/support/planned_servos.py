@@ -9,10 +9,10 @@ import numpy as np
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
-from pupper_sysid.sysid.identify.joint_fit import fit_joint
-from pupper_sysid.sysid.identify.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.joint_fit import fit_joint
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
+from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.plan.candidates import Setup, recorded
 from pupper_sysid.sysid.plan.information import (
     Hypothesis,
@@ -36,7 +36,7 @@ PD = (0.025, 12000.0, 100.0, 200.0, 430.0)
 def tones(
     frequencies: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0), amplitude_rad: float = 0.3,
     loop_period_s: float = 0.019,
-) -> list[TrialData]:  # fmt: skip
+) -> list[Run]:  # fmt: skip
     """Trials of 5 s as a standard sweep has them."""
     made = plan("sine", ["LF_hip"], frequencies, amplitude_rad, 5.0, loop_period_s)
     return [recorded(trial, Setup(loop_period_s=loop_period_s)) for trial in made.trials]
@@ -44,11 +44,11 @@ def tones(
 
 def hypothesis(back_emf: bool = False) -> Hypothesis:
     """A usual servo whose speed is limited by set-point slew, or by back-EMF."""
-    model = candidate_model("delayed_pd_back_emf" if back_emf else "delayed_pd")
+    model = candidate("delayed_pd_back_emf" if back_emf else "delayed_pd")
     return Hypothesis(model, np.array([*PD, 8.0, 0.0]), prior_information(model))
 
 
-def recorded_servo(trials: list[TrialData], structures: int = 1) -> Servo:
+def recorded_servo(trials: list[Run], structures: int = 1) -> Servo:
     """What these trials say about the usual servo, alone or beside a rival as good as it."""
     found = []
     for one in [hypothesis(), hypothesis(back_emf=True)][:structures]:
@@ -57,14 +57,12 @@ def recorded_servo(trials: list[TrialData], structures: int = 1) -> Servo:
     return Servo(tuple(found), NOISE, (0.0,) * structures)
 
 
-def with_readings(
-    one: Hypothesis, trial: TrialData, noise: Noise, rng: np.random.Generator
-) -> TrialData:
+def with_readings(one: Hypothesis, trial: Run, noise: Noise, rng: np.random.Generator) -> Run:
     """The trial with readings of the servo, whose errors grow with its speed."""
     (track,) = free_run(one.model, one.values, [trial])
-    speed = look_up(np.gradient(track) / trial.step_s, trial.sample_step)
+    speed = at_steps(np.gradient(track) / trial.step_s, trial.sample_step)
     error = rng.standard_normal(len(speed)) / np.sqrt(noise.weights(speed))
-    return replace(trial, sample_rad=look_up(track, trial.sample_step) + error)
+    return replace(trial, sample_rad=at_steps(track, trial.sample_step) + error)
 
 
 @cache

@@ -21,7 +21,7 @@ from pupper_sysid.common.joints import (
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.quantity import Quantity
-    from pupper_sysid.sysid.identify.calibrate import CalibrationResult
+    from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 
 _SHOWN = {
     "lag_ms": ("lag ms", 1),
@@ -69,7 +69,7 @@ class Calibrate:
         if self.stall_torque is not None:
             refuse_outside("--stall-torque", self.stall_torque, *STALL_TORQUES_NM, "N·m")
         refuse_outside("--jobs", self.jobs, *terminal.JOBS)
-        from pupper_sysid.sysid.identify.calibrate import STAGES, calibrate
+        from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
 
         started = time.perf_counter()
@@ -89,7 +89,7 @@ class Calibrate:
                 left[joint] -= 1
                 advance(f"{joint}, {stage}")
 
-            def done(joint: str) -> None:  # joints under load have no stages
+            def done(joint: str) -> None:  # joints under load have fewer stages
                 for _ in range(left.pop(joint)):
                     advance(joint)
 
@@ -167,6 +167,8 @@ class Calibrate:
             "or back-EMF (EMF). Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
+        for point, names in made.calibration.operating_points().items():
+            terminal.out.print(f"{', '.join(names)}: {point}.", soft_wrap=True)
         for r in made.values():
             terminal.warn(r.warnings)
         strangers = [

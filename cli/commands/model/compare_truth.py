@@ -42,7 +42,7 @@ class CompareTruth:
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
         from pupper_sysid.servo_models.calibration.quantity import unit_of
         from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
-        from pupper_sysid.sysid.identify.calibrate import calibrate
+        from pupper_sysid.sysid.fit.calibrate import calibrate
 
         truth = read_truth(self.recording)  # before the work, not after it
         (recording,) = terminal.load_all([self.recording])
@@ -82,6 +82,8 @@ class CompareTruth:
             "armature.",
             soft_wrap=True,
         )
+        for definition in found.definitions:
+            terminal.out.print(f"Both sides of {definition}", soft_wrap=True)
         terminal.warn(found.notes)
 
 

@@ -13,7 +13,7 @@ from pupper_sysid.common.joints import share_sentences
 
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
-    from pupper_sysid.sysid.identify.dead_time import LagBudgets
+    from pupper_sysid.sysid.fit.dead_time import LagBudgets
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Delay:
 
     def run(self) -> None:
         """Measure and print."""
-        from pupper_sysid.sysid.identify.dead_time import lag
+        from pupper_sysid.sysid.fit.dead_time import lag
 
         recordings = terminal.load_all(self.recordings)
         joints = terminal.pick_joints(recordings, self.joints)

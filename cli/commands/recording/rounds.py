@@ -14,7 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.identify.results import JointCalibrationResult
+    from pupper_sysid.sysid.fit.results import JointCalibrationResult
     from pupper_sysid.sysid.plan.proposal import SweepPlan
     from pupper_sysid.sysid.plan.until import JointOutcome, Outcome
     from pupper_sysid.sysid.recordings.recording import Recording
@@ -54,7 +54,7 @@ def run_rounds(
         Print one JSON object.
     """
     started = time.perf_counter()
-    from pupper_sysid.sysid.identify.joint_fit import fit_joint
+    from pupper_sysid.sysid.fit.joint_fit import fit_joint
     from pupper_sysid.sysid.plan.plan_file import save_plan
     from pupper_sysid.sysid.plan.until import parse_goal, record_until
     from pupper_sysid.sysid.recordings.joints import each_joint

@@ -11,12 +11,14 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError, refuse_outside
+from pupper_sysid.servo_models.calibration.operating_point import ARMATURES
 from pupper_sysid.servo_models.calibration.parts import P_GAINS
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import InputFile
     from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.servo_models.cards.card import ServoCard
+    from pupper_sysid.servo_models.cards.compare import Difference
     from pupper_sysid.servo_models.cards.compare import Servo as Compared
 
 _WIDTH = 78
@@ -102,7 +104,7 @@ class Show:
 
 @dataclass(frozen=True)
 class Diff:
-    """Compare two servos number by number: cards, calibrations or presets.
+    """Compare two servos number by number at equal P gain: cards, calibrations or presets.
 
     Example: pupper-sysid servo diff sts3215-bam-m1 calibrated.yaml --joint shoulder_pan
     """
@@ -114,30 +116,31 @@ class Diff:
     joint: str | None = None
     """Joint of a calibration, or specimen of a card; by default the first."""
     gain: float | None = None
-    """P gain at which cards of a position loop are taken, instead of their own."""
+    """P gain of both; by default that of a servo whose numbers hold at no other, else the
+    first's."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Read both and print a table."""
-        from pupper_sysid.servo_models.cards.compare import differences, servo_of
+        from pupper_sysid.servo_models.cards.compare import compared
 
         if self.gain is not None:
             refuse_outside("--gain", self.gain, *P_GAINS)
-        one, other = (servo_of(n, self.joint, self.gain) for n in (self.first, self.second))
-        found = differences(one, other)
+        found = compared(self.first, self.second, self.joint, self.gain)
         if self.json:
-            terminal.print_json({"first": one, "second": other, "differences": found})
+            terminal.print_json(found)
             return
-        table = terminal.table("", "", _column(one), _column(other), "ratio")
-        for row in found:
+        table = terminal.table("", "", _column(found.first), _column(found.second), "ratio")
+        for row in found.differences:
             table.add_row(
                 f"{row.quantity} [{row.unit}]", _with_interval(row.first),
                 _with_interval(row.second), terminal.number(row.ratio, 2),
             )  # fmt: skip
         terminal.out.print(table)
-        for line in wrap(_verdict(found), _WIDTH):
-            terminal.out.print(line)
+        for sentence in (*found.notes, _verdict(found.differences)):
+            for line in wrap(sentence, _WIDTH):
+                terminal.out.print(line)
 
 
 Servo = (
@@ -152,7 +155,8 @@ def _summary(card: ServoCard, gain: float | None = None) -> dict[str, Any]:
     return {
         "servo": card.servo, "supply_v": card.supply_v, "p_gain": card.gains.p,
         "published": card.published, "source": card.source, "load": card.load,
-        "default": card.default, "pd": {name: card.pd(name, gain) for name in card.specimens},
+        "armature": card.armature, "default": card.default,
+        "pd": {name: card.pd(name, gain) for name in card.specimens},
     }  # fmt: skip
 
 
@@ -166,6 +170,7 @@ def _head(card: ServoCard) -> list[str]:
         )
         or "not stated",
         "load": card.load,
+        "armature": ARMATURES[card.armature],
         "numbers": f"cited, read on {card.date}" if card.published else f"fitted on {card.date}",
         "source": card.source.title,
         "": card.source.url,
@@ -231,21 +236,21 @@ def _with_interval(quantity: Quantity | None) -> str:
 
 
 def _column(servo: Compared) -> str:
-    return servo.name if servo.part is None else f"{servo.name} {servo.part}"
+    return servo.title + ("" if servo.p_gain is None else f", P {servo.p_gain:g}")
 
 
 def _plain(value: float | None) -> str:
     return "–" if value is None else f"{value:g}"
 
 
-def _verdict(found: list[Any]) -> str:
+def _verdict(found: Sequence[Difference]) -> str:
     """The largest difference in words."""
     known = [row for row in found if row.ratio is not None]
     if not known:
         raise InputError("The two have no number in common.")
     most = max(known, key=lambda row: row.distance)
     if most.distance < 0.02:
-        return "They agree within 2 % in every number that both state."
+        return "They agree within 2 % in every number that is compared."
     return (
         f"They differ most in {most.quantity}: {most.ratio:.3g} times. Numbers that only one "
         "states show a dash."

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.calibration.operating_point import ARMATURES, OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
@@ -170,3 +171,41 @@ def test_compare_truth_prints_a_table_and_its_keys_are_the_documented_ones(swept
     code, out, err = run(capsys, "compare-truth", recording, made, "--json")
     keys = key_line(json.loads(out))
     assert f"| `compare-truth` | `{keys}` |" in (ROOT / "docs/formats.md").read_text()
+
+
+BENCH = {
+    "actuator": {
+        "stiffness": 8.0, "damping": 0.01, "friction_loss": 0.05, "armature": 0.013,
+        "effort_limit": 1.6, "velocity_limit": math.inf, "dead_time_s": 0.012, "back_emf": 0.3,
+    },
+    "feedback": {"quantum_rad": 0.0015},
+    "loaded_servo": {"armature_kg_m2": 0.011, "load_inertia_kg_m2": 0.002},
+    "registers": {"p": 32},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("p_gain", "armature", "stiffness"),
+    [(32.0, "servo", 8.0 / 0.011), (16.0, "servo", 4.0 / 0.011),
+     (16.0, "servo and load", 4.0 / 0.013), (None, "servo and load", 8.0 / 0.013)],
+)  # fmt: skip
+def test_both_sides_have_the_calibrations_gain_and_armature(p_gain, armature, stiffness):
+    point = OperatingPoint(p_gain=p_gain, armature=armature)
+    made = with_numbers()
+    joint = made.joint(JOINT).model_copy(update={"operating_point": point})
+    found = truth_table(
+        made.model_copy(update={"joints": {JOINT: joint}}), {"joints": {JOINT: BENCH}}
+    )
+    rows = {row.quantity: row for row in found}
+    assert rows["stiffness"].truth == pytest.approx(stiffness)
+    at_p_32 = stiffness * 32 / (p_gain or 32)
+    assert rows["effort_limit"].truth == pytest.approx(1.6 / 8.0 * at_p_32)
+    (definition,) = found.definitions
+    assert point.gain_text in definition and ARMATURES[armature] in definition
+
+
+def test_registers_and_load_of_a_bench_are_read_from_its_file(tmp_path):
+    path = tmp_path / "a.truth.yaml"
+    path.write_text(yaml.safe_dump({"joints": {JOINT: BENCH}}))
+    read = read_truth(path)["joints"][JOINT]
+    assert read["registers"]["p"] == 32 and read["loaded_servo"]["armature_kg_m2"] == 0.011

@@ -13,7 +13,7 @@ import pupper_sysid as ps
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.doctor import causality
 from pupper_sysid.sysid.doctor.checks import cautions, findings, refuse_unusable
-from pupper_sysid.sysid.identify.preparation import prepare_joint
+from pupper_sysid.sysid.fit.preparation import prepare_joint
 from support.garbage import GARBAGE, good, spoilt
 from support.made_recordings import JOINT, KINDS, USUAL_SERVO, Setup, good_recording, made, record
 from support.refusals import assert_each_refused

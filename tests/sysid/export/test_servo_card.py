@@ -13,7 +13,7 @@ from pupper_sysid.servo_models.cards.numbers import LoadedLoop, TorquePD
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.sysid.export.servo_card import to_card, to_drive_card
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.loaded.joint_fit import LoadedFit, StructureFit
+from pupper_sysid.sysid.fit.joint_fit import LoadedFit, StructureFit
 from pupper_sysid.sysid.recordings.recording import Recording
 
 SOURCE = Source(title="a bench", url="https://example.org/bench", licence="MIT")
@@ -44,7 +44,7 @@ def fit() -> LoadedFit:
             mae_unseen_rad=float("nan"), nats=0.0,
         ),),
         folds=(), mae_by_run_rad={}, motor_torque_nm=1.0, temperature=1.0, lattice=lattice,
-        servo=servo, runs=(), errors={},
+        servo=servo, runs=(),
     )  # fmt: skip
 
 

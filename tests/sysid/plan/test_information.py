@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.sysid.identify.candidates.models import candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import free_run, look_up
+from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
+from pupper_sysid.sysid.fit.run import at_steps, free_run
+from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.plan.information import (
-    SHIFT_SD_S,
     Hypothesis,
     Noise,
     fitted_noise,
@@ -22,7 +22,7 @@ from support.planned_servos import NOISE, hypothesis, recorded_servo, tones, wit
 
 def test_a_delay_is_as_uncertain_as_the_bound_of_a_tone_says():
     """sd(τ) = sqrt(2 / N) s / (A 2π f), the Cramér-Rao bound of a tone's time shift."""
-    model, delay, floor = candidate_model("pure_delay"), 0.025, 0.01
+    model, delay, floor = candidate("pure_delay"), 0.025, 0.01
     (trial,) = tones((2.0,), loop_period_s=0.002)  # else a delay shifts stairs, not a tone
     found = respond(
         Hypothesis(model, np.array([delay, 1.0, 0.0]), prior_information(model)), trial,
@@ -38,7 +38,7 @@ def test_a_longer_dead_time_shows_where_the_joint_moves():
     own, (trial,) = hypothesis(), tones((2.0,), loop_period_s=0.002)
     found = respond(own, trial, NOISE)
     (track,) = free_run(own.model, own.values, [trial])
-    expected = -own.values[0] * look_up(np.gradient(track) / trial.step_s, trial.sample_step)
+    expected = -own.values[0] * at_steps(np.gradient(track) / trial.step_s, trial.sample_step)
     off = found.sensitivity[:, 0] - expected
     assert np.sqrt(np.mean(off**2)) < 0.1 * np.sqrt(np.mean(expected**2))
 
@@ -48,7 +48,7 @@ def test_however_long_a_tone_is_its_own_shift_in_time_stays_in_doubt():
     information = respond(own, tones((3.0,))[0], NOISE).information
     for repeats in (1e3, 1e6):
         left = without_shift(repeats * information)
-        assert own.values[0] / np.sqrt(left[0, 0]) == pytest.approx(SHIFT_SD_S, rel=0.01)
+        assert own.values[0] / np.sqrt(left[0, 0]) == pytest.approx(PHASE_SD_S, rel=0.01)
 
 
 def test_readings_that_do_not_arrive_say_nothing():

@@ -119,8 +119,8 @@ def test_candidates_are_sent_as_the_guard_lets_them_through():
 def test_live_readings_come_with_every_tick_and_polled_ones_with_every_poll():
     live = candidates(Setup(loop_period_s=0.02, poll_period_s=0.0, loss=0.0), 3.0)[0]
     polled = candidates(Setup(loop_period_s=0.02, poll_period_s=0.04), 3.0)[0]
-    assert len(live.data.sample_step) == pytest.approx(160, abs=1)
-    assert len(polled.data.sample_step) == pytest.approx(80, abs=1)
+    assert len(live.run.sample_step) == pytest.approx(160, abs=1)
+    assert len(polled.run.sample_step) == pytest.approx(80, abs=1)
     assert Setup(loop_period_s=0.02, poll_period_s=0.04, loss=0.4).seen == pytest.approx(0.6)
     # two polls between two reads: one of them succeeds
     assert Setup(loop_period_s=0.02, poll_period_s=0.01, loss=0.5).seen == pytest.approx(0.75)

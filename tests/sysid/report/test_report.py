@@ -22,11 +22,11 @@ from pupper_sysid.common.page import Column, Section, Table, render
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.examination import Examination, JointExamination
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.identify.calibration_file import to_calibration
-from pupper_sysid.sysid.identify.candidates.models import CANDIDATE_MODELS, candidate_model
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run, look_up
-from pupper_sysid.sysid.identify.results import CandidateFit, JointCalibrationResult
-from pupper_sysid.sysid.identify.scores import Scores
+from pupper_sysid.sysid.fit.calibration_file import to_calibration
+from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
+from pupper_sysid.sysid.fit.scores import Scores
+from pupper_sysid.sysid.fit.structure import CANDIDATES, candidate
 from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction
@@ -44,6 +44,7 @@ from pupper_sysid.sysid.report.report import write_findings
 from pupper_sysid.sysid.report.sections import Findings
 from support.browser import looks_right, needs_chromium
 from support.refusals import assert_each_refused
+from support.runs import run_of
 
 HOSTILE = '<script>alert("x")</script>&lt;'
 POLL_S, LOOP_S, AGE_S = 0.030, 0.020, 0.025
@@ -60,23 +61,22 @@ def interval(value: float) -> Interval:
 def fitted(name: str, scores: Scores, undecided: dict[str, str] | None = None) -> CandidateFit:
     return CandidateFit(
         model=name,
-        parameters={p.name: interval(p.nominal) for p in candidate_model(name).parameters},
+        parameters={p.name: interval(p.nominal) for p in candidate(name).parameters},
         undecided=undecided or {},
         scores=scores,
     )
 
 
-def trial_of(model: CandidateFit, frequency_hz: float) -> TrialData:
-    """A trial whose fresh readings are exactly what `model` does; rows show them `AGE_S` late."""
-    steps = 1000
-    command = 0.2 * np.sin(2 * np.pi * frequency_hz * TIME_STEP_S * np.arange(steps))
+def run_like(model: CandidateFit, frequency_hz: float) -> Run:
+    """A run whose fresh readings are exactly what `model` does; rows show them `AGE_S` late."""
+    steps, rest = 1000, 0.5
+    command = rest + 0.2 * np.sin(2 * np.pi * frequency_hz * TIME_STEP_S * np.arange(steps))
     row = np.arange(20.0, 980.0, LOOP_S / TIME_STEP_S)
-    empty = np.zeros(0)
-    bare = TrialData(frequency_hz, 0.5, command, empty, empty, empty, empty, empty)
+    bare = run_of(command, frequency_hz, rest)
     values = np.array(list(model.values.values()))
-    (track,) = free_run(candidate_model(model.model), values, [bare])
+    (track,) = free_run(candidate(model.model), values, [bare])
     measured = row - AGE_S / TIME_STEP_S
-    reading = look_up(track, measured)
+    reading = at_steps(track, measured)
     return replace(
         bare, sample_step=measured, sample_rad=reading, held_step=measured, row_step=row,
         row_rad=reading,
@@ -90,7 +90,7 @@ def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
         rmse_by_left_out_frequency_rad={"1": 0.015, "2": 0.015}, fit_percent=95.0,
     )  # fmt: skip
     raw_best = replace(scores, rmse_fresh_rad=0.150, rmse_raw_rad=0.100)
-    candidates = {m.name: fitted(m.name, scores) for m in CANDIDATE_MODELS}
+    candidates = {m.name: fitted(m.name, scores) for m in CANDIDATES}
     tones = tuple(
         FrequencyLag(
             frequency_hz=f, gain=1.02, phase_deg=-15.0 * f, lag_s=interval(0.042),
@@ -113,7 +113,7 @@ def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
         structure_nats={"delayed_pd": 0.0, "delayed_pd_back_emf": 20.0},
         command_jitter_s=Interval(0.0, 0.0, 0.001), candidate_models=candidates, lag=lag,
         presets={"paper": raw_best}, warnings=("Only two frequencies.",),
-        trials=tuple(trial_of(candidates["delayed_pd"], f) for f in (1.0, 2.0)),
+        runs=tuple(run_like(candidates["delayed_pd"], f) for f in (1.0, 2.0)),
     )  # fmt: skip
     return replace(made, **changes)
 
@@ -296,7 +296,7 @@ def test_the_tables_have_the_numbers_of_the_result(written):
     assert float(transfer["dead_time_s"]["high"]) == pytest.approx(0.11)
     assert float(transfer["gain"]["chi2_per_dof"]) == 1.5
     models = {r["model"]: r for r in rows_of(written, "candidate_models")}
-    assert list(models) == [*(r.name for r in CANDIDATE_MODELS), "paper"]
+    assert list(models) == [*(r.name for r in CANDIDATES), "paper"]
     assert [m for m, r in models.items() if r["is_chosen"] == "True"] == ["delayed_pd"]
     assert float(models["paper"]["rmse_fresh_rad"]) == pytest.approx(0.150)
     assert float(models["delayed_pd"]["rmse_raw_rad"]) == pytest.approx(0.120)

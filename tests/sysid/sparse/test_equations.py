@@ -13,7 +13,7 @@ from pupper_sysid.servo_models.sparse_equation import (
     equation,
     explain,
 )
-from pupper_sysid.sysid.identify.candidates.simulation import TrialData, free_run
+from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sparse.equations import (
     equation_model,
@@ -23,6 +23,7 @@ from pupper_sysid.sysid.sparse.equations import (
 from pupper_sysid.sysid.sparse.structure import LINEAR, PULLS
 from support.command_line import run
 from support.refusals import assert_each_refused
+from support.runs import run_of
 
 SERVO = {
     "stiffness_per_s2": 8000.0, "saturated_stiffness_per_s2": 3000.0, "saturation_error_rad": 0.05,
@@ -48,7 +49,7 @@ def trials(motion, rng, frequencies=FREQUENCIES):
         step = step[step < len(command) - 2]
         reading = np.interp(step, np.arange(len(position)), position)
         reading += NOISE_RAD * rng.standard_normal(len(step))
-        made.append(TrialData(f, 0.0, command, step, reading, step, step, reading))
+        made.append(run_of(command, f, 0.0, step, reading))
     return tuple(made)
 
 
@@ -137,8 +138,9 @@ def test_the_fit_and_the_model_are_one_arithmetic():
     (data, *_) = trials(linear, np.random.default_rng(0))
     values = np.array([0.0213, *SERVO.values(), 0.004])
     (fitted,) = free_run(equation_model(support), values, [data])
-    model = SparseEquation(SERVO, 0.0213, 0.004).rollout(data.command)
-    np.testing.assert_allclose(fitted[1:], model, atol=1e-12)
+    servo = SparseEquation(SERVO, 0.0213, 0.004)
+    servo.reset(data.start_rad - 0.004)  # a run starts at its first reading
+    np.testing.assert_allclose(fitted[1:], servo.rollout(data.command), atol=1e-12)
 
 
 def test_what_cannot_be_simulated_is_refused():

@@ -1,0 +1,223 @@
+"""Calibrate the servos of a robot: `calibrate`, from recordings to a calibration file.
+
+    calibrated = calibrate(load("sweep.csv"))
+    calibrated.save("calibrated.yaml")
+
+Each joint is fitted by `sysid.fit.joint_fit`; `sysid.fit.calibration_file` turns the fits
+into the `Calibration` that simulators read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pupper_sysid.common.errors import refuse_outside
+from pupper_sysid.common.joints import STALL_TORQUES_NM
+from pupper_sysid.common.processes.workers import Workers, prepare
+from pupper_sysid.common.results import JointResults
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
+from pupper_sysid.sysid.fit.joint_fit import (
+    Fitted,
+    Presets,
+    conclude,
+    fit_structures,
+    stages,
+)
+from pupper_sysid.sysid.fit.loads import loaded_joints
+from pupper_sysid.sysid.fit.operating_point import with_operating_points
+from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.structure import SIMULATED
+from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, usable_trials
+from pupper_sysid.sysid.recordings.recording import Trial
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PREPARATION, CHOICE = "preparation", "choice"
+STAGES = (PREPARATION, *SIMULATED, CHOICE)
+"""Work on one joint in free air: dating its readings, a search, posterior and folds per structure,
+the rest. Under load one stage, the ladder of structures, stands for those in the middle."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationResult(JointResults[JointCalibrationResult]):
+    """Calibration of a robot: the fits by joint, and the file that simulators read.
+
+    Attributes
+    ----------
+    joints : dict of str to JointCalibrationResult
+    calibration : Calibration
+        DelayedPD and HeldFeedback per joint.
+    """
+
+    calibration: Calibration
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the calibration file.
+
+        Parameters
+        ----------
+        path : Path or str
+            Ends in `.yaml`.
+        force : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        InputError
+            If the file exists and `force` is not given, or it cannot be written.
+        """
+        self.calibration.save(path, force=force)
+
+    def plot(self) -> Figure:
+        """Command, DelayedPD and readings of the first joint; `overlay_figure` draws the others."""
+        from pupper_sysid.sysid.report.free_run_figures import overlay_figure
+
+        return overlay_figure(next(iter(self.values())))
+
+
+def calibrate(
+    recordings: Recordings,
+    joints: Joints = None,
+    seed: int = 0,
+    stall_torque_nm: float | None = None,
+    workers: int = 1,
+    progress: Callable[[str], None] | None = None,
+    staged: Staged | None = None,
+) -> CalibrationResult:
+    """Calibrate every joint of the recordings.
+
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+        Trials of one joint are pooled.
+    joints : str or sequence of str, optional
+        Which joints; by default all that were recorded.
+    seed : int
+        Results of a joint depend on the seed and its name alone, not on the other joints.
+    stall_torque_nm : float, optional
+        Torque anchor [N·m]: the servo's torque at zero speed; by default that of the recorded
+        servo's data sheet, or of the Mini Pupper's servo.
+    workers : int
+        Processes. Joints are independent, and so are the two structures of a joint.
+    progress : callable, optional
+        Called with a joint's name when it is done.
+    staged : callable, optional
+        See `Staged`.
+
+    Returns
+    -------
+    CalibrationResult
+        Fits by joint, and the calibration.
+
+    Raises
+    ------
+    InputError
+        If a joint has too little motion, or `stall_torque_nm` is no servo's.
+    """
+    if stall_torque_nm is not None:  # before the work, not after it
+        refuse_outside("`stall_torque_nm`", stall_torque_nm, *STALL_TORQUES_NM, "N·m")
+    if workers > 1:  # imports what it needs beside the look at the recordings
+        prepare(__name__)
+    every, presets = usable_trials(recordings, joints), preset_parameters()
+    loaded = loaded_joints(every)
+    free_air = {joint: joint not in loaded for joint in every}
+    if workers > 1 and len(every) > 1:  # of one joint, a second process costs what it saves
+        fits = side_by_side(every, free_air, seed, presets, workers, progress, staged)
+    else:
+        fits = {}
+        for joint, trials in every.items():
+            fits[joint] = _one_by_one(joint, trials, free_air[joint], seed, presets, staged)
+            if progress:
+                progress(joint)
+    calibration = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm)
+    calibration = with_operating_points(calibration, every)
+    return CalibrationResult(joints=fits, calibration=calibration)
+
+
+Staged = Callable[[str, str], None]
+"""Called with a joint's name and a stage that is done."""
+
+
+def _one_by_one(
+    joint: str,
+    trials: tuple[Trial, ...],
+    free_air: bool,
+    seed: int,
+    presets: Presets,
+    staged: Staged | None,
+) -> JointCalibrationResult:
+    """`fit_joint`, telling of its stages."""
+    done = staged or (lambda joint, stage: None)
+    ready, fitted = prepare_joint(joint, trials, seed, free_air), {}
+    done(joint, PREPARATION)
+    for stage in stages(ready):
+        fitted[stage] = fit_structures(ready, stage)
+        done(joint, stage)
+    result = conclude(ready, fitted, presets)
+    done(joint, CHOICE)
+    return result
+
+
+def side_by_side(
+    trials: dict[str, tuple[Trial, ...]],
+    free_air: dict[str, bool],
+    seed: int,
+    presets: Presets,
+    workers: int,
+    progress: Callable[[str], None] | None,
+    staged: Staged | None = None,
+) -> dict[str, JointCalibrationResult]:
+    """`fit_joint` of every joint, its stages on several processes, so that none waits long.
+
+    Parameters
+    ----------
+    trials : dict of str to tuple of Trial
+        By joint.
+    free_air : dict of str to bool
+        Whether each joint carried no load.
+    seed : int
+    presets : dict
+        As for `fit_joint`.
+    workers : int
+        Processes.
+    progress : callable or None
+        Called with a joint's name when it is done.
+    staged : callable or None
+        See `Staged`.
+
+    Raises
+    ------
+    InputError
+        If a joint has too little motion; the others are not waited for.
+    """
+    ready: dict[str, PreparedJoint] = {}
+    fitted: dict[str, dict[str, list[Fitted]]] = {joint: {} for joint in trials}
+    results: dict[str, JointCalibrationResult] = {}
+    with Workers(workers, __name__) as pool:
+        for joint, own in trials.items():
+            pool.submit((joint, PREPARATION), prepare_joint, joint, own, seed, free_air[joint])
+        for (joint, stage), result in pool.results():
+            if stage == PREPARATION:
+                ready[joint] = result
+                for name in stages(result):
+                    pool.submit((joint, name), fit_structures, result, name)
+            elif stage == CHOICE:
+                results[joint] = result
+                if progress:
+                    progress(joint)
+            else:
+                fits = fitted[joint]
+                fits[stage] = result
+                if len(fits) == len(stages(ready[joint])):
+                    # in their order, not in that of their ends
+                    fits = {name: fits[name] for name in stages(ready[joint])}
+                    pool.submit((joint, CHOICE), conclude, ready[joint], fits, presets)
+            if staged:
+                staged(joint, stage)
+    return {joint: results[joint] for joint in trials}

@@ -1,0 +1,403 @@
+"""Convert the fits of calibration to the `Calibration` that simulators read.
+
+Free-air positions give ratios to the armature. One torque sets the scale: the stall torque, which
+is the effort limit; so armature = stall torque / (effort limit per inertia), and the rest follows.
+A known load sets the scale itself. A servo recorded under load or at several gains has a block
+`under_load` besides: the servo at any gain and load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from pupper_sysid.common.data_sheet import recorded_stall_torque
+from pupper_sysid.common.files import versions
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
+from pupper_sysid.servo_models.calibration.calibration import (
+    PRESETS,
+    Calibration,
+    InputFile,
+    load_calibration,
+    utc_now,
+)
+from pupper_sysid.servo_models.calibration.parts import (
+    NO_SPEED_LIMIT_RAD_S,
+    Actuator,
+    CandidateModel,
+    Feedback,
+    JointCalibration,
+    Lag,
+    RatiosToArmature,
+    Scale,
+    Scores,
+    Selection,
+)
+from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
+from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, RecordedLoad, UnderLoad
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.sysid.feedback.poll_lattice import NO_LOSS
+from pupper_sysid.sysid.fit.results import (
+    RATIO_SOURCES,
+    UNTOLD,
+    CandidateFit,
+    JointCalibrationResult,
+    LoadedFit,
+)
+from pupper_sysid.sysid.fit.structure import candidate
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
+from pupper_sysid.sysid.recordings.recording import Recording
+
+GIVEN_TORQUE = "given by the user"
+"""Source of a torque anchor that no data sheet gave."""
+
+_KNOWN_SCALE = (
+    "Torques, armature and friction are in N·m from the known load of the recordings; the "
+    "armature is the servo's own, without the load."
+)
+_RATIOS = {
+    "stiffness": "stiffness_per_s2", "damping": "damping_per_s", "friction_loss": "friction_rad_s2",
+    "effort_limit": "effort_rad_s2", "back_emf": "back_emf_per_s",
+}  # fmt: skip
+"""Ratios to the armature in the file, and their names in a fit."""
+
+_LIMITS = {"velocity_limit_rad_s": NO_SPEED_LIMIT_RAD_S, "back_emf_per_s": 0.0}
+"""The two limits on a servo's speed, with the value that stands for none."""
+
+
+def to_calibration(
+    results: Mapping[str, JointCalibrationResult],
+    recordings: Sequence[Recording],
+    seed: int,
+    stall_torque_nm: float | None = None,
+) -> Calibration:
+    """The calibration file of `results`.
+
+    Parameters
+    ----------
+    results : dict of joint to JointCalibrationResult
+    recordings : sequence of Recording
+        Their sources; names and hashes go into the file.
+    seed : int
+    stall_torque_nm : float, optional
+        As for `torque_anchors`.
+    """
+    anchors = torque_anchors(list(results), recordings, stall_torque_nm)
+    buses = [r.metadata.get("bus") or {} for r in recordings]
+    kinds = {str(bus.get("kind", "unknown bus")) for bus in buses}
+    maps = {str(bus["joint_map"]) for bus in buses if bus.get("joint_map")}
+    pupper = set(results) <= set(JOINT_NAMES)
+    own = "Mini Pupper 2" if pupper else ", ".join(sorted(maps)) or "another robot"
+    return Calibration(
+        robot=f"{own} ({', '.join(sorted(kinds))})",
+        created=utc_now(),
+        inputs=tuple(
+            InputFile(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
+        ),
+        seed=seed,
+        versions=versions(),
+        notes=(
+            "Delay belongs to the actuator; poll period, loss and age belong to the observation.",
+            _KNOWN_SCALE
+            if all(r.loaded is not None and r.loaded.known_load for r in results.values())
+            else "Only ratios to the armature come from the recording; torques scale with the "
+            "anchor.",
+        ),
+        joints={name: _joint(r, *anchors[name]) for name, r in results.items()},
+    )
+
+
+def torque_anchors(
+    joints: Sequence[str], recordings: Sequence[Recording], stall_torque_nm: float | None = None
+) -> dict[str, tuple[float, str]]:
+    """Stall torque [N·m] that sets the scale of each joint's torques, and its source.
+
+    Parameters
+    ----------
+    joints : sequence of str
+    recordings : sequence of Recording
+        Their headers may name the servo.
+    stall_torque_nm : float, optional
+        Of all joints; by default that of the data sheet of the recorded servo, or of the Mini
+        Pupper's servo where no recording names one.
+    """
+    if stall_torque_nm is not None:
+        return dict.fromkeys(joints, (stall_torque_nm, GIVEN_TORQUE))
+    headers = [r.metadata.get("servos") or {} for r in recordings]
+    return {
+        joint: recorded_stall_torque(h.get(joint, {}) for h in headers)
+        or (STALL_TORQUE_NM, STALL_TORQUE_SOURCE)
+        for joint in joints
+    }
+
+
+def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCalibration:
+    lag, loaded, s = result.lag, result.loaded, result.delayed_pd.scores
+    if loaded is None:
+        actuator, block = _free_actuator(result, stall, source), None
+        offset = result.delayed_pd.parameters["offset_rad"]
+    else:
+        # without a known load torques are per inertia: the anchor makes them N·m
+        torque = 1.0 if loaded.known_load else stall / loaded.numbers["stall_torque"].value
+        actuator = _loaded_actuator(result, loaded, torque, stall, source)
+        block, offset = _block(loaded, torque), loaded.numbers["offset_rad"]
+    return JointCalibration(
+        actuator=actuator,
+        under_load=block,
+        feedback=_feedback(lag, offset),
+        lag=measured(
+            Lag,
+            lag_s=quantity_of(lag.lag_s),
+            raw_lag_s=quantity_of(lag.raw_lag_s),
+            fresh_lag_s=quantity_of(lag.fresh_lag_s),
+        ) if loaded is None else Lag(),
+        selection=Selection(
+            model=result.model,
+            candidate_models=tuple(
+                _candidate(f) for f in result.candidate_models.values()
+            ) if loaded is None else tuple(
+                CandidateModel(
+                    model=f.name, parameter_count=len(f.parameters), parameters=f.parameters,
+                    rmse_fresh_rad=_finite(f.rmse_rad),
+                    mae_unseen_runs_rad=_finite(f.mae_unseen_rad),
+                )
+                for f in loaded.structures
+            ),
+        ),
+        scores=Scores(
+            rmse_one_step_rad=_finite(s.rmse_one_step_rad),
+            rmse_free_run_raw_rad=_finite(s.rmse_raw_rad),
+            rmse_free_run_fresh_rad=_finite(s.rmse_fresh_rad),
+            rmse_free_run_held_rad=_finite(s.rmse_held_rad),
+            rmse_leave_one_frequency_out_rad=_finite(s.rmse_leave_one_frequency_out_rad),
+            rmse_unseen_runs_rad=_finite(s.rmse_unseen_runs_rad),
+            fit_percent=_finite(s.fit_percent),
+        ),
+        warnings=result.warnings,
+    )  # fmt: skip
+
+
+def _free_actuator(result: JointCalibrationResult, stall: float, source: str) -> Actuator:
+    """DelayedPD of a joint in free air."""
+    pd, (low, high) = _covering(result), result.delay_steps
+    armature = stall / pd.values["effort_rad_s2"]
+    ratios = {ours: _ratio(pd, name, 1.0) for ours, name in _RATIOS.items()}
+    torque = {ours: _ratio(pd, name, armature, "ratio only") for ours, name in _RATIOS.items()}
+    return measured(
+        Actuator,
+        model="delayed_pd",
+        stiffness_nm_per_rad=torque["stiffness"],
+        damping_nm_s_per_rad=torque["damping"],
+        friction_loss_nm=torque["friction_loss"],
+        armature_kg_m2=_anchored(pd, stall),
+        effort_limit_nm=Quantity(
+            value=stall, identified="no", why="the anchor itself: taken as known, see scale"
+        ),
+        velocity_limit_rad_s=_ratio(pd, "velocity_limit_rad_s", 1.0),
+        back_emf_nm_s_per_rad=torque["back_emf"],
+        dead_time_s=quantity_of(result.dead_time_s, why=pd.undecided.get("dead_time_s")),
+        command_jitter_s=_jitter(result),
+        delay_steps_min=low,
+        delay_steps_max=high,
+        physics_step_s=TIME_STEP_S,
+        ratios_to_armature=measured(RatiosToArmature, **ratios),
+        scale=Scale(anchor="stall torque", value_nm=stall, source=source),
+    )
+
+
+def _loaded_actuator(
+    result: JointCalibrationResult, loaded: LoadedFit, torque: float, stall: float, source: str
+) -> Actuator:
+    """DelayedPD at the reference gain, with the servo's own armature; `torque` makes it N·m."""
+    known, (low, high) = loaded.known_load, result.delay_steps
+    pd = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm).arrays()
+    armature = float(pd["armature"]) * torque
+
+    def number(name: str, factor: float, absolute: bool) -> Quantity:
+        place = RATIO_SOURCES[_RATIOS[name]][0]
+        if not float(pd[name]):
+            return Quantity(value=0.0, identified="no", why="the chosen structure has none")
+        interval = loaded.relative(place, factor * float(pd[name]))
+        return quantity_of(
+            interval, "yes" if absolute else "ratio only", loaded.undecided.get(place)
+        )
+
+    if known:
+        inertia = quantity_of(loaded.numbers["armature"], why=loaded.undecided.get("armature"))
+        scale = Scale(
+            anchor="loaded recording", value_nm=max(g for _, g in loaded.loads),
+            source="the known load",
+        )  # fmt: skip
+    else:
+        inertia = Quantity(value=armature, identified="ratio only", why="scale from the anchor")
+        scale = Scale(anchor="stall torque", value_nm=stall, source=source)
+    numbers = {name: number(name, torque, known) for name in _RATIOS}
+    ratios = {name: number(name, torque / armature, True) for name in _RATIOS}
+    return measured(
+        Actuator,
+        model="delayed_pd",
+        stiffness_nm_per_rad=numbers["stiffness"],
+        damping_nm_s_per_rad=numbers["damping"],
+        friction_loss_nm=numbers["friction_loss"],
+        armature_kg_m2=inertia,
+        effort_limit_nm=numbers["effort_limit"],
+        velocity_limit_rad_s=Quantity(
+            value=NO_SPEED_LIMIT_RAD_S, identified="no", why="the chosen structure has none"
+        ),
+        back_emf_nm_s_per_rad=numbers["back_emf"],
+        dead_time_s=quantity_of(result.dead_time_s, why=loaded.undecided.get("dead_time_s")),
+        delay_steps_min=low,
+        delay_steps_max=high,
+        physics_step_s=TIME_STEP_S,
+        ratios_to_armature=measured(RatiosToArmature, **ratios),
+        scale=scale,
+    )
+
+
+def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
+    """The servo at any gain and load; `torque` makes torques of the fit N·m."""
+    factor = dict.fromkeys(
+        ("stall_torque", "back_emf", "armature", "friction_loss", "stribeck_friction",
+         "torque_limit", "gravity_nm"), torque
+    ) | {"load_friction_quadratic": 1 / torque}  # fmt: skip
+    known = loaded.known_load
+
+    def number(name: str) -> Quantity | None:
+        if name not in loaded.numbers:
+            return None
+        scale, own = factor.get(name, 1.0), loaded.numbers[name]
+        scaled = Interval(scale * own.value, scale * own.low, scale * own.high)
+        absolute = known or name not in factor
+        return quantity_of(scaled, "yes" if absolute else "ratio only", loaded.undecided.get(name))
+
+    own = {key: number(name) for name, key in LOADED_KEYS.items()}
+    if not known:
+        own["armature_kg_m2"] = Quantity(
+            value=torque, identified="ratio only", why="scale from the anchor; holds the load's"
+        )
+    volts = loaded.reference_voltage_v
+    return measured(
+        UnderLoad,
+        structure=loaded.structure,
+        known_load=known,
+        p_gain=loaded.p_gain,
+        p_gains_tested=loaded.p_gains,
+        loads_tested=tuple(
+            RecordedLoad(inertia_kg_m2=inertia, gravity_nm=gravity)
+            for inertia, gravity in (loaded.loads if known else ())
+        ),
+        reference_voltage_v=volts if np.isfinite(volts) else None,
+        **own,
+        gravity_nm=number("gravity_nm"),
+        hanging_rad=number("hanging_rad"),
+    )
+
+
+def _covering(result: JointCalibrationResult) -> CandidateFit:
+    """The fit that is carried, its intervals widened to the other structure if it may be that."""
+    own, rival = result.delayed_pd, result.rival
+    parameters, undecided = dict(own.parameters), dict(own.undecided)
+    if rival is not None:
+        for name in parameters.keys() & rival.parameters.keys():
+            mine, other = parameters[name], rival.parameters[name]
+            low, high = min(mine.low, other.low), max(mine.high, other.high)
+            parameters[name] = Interval(mine.value, low, high)
+            if name in rival.undecided:
+                undecided.setdefault(name, rival.undecided[name])
+    for name, absent in _LIMITS.items():
+        mine = parameters.get(name, Interval(absent, absent, absent))
+        if rival is not None:  # it may have none, or the other's
+            other = rival.parameters.get(name, Interval(absent, absent, absent))
+            mine = Interval(mine.value, min(mine.low, other.low), max(mine.high, other.high))
+            undecided.setdefault(name, UNTOLD)
+        elif name not in parameters:
+            undecided[name] = "the chosen model has none"
+        parameters[name] = mine
+    return replace(own, parameters=parameters, undecided=undecided)
+
+
+def _candidate(fit: CandidateFit) -> CandidateModel:
+    s = fit.scores
+    return CandidateModel(
+        model=fit.model,
+        parameter_count=len(candidate(fit.model).parameters),
+        rmse_fresh_rad=_finite(s.rmse_fresh_rad),
+        rmse_held_rad=_finite(s.rmse_held_rad),
+        rmse_raw_rad=_finite(s.rmse_raw_rad),
+        rmse_leave_one_frequency_out_rad=_finite(s.rmse_leave_one_frequency_out_rad),
+        fit_percent=_finite(s.fit_percent),
+        parameters=fit.values,
+    )
+
+
+def _ratio(
+    pd: CandidateFit, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
+) -> Quantity:
+    """A fitted number times `factor`, with its interval and whether the data settled it."""
+    own = pd.parameters[name]
+    scaled = Interval(own.value * factor, own.low * factor, own.high * factor)
+    return quantity_of(scaled, known, pd.undecided.get(name))
+
+
+def _anchored(pd: CandidateFit, stall: float) -> Quantity:
+    effort, why = pd.parameters["effort_rad_s2"], pd.undecided.get("effort_rad_s2")
+    armature = Interval(stall / effort.value, stall / effort.high, stall / effort.low)
+    return quantity_of(armature, "ratio only", why)
+
+
+def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
+    lattice, step = lag.feedback, lag.quantum_rad
+    quantum = Quantity(value=step, low=step, high=step, identified="yes")
+    if step == 0:
+        quantum = Quantity(value=0.0, identified="no", why="readings show no common step")
+    if lattice.kind == "lattice":
+        why = None if np.isfinite(lattice.loss) else NO_LOSS
+        period = quantity_of(lattice.poll_period_interval)
+        loss = quantity_of(lattice.loss_interval, why=why)
+        age = quantity_of(lattice.mean_age_interval, why=why)
+    else:
+        why = (
+            "readings are live: no poll slower than the loop"
+            if lattice.kind == "every read"
+            else "readings are held, but no poll period is significant"
+        )
+        period = loss = Quantity(value=0.0, identified="no", why=why)
+        live = lattice.kind == "every read"
+        age = Quantity(value=0.0 if live else lattice.time_doubt_s, identified="no", why=why)
+    return measured(
+        Feedback, poll_period_s=period, loss=loss, quantum_rad=quantum,
+        offset_rad=quantity_of(offset_rad), mean_age_s=age,
+    )  # fmt: skip
+
+
+def _jitter(result: JointCalibrationResult) -> Quantity:
+    found = result.command_jitter_s
+    if not np.isfinite(found.value):
+        return Quantity(value=0.0, identified="no", why="it takes several tones to see it")
+    why = "an upper bound: friction that the model lacks grows with the tone, too"
+    if found.low <= 0:
+        why = "it cannot be told from none"
+    if result.lag.feedback.kind == "unresolved":
+        why = "readings are dated to half a loop only"
+    return quantity_of(found, why=why)
+
+
+def _finite(number: float) -> float | None:
+    return number if np.isfinite(number) else None
+
+
+@cache
+def preset_parameters() -> dict[str, dict[str, DelayedPDParameters]]:
+    """The published settings per preset and joint, to be scored beside a fit; read once."""
+    found = {}
+    for preset in PRESETS:
+        calibration = load_calibration(preset)
+        found[preset] = {
+            joint: calibration.delayed_pd([joint]).parameters for joint in calibration.joint_names
+        }
+    return found

@@ -1,0 +1,856 @@
+"""Fit the servo of one joint: its structures, the choice between them, and what stays open.
+
+Every structure is fitted to the readings that count by output error, from seeded global starts and
+from the fits of simpler structures, and scored on what was left out of the fit: a tone, or runs.
+Its numbers are drawn from their posterior. Of the structures that the likelihood does not rule out,
+the simplest whose error on unseen motion is about the smallest is carried; the intervals of its
+numbers cover all of them.
+
+A joint in free air has the candidates of `sysid.fit.structure`; simulators run two of them. Under a
+load or at several gains it is a motor with a ladder of friction terms (`LADDER`). All stages are
+the same: `prepare_joint`, `fit_structures`, `conclude`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
+from pupper_sysid.sysid.fit.posterior import (
+    as_wide_as_folds,
+    in_continuous_time,
+    interval_of,
+    sample,
+    temperature_of,
+    with_date_errors,
+)
+from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
+from pupper_sysid.sysid.fit.results import (
+    RATIO_SOURCES,
+    UNTOLD,
+    CandidateFit,
+    JointCalibrationResult,
+    LoadedFit,
+    StructureFit,
+    plausible,
+)
+from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals
+from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, rms, score
+from pupper_sysid.sysid.fit.search import (
+    Fit,
+    Problem,
+    curvature,
+    evolve,
+    fit_folds,
+    folds_of,
+    group_count,
+    refine,
+    refined,
+    search,
+    search_widely,
+)
+from pupper_sysid.sysid.fit.structure import (
+    CANDIDATES,
+    PREFERRED,
+    SIMULATED,
+    Parameter,
+    Structure,
+    candidate,
+    servo_structure,
+)
+from pupper_sysid.sysid.lag.lag_budget import LagBudget
+from pupper_sysid.sysid.recordings.recording import Trial
+
+Presets = Mapping[str, Mapping[str, DelayedPDParameters]]
+"""Published settings by name, then by joint."""
+
+LADDER = (
+    (),
+    ("stribeck",),
+    ("load friction",),
+    ("load friction", "static"),
+    ("load friction", "quadratic"),
+    ("load friction", "torque limit"),
+    ("load friction", "quadratic", "static"),
+    ("load friction", "quadratic", "torque limit"),
+)
+"""Friction of a motor under load, simplest first; then `ADDITIONS` to the best of them."""
+ADDITIONS = ("acceleration", "damping", "dead zone", "start duty")
+
+_ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
+"""Starts of a limit on the set-point's acceleration: its cost has many minima. A Feetech servo's
+register counts 0.153 rad/s² from 1 to 254, whose largest is 39."""
+_MOST_COMPARED = 3
+_PREFERENCE = 1.02
+"""Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
+_REPORTED_PREFERENCE = 1.05
+_WIDE = 4.0
+_SHARP_DEAD_TIME_S = 0.015
+_POLL_SD_S = 1e-3
+"""Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
+_AT_BOUND = 0.03
+"""Distance from a bound, in fitted coordinates, that counts as on it."""
+_COVARIANCE_STEP = 0.03  # the slope over a likely error, not of one kink
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One structure, fitted to one joint.
+
+    Attributes
+    ----------
+    structure : Structure
+    fit : Fit
+        To all runs.
+    population : ndarray, shape (members, parameters)
+        That it evolved from.
+    draws : ndarray, shape (draws, parameters), or None
+        From the posterior, in fitted coordinates.
+    temperature : float
+        How many readings count as one.
+    folds : list of Fit or None
+        Without the runs of each of `folds_of`; None where it was not compared.
+    """
+
+    structure: Structure
+    fit: Fit
+    population: NDArray[np.float64]
+    draws: NDArray[np.float64] | None = None
+    temperature: float = 1.0
+    folds: list[Fit] | None = None
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """The fitted numbers, shape (parameters,)."""
+        return self.structure.decode(self.fit.point)
+
+
+def fit_joint(
+    joint: str,
+    trials: Sequence[Trial],
+    seed: int = 0,
+    presets: Presets | None = None,
+    free_air: bool | None = None,
+) -> JointCalibrationResult:
+    """Fit the structures to one joint and choose.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+        All of this joint.
+    seed : int
+        Results depend on the seed and the joint's name.
+    presets : dict of str to (dict of joint to DelayedPDParameters), optional
+        Published settings to score beside the fits.
+    free_air : bool, optional
+        Whether the joint carried no load; by default what its trials tell.
+
+    Raises
+    ------
+    InputError
+        If there is too little motion.
+    """
+    ready = prepare_joint(joint, trials, seed, free_air)
+    fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
+    return conclude(ready, fitted, presets)
+
+
+def joint_lag(joint: str, trials: Sequence[Trial], seed: int = 0) -> LagBudget:
+    """Lag budget of one joint, its dead time that of `fit_joint`."""
+    ready = prepare_joint(joint, trials, seed)
+    return _choice(ready, _joined({s: fit_structures(ready, s) for s in stages(ready)})).lag
+
+
+def stages(ready: PreparedJoint) -> tuple[str, ...]:
+    """Fits of a joint that can be made side by side, for `fit_structures`."""
+    return SIMULATED if ready.scales.free_air else ("ladder",)
+
+
+def fit_structures(ready: PreparedJoint, stage: str) -> list[Fitted]:
+    """Fit one of `SIMULATED` in free air, or the ladder of structures under load."""
+    rng = ready.fit_rng()
+    if not ready.scales.free_air:
+        return _ladder(ready, rng)
+    structure = candidate(stage)
+    tried = {
+        s.features: Fitted(s, fit, fit.point[None])
+        for s, fit in ready.first.values()
+        if structure.contains(s)
+    }
+    fitted = _fitted(ready, structure, tried, rng, ready.first[stage][1])
+    return [*tried.values(), _compared(ready, fitted, tried, rng)]
+
+
+def _fitted(
+    ready: PreparedJoint,
+    structure: Structure,
+    tried: Mapping[tuple[str, ...], Fitted],
+    rng: np.random.Generator,
+    first: Fit | None = None,
+    short: bool = False,
+) -> Fitted:
+    """The best fit to all runs; structures that this one contains are among its starts."""
+    problem = ready.searched(structure)
+    near = [f for f in tried.values() if structure.contains(f.structure)] or [*tried.values()]
+    more = [structure.adopt(f.structure, f.fit.point) for f in near]
+    if first is not None:
+        more.append(first.point)
+    elif structure.features in tried:
+        more.append(tried[structure.features].fit.point)
+    if "acceleration_limit" in structure.names and not np.isfinite(
+        ready.scales.acceleration_rad_s2
+    ):
+        place = structure.names.index("acceleration_limit")
+        for start in list(more):
+            for limit in _ACCELERATIONS_RAD_S2:
+                more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
+    if ready.scales.free_air:
+        best, population = search_widely(problem, rng, np.array(more), short)
+    else:  # the first structure was searched for
+        best, population = evolve(problem, refined(problem, np.array(more)), rng, short)
+    return Fitted(structure, best, population)
+
+
+def _ladder(ready: PreparedJoint, rng: np.random.Generator) -> list[Fitted]:
+    """The structures under load that the likelihood does not rule out, the best of all first."""
+    scales = ready.scales
+    stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
+    plain, first = next(iter(ready.first.values()))
+    tried = {plain.features: Fitted(plain, first, first.point[None])}
+
+    def try_out(*features: str, short: bool = False) -> None:
+        structure = servo_structure(("back-EMF", *features), scales)
+        tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
+
+    for features in LADDER:
+        try_out(*features, *stated)
+    for addition in ADDITIONS:
+        best = min(tried.values(), key=lambda f: f.fit.cost).structure.features[1:]
+        if addition not in best:
+            try_out(*best, addition, short=True)
+    best = min(tried.values(), key=lambda f: f.fit.cost)
+    nats = _nats(ready, tried.values())
+    likely = sorted(plausible(nats), key=lambda name: nats[name])[:_MOST_COMPARED]
+    return [
+        _compared(ready, f, tried, rng) if f.structure.name in likely else f for f in tried.values()
+    ]
+
+
+def _compared(
+    ready: PreparedJoint,
+    fitted: Fitted,
+    tried: Mapping[tuple[str, ...], Fitted],
+    rng: np.random.Generator,
+) -> Fitted:
+    """The fit with draws from its posterior, and with the fits to what is left of each fold."""
+    structure, problem = fitted.structure, ready.searched(fitted.structure)
+    best = refine(problem, fitted.fit.point[None])
+    temperature = _temperature(problem, best)
+    points, _ = sample(problem, best, temperature, rng)
+    lowest = points[np.argsort(problem.costs(points))[:2]]
+    best = min(best, refine(problem, lowest), key=lambda f: f.cost)
+    parents = [
+        (f.structure, f.folds)
+        for f in tried.values()
+        if f.folds and structure.contains(f.structure)
+    ]
+    parts = folds_of(problem.runs)
+    folds = fit_folds(problem, parts, rng, points, parents)
+    if ready.lag.feedback.kind == "lattice":
+        points = with_date_errors(points, problem, best, rng)
+    points = as_wide_as_folds(points, structure, best, folds, group_count(problem.runs))
+    points = np.clip(points, *structure.box)
+    return replace(fitted, fit=best, draws=points, temperature=temperature, folds=folds)
+
+
+def _temperature(problem: Problem, fit: Fit) -> float:
+    structure = problem.structure
+    parts = fresh_residuals(structure, structure.decode(fit.point), problem.runs)
+    scaled = [r / n for r, n in zip(parts, problem.noise_rad, strict=True)]
+    return temperature_of(scaled, problem.runs, len(structure.parameters))
+
+
+def _nats(ready: PreparedJoint, fitted: Sequence[Fitted]) -> dict[str, float]:
+    """Log-likelihood below the best by name, one more per feature (Akaike's price of a number).
+
+    All are counted at the temperature of the best one, or a worse fit would excuse itself.
+    """
+    best = min(fitted, key=lambda f: f.fit.cost)
+    temperature = _temperature(ready.searched(best.structure), best.fit)
+    count = {f.structure.name: len(f.structure.parameters) for f in fitted}
+    least = {f.structure.name: f.fit.cost / temperature + count[f.structure.name] for f in fitted}
+    lowest = min(least.values())
+    return {name: value - lowest for name, value in least.items()}
+
+
+def _joined(stages: Mapping[str, Sequence[Fitted]]) -> list[Fitted]:
+    """The fits of all stages, each structure once."""
+    return list({f.structure.name: f for own in stages.values() for f in own}.values())
+
+
+# ------------------------------------------------------------------------------- choice
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The structure that is carried, and those that the data do not tell from it.
+
+    Attributes
+    ----------
+    carried : Fitted
+        Fitted to all readings.
+    likely : tuple of Fitted
+        With draws, the carried one among them.
+    nats : dict of str to float
+        By how much the log-likelihood of each is below that of the best.
+    unseen_rad : dict of str to float
+        RMS error on unseen motion of those that were compared.
+    noise_rad : tuple of float
+    lag : LagBudget
+        With dead time and offset.
+    """
+
+    carried: Fitted
+    likely: tuple[Fitted, ...]
+    nats: dict[str, float]
+    unseen_rad: dict[str, float]
+    noise_rad: tuple[float, ...]
+    lag: LagBudget
+
+
+def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
+    simulated = [f for f in fitted if not ready.scales.free_air or f.structure.name in SIMULATED]
+    nats = _nats(ready, simulated)
+    compared = [f for f in simulated if f.draws is not None]
+    unseen = {f.structure.name: _unseen(ready, f) for f in compared}
+    likely = [f for f in compared if f.structure.name in plausible(nats)]
+    if not likely:
+        likely = [min(compared, key=lambda f: nats[f.structure.name])]
+    lowest = min(unseen[f.structure.name] for f in likely)
+    # without folds by the likelihood alone
+    close = [
+        f for f in likely
+        if not np.isfinite(lowest) or unseen[f.structure.name] <= _PREFERENCE * lowest
+    ]  # fmt: skip
+    fewest = min(len(f.structure.parameters) for f in close)
+    if np.isfinite(lowest):
+        close = [f for f in close if len(f.structure.parameters) == fewest]
+    carried = min(close, key=lambda f: nats[f.structure.name])
+    noise = ready.noise_rad
+    if not ready.scales.free_air:  # the noise of the first structure was that of a worse one
+        for _ in range(2):
+            structure, values = carried.structure, carried.values
+            parts = fresh_residuals(structure, values, ready.runs)
+            noise = noise_by_run(parts, ready.runs, ready.least_rad)
+            problem = replace(ready.problem(structure), noise_rad=noise)
+            carried = replace(carried, fit=refine(problem, carried.fit.point[None]))
+    likely = [carried if f.structure.name == carried.structure.name else f for f in likely]
+    lag = ready.lag.with_dead_time(_dead_time(ready, carried, likely), float(carried.values[-1]))
+    return _Choice(carried, tuple(likely), nats, unseen, noise, lag)
+
+
+def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
+    """RMS error on what was left out [rad]; NaN without folds."""
+    runs = ready.runs
+    folds = folds_of(runs)
+    left_out = held_out_residuals(fitted.structure, fitted.folds or [], folds, runs)
+    return rms(list(left_out.values()))
+
+
+def _dead_time(ready: PreparedJoint, carried: Fitted, likely: Sequence[Fitted]) -> Interval:
+    """Dead time, the interval over all structures that the data allow and the dates' doubt."""
+    value = float(carried.values[0])
+    ends = [_intervals(f, value)["dead_time_s"] for f in likely]
+    # readings that were taken later than dated lengthen the dead time, as they do the lag
+    doubt = ready.lag.feedback.time_doubt_s + max(t.read_time_doubt_s for t in ready.recorded)
+    hull = Interval(value, min(e.low for e in ends), max(e.high for e in ends)).widened(doubt)
+    return replace(hull, low=max(hull.low, 0.0))
+
+
+def _intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, Interval]:
+    """Interval of each fitted number, and of the back-EMF where the structure has one."""
+    structure, values = fitted.structure, fitted.values.copy()
+    assert fitted.draws is not None
+    draws = structure.decode(fitted.draws)
+    exact = in_continuous_time(structure, draws, _inertia(structure, draws))
+    if dead_time_s is not None:
+        values[0] = dead_time_s
+    found = {
+        name: interval_of(name, float(v), own, continuous)
+        for name, v, own, continuous in zip(
+            structure.names, values, draws.T, exact.T, strict=True
+        )
+    }  # fmt: skip
+    if {"no_load_speed_rad_s", "effort_rad_s2"} <= found.keys():
+        at = [structure.names.index(n) for n in ("effort_rad_s2", "no_load_speed_rad_s")]
+        value = float(values[at[0]] / values[at[1]])
+        own, continuous = (x[:, at[0]] / x[:, at[1]] for x in (draws, exact))
+        found["back_emf_per_s"] = interval_of("back_emf_per_s", value, own, continuous)
+    return found
+
+
+def _inertia(structure: Structure, values: NDArray) -> NDArray[np.float64] | float:
+    """Armature and the largest load [kg·m²]; 1 without a known load."""
+    if not structure.scales.known_load:
+        return 1.0
+    return values[:, structure.names.index("armature")] + structure.scales.inertia
+
+
+# ------------------------------------------------------------------------------- results
+
+
+def conclude(
+    ready: PreparedJoint,
+    fitted: Mapping[str, Sequence[Fitted]],
+    presets: Presets | None = None,
+) -> JointCalibrationResult:
+    """Choose among the fits of a joint, and say what they tell.
+
+    Parameters
+    ----------
+    ready : PreparedJoint
+    fitted : dict of str to sequence of Fitted
+        By stage (`stages`), from `fit_structures`.
+    presets : dict, optional
+        As for `fit_joint`.
+    """
+    every = _joined(fitted)
+    choice = _choice(ready, every)
+    if not ready.scales.free_air:
+        return _under_load(ready, every, choice)
+    return _in_free_air(ready, every, choice, presets)
+
+
+def _in_free_air(
+    ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice, presets: Presets | None
+) -> JointCalibrationResult:
+    runs, folds = ready.runs, folds_of(ready.runs)
+    by_name = {f.structure.name: f for f in every}
+    results = {name: _candidate_fit(ready, f, folds) for name, f in by_name.items()}
+    least = [f.scores.rmse_unseen_rad for n, f in results.items() if n in SIMULATED]
+    for structure in CANDIDATES:
+        if structure.name in SIMULATED:
+            continue
+        rng, problem = ready.fit_rng(), ready.problem(structure)
+        parents = [f for f in by_name.values() if structure.contains(f.structure)]
+        more = [structure.adopt(f.structure, f.fit.point) for f in parents]
+        if structure.name in by_name:
+            fitted = by_name[structure.name]
+        else:
+            fits = search(problem, rng, np.array(more) if more else None)
+            fitted = Fitted(structure, fits[0], np.array([f.point for f in fits]))
+        # a model that errs more on what it was fitted to cannot be better on unseen tones
+        residuals = fresh_residuals(structure, fitted.values, runs)
+        if rms(residuals) <= min(least):
+            own = [(f.structure, f.folds) for f in parents if f.folds]
+            fitted = replace(fitted, folds=fit_folds(problem, folds, rng, None, own))
+        by_name[structure.name] = fitted
+        results[structure.name] = _candidate_fit(ready, fitted, folds)
+    results = {s.name: results[s.name] for s in CANDIDATES}
+    carried = choice.carried.structure
+    chosen = _best(results, carried.name)
+    jitter = command_jitter(
+        carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
+        _date_sd_s(ready.lag.feedback), ready.fit_rng(),
+    )  # fmt: skip
+    return JointCalibrationResult(
+        joint=ready.joint,
+        model=chosen,
+        simulated_model=carried.name,
+        structure_nats=choice.nats,
+        command_jitter_s=jitter,
+        candidate_models=results,
+        lag=choice.lag,
+        presets={
+            name: score_preset(by_joint[ready.joint], runs)
+            for name, by_joint in (presets or {}).items()
+            if ready.joint in by_joint
+        },
+        warnings=(
+            *choice.lag.warnings, *ready.warnings(), *_free_warnings(ready.joint, results, chosen,
+                                                                    choice),
+        ),
+        runs=runs,
+    )  # fmt: skip
+
+
+def _candidate_fit(
+    ready: PreparedJoint, fitted: Fitted, folds: Mapping[str, NDArray[np.bool_]]
+) -> CandidateFit:
+    structure, values = fitted.structure, fitted.values
+    if fitted.draws is None:
+        sd = _spread(ready, fitted)
+        parameters = {
+            p.name: _curved(p, float(v), float(s))
+            for p, v, s in zip(structure.parameters, values, sd, strict=True)
+        }
+    else:
+        parameters, sd = _intervals(fitted), fitted.draws.std(axis=0)
+    speed = max(_command_speed(r) for r in ready.runs)
+    undecided = {
+        p.name: why
+        for p, v, s in zip(structure.parameters, values, sd, strict=True)
+        if (why := _why_unidentified(p, float(v), float(s), parameters[p.name], speed))
+    }
+    if "back_emf_per_s" in parameters and "no_load_speed_rad_s" in undecided:
+        undecided["back_emf_per_s"] = undecided["no_load_speed_rad_s"]
+    if why := _undated(ready.lag.feedback):
+        undecided["dead_time_s"] = why
+    left_out = (
+        held_out_residuals(structure, fitted.folds, folds, ready.runs) if (fitted.folds) else {}
+    )
+    return CandidateFit(
+        model=structure.name,
+        parameters=parameters,
+        undecided=undecided,
+        scores=score(free_run(structure, values, ready.runs), ready.runs, left_out),
+    )
+
+
+def score_preset(parameters: DelayedPDParameters, runs: Sequence[Run]) -> Scores:
+    """Scores of published settings on one joint.
+
+    The offset is that of these readings: their median about it, as in `sysid.fit.predict`.
+
+    Parameters
+    ----------
+    parameters : DelayedPDParameters
+        Of the joint.
+    runs : sequence of Run
+    """
+    one = parameters.per_inertia()
+    parts = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
+             one.velocity_limit, 0.0)  # fmt: skip
+    structure = candidate(PREFERRED)
+    values = np.array([np.asarray(part, float).item() for part in parts])
+    for _ in range(3):  # the offset moves the start, and with it a little itself
+        values[-1] -= np.median(np.concatenate(fresh_residuals(structure, values, runs)))
+    return score(free_run(structure, values, runs), runs)
+
+
+def _date_sd_s(lattice: PollLattice) -> float:
+    """Standard deviation of the date of one reading [s]."""
+    if lattice.kind != "lattice":
+        return 0.0
+    return max(float(lattice.blur_s / np.sqrt(12)), _POLL_SD_S)
+
+
+def _spread(ready: PreparedJoint, fitted: Fitted) -> NDArray[np.float64]:
+    """Standard deviations from the curvature of the cost, for models without a posterior."""
+    problem = ready.problem(fitted.structure)
+    bent = curvature(problem, fitted.fit.point, _COVARIANCE_STEP)
+    covariance = np.linalg.pinv(bent + 1e-9 * np.eye(len(bent)))
+    scaled = problem.scaled(fitted.fit.point[None])[0]
+    # soft-L1 works in units of the noise; its covariance is for residuals of that size
+    inflation = _temperature(problem, fitted.fit) * max(1.0, float(np.mean(scaled**2)))
+    return np.sqrt(np.maximum(np.diag(covariance) * inflation, 0.0))
+
+
+def _curved(parameter: Parameter, value: float, sd: float) -> Interval:
+    """Value with its 90 % interval from the standard deviation of the fitted coordinate."""
+    z, centre = ndtri((1 + LEVEL) / 2), float(parameter.encode(value))
+    box = parameter.encode(parameter.low), parameter.encode(parameter.high)
+    low, high = (
+        float(parameter.decode(c)) for c in np.clip([centre - z * sd, centre + z * sd], *box)
+    )
+    return Interval(value, min(low, value), max(high, value))
+
+
+def _why_unidentified(
+    p: Parameter, value: float, sd: float, interval: Interval, speed: float
+) -> str | None:
+    """Why the data do not identify a number; None if they do.
+
+    Parameters
+    ----------
+    p : Parameter
+    value, sd : float
+        Its value, and the standard deviation of the fitted coordinate.
+    interval : Interval
+    speed : float
+        Fastest command [rad/s].
+    """
+    if p.name in ("offset_rad", "hanging_rad") or p.name.startswith("gravity"):
+        return None
+    limit = p.name in ("velocity_limit_rad_s", "no_load_speed_rad_s")
+    if limit and speed < 0.8 * value:
+        return f"commands reach {speed:.1f} rad/s only, so the limit was never reached"
+    for bound, end in ((p.low, min(value, interval.low)), (p.high, max(value, interval.high))):
+        end = max(end, p.low)
+        on = float(abs(p.encode(end) - p.encode(bound))) < _AT_BOUND
+        if on and (p.logarithmic or abs(value - bound) < _AT_BOUND):
+            return f"on its bound, {bound:g}: the recording does not limit it on that side"
+    if sd > 0.7 * p.prior_sd:
+        return "these recordings do not excite it; the value is the prior's"
+    if p.name == "dead_time_s" and interval.high - interval.low < _SHARP_DEAD_TIME_S:
+        return None  # a short one may well be close to none
+    if interval.low <= 0 and p.logarithmic:
+        return "it cannot be told from none"
+    if p.logarithmic and interval.high > _WIDE * interval.low:
+        return f"its interval is wider than a factor of {_WIDE:g}"
+    return None
+
+
+def _undated(lattice: PollLattice) -> str | None:
+    """Why the dates of readings do not let the dead time be known."""
+    if lattice.time_doubt_s <= 0:
+        return None
+    if lattice.readings == "polled":
+        return "readings are held, their poll is unknown"
+    return "it is not known whether readings are live"
+
+
+def _best(results: Mapping[str, CandidateFit], carried: str) -> str:
+    """The model with the smallest error on unseen motion; the one carried where it is as good."""
+    errors = {n: f.scores.rmse_unseen_rad for n, f in results.items()}
+    errors = {n: e for n, e in errors.items() if np.isfinite(e)}
+    if carried not in errors:
+        return carried  # one frequency: nothing to choose by
+    best = min(errors, key=lambda name: errors[name])
+    return carried if errors[carried] <= _REPORTED_PREFERENCE * errors[best] else best
+
+
+def _free_warnings(
+    joint: str, results: Mapping[str, CandidateFit], chosen: str, choice: _Choice
+) -> Iterator[str]:
+    carried = choice.carried.structure.name
+    pd = results[carried]
+    if why := pd.undecided.get("dead_time_s"):
+        yield f"{joint}: the dead time is not identified: {why}."
+    limits = {"velocity_limit_rad_s", "no_load_speed_rad_s"} & pd.undecided.keys()
+    for limit in limits:
+        yield (
+            f"{joint}: the speed limit was not excited: {pd.undecided[limit]}. Record a faster "
+            "tone or a step."
+        )
+    if len(choice.likely) > 1 and not limits:
+        yield (
+            f"{joint}: {UNTOLD} ({max(choice.nats.values()):.1f} nats); dead time and gains "
+            "cover both. Faster tones at a smaller amplitude would tell (`pupper-sysid plan`)."
+        )
+    for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
+        if name in pd.undecided:
+            quantity = name.split("_")[0]
+            yield f"{joint}: {quantity} is not identified: {pd.undecided[name]}."
+    own = pd.scores.rmse_unseen_rad
+    if chosen != carried:
+        best = results[chosen].scores.rmse_unseen_rad
+        yield (
+            f"{joint}: {chosen} predicts unseen motion better ({1e3 * best:.1f} against "
+            f"{1e3 * own:.1f} mrad); simulators still get DelayedPD, the model they can run."
+        )
+    if not np.isfinite(own):
+        yield f"{joint}: one frequency only, so no model was tested on unseen motion."
+
+
+def _command_speed(run: Run) -> float:
+    """Peak rate of the command [rad/s], over windows longer than a control loop."""
+    window = 25
+    command = run.command
+    if len(command) <= window:
+        return 0.0
+    moved = command[window:] - command[:-window]
+    return float(np.max(np.abs(moved)) / (window * TIME_STEP_S))
+
+
+# ------------------------------------------------------------------------------- under load
+
+
+def _under_load(
+    ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice
+) -> JointCalibrationResult:
+    loaded = _loaded_fit(ready, every, choice)
+    structure, values = choice.carried.structure, choice.carried.values
+    folds = folds_of(ready.runs)
+    left_out = held_out_residuals(structure, choice.carried.folds or [], folds, ready.runs)
+    scores = score(free_run(structure, values, ready.runs), ready.runs, left_out)
+    pd = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm).arrays()
+    inertia = float(np.asarray(loaded.servo.armature))
+    inertia += max(i for i, _ in loaded.loads) if loaded.known_load else 0.0
+    parameters = {"dead_time_s": loaded.numbers["dead_time_s"]}
+    for name, (source, field) in RATIO_SOURCES.items():
+        parameters[name] = loaded.relative(source, float(pd[field]) / inertia)
+    for name in ("no_load_speed_rad_s", "offset_rad"):
+        parameters[name] = loaded.numbers[name]
+    undecided = {
+        name: loaded.undecided[source]
+        for name, (source, _) in RATIO_SOURCES.items()
+        if source in loaded.undecided
+    }
+    undecided |= {k: v for k, v in loaded.undecided.items() if k == "dead_time_s"}
+    nan = float("nan")
+    return JointCalibrationResult(
+        joint=ready.joint,
+        model=loaded.structure,
+        simulated_model=SIMULATED[1],
+        structure_nats={SIMULATED[1]: 0.0},
+        command_jitter_s=Interval(nan, nan, nan),
+        candidate_models={SIMULATED[1]: CandidateFit(
+            model=SIMULATED[1], parameters=parameters, undecided=undecided, scores=scores
+        )},
+        lag=choice.lag,
+        presets={},
+        warnings=(*choice.lag.warnings, *ready.warnings(), *_load_warnings(ready.joint, loaded)),
+        loaded=loaded,
+        runs=ready.runs,
+    )  # fmt: skip
+
+
+def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) -> LoadedFit:
+    carried, runs = choice.carried, ready.runs
+    structure, scales = carried.structure, ready.scales
+    own = {name: x[0] for name, x in numbers_of(structure, carried.values[None]).items()}
+    ends: dict[str, list[Interval]] = {name: [] for name in own}
+    spread: dict[str, NDArray] = {}
+    for f in choice.likely:
+        assert f.draws is not None
+        draws = f.structure.decode(f.draws)
+        exact = in_continuous_time(f.structure, draws, _inertia(f.structure, draws))
+        drawn, continuous = numbers_of(f.structure, draws), numbers_of(f.structure, exact)
+        for name in own.keys() & drawn.keys():
+            ends[name].append(interval_of(name, float(own[name]), drawn[name], continuous[name]))
+        if f.structure.name == structure.name:
+            spread = {n: f.draws[:, j] for j, n in enumerate(f.structure.names)}
+    numbers = {
+        name: Interval(float(own[name]), min(e.low for e in x), max(e.high for e in x))
+        for name, x in ends.items()
+    }
+    assert choice.lag.dead_time_s is not None
+    numbers["dead_time_s"] = choice.lag.dead_time_s
+    speed, undecided = max(_command_speed(r) for r in runs), {}
+    named = {_shown(p.name): p for p in structure.parameters}
+    for name, interval in numbers.items():
+        p = named.get(name)
+        if p is not None:
+            fitted = float(carried.values[structure.names.index(p.name)])
+            scale = interval.value / fitted if fitted else 1.0
+            scaled = Interval(fitted, *(x / scale for x in (interval.low, interval.high)))
+            why = _why_unidentified(p, fitted, float(np.std(spread[p.name])), scaled, speed)
+        elif name in ("hanging_rad", "offset_rad", "gravity_nm") or interval.low > 0:
+            wide = name not in ("hanging_rad", "offset_rad", "gravity_nm")
+            wide = wide and interval.high > _WIDE * interval.low
+            why = f"its interval is wider than a factor of {_WIDE:g}" if wide else None
+        else:
+            why = "it cannot be told from none"
+        if why:
+            undecided[name] = why
+    if why := _undated(ready.lag.feedback):
+        undecided["dead_time_s"] = why
+    labels = [r.label for r in runs]
+    per_run = [float(np.mean(np.abs(r))) for r in fresh_residuals(structure, carried.values, runs)]
+    return LoadedFit(
+        joint=ready.joint,
+        structure=structure.name,
+        known_load=scales.known_load,
+        p_gain=scales.p_gain,
+        p_gains=tuple(sorted({r.p_gain for r in runs})),
+        loads=tuple(sorted({(float(r.load[0]), float(r.load[1])) for r in runs})),
+        reference_voltage_v=ready.reference_voltage_v,
+        numbers=numbers,
+        undecided=undecided,
+        structures=tuple(_summary(f, runs, choice) for f in every),
+        folds=tuple(folds_of(runs)),
+        mae_by_run_rad={
+            label: float(np.mean([e for e, x in zip(per_run, labels, strict=True) if x == label]))
+            for label in dict.fromkeys(labels)
+        },
+        motor_torque_nm=typical_torque(structure, carried.values, runs),
+        temperature=carried.temperature,
+        lattice=ready.lag.feedback,
+        servo=structure.servo(carried.values),
+        runs=runs,
+    )
+
+
+def numbers_of(structure: Structure, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """What a fit under load says, (draws,) each, under the names of `LoadedServoParameters`."""
+    by_column = dict(zip(kernel.COLUMNS, structure.columns(values).T, strict=True))
+    stall = by_column["effort_limit"]
+    by_column |= {
+        "duty_per_rad": by_column["stiffness"] / stall, "stall_torque": stall,
+        "duty_s_per_rad": by_column["damping"] / stall,
+    }  # fmt: skip
+    fitted, scales = {_shown(name) for name in structure.names}, structure.scales
+    shown = {"dead_time_s": values[:, 0]}
+    also = {"duty_per_rad", "stall_torque", "back_emf", "friction_loss"}
+    also |= {"armature"} if scales.known_load else set()
+    also |= {"off_brake"} if scales.torque_off else set()
+    for column, name in (("stribeck_speed", "stribeck_speed_rad_s"), ("duty_s_per_rad", "damping"),
+                         ("torque_limit", "torque_limit_share")):  # fmt: skip
+        also |= {column} if name in fitted else set()
+    for name in (f.name for f in fields(LoadedServoParameters) if f.name in by_column):
+        if name in also or name in fitted:
+            shown[name] = by_column[name]
+    shown["stiffness_nm_per_rad"] = scales.p_gain * by_column["stiffness"]
+    shown["no_load_speed_rad_s"] = stall / by_column["back_emf"]
+    if scales.gravity:
+        shown["gravity_nm"] = by_column["gravity_nm"]
+    shown["hanging_rad"] = by_column["hanging_rad"]
+    shown["offset_rad"] = by_column["offset_rad"]
+    return shown
+
+
+def _shown(name: str) -> str:
+    """Name of a fitted number in `numbers_of`."""
+    return {
+        "stiffness": "stiffness_nm_per_rad", "stiffness_per_s2": "stiffness_nm_per_rad",
+        "effort_rad_s2": "stall_torque", "friction_rad_s2": "friction_loss",
+        "damping": "duty_s_per_rad", "damping_per_s": "duty_s_per_rad",
+        "stribeck_speed_rad_s": "stribeck_speed", "torque_limit_share": "torque_limit",
+    }.get(name, name)  # fmt: skip
+
+
+def typical_torque(structure: Structure, values: NDArray[np.float64], runs: Sequence[Run]) -> float:
+    """Median torque of the motor while its torque is on."""
+    servo = structure.servo(values)
+    torques = []
+    for run, track in zip(runs, free_run(structure, values, runs), strict=True):
+        speed = np.gradient(track, run.step_s)[:-1]
+        duty = np.asarray(servo.duty_per_rad) * run.p_gain * (run.command - track[:-1])
+        torque = np.asarray(servo.stall_torque) * np.clip(duty, -1, 1)
+        torque = torque - np.asarray(servo.back_emf) * speed
+        torques.append(np.abs(torque)[run.torque_on > 0.5])
+    return float(np.median(np.concatenate(torques)))
+
+
+def _summary(fitted: Fitted, runs: Sequence[Run], choice: _Choice) -> StructureFit:
+    structure, values = fitted.structure, fitted.values
+    parts = fresh_residuals(structure, values, runs)
+    left_out = (
+        held_out_residuals(structure, fitted.folds or [], folds_of(runs), runs)
+        if (fitted.folds)
+        else {}
+    )
+    unseen = [float(np.mean(np.abs(r))) for r in left_out.values()]
+    return StructureFit(
+        name=structure.name,
+        parameters={n: float(v) for n, v in zip(structure.names, values, strict=True)},
+        mae_rad=float(np.mean([np.mean(np.abs(r)) for r in parts])),
+        rmse_rad=rms(parts),
+        mae_unseen_rad=float(np.mean(unseen)) if unseen else float("nan"),
+        nats=choice.nats[structure.name],
+    )
+
+
+def _load_warnings(joint: str, loaded: LoadedFit) -> Iterator[str]:
+    for name, why in loaded.undecided.items():
+        yield f"{joint}: {name} is not identified: {why}."
+    if lost := loaded.servo.beyond_delayed_pd():
+        yield (
+            f"{joint}: simulators' actuators do not carry {', '.join(lost)}; DelayedPD has the "
+            f"friction of a motor torque of {loaded.motor_torque_nm:.2g}"
+            f"{' N·m' if loaded.known_load else ' rad/s²'}. `under_load` has the whole servo."
+        )
+    if not loaded.folds:
+        yield f"{joint}: one run only, so no structure was tested on unseen motion."

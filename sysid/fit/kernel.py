@@ -1,0 +1,428 @@
+"""Compiled simulation of a servo on one run: the inner loop of every fit, score and comparison.
+
+`LANES` candidates are stepped abreast: the delayed command, the set-point's profile, the position
+loop, motor, gears and load, and the position at the moments of the readings, without an array of
+all positions of all candidates. `servo_models.loaded_servo` has the equations; they stand a step a
+line in `tests/reference/servo.py`, and tests hold the two together. What a servo does not have is
+not computed: the branches stand outside of the loops over candidates.
+
+The linear models (`LINEAR`) have no limits and no friction; they are what other people fit, and
+stand beside the servo in tables. Compiled once per machine, on first use, and cached.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
+
+LANES = 16
+"""Candidates abreast: two registers of AVX-512, four of AVX2."""
+
+COLUMNS = (
+    "stiffness", "damping", "effort_limit", "back_emf", "armature", "friction_loss",
+    "velocity_limit", "acceleration_limit", "stribeck_friction", "stribeck_speed",
+    "load_friction_motor", "load_friction_load", "load_friction_quadratic",
+    "load_friction_static", "torque_limit", "off_brake", "dead_zone_rad", "start_duty",
+    "gravity_nm", "hanging_rad", "backlash_rad", "offset_rad",
+)  # fmt: skip
+"""A candidate's numbers, in order: those of the servo without its dead time, then the gravity [N·m]
+and hanging position [rad] that are added to the load's, and the offset of readings [rad]."""
+OFFSET, WIDTH = len(COLUMNS) - 1, len(COLUMNS)
+
+_LIMITS = ("velocity_limit", "acceleration_limit", "torque_limit", "effort_limit")
+ABSENT = np.array([
+    np.inf if name in _LIMITS else {"armature": 1.0, "stribeck_speed": 0.1}.get(name, 0.0)
+    for name in COLUMNS
+])  # fmt: skip
+"""A candidate without any of the terms: limits that are infinite, an inertia of 1, else 0."""
+
+SERVO = 0
+LINEAR = {"pure_delay": 1, "fopdt": 2, "sopdt": 3}
+"""Numbers of the linear models; their columns are their own parameters, the offset the last."""
+SPARSE = 4
+"""Number of `servo_models.sparse_equation`; its columns are its coefficients, then the offset."""
+
+_PI, _PER_PI = 3.141592653589793, 0.3183098861837907
+
+# No reordering of sums and no fused multiplication: stick-slip would turn the last bit into
+# another trajectory, and the NumPy reference could not be compared with.
+SAFE = {"nnan", "nsz"}
+
+
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
+def clip(x, limit):
+    """`x` within `±limit`; ternaries, which vectorise."""
+    x = limit if x > limit else x
+    return -limit if x < -limit else x
+
+
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
+def _sin(x):
+    """Sine to 1e-9: a Taylor series after folding; unlike the library's it fits in a register."""
+    n = np.rint(x * _PER_PI)
+    r = x - n * _PI
+    odd = n - 2.0 * np.floor(0.5 * n)
+    q = r * r
+    s = 1.0 - q * (1 / 156.0)
+    s = 1.0 - q * (1 / 110.0) * s
+    s = 1.0 - q * (1 / 72.0) * s
+    s = 1.0 - q * (1 / 42.0) * s
+    s = 1.0 - q * (1 / 20.0) * s
+    s = 1.0 - q * (1 / 6.0) * s
+    return r * s * (1.0 - 2.0 * odd)
+
+
+@njit(fastmath=SAFE, error_model="numpy")
+def _delayed(held, row, k, shift, part, out):
+    """Row `row` of `held` at step `k`, a fraction of a step earlier or later for each candidate."""
+    for i in range(LANES):
+        now = held[row, k + shift[i]]
+        out[i] = (held[row, k + shift[i] - 1] - now) * part[i] + now
+
+
+@njit(fastmath=SAFE, error_model="numpy")
+def _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, part, track):
+    """Positions of the servos `who` after each step, into rows 1 … `steps` of `track`."""
+    p = np.zeros((WIDTH, LANES))
+    y, v, c, s = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    on, rate, play = np.ones(LANES), np.zeros(LANES), np.zeros(LANES)
+    braked, clipped = np.zeros(LANES), np.zeros(LANES)
+    slew, friction, firmware, profile, gravity, backlash = (
+        False,
+        False,
+        False,
+        False,
+        False,
+        False,
+    )
+    for i in range(LANES):
+        w = values[who[i]]
+        for j in range(WIDTH):
+            p[j, i] = w[j]
+        inertia = w[4] + load[0]
+        p[0, i] = w[0] * gain / inertia
+        for j in (1, 2, 3, 5, 8, 14):  # torques over the inertia
+            p[j, i] = w[j] / inertia
+        p[6, i] = w[6] * h
+        p[9, i] = 1.0 / (w[9] * w[9])
+        p[12, i] = w[12] * inertia
+        p[17, i] = w[17] * p[2, i]
+        p[18, i] = (load[1] + w[18]) / inertia
+        p[19, i] = load[2] + w[19]
+        p[20, i] = 0.5 * w[20]
+        braked[i] = h / (1.0 + h * (p[1, i] + p[3, i]))
+        clipped[i] = h / (1.0 + h * p[3, i])
+        y[i] = start - w[OFFSET]
+        s[i] = y[i]
+        play[i] = y[i]
+        track[0, i] = y[i]
+        slew = slew or w[6] < np.inf
+        profile = profile or w[7] < np.inf
+        friction = friction or w[8] + w[10] + w[11] + w[12] > 0.0
+        firmware = firmware or w[16] + w[17] > 0.0
+        gravity = gravity or p[18, i] != 0.0
+        backlash = backlash or w[20] > 0.0
+    supply = held.shape[0] > 1
+    plain = not (profile or friction or firmware or gravity or supply)
+    for i in range(LANES):
+        plain = plain and not p[14, i] < np.inf
+    for k in range(steps):
+        _delayed(held, 0, k, shift, part, c)
+        if profile:
+            for i in range(LANES):
+                way = c[i] - s[i]
+                fastest = np.sqrt(2.0 * p[7, i] * abs(way))
+                fastest = fastest if fastest < p[6, i] / h else p[6, i] / h
+                rate[i] += clip(clip(way * (1.0 / h), fastest) - rate[i], p[7, i] * h)
+                follows = not p[7, i] < np.inf
+                s[i] = s[i] + clip(way, p[6, i]) if follows else s[i] + rate[i] * h
+        elif slew:
+            for i in range(LANES):
+                s[i] += clip(c[i] - s[i], p[6, i])
+        else:
+            for i in range(LANES):
+                s[i] = c[i]
+        if plain:
+            for i in range(LANES):
+                wanted = (s[i] - y[i]) * p[0, i] - p[1, i] * v[i]
+                force = clip(wanted, p[2, i])
+                step = braked[i] if force == wanted else clipped[i]
+                force -= p[3, i] * v[i]
+                force += clip((v[i] * (1.0 / h) + force) * stop, p[5, i])
+                v[i] += force * step
+                y[i] += v[i] * h
+                track[k + 1, i] = y[i]
+        else:
+            volt = 1.0
+            if supply:
+                _delayed(held, 1, k, shift, part, on)
+                volt = held[2, k + pad]
+            for i in range(LANES):
+                error = s[i] - y[i]
+                begin = 0.0
+                if firmware:
+                    error -= clip(error, p[16, i])
+                    begin = p[17, i] * clip(error * (1.0 / START_ERROR_RAD), 1.0)
+                wanted = error * p[0, i] - p[1, i] * v[i] + begin
+                drive = clip(wanted, p[2, i])
+                back, step, given = p[3, i], braked[i], 1.0
+                inner = step if drive == wanted else clipped[i]
+                if supply:
+                    given = volt * on[i]
+                    back *= p[15, i] + (1.0 - p[15, i]) * on[i]
+                    damping = p[1, i] * given if drive == wanted else 0.0
+                    inner = h / (1.0 + h * (damping + back))
+                drawn = drive * given - back * v[i]
+                motor = clip(drawn, p[14, i])
+                step = inner if motor == drawn else h
+                force, limit = motor, p[5, i]
+                weight = 0.0
+                if gravity:
+                    weight = -p[18, i] * _sin(y[i] - p[19, i])
+                    force += weight
+                if friction:
+                    standing = 1.0 / (1.0 + v[i] * v[i] * p[9, i])
+                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(weight)
+                    limit += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
+                    limit += p[12, i] * motor * motor
+                force += clip((v[i] * (1.0 / h) + force) * stop, limit)
+                v[i] += force * step
+                y[i] += v[i] * h
+                track[k + 1, i] = y[i]
+        if backlash:
+            for i in range(LANES):
+                low, high = y[i] - p[20, i], y[i] + p[20, i]
+                x = play[i] if play[i] > low else low
+                play[i] = high if x > high else x
+                track[k + 1, i] = play[i]
+
+
+@njit(fastmath=SAFE, error_model="numpy")
+def _linear(kind, values, who, held, start, steps, h, shift, part, track):
+    """As `_servo`, for the linear models: parameters, then the offset in the last column."""
+    last = values.shape[1] - 1
+    c, y, v, rest = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    p = np.zeros((3, LANES))
+    for i in range(LANES):
+        w = values[who[i]]
+        rest[i] = start - w[last]
+        track[0, i] = rest[i]
+        p[0, i] = w[0]
+        if kind == 2:
+            p[1, i] = np.exp(-h / w[1])
+        elif kind == 3:
+            p[1, i] = h * w[1] * w[1]
+            p[2, i] = 1.0 / (1.0 + 2 * h * w[2] * w[1] + (h * w[1]) ** 2)
+    for k in range(steps):
+        _delayed(held, 0, k, shift, part, c)
+        for i in range(LANES):
+            moved = c[i] - rest[i]
+            if kind == 1:
+                y[i] = moved
+            elif kind == 2:
+                y[i] = p[1, i] * y[i] + (1 - p[1, i]) * moved
+            else:  # backward Euler: stable for any frequency
+                v[i] = (v[i] + p[1, i] * (moved - y[i])) * p[2, i]
+                y[i] += h * v[i]
+            track[k + 1, i] = rest[i] + y[i] * p[0, i]
+
+
+@njit(fastmath=SAFE, error_model="numpy")
+def _sparse(values, who, held, start, steps, h, shift, part, track):
+    """As `_servo`, for the equation of motion of `servo_models.sparse_equation`."""
+    last = values.shape[1] - 1
+    c, y, v = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    p = np.zeros((6, LANES))
+    for i in range(LANES):
+        w = values[who[i]]
+        y[i] = start - w[last]
+        track[0, i] = y[i]
+        p[0, i], p[1, i], p[2, i] = w[0] * h, w[1] * h, w[2]
+        p[3, i], p[4, i], p[5, i] = 0.5 * h * w[3], w[4] * (0.5 * h), w[5] * h
+    for k in range(steps):
+        _delayed(held, 0, k, shift, part, c)
+        for i in range(LANES):
+            error = c[i] - y[i]
+            loss = p[3, i] + abs(v[i]) * p[4, i]
+            x = v[i] - v[i] * loss
+            x += p[0, i] * error
+            x += clip(error, p[2, i]) * p[1, i]
+            x -= clip(x, p[5, i])
+            v[i] = x / (loss + 1.0)
+            y[i] += v[i] * h
+            track[k + 1, i] = y[i]
+
+
+@njit(fastmath=SAFE, error_model="numpy")
+def _simulate(kind, values, dead_time, who, held, gain, load, start, steps, pad, h, stop, track):
+    part, shift = np.zeros(LANES), np.zeros(LANES, np.int64)
+    for i in range(LANES):
+        whole = int(np.floor(dead_time[who[i]]))
+        shift[i], part[i] = pad - whole, dead_time[who[i]] - whole
+    if kind == SERVO:
+        _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, part, track)
+    elif kind == SPARSE:
+        _sparse(values, who, held, start, steps, h, shift, part, track)
+    else:
+        _linear(kind, values, who, held, start, steps, h, shift, part, track)
+
+
+@njit(inline="always")
+def _fill_lanes(first, count, who):
+    """Fill `who` with candidates from `first` on, the first repeated where there are too few."""
+    used = min(LANES, count - first)
+    for i in range(LANES):
+        who[i] = first + (i if i < used else 0)
+    return used
+
+
+_POSITIONS, _RESIDUALS, _COSTS, _MOMENTS = range(4)
+_NONE, _NO_TABLE = np.empty(0), np.empty((0, 0))
+
+
+@njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
+def _evaluate(
+    task, kind, values, dead_time, held, gain, load, start, pad, h, stop, step, reading, noise,
+    later, out, total,
+):  # fmt: skip
+    """Simulate each candidate and do one of four tasks: one function, compiled once."""
+    count, last, samples = len(values), values.shape[1] - 1, len(step)
+    steps = held.shape[1] - pad
+    if task == _RESIDUALS or task == _COSTS:
+        steps = min(int(np.ceil(np.max(step))) + 1, steps) if samples else 0
+    who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
+    offset, cost = np.zeros(LANES), np.zeros(LANES)
+    for first in range(0, count, LANES):
+        used = _fill_lanes(first, count, who)
+        _simulate(kind, values, dead_time, who, held, gain, load, start, steps, pad, h, stop, track)
+        for i in range(LANES):
+            offset[i], cost[i] = values[who[i], last], 0.0
+        if task == _POSITIONS:
+            for k in range(steps + 1):
+                for i in range(used):
+                    out[k, first + i] = track[k, i] + offset[i]
+        elif task == _RESIDUALS:
+            for n in range(samples):
+                row = min(int(step[n]), steps - 1)
+                part = step[n] - row
+                for i in range(used):
+                    low = track[row, i]
+                    position = low + part * (track[row + 1, i] - low)
+                    out[first + i, n] = position + offset[i] - reading[n]
+        elif task == _COSTS:
+            for n in range(samples):
+                row = min(int(step[n]), steps - 1)
+                part, read = step[n] - row, reading[n]
+                for i in range(LANES):
+                    low = track[row, i]
+                    position = low + part * (track[row + 1, i] - low)
+                    r = (position + offset[i] - read) / noise
+                    cost[i] += np.sqrt(1.0 + r * r) - 1.0
+            for i in range(used):
+                out[0, first + i] = cost[i]
+        else:
+            for m in range(len(later)):
+                for n in range(samples):
+                    moment = max(step[n] - later[m], 0.0)
+                    row = min(int(moment), steps - 1)
+                    part = moment - row
+                    for i in range(used):
+                        low = track[row, i]
+                        position = low + part * (track[row + 1, i] - low)
+                        error = position + offset[i] - reading[n]
+                        out[m, first + i] += error
+                        total[m, first + i] += error * error
+
+
+Simulated = tuple[int, NDArray, NDArray, NDArray, float, NDArray, float, int, float, float]
+"""What every task takes: candidates on one run.
+
+kind : int
+    `SERVO`, `SPARSE`, or a number of `LINEAR`.
+values : ndarray, shape (candidates, columns)
+    Of a servo: `COLUMNS`.
+dead_time : ndarray, shape (candidates,)
+    In steps.
+held : ndarray, shape (1 or 3, pad + steps)
+    Command of each step [rad], after `pad` steps of rest; then, where they are not always 1, the
+    share of the step for which the torque is on, and the supply voltage over the reference.
+gain : float
+    P gain over the one that `stiffness` is for.
+load : ndarray, shape (3,)
+    Inertia [kg·m²], gravity [N·m], hanging position [rad].
+start : float
+    First reading [rad], at rest.
+pad : int
+h : float
+    Duration of a step [s].
+stop : float
+    Minus the share of the speed that dry friction removes in a step.
+"""
+
+
+def positions(*simulated: *Simulated) -> NDArray[np.float64]:
+    """Readings at the edges of the steps, shape (steps + 1, candidates) [rad]."""
+    values, held, pad = simulated[1], simulated[3], simulated[7]
+    out = np.empty((held.shape[1] - pad + 1, len(values)))
+    _evaluate(_POSITIONS, *simulated, _NONE, _NONE, 1.0, _NONE, out, _NO_TABLE)
+    return out
+
+
+def residuals(
+    *simulated: *Simulated, step: NDArray[np.float64], reading: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Model minus reading, shape (candidates, samples) [rad].
+
+    Parameters
+    ----------
+    *simulated
+        See `Simulated`.
+    step, reading : ndarray, shape (samples,)
+        When the readings were measured, in steps, and their values [rad].
+    """
+    out = np.empty((len(simulated[1]), len(step)))
+    _evaluate(_RESIDUALS, *simulated, step, reading, 1.0, _NONE, out, _NO_TABLE)
+    return out
+
+
+def costs(
+    *simulated: *Simulated, step: NDArray[np.float64], reading: NDArray[np.float64],
+    noise: float,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Soft-L1 cost, Σ sqrt(1 + r²) − 1 with r a residual over `noise` [rad]: shape (candidates,).
+
+    Parameters as for `residuals`.
+    """
+    out = np.empty((1, len(simulated[1])))
+    _evaluate(_COSTS, *simulated, step, reading, noise, _NONE, out, _NO_TABLE)
+    return out[0]
+
+
+def moments_if_later(
+    *simulated: *Simulated, step: NDArray[np.float64], reading: NDArray[np.float64],
+    later: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Sums of the residuals and of their squares if every candidate had moved later.
+
+    Parameters
+    ----------
+    *simulated
+        See `Simulated`.
+    step, reading : ndarray, shape (samples,)
+        When the readings were measured, in steps, and their values [rad].
+    later : ndarray, shape (delays,)
+        In steps.
+
+    Returns
+    -------
+    total : ndarray, shape (delays, candidates)
+        In rad.
+    square : ndarray, shape (delays, candidates)
+        In rad².
+    """
+    total, square = np.zeros((2, len(later), len(simulated[1])))
+    _evaluate(_MOMENTS, *simulated, step, reading, 1.0, later, total, square)
+    return total, square

@@ -1,0 +1,131 @@
+"""Noise of a joint's readings, motion by motion, and the command jitter that explains its growth.
+
+Fast tones leave larger residuals than slow ones: a command that comes a few milliseconds late moves
+a fast joint further off. With one noise for all tones the fastest would decide every fit, so each
+tone has its own (`noise_by_run`). `command_jitter` asks which random latency of commands the growth
+amounts to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, with_late_commands
+from pupper_sysid.sysid.fit.structure import Structure
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_OUTLIER_MAD = 4.0
+_NOISE_RATIO = 1.5  # of the noise of a run without a tone to that of the others
+_PROBE_S = 0.002  # jitter at which its effect is simulated: small beside the servo's own times
+_PROBES, _DRAWS = 6, 200
+_DATES = (0.5, 1.5)  # of the standard deviation of dates
+_SAMPLES_PER_INDEPENDENT = 4.0  # a servo carries a late command on for about so many readings
+
+
+def noise_by_run(
+    residuals: Sequence[NDArray[np.float64]], runs: Sequence[Run], least_rad: float
+) -> tuple[float, ...]:
+    """Root mean square of the residuals of each tone, or run without a tone, outliers clipped.
+
+    Parameters
+    ----------
+    residuals : sequence of ndarray, shape (samples,) each
+        Model minus fresh reading, per run [rad].
+    runs : sequence of Run
+        Runs of one tone, gain and load share their noise. That of runs without a tone is not far
+        from the others': it is the model's error, and a run that it suits would decide the fit.
+    least_rad : float
+        Noise of a tone that is fitted better than readings can be.
+
+    Returns
+    -------
+    tuple of float
+        One per run [rad].
+    """
+    kinds = [(r.tone, r.p_gain, *r.load, n if r.tone < 0 else 0) for n, r in enumerate(runs)]
+    sizes = {}
+    for kind in set(kinds):
+        r = np.concatenate([x for x, k in zip(residuals, kinds, strict=True) if k == kind])
+        most = _OUTLIER_MAD * 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
+        size = np.sqrt(np.mean(np.minimum(np.abs(r), most) ** 2)) if len(r) else 0.0
+        sizes[kind] = max(float(size), least_rad)
+    others = [size for kind, size in sizes.items() if kind[0] < 0]
+    if others:
+        middle = float(np.median(others))
+        ends = max(middle / _NOISE_RATIO, least_rad), middle * _NOISE_RATIO
+        for kind in sizes:
+            if kind[0] < 0:
+                sizes[kind] = float(np.clip(sizes[kind], *ends))
+    return tuple(sizes[kind] for kind in kinds)
+
+
+def command_jitter(
+    structure: Structure,
+    values: NDArray[np.float64],
+    recorded: Sequence[Trial],
+    runs: Sequence[Run],
+    noise_rad: Sequence[float],
+    date_sd_s: float,
+    rng: np.random.Generator,
+) -> Interval:
+    """Standard deviation of the latency of commands that explains the noise of fast tones [s].
+
+    Commands late at random (exponentially, about the dead time as mean) are simulated. The squared
+    noise of a tone is a floor, common to all tones, and a share that grows as the squared jitter.
+
+    Parameters
+    ----------
+    structure : Structure
+    values : ndarray, shape (parameters,)
+    recorded : sequence of Trial
+        The trials of the runs as recorded, with the times at which commands were sent.
+    runs : sequence of Run
+    noise_rad : sequence of float
+        From `noise_by_run`.
+    date_sd_s : float
+        Standard deviation of the dates of readings [s]: it grows with the speed, too, and is taken
+        off, half to one and a half of it.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    Interval
+        An upper bound where the model errs more at fast tones for other reasons; (0, 0, high) where
+        nothing is seen; NaN with fewer than two tones.
+    """
+    tones = sorted({r.tone for r in runs})
+    if len(tones) < 2:
+        return Interval(np.nan, np.nan, np.nan)
+    plain = free_run(structure, values, runs)
+    moved: dict[float, list[NDArray]] = {tone: [] for tone in tones}
+    for _ in range(_PROBES):
+        late = [
+            with_late_commands(t, r, _PROBE_S, rng) for t, r in zip(runs, recorded, strict=True)
+        ]
+        for t, one, other in zip(runs, plain, free_run(structure, values, late), strict=True):
+            moved[t.tone].append(at_steps(other, t.sample_step) - at_steps(one, t.sample_step))
+    gain = np.array([np.mean(np.concatenate(moved[t]) ** 2) for t in tones]) / _PROBE_S**2
+    speeds: dict[float, list[NDArray]] = {tone: [] for tone in tones}
+    for t, track in zip(runs, plain, strict=True):
+        speeds[t.tone].append(at_steps(np.gradient(track) / t.step_s, t.sample_step))
+    dating = np.array([np.mean(np.concatenate(speeds[t]) ** 2) for t in tones]) * date_sd_s**2
+    own = {t.tone: n for t, n in zip(runs, noise_rad, strict=True)}
+    square = np.array([own[t] ** 2 for t in tones])
+    count = [sum(len(t.sample_step) for t in runs if t.tone == tone) for tone in tones]
+    freedom = np.maximum(np.array(count) / _SAMPLES_PER_INDEPENDENT, 2.0)
+
+    def jitter(squares: NDArray, dates: float) -> float:
+        design = np.column_stack([np.ones(len(tones)), gain]) / squares[:, None]
+        scale = np.linalg.norm(design, axis=0)
+        rest = np.maximum(1.0 - dates**2 * dating / squares, 0.0)
+        return float(np.sqrt(nnls(design / scale, rest)[0][1] / scale[1]))
+
+    draws = square * rng.chisquare(freedom, (_DRAWS, len(tones))) / freedom
+    dates = rng.uniform(*_DATES, _DRAWS)
+    found = [jitter(s, d) for s, d in zip(draws, dates, strict=True)]
+    return Interval.of_draws(jitter(square, 1.0), np.array(found))

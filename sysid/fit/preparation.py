@@ -1,0 +1,351 @@
+"""Trials of a joint made ready for its fits: readings dated, commands on the physics clock, noise.
+
+A first fit, to readings dated by the poll lattice, gives the expected motion. With it the lattice
+is searched for slips and the readings are dated anew, readings behind commands that never arrived
+are left out, and each motion gets the noise that its residuals show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    PollLattice,
+    find_poll_lattice,
+    quantum,
+    readings,
+    redate,
+)
+from pupper_sysid.sysid.feedback.slips import Motion
+from pupper_sysid.sysid.feedback.upsets import Upset, find_upsets
+from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
+from pupper_sysid.sysid.fit.loads import droops, tells_of_load
+from pupper_sysid.sysid.fit.noise import noise_by_run
+from pupper_sysid.sysid.fit.operating_point import reference_gain
+from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals, prepare
+from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
+from pupper_sysid.sysid.fit.structure import (
+    FREE_AIR,
+    SIMULATED,
+    Scales,
+    Structure,
+    candidate,
+    servo_structure,
+)
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
+from pupper_sysid.sysid.recordings.joints import joint_rng
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_NOISE_RAD = 0.02  # of a first fit where no lag could be measured
+_LEAST_NOISE_RAD = 3e-4
+_ROUNDS = 3
+_LEAST_READINGS = 20  # of a run under load: fewer tell nothing that the others do not
+_RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
+_SEARCHED_S = 250.0
+"""Duration of all runs together that a search uses; the final fit uses all."""
+
+
+@dataclass(frozen=True)
+class PreparedJoint:
+    """One joint's trials on the physics clock.
+
+    Attributes
+    ----------
+    joint : str
+    rng : numpy.random.Generator
+    lag : LagBudget
+        Without dead time.
+    scales : Scales
+    reference_voltage_v : float
+        Supply voltage that the stall torque is for; NaN where torques do not depend on it.
+    recorded : tuple of Trial
+        The trials that `runs` is of.
+    runs : tuple of Run
+    noise_rad : tuple of float
+        Size of ordinary residuals of each run [rad].
+    least_rad : float
+        Least noise that a run may have [rad].
+    first : dict of str to (Structure, Fit)
+        First fits, by the structure's name.
+    upsets : tuple of Upset
+        Commands that never arrived; the readings that they touch are not in `runs`.
+    load_notes : tuple of str
+        What the recordings say against the claimed load, in sentences.
+    """
+
+    joint: str
+    rng: np.random.Generator
+    lag: LagBudget
+    scales: Scales
+    reference_voltage_v: float
+    recorded: tuple[Trial, ...]
+    runs: tuple[Run, ...]
+    noise_rad: tuple[float, ...]
+    least_rad: float
+    first: dict[str, tuple[Structure, Fit]]
+    upsets: tuple[Upset, ...]
+    load_notes: tuple[str, ...] = ()
+
+    def fit_rng(self) -> np.random.Generator:
+        """The same generator for every fit, so that a fit does not depend on those before it."""
+        return deepcopy(self.rng)
+
+    def problem(self, structure: Structure) -> Problem:
+        """The fit of a structure to all runs."""
+        return Problem(structure, self.runs, self.noise_rad)
+
+    def searched(self, structure: Structure) -> Problem:
+        """The same with fewer readings at the ends of long runs, as much as a search needs."""
+        total = sum(r.steps * r.step_s for r in self.runs)
+        share = min(_SEARCHED_S / max(total, 1e-9), 1.0)
+        return replace(self.problem(structure), runs=tuple(r.until(share) for r in self.runs))
+
+    def warnings(self) -> Iterator[str]:
+        """What went wrong while the joint was recorded, in sentences."""
+        yield from self.load_notes
+        tone = {
+            t.number: f"at {t.frequency_hz:.3g} Hz" if t.frequency_hz > 0 else f"trial {t.number}"
+            for t in self.recorded
+        }
+        for slip in self.lag.feedback.slips:
+            yield (
+                f"{self.joint}: {tone.get(slip.trial, 'somewhere')} the poll slipped by "
+                f"{1e3 * slip.jump_s:.0f} ms at {slip.time_s:.2f} s ({slip.nats:.0f} nats); "
+                "readings behind it are dated anew."
+            )
+        for upset in self.upsets:
+            lost = "1 command" if upset.commands == 1 else f"{upset.commands} commands"
+            yield (
+                f"{self.joint}: {tone[upset.trial]}, {upset.time_s:.2f} s, {lost} never reached "
+                f"the servo ({upset.nats:.0f} nats); the {len(upset.readings)} readings that this "
+                "touches are left out."
+            )
+
+
+def prepare_joint(
+    joint: str,
+    trials: Sequence[Trial],
+    seed: int,
+    free_air: bool | None = None,
+    known: Mapping[str, NDArray[np.float64]] | None = None,
+) -> PreparedJoint:
+    """Measure the lag of a joint, date its readings, and put its trials on the physics clock.
+
+    Parameters
+    ----------
+    joint : str
+    trials : sequence of Trial
+        All of this joint.
+    seed : int
+    free_air : bool, optional
+        Whether the joint carried no load; by default what its trials tell.
+    known : dict of str to ndarray, optional
+        Values of candidates of free air by name, from an earlier fit to these trials; nothing is
+        fitted then.
+
+    Raises
+    ------
+    InputError
+        If there is too little motion, or none of the load that is claimed.
+    """
+    trials = tuple(trials)
+    if free_air is None:
+        free_air = not (tells_of_load(trials) or droops(trials))
+    rng = joint_rng(seed, joint)
+    lattice = find_poll_lattice(trials, rng.spawn(1)[0])
+    lag = _lag(joint, trials, deepcopy(rng), lattice, free_air)
+    volts = float("nan") if free_air else reference_voltage(trials)
+    recorded, runs = _dated(trials, lattice, volts, free_air)
+    if not runs:
+        raise InputError(f"{joint}: no readings; record again.")
+    scales = FREE_AIR if free_air else scales_of(recorded, runs)
+    # fits of a noise-free servo still meet rounding: a third of a quantisation step
+    least = max(quantum(trials) / 3, _LEAST_NOISE_RAD)
+    scale = max(lag.noise_rad, least) if free_air and np.isfinite(lag.noise_rad) else _NOISE_RAD
+    noise = (max(scale, least),) * len(runs)
+    if known is None:
+        first = _first_fits(scales, runs, noise, rng)
+    else:
+        models = {name: candidate(name) for name in known}
+        first = {n: (models[n], Fit(models[n].encode(v), 0.0)) for n, v in known.items()}
+    upsets: tuple[Upset, ...] = ()
+    for _ in range(_ROUNDS):
+        structure, best = min(first.values(), key=lambda pair: pair[1].cost)
+        values = structure.decode(best.point)
+        motions = _motions(recorded, runs, free_run(structure, values, runs))
+        dated = redate(recorded, lattice, motions)
+        if dated is not lattice and dated.phases != lattice.phases:
+            lattice = dated
+            recorded, runs = _dated(trials, lattice, volts, free_air)
+        noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
+        if not upsets and free_air:  # under load, friction that the model lacks looks the same
+            upsets = _upsets(recorded, lattice, noise, structure, values)
+        if upsets:
+            recorded, runs = _dated(trials, lattice, volts, free_air, upsets)
+            noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
+        if known is None:
+            first = {
+                name: (s, refine(Problem(s, runs, noise), fit.point[None]))
+                for name, (s, fit) in first.items()
+            }
+    if lattice is not lag.feedback:
+        lag = _lag(joint, trials, deepcopy(rng), lattice, free_air)
+    load_notes: tuple[str, ...] = ()
+    if scales.known_load:
+        structure, best = next(iter(first.values()))
+        load_notes = check_claimed_load(
+            joint, recorded, structure, runs, noise, best, least, deepcopy(rng)
+        )
+    return PreparedJoint(
+        joint, rng, lag, scales, volts, recorded, runs, noise, least, first, upsets, load_notes
+    )  # fmt: skip
+
+
+def reference_voltage(trials: Sequence[Trial]) -> float:
+    """Median of the logged or nominal voltages [V]; NaN where torques cannot follow them."""
+    medians, ripple = [], []
+    for t in trials:
+        logged = t.voltage_v
+        if logged is not None and np.isfinite(logged).sum() > 10:
+            known = logged[np.isfinite(logged)]
+            medians.append(float(np.median(known)))
+            if known.std() > 0:
+                ripple.append(float(np.corrcoef(known[1:], known[:-1])[0, 1]))
+        elif t.servo.supply_voltage_v is not None:
+            medians.append(t.servo.supply_voltage_v)
+        else:
+            return float("nan")
+    # a voltage that jumps from reading to reading is the ripple of the pulse width
+    if ripple and np.median(ripple) < _RIPPLE:
+        return float("nan")
+    return float(np.median(medians))
+
+
+def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
+    """Scales of the parameters under load: from the known load, or per inertia without one."""
+    known = all(t.load is not None for t in trials) and any(r.load[0] > 0 for r in runs)
+    ramps = [t.servo.set_point_acceleration_rad_s2 for t in trials]
+    stated = [ramp for ramp in ramps if ramp is not None and np.isfinite(ramp)]
+    inertia = max(float(r.load[0]) for r in runs) if known else 1.0
+    # without gravity the scale is a torque that would reach 10 rad/s within 0.1 s
+    torque = max(max(float(r.load[1]) for r in runs), 100.0 * inertia) if known else 1.0
+    return Scales(
+        torque=torque, inertia=inertia, p_gain=reference_gain(trials).value or 1.0, free_air=False,
+        known_load=known, torque_off=any((r.torque_on < 0.5).any() for r in runs),
+        acceleration_rad_s2=float(np.median(stated)) if stated else float("nan"),
+    )  # fmt: skip
+
+
+def _lag(
+    joint: str, trials: tuple[Trial, ...], rng: np.random.Generator, lattice: PollLattice,
+    free_air: bool,
+) -> LagBudget:  # fmt: skip
+    """The lag in these recordings; under load it is no part of the fit, and may be missing."""
+    try:
+        budget = lag_budget(joint, trials, rng, lattice)
+    except InputError:
+        if free_air:
+            raise
+        nan = float("nan")
+        none = Interval(nan, nan, nan)
+        return LagBudget(
+            joint=joint, raw_lag_s=none, fresh_lag_s=none, lag_s=none, stale_lag_s=nan,
+            command_hold_s=nan, feedback=lattice, quantum_rad=quantum(trials),
+            by_frequency=(), estimators_s={}, noise_rad=nan, warnings=(),
+        )  # fmt: skip
+    if free_air:
+        return budget
+    own = tuple(w for w in budget.warnings if "mechanical stop clips" not in w)  # friction holds it
+    gains = {t.p_gain for t in trials if np.isfinite(t.p_gain)}
+    if len(gains) > 1 or len({str(t.load) for t in trials}) > 1:
+        own = (*own, f"{joint}: the lag is a mean over gains and loads; only the dead time is "
+                     "the servo's own.")  # fmt: skip
+    return replace(budget, warnings=own)
+
+
+def _upsets(
+    recorded: Sequence[Trial],
+    lattice: PollLattice,
+    noise: Sequence[float],
+    structure: Structure,
+    values: NDArray[np.float64],
+) -> tuple[Upset, ...]:
+    """Commands that never arrived, in all trials."""
+
+    def of_trial(trial: Trial, scale: float) -> list[Upset]:
+        read = readings(trial, lattice)
+        time = read.time_s[read.time_s >= trial.send_time_s[0]]
+
+        def simulate(command: NDArray[np.float64]) -> NDArray[np.float64]:
+            run = prepare(replace(trial, command_rad=command), read).in_free_air()
+            return fresh_residuals(structure, values, [run])[0]
+
+        return find_upsets(trial, time, scale, simulate)
+
+    upsets = [of_trial(t, s) for t, s in zip(recorded, noise, strict=True)]
+    return tuple(upset for of_one in upsets for upset in of_one)
+
+
+def _dated(
+    trials: Sequence[Trial], lattice: PollLattice, volts: float, free_air: bool,
+    upsets: Sequence[Upset] = (),
+) -> tuple[tuple[Trial, ...], tuple[Run, ...]]:  # fmt: skip
+    """The trials that have readings that count, as recorded and on the physics clock."""
+    touched = {
+        t.number: [k for u in upsets if u.trial == t.number for k in u.readings] for t in trials
+    }
+    least = 1 if free_air else _LEAST_READINGS + 1
+    pairs = [(t, _without(prepare(t, lattice, volts), touched[t.number])) for t in trials]
+    if free_air:
+        pairs = [(t, run.in_free_air()) for t, run in pairs]
+    used = [(t, r) for t, r in pairs if len(r.sample_step) >= least]
+    return tuple(t for t, _ in used), tuple(r for _, r in used)
+
+
+def _without(run: Run, touched: Sequence[int]) -> Run:
+    """A run without some fresh readings and the rows that show them."""
+    if not touched:
+        return run
+    kept = np.ones(len(run.sample_step), bool)
+    kept[touched] = False
+    shown = np.isin(run.held_step, run.sample_step[~kept])
+    return replace(
+        run, sample_step=run.sample_step[kept], sample_rad=run.sample_rad[kept],
+        row_rad=np.where(shown, np.nan, run.row_rad),
+    )  # fmt: skip
+
+
+def _first_fits(
+    scales: Scales, runs: tuple[Run, ...], noise: tuple[float, ...], rng: np.random.Generator
+) -> dict[str, tuple[Structure, Fit]]:
+    structures = (
+        [candidate(name) for name in ("dc_servo", *SIMULATED)]
+        if scales.free_air
+        else [servo_structure(("back-EMF", "load friction"), scales)]
+    )
+    first: dict[str, tuple[Structure, Fit]] = {}
+    for s in structures:
+        problem, own = Problem(s, runs, noise), deepcopy(rng)
+        near = [s.adopt(t, fit.point) for t, fit in first.values() if s.contains(t)]
+        # the noise follows from this fit, and with it which fits count as equally good
+        first[s.name] = s, search_widely(problem, own, np.array(near), short=True)[0]
+    return first
+
+
+def _motions(
+    recorded: Sequence[Trial], runs: Sequence[Run], tracks: Sequence[NDArray]
+) -> list[Motion]:
+    """Simulated positions as functions of time on the recording's clock."""
+
+    def motion(trial: Trial, run: Run, track: NDArray) -> Motion:
+        edges = trial.send_time_s[0] + run.step_s * np.arange(len(track))
+        return lambda time: np.interp(time, edges, track)
+
+    return [motion(*parts) for parts in zip(recorded, runs, tracks, strict=True)]

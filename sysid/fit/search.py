@@ -1,0 +1,482 @@
+"""Output-error fit of one structure to runs: global starts, local fits, evolution, folds.
+
+One cost serves the search, the local fit, the folds and the posterior: free runs against the
+readings that count, under a soft-L1 loss in units of each run's noise (a late poll must not steer
+the fit), plus wide priors. All candidates are simulated abreast.
+
+The cost of a servo with dry friction has many local optima (delay trades against damping, friction
+against effort). So many seeded starts are simulated once, the best are improved a little, the best
+of those are fitted to convergence, and a population evolves around them. A structure that contains
+another one starts from its fit, too, so that it never costs more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.fit.run import Run, costs, moments_if_later, residuals
+from pupper_sysid.sysid.fit.structure import Structure
+
+_CANDIDATES, _KEEP, _FINAL = 512, 12, 4
+_SHORT, _LONG = 8, 20  # iterations of the local fit
+_WIDE_STEP, _STEP = 0.05, 0.01
+"""Steps of the Jacobian in fitted coordinates: a wide one looks past a rugged cost's dents, one
+smaller than the second drowns in friction's stick-slip."""
+_POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 60, 20
+_LARGEST_BATCH = 4_000_000  # residuals at once
+_LEAST_GAIN = 0.05  # of log-likelihood: far below anything that an interval would notice
+_DELAY_GRID = 2.0  # steps between the delays tried for a start
+_DENSE_DELAYS, _LONG_DELAYS = 40.0, 34  # steps up to which they are dense; how many beyond
+_START_RAD = 0.3  # offset within which a start may lie where no prior says so
+_MOST_FOLDS = 6
+_FOLD_DRAWS, _FOLD_STARTS = 512, 6
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One fit.
+
+    Attributes
+    ----------
+    structure : Structure
+    runs : tuple of Run
+    noise_rad : tuple of float
+        Of each run: the soft-L1 loss bends here, the prior is weighed against it.
+    """
+
+    structure: Structure
+    runs: tuple[Run, ...]
+    noise_rad: tuple[float, ...]
+
+    @cached_property
+    def samples(self) -> int:
+        """Readings that count."""
+        return sum(len(r.sample_step) for r in self.runs)
+
+    def scaled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Residuals in units of their noise, shape (candidates, samples)."""
+        parts = residuals(self.structure, self.structure.decode(points), self.runs)
+        scaled = [r / s for r, s in zip(parts, self.noise_rad, strict=True)]
+        return np.concatenate([np.empty((len(points), 0)), *scaled], axis=1)
+
+    def prior(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minus the logarithm of the prior."""
+        centre, precision = self.structure.prior
+        return 0.5 * np.sum(precision * (points - centre) ** 2, axis=-1)
+
+    def costs(
+        self, points: NDArray[np.float64], ceiling: NDArray[np.float64] | float = np.inf
+    ) -> NDArray[np.float64]:
+        """Cost of each of `points` (candidates, parameters).
+
+        Parameters
+        ----------
+        points : ndarray, shape (candidates, parameters)
+        ceiling : ndarray, shape (candidates,), or float
+            A candidate that costs as much after some runs is not simulated on the others; its cost
+            is what it had by then.
+        """
+        cost = self.prior(points)
+        values = self.structure.decode(points)
+        columns = self.structure.columns(values)
+        for run, noise in zip(self.runs, self.noise_rad, strict=True):
+            (below,) = np.nonzero(cost < ceiling)
+            if not len(below):
+                break
+            cost[below] += costs(self.structure, columns[below], values[below, 0], run, noise)
+        return cost
+
+    def costs_by_run(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Cost of the readings of each run, without the prior, shape (runs, candidates)."""
+        values = self.structure.decode(points)
+        columns = self.structure.columns(values)
+        return np.array([
+            costs(self.structure, columns, values[:, 0], run, noise)
+            for run, noise in zip(self.runs, self.noise_rad, strict=True)
+        ])  # fmt: skip
+
+    def only(self, use: Sequence[bool] | NDArray[np.bool_]) -> Problem:
+        """The same fit to some of the runs."""
+        kept = [i for i, used in enumerate(use) if used]
+        return replace(
+            self, runs=tuple(self.runs[i] for i in kept),
+            noise_rad=tuple(self.noise_rad[i] for i in kept),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of one problem.
+
+    Attributes
+    ----------
+    point : ndarray, shape (parameters,)
+        In fitted coordinates.
+    cost : float
+        Half the sum of robust squared residuals in units of the noise, plus the prior.
+    """
+
+    point: NDArray[np.float64]
+    cost: float
+
+
+def search(
+    problem: Problem,
+    rng: np.random.Generator,
+    more: NDArray[np.float64] | None = None,
+    keep: int = _KEEP,
+    final: int = _FINAL,
+) -> list[Fit]:
+    """Fits from the best of many starts, best first.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : numpy.random.Generator
+    more : ndarray, shape (starts, parameters), optional
+        Further starts, in fitted coordinates.
+    keep : int
+        How many of the starts are improved a little.
+    final : int
+        How many of those are fitted to the end.
+    """
+    starts = Starts(problem, rng).best(np.ones(len(problem.runs), bool), keep)
+    if more is not None and len(more):
+        starts = np.concatenate([starts, more])
+    return refined(problem, starts, final)
+
+
+def search_widely(
+    problem: Problem,
+    rng: np.random.Generator,
+    more: NDArray[np.float64] | None = None,
+    short: bool = False,
+) -> tuple[Fit, NDArray[np.float64]]:
+    """The best fit of `search`, then of a population of its starts that evolves.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : numpy.random.Generator
+    more : ndarray, shape (starts, parameters), optional
+        Further starts, in fitted coordinates.
+    short : bool
+        Fewer generations.
+
+    Returns
+    -------
+    Fit
+    ndarray, shape (population, parameters)
+        The last population.
+    """
+    crowd = Starts(problem, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
+    starts = crowd[:_KEEP]
+    if more is not None and len(more):
+        starts = np.concatenate([starts, more])
+    return evolve(problem, refined(problem, starts), rng, short, crowd)
+
+
+def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:
+    """Fits from starts in fitted coordinates, best first: all a little, the best to the end."""
+    rough = sorted(local(problem, starts, _SHORT, _WIDE_STEP), key=lambda f: f.cost)[:final]
+    ends = local(problem, np.array([f.point for f in rough]), _LONG, _STEP)
+    return sorted([*ends, *rough], key=lambda f: f.cost)
+
+
+def refine(problem: Problem, points: NDArray[np.float64]) -> Fit:
+    """The best local fit from some points (starts, parameters)."""
+    return min(local(problem, points, _LONG, _STEP), key=lambda f: f.cost)
+
+
+class Starts:
+    """Quasi-random parameter vectors, each with the dead time and offset that suit runs best.
+
+    The vectors fill the box of fitted coordinates, within two standard deviations of the prior
+    where there is one. A delay only shifts the motion in time, so that one simulation serves all
+    delays, and any choice of runs (`best`): the most rugged coordinate is not searched.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : numpy.random.Generator
+    count : int
+        How many vectors.
+    """
+
+    def __init__(
+        self, problem: Problem, rng: np.random.Generator, count: int = _CANDIDATES
+    ) -> None:
+        self._problem = problem
+        structure = problem.structure
+        values = structure.decode(_sobol(structure, rng, count))
+        first = structure.parameters[0]
+        values[:, 0], values[:, -1] = first.low, 0.0
+        longest = (first.high - first.low) / TIME_STEP_S
+        # as dense as a twentieth of the delay, and never denser than two steps
+        later = np.unique(np.concatenate([
+            np.arange(0.0, min(longest, _DENSE_DELAYS), _DELAY_GRID),
+            np.geomspace(_DENSE_DELAYS, max(longest, _DENSE_DELAYS), _LONG_DELAYS).round(),
+        ]))  # fmt: skip
+        self._values, self._later_s = values, TIME_STEP_S * later
+        self._moments = np.array([
+            moments_if_later(structure, values, run, later * TIME_STEP_S / run.step_s)
+            for run in problem.runs
+        ])  # fmt: skip
+
+    def best(self, use: NDArray[np.bool_], keep: int) -> NDArray[np.float64]:
+        """The `keep` of the lowest cost on some of the runs, in fitted coordinates."""
+        problem = self._problem.only(use)
+        total, square = self._moments[np.asarray(use, bool)].sum(axis=0) / max(problem.samples, 1)
+        delay = np.argmin(square - total**2, axis=0)
+        values = self._values.copy()
+        values[:, 0] += self._later_s[delay]
+        spread = (square - total**2)[delay, np.arange(len(delay))]
+        likely = np.argsort(spread)[: 8 * keep]
+        precision = problem.structure.prior[1]
+        values = values[likely]
+        if precision[-1] == 0:
+            values[:, -1] = -total[delay, np.arange(len(delay))][likely]
+        points = np.clip(problem.structure.encode(values), *problem.structure.box)
+        # by the readings alone: a prior that is off would leave out what suits them best
+        return points[np.argsort(problem.costs(points) - problem.prior(points))[:keep]]
+
+
+def _sobol(structure: Structure, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Points that fill the prior's middle, shape (count, parameters)."""
+    from scipy.stats import qmc  # half a second to import
+
+    low, high = structure.box
+    centre, precision = structure.prior
+    reach = 2.0 / np.sqrt(np.maximum(precision, 1e-12))
+    reach = np.where(structure.logarithmic, reach, np.minimum(reach, _START_RAD))
+    low, high = np.maximum(low, centre - reach), np.minimum(high, centre + reach)
+    points = low + qmc.Sobol(len(low), rng=rng).random(count) * (high - low)
+    points[0] = centre
+    return points
+
+
+def local(
+    problem: Problem, starts: NDArray[np.float64], iterations: int, difference: float
+) -> list[Fit]:
+    """Levenberg-Marquardt from every start (starts, parameters), all abreast.
+
+    Parameters
+    ----------
+    problem : Problem
+    starts : ndarray, shape (starts, parameters)
+        In fitted coordinates.
+    iterations : int
+        At most; starts that no longer improve drop out.
+    difference : float
+        Step of the Jacobian.
+    """
+    structure = problem.structure
+    low, high = structure.box
+    scale = structure.scale
+    z = np.clip(starts, low, high)
+    k = z.shape[1]
+    cost, gradient, curvature = _slopes(problem, z, difference)
+    damp, stalled = np.full(len(z), 1e-2), np.zeros(len(z), int)
+    for _ in range(iterations):
+        active = np.flatnonzero(stalled < 2)
+        if not len(active):
+            break
+        here, slope, bent = z[active], gradient[active], curvature[active]
+        # a coordinate pressed against its bound must not hold back the others
+        go = ~(((here <= low) & (slope > 0)) | ((here >= high) & (slope < 0)))
+        diagonal = np.diagonal(bent, axis1=1, axis2=2) + 1e-9
+        matrix = bent + np.eye(k) * (damp[active, None] * diagonal)[:, None]
+        matrix = np.where(go[:, :, None] & go[:, None], matrix, np.eye(k))
+        move = np.linalg.solve(matrix, np.where(go, -slope, 0.0)[..., None])[..., 0]
+        longest = np.max(np.abs(move) / scale, axis=1, keepdims=True)
+        new = np.clip(here + move * np.minimum(1.0, 1.0 / np.maximum(longest, 1e-12)), low, high)
+        cost_new, gradient_new, curvature_new = _slopes(problem, new, difference)
+        gained = cost[active] - cost_new
+        better = gained > 0
+        moved = active[better]
+        z[moved], cost[moved] = new[better], cost_new[better]
+        gradient[moved], curvature[moved] = gradient_new[better], curvature_new[better]
+        damp[active] = np.where(
+            better, np.maximum(damp[active] / 4, 1e-6), np.minimum(damp[active] * 6, 1e6)
+        )
+        stalled[active] = np.where(gained < _LEAST_GAIN, stalled[active] + 1, 0)
+    return [Fit(point, float(c)) for point, c in zip(z, cost, strict=True)]
+
+
+def curvature(problem: Problem, point: NDArray[np.float64], difference: float) -> NDArray:
+    """Hessian of the cost at a point, Gauss-Newton's, shape (parameters, parameters)."""
+    return _slopes(problem, point[None], difference)[2][0]
+
+
+def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArray, ...]:
+    """Cost, gradient and curvature at points (starts, parameters)."""
+    structure, k = problem.structure, points.shape[1]
+    _, high = structure.box
+    centre, precision = structure.prior
+    step = difference * structure.scale
+    away = np.where(points + step > high, -1.0, 1.0) * step
+    pull = precision * (points - centre)
+    cost, gradient = problem.prior(points), np.empty(points.shape)
+    bent = np.empty((len(points), k, k))
+    together = max(1, _LARGEST_BATCH // max(problem.samples * (k + 1), 1))
+    for first in range(0, len(points), together):
+        at = slice(first, first + together)
+        cloud = np.repeat(points[at, None, :], k + 1, axis=1)
+        cloud[:, 1:] += away[at, None, :] * np.eye(k)
+        r = problem.scaled(cloud.reshape(-1, k)).reshape(len(cloud), k + 1, -1)
+        jacobian = (r[:, 1:] - r[:, :1]) / away[at][:, :, None]
+        root = np.sqrt(1.0 + r[:, 0] ** 2)
+        weighted = jacobian / root[:, None]
+        cost[at] += np.sum(root - 1.0, axis=-1)
+        gradient[at] = (weighted @ r[:, 0, :, None])[..., 0] + pull[at]
+        bent[at] = weighted @ jacobian.mT + np.diag(precision)
+    return cost, gradient, bent
+
+
+def evolve(
+    problem: Problem,
+    fits: Sequence[Fit],
+    rng: np.random.Generator,
+    short: bool = False,
+    crowd: NDArray[np.float64] | None = None,
+) -> tuple[Fit, NDArray[np.float64]]:
+    """The best of a population that evolves around fits, fitted to the end.
+
+    Differential evolution finds its way between the local optima of a servo with dry friction,
+    where a gradient does not.
+
+    Parameters
+    ----------
+    problem : Problem
+    fits : sequence of Fit
+    rng : numpy.random.Generator
+    short : bool
+        Fewer generations.
+    crowd : ndarray, shape (places, parameters), optional
+        Further members, in fitted coordinates.
+
+    Returns
+    -------
+    Fit
+    ndarray, shape (population, parameters)
+        The last population.
+    """
+    low, high = problem.structure.box
+    seeds = np.array([f.point for f in fits])
+    if crowd is not None:
+        seeds = np.concatenate([seeds, crowd])
+    seeds = seeds[:_POPULATION]
+    spread = 0.3 * problem.structure.scale
+    around = seeds[rng.integers(0, min(len(fits), len(seeds)), _POPULATION)]
+    z = np.clip(around + spread * rng.standard_normal(around.shape), low, high)
+    z[: len(seeds)] = seeds
+    cost = problem.costs(z)
+    everyone = np.arange(len(z))
+    for _ in range(_SHORT_GENERATIONS if short else _GENERATIONS):
+        one, two = (rng.permutation(everyone) for _ in range(2))
+        toward = z[np.argsort(cost)[rng.integers(0, 6, len(z))]]
+        factor = rng.uniform(0.4, 0.9, (len(z), 1))
+        trial = z + factor * (toward - z) + factor * (z[one] - z[two])
+        keep = rng.random(z.shape) > 0.9
+        trial = np.clip(np.where(keep, z, trial), low, high)
+        new = problem.costs(trial, cost)
+        better = new < cost
+        z[better], cost[better] = trial[better], new[better]
+    best = refine(problem, z[np.argsort(cost)[:2]])
+    return min(best, *fits, key=lambda f: f.cost), z
+
+
+# ------------------------------------------------------------------------------- folds
+
+
+def folds_of(runs: Sequence[Run]) -> dict[str, NDArray[np.bool_]]:
+    """Which runs are left out together: a tone, or else a part of the runs of every gain and load.
+
+    Returns
+    -------
+    dict of str to ndarray of bool, shape (runs,)
+        True where left out, by what is. A tone is named by its frequency [Hz]. Of many tones some
+        are picked, evenly; runs without tones are divided in as many parts, all of a gain between
+        others besides. Empty if there is only one run or tone.
+    """
+    tones = np.array([r.tone for r in runs])
+    labels = [r.label for r in runs]
+    if len(runs) and (tones > 0).all() and len({r.p_gain for r in runs}) == 1:
+        names = np.unique(tones)
+        if len(names) < 2:
+            return {}
+        if len(names) > _MOST_FOLDS:  # a fine sweep: every n-th frequency says as much
+            names = names[np.round(np.linspace(0, len(names) - 1, _MOST_FOLDS)).astype(int)]
+        return {f"{name:g}": tones == name for name in np.unique(names)}
+    if len(runs) < 2:
+        return {}
+    count = min(4, len(runs))
+    kinds = list(dict.fromkeys(labels))
+    turn = [labels[:n].count(x) + kinds.index(x) for n, x in enumerate(labels)]
+    folds = {
+        f"part {k + 1} of {count}": np.array([t % count == k for t in turn]) for k in range(count)
+    }
+    gains = sorted({r.p_gain for r in runs})
+    for gain in gains[1:-1][:2]:
+        folds[f"P {gain:g}"] = np.array([r.p_gain == gain for r in runs])
+    return {name: out for name, out in folds.items() if out.any() and not out.all()}
+
+
+def group_count(runs: Sequence[Run]) -> int:
+    """Groups of readings of which `folds_of` leaves out one at a time."""
+    tones = {r.tone for r in runs}
+    return len(tones) if min(tones) > 0 else min(4, len(runs))
+
+
+def fit_folds(
+    problem: Problem,
+    folds: Mapping[str, NDArray[np.bool_]],
+    rng: np.random.Generator,
+    draws: NDArray[np.float64] | None = None,
+    parents: Sequence[tuple[Structure, Sequence[Fit]]] = (),
+) -> list[Fit]:
+    """The best fit without each fold's runs.
+
+    A fold's fit is the lowest cost on its own runs, from draws of the posterior (from starts all
+    over the box without any), and from the fits of simpler structures to the same runs: so it is
+    as good an optimum as that of all runs.
+
+    Parameters
+    ----------
+    problem : Problem
+        All runs.
+    folds : dict of str to ndarray of bool
+        From `folds_of`.
+    rng : numpy.random.Generator
+    draws : ndarray, shape (draws, parameters), optional
+        In fitted coordinates.
+    parents : sequence of (Structure, sequence of Fit)
+        Structures that this one contains, and their fits, one per fold.
+    """
+    if not folds:
+        return []
+    starts, by_run = None, None
+    if draws is None:
+        starts = Starts(problem, rng)
+    else:
+        draws = np.unique(draws, axis=0)
+        draws = draws[rng.permutation(len(draws))[:_FOLD_DRAWS]]
+        by_run = problem.costs_by_run(draws)
+    fits = []
+    for n, out in enumerate(folds.values()):
+        part = problem.only(~out)
+        if starts is not None:
+            crowd = [starts.best(~out, _KEEP)]
+        else:
+            whole = by_run[~out].sum(axis=0) + problem.prior(draws)
+            crowd = [draws[np.argsort(whole)[:_FOLD_STARTS]]]
+        for parent, own in parents:
+            crowd.append(problem.structure.adopt(parent, own[n].point[None]))
+        fits.append(refined(part, np.concatenate(crowd), 2)[0])
+    return fits

@@ -1,0 +1,444 @@
+"""Structures of a servo that are fitted: which terms it has, their boxes and priors.
+
+A servo is a position loop with an effort limit, a limit on its speed, dry friction, inertia and a
+dead time; `FEATURES` are what may be added. In free air the armature is 1 and there is no load:
+positions tell torques per inertia only. Under a known load torques are in N·m. A `Structure`
+translates between fitted coordinates and the columns of `sysid.fit.kernel`; `SERVO_TERMS` is the
+one table of its numbers.
+
+The linear models (a pure delay, one and two poles) are what other people fit, and stand beside the
+servo in tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
+from pupper_sysid.sysid.fit import kernel
+
+LONGEST_DEAD_TIME_S = 0.4
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a structure, fitted as its logarithm unless it may be negative.
+
+    Attributes
+    ----------
+    name : str
+        Ends in its unit where that does not depend on the load.
+    nominal, low, high : float
+        Where the search starts and the box it stays in.
+    prior_sd : float
+        Standard deviation of a Gaussian prior about `nominal`, of the logarithm where that is
+        what is fitted. Wide: it decides only what the data leave open, such as a speed limit
+        that was never reached.
+    """
+
+    name: str
+    nominal: float
+    low: float
+    high: float
+    prior_sd: float = float("inf")
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether the logarithm is fitted."""
+        return self.low > 0
+
+    def encode(self, value):
+        """Fitted coordinate of a value."""
+        return np.log(value) if self.logarithmic else np.asarray(value, float)
+
+    def decode(self, coordinate):
+        """Value of a fitted coordinate."""
+        return np.exp(coordinate) if self.logarithmic else np.asarray(coordinate, float)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What the recordings of a joint say of its load, which places the search.
+
+    Attributes
+    ----------
+    torque : float
+        Of the load: its gravity, or what moves it [N·m]; 1 without a known load.
+    inertia : float
+        Of the load [kg·m²]; 1 without a known load.
+    p_gain : float
+        The gain that `stiffness` is for; 1 where the recordings do not say it.
+    free_air : bool
+        Whether the joint moved without a load at one gain.
+    known_load : bool
+        Whether torques are in N·m; otherwise they are per inertia.
+    torque_off : bool
+        Whether a run has the torque switched off.
+    acceleration_rad_s2 : float
+        Limit on the set-point's acceleration that headers state; NaN if none.
+    """
+
+    torque: float = 1.0
+    inertia: float = 1.0
+    p_gain: float = 1.0
+    free_air: bool = True
+    known_load: bool = False
+    torque_off: bool = False
+    acceleration_rad_s2: float = float("nan")
+
+    @property
+    def gravity(self) -> bool:
+        """Whether the gravity of an unknown load is fitted."""
+        return not (self.free_air or self.known_load)
+
+
+FREE_AIR = Scales()
+
+FEATURES: dict[str, tuple[str, ...]] = {
+    "slew": ("velocity_limit_rad_s",),
+    "back-EMF": ("no_load_speed_rad_s",),
+    "damping": ("damping",),
+    "backlash": ("backlash_rad",),
+    "load friction": ("load_friction_motor", "load_friction_load"),
+    "quadratic": ("load_friction_quadratic",),
+    "torque limit": ("torque_limit_share",),
+    "stribeck": ("stribeck_friction", "stribeck_speed_rad_s"),
+    "static": ("load_friction_static", "stribeck_speed_rad_s"),
+    "acceleration": ("acceleration_limit",),
+    "dead zone": ("dead_zone_rad",),
+    "start duty": ("start_duty",),
+}
+"""Terms beside stiffness, effort limit and dry friction, and their parameters."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """One number of the servo: a row of `SERVO_TERMS`.
+
+    Attributes
+    ----------
+    name : str
+        Under a known load; a torque then is in N·m.
+    free_name : str
+        Per inertia, the unit in its name.
+    column : str
+        Of the kernel, or what the column follows from (`Structure.columns`).
+    scale : {"", "torque", "inertia", "per torque"}
+        What `nominal`, `low` and `high` are in.
+    nominal, low, high, prior_sd : float
+        Under load: a factor of 5 to 10 either way.
+    free : tuple of float, optional
+        Nominal value, box and prior of a hobby servo in free air, per inertia.
+    """
+
+    name: str
+    free_name: str
+    column: str
+    scale: str
+    nominal: float
+    low: float
+    high: float
+    prior_sd: float
+    free: tuple[float, float, float, float] | None = None
+
+
+# Free air: the priors cover hobby servos. Speed: data sheets say 0.08 to 0.2 s per 60 degrees, 13
+# to 5 rad/s, about a geometric mean of 8.3. The rest: stiff enough to hold a leg, and torque enough
+# to bring it to that speed within a few hundredths of a second.
+SERVO_TERMS = {t.name: t for t in (
+    Term("dead_time_s", "dead_time_s", "", "", 0.015, 1e-4, LONGEST_DEAD_TIME_S, 1.5,
+         (0.02, 0.001, LONGEST_DEAD_TIME_S, np.inf)),
+    Term("stiffness", "stiffness_per_s2", "stiffness", "torque", 5, 0.02, 2000, 2.0,
+         (9000.0, 30.0, 200000.0, 1.0)),
+    Term("damping", "damping_per_s", "damping", "torque", 0.05, 1e-5, 200, 2.0,
+         (90.0, 0.05, 2000.0, 1.0)),
+    Term("friction_loss", "friction_rad_s2", "friction_loss", "torque", 0.1, 1e-5, 10, 2.0,
+         (120.0, 0.1, 10000.0, 1.2)),
+    Term("stall_torque", "effort_rad_s2", "effort_limit", "torque", 3, 0.05, 300, 1.2,
+         (450.0, 5.0, 20000.0, 0.6)),
+    Term("velocity_limit_rad_s", "velocity_limit_rad_s", "velocity_limit", "",
+         8.3, 0.3, 200.0, 0.8, (8.3, 0.3, 60.0, 0.3)),
+    Term("no_load_speed_rad_s", "no_load_speed_rad_s", "back_emf", "", 9.0, 0.3, 200.0, 0.8,
+         (9.0, 0.3, 60.0, 0.4)),
+    Term("armature", "armature", "armature", "inertia", 0.3, 1e-4, 300, 2.0),
+    Term("backlash_rad", "backlash_rad", "backlash_rad", "", 0.01, 5e-4, 0.15, 1.0),
+    Term("hanging_rad", "hanging_rad", "hanging_rad", "", 0.0, -0.3, 0.3, 0.03),
+    Term("off_brake", "off_brake", "off_brake", "", 0.5, 0.0, 1.0, 1.0),
+    Term("gravity_sin", "gravity_sin", "gravity_nm", "torque", 0.0, -2, 2, 0.3),
+    Term("gravity_cos", "gravity_cos", "gravity_nm", "torque", 0.0, -2, 2, 0.3),
+    Term("load_friction_motor", "load_friction_motor", "load_friction_motor", "",
+         0.1, 1e-4, 0.95, 2.0),
+    Term("load_friction_load", "load_friction_load", "load_friction_load", "",
+         0.05, 1e-4, 0.95, 2.0),
+    Term("load_friction_quadratic", "load_friction_quadratic", "load_friction_quadratic",
+         "per torque", 0.05, 1e-5, 10, 2.0),
+    Term("load_friction_static", "load_friction_static", "load_friction_static", "",
+         0.3, 1e-3, 20.0, 2.0),
+    Term("torque_limit_share", "torque_limit_share", "torque_limit", "", 0.8, 0.1, 1.0, 0.5),
+    Term("stribeck_friction", "stribeck_friction", "stribeck_friction", "torque",
+         0.05, 1e-5, 10, 2.0),
+    Term("stribeck_speed_rad_s", "stribeck_speed_rad_s", "stribeck_speed", "",
+         0.1, 0.005, 3.0, 1.5),
+    Term("acceleration_limit", "acceleration_limit", "acceleration_limit", "",
+         60.0, 1.0, 3000.0, 1.2),
+    Term("dead_zone_rad", "dead_zone_rad", "dead_zone_rad", "", 0.003, 1e-4, 0.05, 1.0),
+    Term("start_duty", "start_duty", "start_duty", "", 0.01, 1e-4, 0.2, 1.5),
+    Term("offset_rad", "offset_rad", "offset_rad", "", 0.0, -0.3, 0.3, 0.02,
+         (0.0, -2.0, 2.0, np.inf)),
+)}  # fmt: skip
+"""Numbers of a servo, by name, in the order in which they are fitted."""
+
+_LEAST_SCALE = 0.02  # of angles [rad]
+_STATED_SD = 0.03  # of the logarithm of a limit that a register states
+_KNOWN_OFFSET_SD_RAD = 0.002  # where command and reading share the encoder's zero
+_BASE = ("dead_time_s", "stiffness", "damping", "friction_loss", "stall_torque")
+_NEUTRAL = {
+    "torque_limit_share": 0.98, "acceleration_limit": 500.0, "stribeck_speed_rad_s": 0.1,
+    "off_brake": 0.5,
+}  # fmt: skip
+"""Values with nearly no effect, of numbers whose least value is not that."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is fitted: some numbers of a servo, or a linear model.
+
+    Attributes
+    ----------
+    name : str
+    parameters : tuple of Parameter
+        The dead time [s] is the first and the offset [rad] the last, in every structure.
+    kind : int
+        Which arithmetic of `sysid.fit.kernel` it is.
+    features : tuple of str
+        Of `FEATURES`, of a servo.
+    scales : Scales
+    columns_of : callable or None
+        From values (candidates, parameters) to the kernel's columns, where those do not follow from
+        the parameters' names.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    kind: int = kernel.SERVO
+    features: tuple[str, ...] = ()
+    scales: Scales = FREE_AIR
+    columns_of: Callable[[NDArray], NDArray] | None = None
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of `parameters`."""
+        return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def logarithmic(self) -> NDArray[np.bool_]:
+        """Which coordinates are logarithms."""
+        return np.array([p.logarithmic for p in self.parameters])
+
+    @cached_property
+    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bounds of the fitted coordinates, shape (parameters,) each."""
+        ends = np.array([[float(p.encode(x)) for x in (p.low, p.high)] for p in self.parameters])
+        return ends[:, 0], ends[:, 1]
+
+    @cached_property
+    def prior(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centre and precision (inverse variance) of the fitted coordinates."""
+        centre = np.array([float(p.encode(p.nominal)) for p in self.parameters])
+        return centre, np.array([p.prior_sd**-2.0 for p in self.parameters])
+
+    @cached_property
+    def scale(self) -> NDArray[np.float64]:
+        """Length of a usual move of each fitted coordinate: of logarithms 1, else by the prior."""
+        return np.array([
+            1.0 if p.logarithmic
+            else max(0.1 * p.prior_sd, _LEAST_SCALE) if np.isfinite(p.prior_sd)
+            else _LEAST_SCALE
+            for p in self.parameters
+        ])  # fmt: skip
+
+    def encode(self, values: NDArray) -> NDArray[np.float64]:
+        """Fitted coordinates of values (..., parameters)."""
+        points = np.array(values, float)
+        points[..., self.logarithmic] = np.log(points[..., self.logarithmic])
+        return points
+
+    def decode(self, points: NDArray) -> NDArray[np.float64]:
+        """Values of fitted coordinates (..., parameters)."""
+        values = np.array(points, float)
+        values[..., self.logarithmic] = np.exp(values[..., self.logarithmic])
+        return values
+
+    def columns(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Columns of the kernel for values (candidates, parameters)."""
+        if self.columns_of is not None:
+            return self.columns_of(values)
+        if self.kind != kernel.SERVO:
+            return values[:, 1:].copy()
+        by_name = dict(zip(self.names, values.T, strict=True))
+        own = {_TERM[name].name: value for name, value in by_name.items()}
+        effort, zero = own["stall_torque"], np.zeros(len(values))
+        sine, cosine = own.get("gravity_sin", zero), own.get("gravity_cos", zero)
+        numbers = {SERVO_TERMS[name].column: value for name, value in own.items()}
+        numbers |= {
+            "stiffness": own["stiffness"] / self.scales.p_gain,
+            "gravity_nm": np.hypot(sine, cosine),
+            "hanging_rad": own.get("hanging_rad", zero) + np.arctan2(cosine, sine),
+        }
+        if "no_load_speed_rad_s" in own:
+            numbers["back_emf"] = effort / own["no_load_speed_rad_s"]
+        if "torque_limit_share" in own:
+            numbers["torque_limit"] = own["torque_limit_share"] * effort
+        columns = np.tile(kernel.ABSENT, (len(values), 1))
+        for j, name in enumerate(kernel.COLUMNS):
+            if name in numbers:
+                columns[:, j] = numbers[name]
+        return columns
+
+    def contains(self, other: Structure) -> bool:
+        """Whether this structure can move as the other does, for some of its numbers."""
+        both_servos = self.kind == other.kind == kernel.SERVO
+        return both_servos and self is not other and set(other.features) < set(self.features)
+
+    def adopt(self, other: Structure, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points of another structure as points of this one; what is new is nearly without effect.
+
+        Parameters
+        ----------
+        other : Structure
+        points : ndarray, shape (..., parameters of the other)
+        """
+        low, high = self.box
+        adopted = np.empty((*points.shape[:-1], len(self.parameters)))
+        for j, p in enumerate(self.parameters):
+            if p.name in other.names:
+                adopted[..., j] = points[..., other.names.index(p.name)]
+            elif p.name in _NEUTRAL or not p.logarithmic:
+                adopted[..., j] = float(p.encode(_NEUTRAL.get(p.name, p.nominal)))
+            else:
+                adopted[..., j] = low[j]
+        return np.clip(adopted, low, high)
+
+    def servo(self, values: NDArray[np.float64]) -> LoadedServoParameters:
+        """The servo of one vector of values, its torques per inertia without a known load."""
+        return loaded_servo(self.columns(values[None])[0], float(values[0]))
+
+
+_TERM = {name: t for t in SERVO_TERMS.values() for name in (t.name, t.free_name)}
+
+
+def servo_structure(
+    features: Sequence[str], scales: Scales = FREE_AIR, name: str = ""
+) -> Structure:
+    """The servo with some features.
+
+    Parameters
+    ----------
+    features : sequence of str
+        Of `FEATURES`.
+    scales : Scales
+    name : str
+        By default the features in words.
+    """
+    wanted = [n for n in _BASE if n != "damping"]
+    wanted += dict.fromkeys(n for f in features for n in FEATURES[f])
+    if scales.known_load:
+        wanted += ["armature", "hanging_rad"]
+    if scales.torque_off:
+        wanted.append("off_brake")
+    if scales.gravity:
+        wanted += ["gravity_sin", "gravity_cos"]
+    wanted.append("offset_rad")
+    parameters = tuple(_parameter(t, scales) for n, t in SERVO_TERMS.items() if n in wanted)
+    words = " + ".join(f for f in features if f not in ("back-EMF", "damping")) or "base"
+    return Structure(name or words, parameters, features=tuple(features), scales=scales)
+
+
+def _parameter(term: Term, scales: Scales) -> Parameter:
+    """The number of the table as it is fitted."""
+    if scales.free_air and term.free is not None:
+        return Parameter(term.free_name, *term.free)
+    name = term.name if scales.known_load else term.free_name
+    # per inertia, torques are about those of a joint that gains 10 rad/s within 0.1 s
+    torque = scales.torque if scales.known_load else 100.0
+    factor = {
+        "": 1.0, "torque": torque, "inertia": scales.inertia, "per torque": 1.0 / torque
+    }[term.scale]  # fmt: skip
+    nominal, low, high, sd = term.nominal, term.low, term.high, term.prior_sd
+    if term.name == "acceleration_limit" and np.isfinite(scales.acceleration_rad_s2):
+        nominal, sd = scales.acceleration_rad_s2, _STATED_SD
+    if term.scale == "torque" and term.name.startswith("gravity"):
+        sd *= factor
+    if term.name == "offset_rad" and scales.known_load:
+        sd = _KNOWN_OFFSET_SD_RAD
+    return Parameter(name, factor * nominal, factor * low, factor * high, sd)
+
+
+def _linear(name: str, *parameters: Parameter) -> Structure:
+    delay, offset = (_parameter(SERVO_TERMS[n], FREE_AIR) for n in ("dead_time_s", "offset_rad"))
+    gain = Parameter("gain", 1.0, 0.5, 1.5)
+    return Structure(name, (delay, gain, *parameters, offset), kernel.LINEAR[name])
+
+
+LINEAR = (
+    _linear("pure_delay"),
+    _linear("fopdt", Parameter("time_constant_s", 0.02, 0.0005, 0.5)),
+    _linear(
+        "sopdt",
+        Parameter("natural_frequency_rad_s", 90.0, 8.0, 600.0),
+        Parameter("damping_ratio", 0.8, 0.1, 4.0),
+    ),
+)
+"""Linear models, simplest first."""
+
+PREFERRED = "delayed_pd"
+"""DelayedPD with a set-point of limited rate: what a simulator runs unless the data say more."""
+
+SIMULATED = (PREFERRED, "delayed_pd_back_emf")
+"""Structures in free air that simulators and training can run: DelayedPD with one limit on its
+speed."""
+
+CANDIDATES = (
+    *LINEAR,
+    servo_structure(("back-EMF",), name="dc_servo"),
+    servo_structure(("damping", "slew"), name=PREFERRED),
+    servo_structure(("damping", "back-EMF"), name=SIMULATED[1]),
+    servo_structure(("damping", "slew", "backlash"), name="delayed_pd_backlash"),
+)
+"""What is fitted to a joint in free air, simplest first."""
+
+
+def candidate(name: str) -> Structure:
+    """The candidate of free air called `name`."""
+    return next(s for s in CANDIDATES if s.name == name)
+
+
+def loaded_servo(columns: NDArray[np.float64], dead_time_s: float) -> LoadedServoParameters:
+    """The servo of one row of the kernel's columns; its stiffness is per unit of the P gain."""
+    own = {name: float(x) for name, x in zip(kernel.COLUMNS, columns, strict=True)}
+    stall = own["effort_limit"]
+    shared = {f.name for f in fields(LoadedServoParameters)} & own.keys()
+    return LoadedServoParameters(
+        duty_per_rad=own["stiffness"] / stall, duty_s_per_rad=own["damping"] / stall,
+        stall_torque=stall, dead_time_s=dead_time_s, **{name: own[name] for name in shared},
+    )  # fmt: skip
+
+
+def loaded_columns(servo: LoadedServoParameters) -> NDArray[np.float64]:
+    """The kernel's columns of a servo, shape (columns,): stiffness per unit of the P gain."""
+    own = {name: float(x) for name, x in servo.arrays().items()}
+    stall = own["stall_torque"]
+    own |= {
+        "stiffness": own["duty_per_rad"] * stall, "damping": own["duty_s_per_rad"] * stall,
+        "effort_limit": stall,
+    }  # fmt: skip
+    columns = kernel.ABSENT.copy()
+    for j, name in enumerate(kernel.COLUMNS):
+        if name in own:
+            columns[j] = own[name]
+    return columns

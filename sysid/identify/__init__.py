@@ -1,1 +1,0 @@
-"""Output-error identification of servo models; calibration of joints and fleets."""

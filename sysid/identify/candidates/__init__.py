@@ -1,1 +1,0 @@
-"""Candidate servo models of calibration, and their compiled simulation."""

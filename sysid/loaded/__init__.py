@@ -1,1 +1,0 @@
-"""Identify servos under load: position loop, motor, friction and gravity, in N·m."""

@@ -1,0 +1,34 @@
+"""Runs on the physics clock, made from arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.fit.run import Run
+from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S
+
+PAD = int(LONGEST_DEAD_TIME_S / TIME_STEP_S) + 4
+NOTHING = np.empty(0)
+
+
+def run_of(
+    command: NDArray[np.float64],
+    frequency_hz: float = float("nan"),
+    rest_rad: float = 0.0,
+    sample_step: NDArray[np.float64] = NOTHING,
+    sample_rad: NDArray[np.float64] = NOTHING,
+    row_step: NDArray[np.float64] | None = None,
+    held_step: NDArray[np.float64] | None = None,
+    row_rad: NDArray[np.float64] | None = None,
+) -> Run:
+    """A run in free air under `command` [rad], one a step; its rows are its samples by default."""
+    row_step = sample_step if row_step is None else row_step
+    return Run(
+        label="trial 0", frequency_hz=frequency_hz, p_gain=1.0, load=np.zeros(3),
+        held=np.concatenate([np.full(PAD, rest_rad), command])[None], pad=PAD, start_rad=rest_rad,
+        sample_step=sample_step, sample_rad=sample_rad, row_step=row_step,
+        held_step=row_step if held_step is None else held_step,
+        row_rad=sample_rad if row_rad is None else row_rad,
+    )  # fmt: skip

@@ -1,0 +1,98 @@
+"""A limit on the set-point's acceleration is found in the recordings that have it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.servo_models.cards.files import load_card
+from pupper_sysid.servo_models.cards.numbers import LoadedLoop, stated
+from pupper_sysid.servo_models.loaded_servo import LoadedServo, LoadedServoParameters
+from pupper_sysid.sysid.compare.compare import compare
+from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.recordings.recording import Recording
+
+LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.002, 0.02, 600
+JUMPS, CHIRP = "jumps", "chirp"
+
+
+def random_servo(limit: float, seed: int) -> LoadedServoParameters:
+    """A servo with friction that the fitted structure lacks."""
+    rng = np.random.default_rng(seed)
+    return LoadedServoParameters(
+        duty_per_rad=rng.uniform(0.1, 0.4), duty_s_per_rad=0.0, stall_torque=rng.uniform(2.4, 5),
+        back_emf=rng.uniform(0.6, 1.0), armature=0.02, friction_loss=rng.uniform(0.04, 0.12),
+        dead_time_s=rng.uniform(0.004, 0.02), stribeck_friction=rng.uniform(0.02, 0.08),
+        acceleration_limit=limit,
+    )  # fmt: skip
+
+
+def recording(
+    motion: str, limit: float, seed: int = 0, registers: dict[str, int] | None = None
+) -> Recording:
+    """What a random servo does, in counts; no load is stated."""
+    time = LOOP_S * np.arange(ROWS)
+    if motion == CHIRP:
+        command = 0.15 * np.sin(2 * np.pi * np.cumsum(np.linspace(0.2, 4.0, ROWS)) * LOOP_S)
+    else:
+        rng = np.random.default_rng(seed)
+        command = np.repeat(rng.choice([-0.12, 0.12], ROWS // 30), 30)
+    servo = LoadedServo(random_servo(limit, seed), 16.0, time_step_s=STEP_S)
+    servo.reset(command[0])
+    per = round(LOOP_S / STEP_S)
+    moved = servo.rollout(np.repeat(command, per))[per - 2 :: per]
+    count = 2 * np.pi / 4096
+    table = pd.DataFrame(
+        {
+            "send_time_s": time, "read_time_s": time + LOOP_S - STEP_S, "trial": 0, "joint": "j",
+            "frequency_hz": np.nan, "command_rad": command,
+            "position_rad": np.round(moved / count) * count,
+        }
+    )  # fmt: skip
+    setup = {"p_gain": 16.0, "registers": registers or {}}
+    header = {
+        "readings": "live", "joints": ["j"], "start_pose_rad": {"j": float(command[0])},
+        "servos": {"j": setup},
+    }  # fmt: skip
+    return Recording.from_frame(table, metadata=header, name=motion)
+
+
+@pytest.mark.slow
+def test_a_limit_of_the_servo_is_found_in_fast_motion():
+    fit = calibrate([recording(CHIRP, LIMIT_RAD_S2, 2), recording(JUMPS, LIMIT_RAD_S2, 2)])
+    limit = fit.calibration.joint("j").under_load.acceleration_limit_rad_s2
+    assert limit.identified == "yes" and limit.value == pytest.approx(LIMIT_RAD_S2, rel=0.05)
+    assert limit.low <= LIMIT_RAD_S2 <= limit.high
+
+
+@pytest.mark.slow
+def test_no_limit_is_found_where_there_is_none():
+    block = calibrate([recording(CHIRP, np.inf, 3), recording(JUMPS, np.inf, 3)])
+    block = block.calibration.joint("j").under_load
+    assert block is None or block.acceleration_limit_rad_s2 is None
+
+
+def test_a_model_with_a_limit_predicts_with_it_unless_the_header_says_otherwise(tmp_path):
+    servo = random_servo(LIMIT_RAD_S2, 6).arrays()
+    numbers = LoadedLoop(
+        model="loaded_servo", duty_per_rad=stated(float(servo["duty_per_rad"])),
+        stall_torque_nm=stated(float(servo["stall_torque"])),
+        back_emf_nm_s_per_rad=stated(float(servo["back_emf"])), armature_kg_m2=stated(0.02),
+        friction_loss_nm=stated(float(servo["friction_loss"])),
+        stribeck_friction_nm=stated(float(servo["stribeck_friction"])),
+        stribeck_speed_rad_s=stated(0.1), dead_time_s=stated(float(servo["dead_time_s"])),
+        acceleration_limit_rad_s2=stated(LIMIT_RAD_S2),
+    )  # fmt: skip
+    card = load_card("xl330-m288").model_copy(update={"specimens": {"servo": numbers}})
+    card.save(tmp_path / "servo.yaml")
+
+    def error(*recordings: Recording) -> float:
+        found = compare(recordings, [tmp_path / "servo.yaml"], "j")
+        (model,) = (m for name, m in found.models.items() if "servo.yaml" in name)
+        return model.mean.rmse_raw_rad
+
+    assert error(recording(CHIRP, LIMIT_RAD_S2, 6)) < 1.5e-3  # a count
+    free = recording(JUMPS, np.inf, 6)
+    assert error(free) > 10e-3, "readings choose no limit for the model that they score"
+    assert error(recording(JUMPS, np.inf, 6, {"acceleration": 0})) < 1.5e-3
