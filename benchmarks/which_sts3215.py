@@ -181,7 +181,7 @@ def with_load(
     structure = Structure("arm", tuple(arm), columns_of=columns_of)
     problem = Problem(structure, tuple(runs), (NOISE_RAD,) * len(runs))
     fits = local(problem, structure.encode(start), ITERATIONS, DIFFERENCE)
-    fit, _ = evolve(problem, fits, np.random.default_rng(0), short=True)
+    fit = evolve(problem, fits, np.random.default_rng(0), short=True)
     best = structure.decode(fit.point)
     return replace(model, columns=columns_of(best[None])[0])
 

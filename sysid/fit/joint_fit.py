@@ -112,8 +112,6 @@ class Fitted:
     structure : Structure
     fit : Fit
         To all runs.
-    population : ndarray, shape (members, parameters)
-        That it evolved from.
     draws : ndarray, shape (draws, parameters), or None
         From the posterior, in fitted coordinates.
     temperature : float
@@ -124,7 +122,6 @@ class Fitted:
 
     structure: Structure
     fit: Fit
-    population: NDArray[np.float64]
     draws: NDArray[np.float64] | None = None
     temperature: float = 1.0
     folds: list[Fit] | None = None
@@ -183,11 +180,7 @@ def fit_structures(ready: PreparedJoint, stage: str) -> list[Fitted]:
     if not ready.scales.free_air:
         return _ladder(ready, rng)
     structure = candidate(stage)
-    tried = {
-        s.features: Fitted(s, fit, fit.point[None])
-        for s, fit in ready.first.values()
-        if structure.contains(s)
-    }
+    tried = {s.features: Fitted(s, fit) for s, fit in ready.first.values() if structure.contains(s)}
     fitted = _fitted(ready, structure, tried, rng, ready.first[stage][1])
     return [*tried.values(), _compared(ready, fitted, tried, rng)]
 
@@ -216,10 +209,10 @@ def _fitted(
             for limit in _ACCELERATIONS_RAD_S2:
                 more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
     if ready.scales.free_air:
-        best, population = search_widely(problem, rng, np.array(more), short)
+        best = search_widely(problem, rng, np.array(more), short)
     else:  # the first structure was searched for
-        best, population = evolve(problem, refined(problem, np.array(more)), rng, short)
-    return Fitted(structure, best, population)
+        best = evolve(problem, refined(problem, np.array(more)), rng, short)
+    return Fitted(structure, best)
 
 
 def _ladder(ready: PreparedJoint, rng: np.random.Generator) -> list[Fitted]:
@@ -227,7 +220,7 @@ def _ladder(ready: PreparedJoint, rng: np.random.Generator) -> list[Fitted]:
     scales = ready.scales
     stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
     plain, first = next(iter(ready.first.values()))
-    tried = {plain.features: Fitted(plain, first, first.point[None])}
+    tried = {plain.features: Fitted(plain, first)}
 
     def try_out(*features: str, short: bool = False) -> None:
         structure = servo_structure(("back-EMF", *features), scales)
@@ -449,7 +442,7 @@ def _in_free_air(
             fitted = by_name[structure.name]
         else:
             fits = search(problem, rng, np.array(more) if more else None)
-            fitted = Fitted(structure, fits[0], np.array([f.point for f in fits]))
+            fitted = Fitted(structure, fits[0])
         # a model that errs more on what it was fitted to cannot be better on unseen tones
         residuals = fresh_residuals(structure, fitted.values, runs)
         if rms(residuals) <= min(least):

@@ -157,7 +157,7 @@ def search_widely(
     rng: np.random.Generator,
     more: NDArray[np.float64] | None = None,
     short: bool = False,
-) -> tuple[Fit, NDArray[np.float64]]:
+) -> Fit:
     """The best fit of `search`, then of a population of its starts that evolves.
 
     Parameters
@@ -168,12 +168,6 @@ def search_widely(
         Further starts, in fitted coordinates.
     short : bool
         Fewer generations.
-
-    Returns
-    -------
-    Fit
-    ndarray, shape (population, parameters)
-        The last population.
     """
     crowd = Starts(problem, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
     starts = crowd[:_KEEP]
@@ -345,7 +339,7 @@ def evolve(
     rng: np.random.Generator,
     short: bool = False,
     crowd: NDArray[np.float64] | None = None,
-) -> tuple[Fit, NDArray[np.float64]]:
+) -> Fit:
     """The best of a population that evolves around fits, fitted to the end.
 
     Differential evolution finds its way between the local optima of a servo with dry friction,
@@ -360,12 +354,6 @@ def evolve(
         Fewer generations.
     crowd : ndarray, shape (places, parameters), optional
         Further members, in fitted coordinates.
-
-    Returns
-    -------
-    Fit
-    ndarray, shape (population, parameters)
-        The last population.
     """
     low, high = problem.structure.box
     seeds = np.array([f.point for f in fits])
@@ -389,7 +377,7 @@ def evolve(
         better = new < cost
         z[better], cost[better] = trial[better], new[better]
     best = refine(problem, z[np.argsort(cost)[:2]])
-    return min(best, *fits, key=lambda f: f.cost), z
+    return min(best, *fits, key=lambda f: f.cost)
 
 
 # ------------------------------------------------------------------------------- folds
