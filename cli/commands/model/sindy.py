@@ -60,9 +60,9 @@ class Sindy:
         for name, r in results.items():
             shown.add_row(
                 name, terminal.ms(r.scores.rmse_fresh_rad), terminal.ms(r.scores.rmse_held_rad),
-                terminal.ms(r.scores.rmse_leave_one_frequency_out_rad),
+                terminal.ms(r.scores.rmse_unseen_rad),
                 terminal.ms(r.delayed_pd.rmse_fresh_rad),
-                terminal.ms(r.delayed_pd.rmse_leave_one_frequency_out_rad), str(len(r.candidates)),
+                terminal.ms(r.delayed_pd.rmse_unseen_rad), str(len(r.candidates)),
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print(
