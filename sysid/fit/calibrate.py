@@ -203,6 +203,8 @@ def side_by_side(
         for joint, own in trials.items():
             pool.submit((joint, PREPARATION), prepare_joint, joint, own, seed, free_air[joint])
         for (joint, stage), result in pool.results():
+            if staged:  # before `progress`, which ends the joint
+                staged(joint, stage)
             if stage == PREPARATION:
                 ready[joint] = result
                 for name in stages(result):
@@ -218,6 +220,4 @@ def side_by_side(
                     # in their order, not in that of their ends
                     fits = {name: fits[name] for name in stages(ready[joint])}
                     pool.submit((joint, CHOICE), conclude, ready[joint], fits, presets)
-            if staged:
-                staged(joint, stage)
     return {joint: results[joint] for joint in trials}

@@ -11,7 +11,7 @@ import pytest
 from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
-from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import (
     GIVEN_TORQUE,
     to_calibration,
@@ -22,6 +22,7 @@ from pupper_sysid.sysid.fit.results import plausible
 from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial, Truncation
+from support.planned_servos import two_joints
 from support.synthetic import LOOP_S, tone_trials
 
 JOINT = "LF_hip"
@@ -113,17 +114,27 @@ def test_ratios_are_identified_and_torques_only_by_the_anchor(result):
     np.testing.assert_allclose(tracks[0], tracks[1], atol=1e-12)
 
 
-def test_a_speed_limit_that_was_never_reached_is_not_claimed_on_any_number_of_processes():
-    slow, done = servo_recording(2, (0.5, 1.5)), []  # 2.8 rad/s at most
-    first = calibrate(slow, seed=5)[JOINT]
+def test_a_speed_limit_that_was_never_reached_is_not_claimed():
+    first = calibrate(servo_recording(2, (0.5, 1.5)), seed=5)[JOINT]  # 2.8 rad/s at most
     assert "velocity_limit_rad_s" in first.candidate_models["delayed_pd"].undecided
     assert "no_load_speed_rad_s" in first.candidate_models["delayed_pd_back_emf"].undecided
     assert any("speed limit was not excited" in w for w in first.warnings)
-    again = calibrate(slow, seed=5, workers=2, progress=done.append)[JOINT]
-    assert done == [JOINT]
-    # as text: a score that was not found is NaN, which equals nothing
-    assert repr(first.candidate_models) == repr(again.candidate_models)
-    assert first.dead_time_s == again.dead_time_s
+
+
+def test_two_processes_find_what_one_finds_and_report_every_stage_of_a_joint_before_its_end():
+    events: list[tuple[str, ...]] = []
+    alone = calibrate(two_joints(), seed=5)
+    beside = calibrate(
+        two_joints(), seed=5, workers=2, progress=lambda joint: events.append((joint,)),
+        staged=lambda *stage: events.append(stage),
+    )  # fmt: skip
+    for joint in ("LF_hip", "LF_thigh"):
+        # as text: a score that was not found is NaN, which equals nothing
+        assert repr(alone[joint].candidate_models) == repr(beside[joint].candidate_models)
+        assert alone[joint].dead_time_s == beside[joint].dead_time_s
+        own = [event for event in events if event[0] == joint]
+        assert sorted(own[:-1]) == sorted((joint, stage) for stage in STAGES)
+        assert own[0] == (joint, STAGES[0]) and own[-2:] == [(joint, STAGES[-1]), (joint,)]
 
 
 def test_commands_are_averaged_over_physics_steps_and_truncated_by_count():
