@@ -5,12 +5,13 @@ end. A stepped servo therefore responds earlier than the same servo in continuou
 step: a calibration found with steps of 2 ms and simulated with 5 ms would be 2 to 3 ms too early. A
 simulator without a speed limit on set-points responds earlier, too, and one that computes the PD
 before its step later. `delay_at_step` is the dead time with which another `Engine`, or another
-step, gives the same lag.
+step, gives the same lag. A calibration holds a servo's own numbers, in continuous time; `at_step`
+has those that a simulator needs to move like it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,16 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.tones import least_squares, sine_design
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, integrate
 
+CONTINUOUS_S = 0.0002
+"""Step that stands for continuous time [s]: a tenth of the physics step of training."""
+
 _TONES_HZ, _AMPLITUDE_RAD = (1.0, 2.0, 4.0), 0.2  # a walk's speeds, below most servos' limits
 _LOOP_S = 0.0193  # no multiple of a step: a delay puts commands anywhere in one
 _WARM_UP_S, _LENGTH_S = 1.0, 3.0
 _FAR_RAD = 100.0  # further than a servo goes, near enough to be squared
+_UNSTABLE_STEP = (
+    "a servo of this calibration is not stable in physics steps of {:g} ms; take shorter ones."
+)
 _UNSTABLE = 0.5  # random servos in steps of up to 10 ms are at most 0.4 from the usual
 
 
@@ -95,6 +102,72 @@ def tones_in_steps_of(
     return np.mean(lags, axis=0), np.max(rests, axis=0)
 
 
+def at_step(
+    parameters: DelayedPDParameters,
+    time_step_s: float,
+    fitted_step_s: float = CONTINUOUS_S,
+    engine: Engine = MUJOCO,
+) -> DelayedPDParameters:
+    """Numbers with which servos in steps of `time_step_s` move as in those of `fitted_step_s`.
+
+    In a step h at damping d over the inertia, MuJoCo's drive acts over h / (1 + h d), in continuous
+    time over (1 - exp(-h d')) / d' with exp(-h d') = 1 / (1 + h d). Stiffness, damping and friction
+    are larger in steps, therefore; while the torque is clipped, the same holds of the effort limit
+    and the back-EMF alone. The dead time is that of `delay_at_step`. Between steps of two lengths,
+    neither of them `CONTINUOUS_S`, only the dead time changes.
+
+    Parameters and errors as for `delay_at_step`.
+
+    Returns
+    -------
+    DelayedPDParameters
+        Arrays of shape (servos,); no dead time is below 0.
+    """
+    if time_step_s == fitted_step_s and engine == MUJOCO:
+        return parameters
+    moved = parameters
+    if fitted_step_s <= CONTINUOUS_S < time_step_s and engine.implicit:
+        moved = _discrete(parameters, time_step_s)
+    elif time_step_s <= CONTINUOUS_S < fitted_step_s:
+        moved = _continuous(parameters, fitted_step_s)
+    fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
+    there, rest = tones_in_steps_of(moved, time_step_s, engine)
+    if not (rest - usual < _UNSTABLE).all():
+        raise InputError(_UNSTABLE_STEP.format(1e3 * time_step_s))
+    delay = np.atleast_1d(parameters.dead_time_s) - (there - fitted)
+    return replace(moved, dead_time_s=np.maximum(delay, 0.0))
+
+
+def _discrete(parameters: DelayedPDParameters, h: float) -> DelayedPDParameters:
+    v = parameters.arrays()
+    brake = h * v["back_emf"] / v["armature"]
+    total = brake + h * v["damping"] / v["armature"]
+    longer, longer_clipped = _longer(total), _longer(brake)
+    return replace(
+        parameters, stiffness=v["stiffness"] * longer, friction_loss=v["friction_loss"] * longer,
+        effort_limit=v["effort_limit"] * longer_clipped,
+        back_emf=np.expm1(brake) / h * v["armature"],
+        damping=(np.exp(total) - np.exp(brake)) / h * v["armature"],
+    )  # fmt: skip
+
+
+def _continuous(parameters: DelayedPDParameters, h: float) -> DelayedPDParameters:
+    v = parameters.arrays()
+    brake = np.log1p(h * v["back_emf"] / v["armature"])
+    total = np.log1p(h * (v["back_emf"] + v["damping"]) / v["armature"])
+    shorter, shorter_clipped = 1.0 / _longer(total), 1.0 / _longer(brake)
+    return replace(
+        parameters, stiffness=v["stiffness"] * shorter, friction_loss=v["friction_loss"] * shorter,
+        effort_limit=v["effort_limit"] * shorter_clipped, back_emf=brake / h * v["armature"],
+        damping=(total - brake) / h * v["armature"],
+    )  # fmt: skip
+
+
+def _longer(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(exp(x) - 1) / x."""
+    return np.where(x > 1e-9, np.expm1(x) / np.maximum(x, 1e-9), 1.0)
+
+
 def delay_at_step(
     parameters: DelayedPDParameters,
     time_step_s: float,
@@ -126,10 +199,7 @@ def delay_at_step(
         return delay
     change = lag_of_steps(parameters, time_step_s, fitted_step_s, engine)
     if not np.isfinite(change).all():
-        raise InputError(
-            f"a servo of this calibration is not stable in physics steps of {1e3 * time_step_s:g} "
-            "ms; take shorter ones."
-        )
+        raise InputError(_UNSTABLE_STEP.format(1e3 * time_step_s))
     return delay - change
 
 

@@ -32,6 +32,7 @@ from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCal
 from pupper_sysid.servo_models.calibration.quantity import Part, Whole
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.servo_models.step_size import at_step
 
 SCHEMA = "pupper-calibration"
 SCHEMA_VERSION = 4
@@ -217,6 +218,12 @@ class Calibration(Part):
                 for field, key in PARAMETER_KEYS.items()
             }
         )
+        own = np.array([a.numbers_in == "continuous time" for a in actuators])
+        if own.any():
+            numbers, stepped = parameters.arrays(), at_step(parameters, time_step_s).arrays()
+            parameters = DelayedPDParameters(
+                **{name: np.where(own, stepped[name], numbers[name]) for name in numbers}
+            )
         return DelayedPD(parameters, time_step_s)
 
     def held_feedback(self, joint: str) -> HeldFeedback:

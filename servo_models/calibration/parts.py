@@ -32,6 +32,7 @@ from pupper_sysid.servo_models.calibration.quantity import (
 )
 from pupper_sysid.servo_models.calibration.under_load import UnderLoad
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 
 P_GAINS = (1e-3, 1e5)
 """Smallest and largest P gain of a position loop, whatever the unit of its register."""
@@ -115,6 +116,9 @@ class Actuator(Part):
     """Largest dead time to train with, in whole physics steps."""
     physics_step_s: Annotated[Number, Field(gt=0, le=0.1)]
     """Length of a physics step [s]."""
+    numbers_in: Literal["continuous time", "physics steps"] = "physics steps"
+    """Whether the numbers are the servo's own, or those with which MuJoCo's servo in steps of
+    `physics_step_s` moves like it, as in older files."""
     ratios_to_armature: RatiosToArmature
     """Ratios that were identified."""
     scale: Scale
@@ -125,6 +129,11 @@ class Actuator(Part):
         """The numbers themselves, without intervals."""
         values = {field: getattr(self, key).value for field, key in PARAMETER_KEYS.items()}
         return DelayedPDParameters(**values)
+
+    @property
+    def fitted_step_s(self) -> float:
+        """Step in which the numbers hold [s]; `CONTINUOUS_S` for the servo's own."""
+        return CONTINUOUS_S if self.numbers_in == "continuous time" else self.physics_step_s
 
     @property
     def top_speed_rad_s(self) -> float:
@@ -196,6 +205,13 @@ class Scores(Part):
     """Under load: free-run error on fresh rows of runs that were left out of the fit [rad]."""
     fit_percent: Number | None = None
     """100 · (1 − RMSE / standard deviation of the reading) on fresh rows [%]."""
+    residual_over_noise: NotNegative | None = None
+    """Free-run error over the noise of readings, which is found without the model: about 1 where
+    the model describes the servo."""
+    r_hat: NotNegative | None = None
+    """Split-R̂ of the draws behind the intervals: they have converged where it is below 1.03."""
+    effective_draws: NotNegative | None = None
+    """Independent draws that those of each number are worth, at least."""
 
 
 class CandidateModel(Part):

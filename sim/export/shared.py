@@ -58,7 +58,7 @@ def delays_at_step(
     found = {}
     for name, joint in calibration.joints.items():
         a = joint.actuator
-        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s, engine)
+        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.fitted_step_s, engine)
         more = float(fitting) - a.dead_time_s.value
         numbers = (max(t + more, 0.0) for t in (a.dead_time_s.value, *a.dead_time_interval_s))
         found[name] = Interval(*numbers)

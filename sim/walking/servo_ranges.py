@@ -30,11 +30,11 @@ from pupper_sysid.servo_models.calibration.parts import (
     JointCalibration,
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.joint_arrays import JointArrays
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.servo_models.step_size import delay_at_step
+from pupper_sysid.servo_models.step_size import at_step, delay_at_step
 
 IDEAL = "ideal"
 _NO_LIMIT_NM = 1e3
@@ -181,6 +181,19 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
     low["dead_time_s"], high["dead_time_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
+    own = np.array([p.actuator.numbers_in == "continuous time" for p in parts])
+    if own.any():  # what a simulation in steps needs, as older files have it
+        stepped = at_step(DelayedPDParameters(**value), TIME_STEP_S).arrays()
+        for field, number in value.items():
+            more = np.where(own, stepped[field] - number, 0.0)
+            longer = np.where(own & (number > 0), stepped[field] / np.maximum(number, 1e-12), 1.0)
+            for ends in (low, high):
+                ends[field] = (
+                    np.maximum(ends[field] + more, 0.0)
+                    if field == "dead_time_s"
+                    else ends[field] * longer
+                )
+        value = {field: np.where(own, stepped[field], value[field]) for field in value}
     feedback = tuple(calibration.held_feedback(fallbacks.get(n, n)) for n in JOINT_NAMES)
     jitters = [p.actuator.command_jitter_s for p in parts]
     known = [q.value for q in jitters if q.low]  # seen, if only as an upper bound

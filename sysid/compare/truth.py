@@ -32,7 +32,7 @@ from pupper_sysid.servo_models.calibration.operating_point import OperatingPoint
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.step_size import delay_at_step
+from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 from pupper_sysid.sysid.fit.run import whole_counts
@@ -215,7 +215,7 @@ def truth_table(
     for joint in both:
         found, true = calibration.joint(joint), truth["joints"][joint]
         feedback, point = true["feedback"], found.holds_at
-        stepped = defined_as(point, true, found.actuator.physics_step_s)
+        stepped = defined_as(point, true, found.actuator.fitted_step_s)
         definitions.append(f"{joint}: {point}.")
         if recordings is not None and found.lag.lag_s is not None:
             trials = joint_trials(recordings, joint)
@@ -319,12 +319,12 @@ def _parameters(actuator: _Numbers) -> DelayedPDParameters:
 
 
 def defined_as(
-    point: OperatingPoint, truth: Mapping[str, Any], physics_step_s: float
+    point: OperatingPoint, truth: Mapping[str, Any], fitted_step_s: float
 ) -> dict[str, float]:
     """Numbers of the true actuator by the definitions of a calibration.
 
-    The dead time is the one that gives the true lag, with the load, in the calibration's physics
-    steps.
+    They are those with which a servo in the calibration's steps moves like the emulated one in its
+    own, with the load.
 
     Parameters
     ----------
@@ -332,16 +332,17 @@ def defined_as(
         Of the calibration.
     truth : mapping
         Of the joint.
-    physics_step_s : float
-        Of the calibration.
+    fitted_step_s : float
+        In which the calibration's numbers hold.
     """
     actuator = _at_gain(truth, math.nan if point.p_gain is None else point.p_gain)
     step = truth.get("physics_step_s", _EMULATOR_STEP_S)
-    dead_time = float(delay_at_step(_parameters(actuator), physics_step_s, step)[0])
+    own = at_step(_parameters(actuator), fitted_step_s, step).arrays()
+    actuator |= {name: float(np.squeeze(own[name])) for name in own.keys() & actuator.keys()}
     bench = truth.get("loaded_servo")
     if bench is not None and point.armature == "servo":
         actuator["armature"] = bench["armature_kg_m2"]
-    return actuator | {"dead_time_s": dead_time}
+    return actuator
 
 
 def _at_gain(truth: Mapping[str, Any], p_gain: float) -> dict[str, float]:

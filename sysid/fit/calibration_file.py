@@ -40,8 +40,10 @@ from pupper_sysid.servo_models.calibration.parts import (
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
 from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, RecordedLoad, UnderLoad
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
+from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.feedback.poll_lattice import NO_LOSS
+from pupper_sysid.sysid.fit.goodness import overall
 from pupper_sysid.sysid.fit.results import (
     RATIO_SOURCES,
     UNTOLD,
@@ -155,7 +157,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             lag_s=quantity_of(lag.lag_s),
             raw_lag_s=quantity_of(lag.raw_lag_s),
             fresh_lag_s=quantity_of(lag.fresh_lag_s),
-        ) if loaded is None else Lag(),
+        ) if loaded is None or _one_motion(loaded) else Lag(),
         selection=Selection(
             model=result.model,
             candidate_models=tuple(
@@ -177,15 +179,29 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             rmse_leave_one_frequency_out_rad=_finite(s.rmse_leave_one_frequency_out_rad),
             rmse_unseen_runs_rad=_finite(s.rmse_unseen_runs_rad),
             fit_percent=_finite(s.fit_percent),
+            residual_over_noise=_finite(overall(result.goodness)),
+            r_hat=_finite(result.r_hat),
+            effective_draws=_finite(result.effective_draws),
         ),
         warnings=result.warnings,
     )  # fmt: skip
 
 
+def _one_motion(loaded: LoadedFit) -> bool:
+    """Whether the lag is that of the joint, not a mean over gains and loads."""
+    return not loaded.known_load and len(loaded.p_gains) < 2
+
+
 def _free_actuator(result: JointCalibrationResult, stall: float, source: str) -> Actuator:
     """DelayedPD of a joint in free air."""
-    pd, (low, high) = _covering(result), result.delay_steps
+    pd = _covering(result)
     armature = stall / pd.values["effort_rad_s2"]
+    values = {ours: pd.values[name] for ours, name in _RATIOS.items()}
+    servo = DelayedPDParameters(
+        **values, armature=1.0, velocity_limit=pd.values["velocity_limit_rad_s"],
+        dead_time_s=result.dead_time_s.value,
+    )  # fmt: skip
+    low, high = _delay_steps(servo, result.dead_time_s)
     ratios = {ours: _ratio(pd, name, 1.0) for ours, name in _RATIOS.items()}
     torque = {ours: _ratio(pd, name, armature, "ratio only") for ours, name in _RATIOS.items()}
     return measured(
@@ -205,6 +221,7 @@ def _free_actuator(result: JointCalibrationResult, stall: float, source: str) ->
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
+        numbers_in="continuous time",
         ratios_to_armature=measured(RatiosToArmature, **ratios),
         scale=Scale(anchor="stall torque", value_nm=stall, source=source),
     )
@@ -214,8 +231,9 @@ def _loaded_actuator(
     result: JointCalibrationResult, loaded: LoadedFit, torque: float, stall: float, source: str
 ) -> Actuator:
     """DelayedPD at the reference gain, with the servo's own armature; `torque` makes it N·m."""
-    known, (low, high) = loaded.known_load, result.delay_steps
-    pd = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm).arrays()
+    known = loaded.known_load
+    servo = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm)
+    pd, (low, high) = servo.arrays(), _delay_steps(servo, result.dead_time_s)
     armature = float(pd["armature"]) * torque
 
     def number(name: str, factor: float, absolute: bool) -> Quantity:
@@ -254,9 +272,18 @@ def _loaded_actuator(
         delay_steps_min=low,
         delay_steps_max=high,
         physics_step_s=TIME_STEP_S,
+        numbers_in="continuous time",
         ratios_to_armature=measured(RatiosToArmature, **ratios),
         scale=scale,
     )
+
+
+def _delay_steps(servo: DelayedPDParameters, dead_time_s: Interval) -> tuple[int, int]:
+    """Dead times to train with, in whole physics steps, rounded outward."""
+    stepped = at_step(servo, TIME_STEP_S)
+    more = float(np.squeeze(stepped.dead_time_s)) - dead_time_s.value
+    ends = (max(t + more, 0.0) for t in (dead_time_s.low, dead_time_s.high))
+    return whole_steps(*ends, TIME_STEP_S)
 
 
 def _block(loaded: LoadedFit, torque: float) -> UnderLoad:

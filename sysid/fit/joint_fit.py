@@ -23,13 +23,16 @@ from scipy.special import ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
+    EFFECTIVE,
     LEAST_FOLDS,
+    R_HAT,
     as_wide_as_folds,
-    in_continuous_time,
     interval_of,
     sample,
     temperature_of,
@@ -87,7 +90,11 @@ LADDER = (
     ("load friction", "quadratic", "torque limit"),
 )
 """Friction of a motor under load, simplest first; then `ADDITIONS` to the best of them."""
-ADDITIONS = ("acceleration", "damping", "dead zone", "start duty")
+SHORT_LADDER = ((), ("acceleration",), ("load friction",))
+"""For a joint in free air that DelayedPD does not describe."""
+_DESCRIBES_BETTER = 0.75
+"""Errors over those of DelayedPD, below which a servo with more terms is carried."""
+ADDITIONS = ("damping", "acceleration", "slew", "dead zone", "stribeck", "start duty")
 
 _ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
 """Starts of a limit on the set-point's acceleration: its cost has many minima. A Feetech servo's
@@ -120,6 +127,8 @@ class Fitted:
         How many readings count as one.
     folds : list of Fit or None
         Without the runs of each of `folds_of`; None where it was not compared.
+    r_hat, effective : float
+        Of the draws: see `sysid.fit.posterior.Posterior`.
     """
 
     structure: Structure
@@ -127,6 +136,8 @@ class Fitted:
     draws: NDArray[np.float64] | None = None
     temperature: float = 1.0
     folds: list[Fit] | None = None
+    r_hat: float = float("nan")
+    effective: float = float("nan")
 
     @property
     def values(self) -> NDArray[np.float64]:
@@ -217,7 +228,9 @@ def _fitted(
     return Fitted(structure, best)
 
 
-def _ladder(ready: PreparedJoint, rng: np.random.Generator) -> list[Fitted]:
+def _ladder(
+    ready: PreparedJoint, rng: np.random.Generator, ladder: Sequence[tuple[str, ...]] = LADDER
+) -> list[Fitted]:
     """The structures under load that the likelihood does not rule out, the best of all first."""
     scales = ready.scales
     stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
@@ -228,7 +241,7 @@ def _ladder(ready: PreparedJoint, rng: np.random.Generator) -> list[Fitted]:
         structure = servo_structure(("back-EMF", *features), scales)
         tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
 
-    for features in LADDER:
+    for features in ladder:
         try_out(*features, *stated)
     for addition in ADDITIONS:
         best = min(tried.values(), key=lambda f: f.fit.cost).structure.features[1:]
@@ -252,9 +265,9 @@ def _compared(
     structure, problem = fitted.structure, ready.searched(fitted.structure)
     best = refine(problem, fitted.fit.point[None])
     temperature = _temperature(problem, best)
-    points, _ = sample(problem, best, temperature, rng)
-    lowest = points[np.argsort(problem.costs(points))[:2]]
-    best = min(best, refine(problem, lowest), key=lambda f: f.cost)
+    posterior = sample(problem, best, temperature, rng)
+    points = posterior.points
+    best = min(best, refine(problem, posterior.best.point[None]), key=lambda f: f.cost)
     parents = [
         (f.structure, f.folds)
         for f in tried.values()
@@ -270,7 +283,10 @@ def _compared(
         left_out, groups = fit_folds(blocks, apart, rng, points), len(apart)
     points = as_wide_as_folds(points, structure, best, left_out, groups)
     points = np.clip(points, *structure.box)
-    return replace(fitted, fit=best, draws=points, temperature=temperature, folds=folds)
+    return replace(
+        fitted, fit=best, draws=points, temperature=temperature, folds=folds,
+        r_hat=posterior.r_hat, effective=posterior.effective,
+    )  # fmt: skip
 
 
 def _temperature(problem: Problem, fit: Fit) -> float:
@@ -382,28 +398,18 @@ def _intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, In
     structure, values = fitted.structure, fitted.values.copy()
     assert fitted.draws is not None
     draws = structure.decode(fitted.draws)
-    exact = in_continuous_time(structure, draws, _inertia(structure, draws))
     if dead_time_s is not None:
         values[0] = dead_time_s
     found = {
-        name: interval_of(name, float(v), own, continuous)
-        for name, v, own, continuous in zip(
-            structure.names, values, draws.T, exact.T, strict=True
-        )
-    }  # fmt: skip
+        name: interval_of(name, float(v), own)
+        for name, v, own in zip(structure.names, values, draws.T, strict=True)
+    }
     if {"no_load_speed_rad_s", "effort_rad_s2"} <= found.keys():
         at = [structure.names.index(n) for n in ("effort_rad_s2", "no_load_speed_rad_s")]
         value = float(values[at[0]] / values[at[1]])
-        own, continuous = (x[:, at[0]] / x[:, at[1]] for x in (draws, exact))
-        found["back_emf_per_s"] = interval_of("back_emf_per_s", value, own, continuous)
+        own = draws[:, at[0]] / draws[:, at[1]]
+        found["back_emf_per_s"] = interval_of("back_emf_per_s", value, own)
     return found
-
-
-def _inertia(structure: Structure, values: NDArray) -> NDArray[np.float64] | float:
-    """Armature and the largest load [kg·m²]; 1 without a known load."""
-    if not structure.scales.known_load:
-        return 1.0
-    return values[:, structure.names.index("armature")] + structure.scales.inertia
 
 
 # ------------------------------------------------------------------------------- results
@@ -428,7 +434,15 @@ def conclude(
     choice = _choice(ready, every)
     if not ready.scales.free_air:
         return _under_load(ready, every, choice)
-    return _in_free_air(ready, every, choice, presets)
+    result = _in_free_air(ready, every, choice, presets)
+    if not _undescribed(result.goodness):
+        return result
+    # DelayedPD does not describe it: one with a profile, gravity or other friction may
+    ready = ready.as_any_servo()
+    every = _ladder(ready, ready.fit_rng(), SHORT_LADDER)
+    other = _under_load(ready, every, _choice(ready, every))
+    better = overall(other.goodness) < _DESCRIBES_BETTER * overall(result.goodness)
+    return other if better else result
 
 
 def _in_free_air(
@@ -458,6 +472,11 @@ def _in_free_air(
         results[structure.name] = _candidate_fit(ready, fitted, folds)
     results = {s.name: results[s.name] for s in CANDIDATES}
     carried = choice.carried.structure
+    goodness = _goodness(ready, choice.carried)
+    lag = choice.lag
+    if why := _undescribed(goodness):
+        results = {name: _doubted(fit, why) for name, fit in results.items()}
+        lag = _with_misfit(ready, choice, goodness)
     chosen = _best(results, carried.name)
     jitter = command_jitter(
         carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
@@ -470,18 +489,93 @@ def _in_free_air(
         structure_nats=choice.nats,
         command_jitter_s=jitter,
         candidate_models=results,
-        lag=choice.lag,
+        lag=lag,
+        goodness=goodness,
+        r_hat=choice.carried.r_hat,
+        effective_draws=choice.carried.effective,
         presets={
             name: score_preset(by_joint[ready.joint], runs)
             for name, by_joint in (presets or {}).items()
             if ready.joint in by_joint
         },
         warnings=(
-            *choice.lag.warnings, *ready.warnings(), *_free_warnings(ready.joint, results, chosen,
-                                                                    choice),
+            *lag.warnings, *ready.warnings(), *_fit_warnings(ready.joint, goodness, choice),
+            *_free_warnings(ready.joint, results, chosen, choice),
         ),
         runs=runs,
     )  # fmt: skip
+
+
+def _braking(fitted: Fitted) -> Interval:
+    """Damping and back-EMF together, per inertia [1/s]."""
+    names = fitted.structure.names
+
+    def total(values: NDArray) -> NDArray:
+        effort, speed, damping = (
+            values[..., names.index(n)] if n in names else 0.0
+            for n in ("effort_rad_s2", "no_load_speed_rad_s", "damping_per_s")
+        )
+        return damping + effort / speed
+
+    value = float(total(fitted.values))
+    if fitted.draws is None:
+        return Interval(value, value, value)
+    return interval_of("damping", value, total(fitted.structure.decode(fitted.draws)))
+
+
+def _goodness(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
+    quantum_rad = ready.lag.quantum_rad
+    return goodness_of_fit(
+        fitted.structure, fitted.values, ready.runs,
+        quantum_rad if np.isfinite(quantum_rad) else 0.0,
+    )  # fmt: skip
+
+
+def _undescribed(goodness: Mapping[str, float]) -> str | None:
+    """Why the model's gains mean little; None if it describes the servo, as far as is known."""
+    ratio = overall(goodness)
+    if not ratio > DESCRIBED:
+        return None
+    return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
+
+
+def _doubted(fit: CandidateFit, why: str) -> CandidateFit:
+    kept = ("offset_rad", "dead_time_s")
+    return replace(fit, undecided={n: why for n in fit.parameters if n not in kept} | fit.undecided)
+
+
+def _with_misfit(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> LagBudget:
+    """The lag budget with a dead time as wide as the misfit allows.
+
+    A motion in a wrong shape can hide a dead time that is wrong by its error over its speed; and
+    where errors are larger than noise, so are those of fitted numbers.
+    """
+    structure, values = choice.carried.structure, choice.carried.values
+    tracks = free_run(structure, values, ready.runs)
+    speed = rms([np.gradient(t) / r.step_s for t, r in zip(tracks, ready.runs, strict=True)])
+    error = rms(fresh_residuals(structure, values, ready.runs))
+    ratio = overall(goodness)
+    hidden = error * np.sqrt(1.0 - ratio**-2) / max(speed, 1e-9)
+    own = choice.lag.dead_time_s
+    assert own is not None
+    low = own.value - ratio * (own.value - own.low) - hidden
+    high = own.value + ratio * (own.high - own.value) + hidden
+    wide = Interval(own.value, max(float(low), 0.0), float(high))
+    return replace(choice.lag, dead_time_s=wide)
+
+
+def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) -> Iterator[str]:
+    if why := _undescribed(goodness):
+        worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
+        yield f"{joint}: {why} ({worst[0]:.1f} at {worst[1]}). The lag holds; gains do not."
+    elif not np.isfinite(overall(goodness)):
+        yield f"{joint}: too few readings to tell how well the model describes this servo."
+    own = choice.carried
+    if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
+        yield (
+            f"{joint}: the draws have not converged (split-R̂ {own.r_hat:.2f}, {own.effective:.0f} "
+            "effective); intervals may be too narrow."
+        )
 
 
 def _candidate_fit(
@@ -503,7 +597,13 @@ def _candidate_fit(
         if (why := _why_unidentified(p, float(v), float(s), parameters[p.name], speed))
     }
     if "back_emf_per_s" in parameters and "no_load_speed_rad_s" in undecided:
-        undecided["back_emf_per_s"] = undecided["no_load_speed_rad_s"]
+        # inside of the effort limit the two brake alike
+        total = _braking(fitted)
+        both = (
+            f"only the sum of damping and back-EMF is known, {total.value:.4g} "
+            f"({total.low:.4g}…{total.high:.4g}) 1/s"
+        )
+        undecided |= {"back_emf_per_s": both, "damping_per_s": both}
     if why := _undated(ready.lag.feedback):
         undecided["dead_time_s"] = why
     left_out = (
@@ -528,11 +628,12 @@ def score_preset(parameters: DelayedPDParameters, runs: Sequence[Run]) -> Scores
         Of the joint.
     runs : sequence of Run
     """
-    one = parameters.per_inertia()
+    # published for steps of MuJoCo, as those of older calibrations
+    one = at_step(parameters.per_inertia(), CONTINUOUS_S, TIME_STEP_S)
     parts = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
              one.velocity_limit, 0.0)  # fmt: skip
     structure = candidate(PREFERRED)
-    values = np.array([np.asarray(part, float).item() for part in parts])
+    values = np.array([float(np.squeeze(part)) for part in parts])
     for _ in range(3):  # the offset moves the start, and with it a little itself
         values[-1] -= np.median(np.concatenate(fresh_residuals(structure, values, runs)))
     return score(free_run(structure, values, runs), runs)
@@ -674,6 +775,15 @@ def _under_load(
     folds = folds_of(ready.runs)
     left_out = held_out_residuals(structure, choice.carried.folds or [], folds, ready.runs)
     scores = score(free_run(structure, values, ready.runs), ready.runs, left_out)
+    goodness, lag = _goodness(ready, choice.carried), choice.lag
+    if why := _undescribed(goodness):
+        doubted = {n: why for n in loaded.numbers if n not in ("offset_rad", "dead_time_s")}
+        lag = _with_misfit(ready, choice, goodness)
+        assert lag.dead_time_s is not None
+        loaded = replace(
+            loaded, undecided=doubted | loaded.undecided,
+            numbers=loaded.numbers | {"dead_time_s": lag.dead_time_s},
+        )  # fmt: skip
     pd = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm).arrays()
     inertia = float(np.asarray(loaded.servo.armature))
     inertia += max(i for i, _ in loaded.loads) if loaded.known_load else 0.0
@@ -698,9 +808,15 @@ def _under_load(
         candidate_models={SIMULATED[1]: CandidateFit(
             model=SIMULATED[1], parameters=parameters, undecided=undecided, scores=scores
         )},
-        lag=choice.lag,
+        lag=lag,
+        goodness=goodness,
+        r_hat=choice.carried.r_hat,
+        effective_draws=choice.carried.effective,
         presets={},
-        warnings=(*choice.lag.warnings, *ready.warnings(), *_load_warnings(ready.joint, loaded)),
+        warnings=(
+            *lag.warnings, *ready.warnings(), *_fit_warnings(ready.joint, goodness, choice),
+            *_load_warnings(ready.joint, loaded),
+        ),
         loaded=loaded,
         runs=ready.runs,
     )  # fmt: skip
@@ -715,10 +831,9 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) 
     for f in choice.likely:
         assert f.draws is not None
         draws = f.structure.decode(f.draws)
-        exact = in_continuous_time(f.structure, draws, _inertia(f.structure, draws))
-        drawn, continuous = numbers_of(f.structure, draws), numbers_of(f.structure, exact)
+        drawn = numbers_of(f.structure, draws)
         for name in own.keys() & drawn.keys():
-            ends[name].append(interval_of(name, float(own[name]), drawn[name], continuous[name]))
+            ends[name].append(interval_of(name, float(own[name]), drawn[name]))
         if f.structure.name == structure.name:
             spread = {n: f.draws[:, j] for j, n in enumerate(f.structure.names)}
     numbers = {

@@ -83,11 +83,34 @@ def _delayed(held, row, k, shift, part, out):
         out[i] = (held[row, k + shift[i] - 1] - now) * part[i] + now
 
 
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
+def _acting(x, h):
+    """Time for which a step's torque acts against a damping of `x` per step [s].
+
+    (1 - exp(-x)) / x of the step, here to 1 % up to x = 2.5.
+    """
+    return h / (1.0 + x * (0.5 + x * (1 / 12.0)))
+
+
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
+def _rubbed(v, force, limit, step):
+    """Velocity after a step under a force and dry friction, which turns where the velocity does."""
+    forward = v > 0.0 or (v == 0.0 and force > 0.0)
+    slowed = v + (force - limit if forward else force + limit) * step
+    goes_on = slowed > 0.0 if forward else slowed < 0.0
+    rest = -slowed / (v - slowed)  # of the step, after the standstill
+    turned = (force - clip(force, limit)) * step * rest
+    return slowed if goes_on else turned
+
+
 @njit(fastmath=SAFE, error_model="numpy")
-def _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, part, track):
+def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, part, track):
     """Positions of the servos `who` after each step, into rows 1 … `steps` of `track`."""
     p = np.zeros((WIDTH, LANES))
-    y, v, c, s = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    y, v, s = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    earlier, now, cut = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
+    before, after = np.zeros(LANES), np.zeros(LANES)
+    one, two, share = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
     on, rate, play = np.ones(LANES), np.zeros(LANES), np.zeros(LANES)
     braked, clipped = np.zeros(LANES), np.zeros(LANES)
     slew, friction, firmware, profile, gravity, backlash = (
@@ -113,8 +136,8 @@ def _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, par
         p[18, i] = (load[1] + w[18]) / inertia
         p[19, i] = load[2] + w[19]
         p[20, i] = 0.5 * w[20]
-        braked[i] = h / (1.0 + h * (p[1, i] + p[3, i]))
-        clipped[i] = h / (1.0 + h * p[3, i])
+        braked[i] = _acting(h * (p[1, i] + p[3, i]), h)
+        clipped[i] = _acting(h * p[3, i], h)
         y[i] = start - w[OFFSET]
         s[i] = y[i]
         play[i] = y[i]
@@ -126,34 +149,80 @@ def _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, par
         gravity = gravity or p[18, i] != 0.0
         backlash = backlash or w[20] > 0.0
     supply = held.shape[0] > 1
-    plain = not (profile or friction or firmware or gravity or supply)
+    plain = not (friction or firmware or gravity or supply)
     for i in range(LANES):
         plain = plain and not p[14, i] < np.inf
+    for i in range(LANES):
+        first = shift[i] - 1
+        earlier[i], now[i], cut[i] = edges[0, first - 1], edges[0, first], edges[1, first]
     for k in range(steps):
-        _delayed(held, 0, k, shift, part, c)
+        # the command's window of this step: the last `part` of one step, the first of the next
+        for i in range(LANES):
+            later, next_cut = edges[0, k + shift[i]], edges[1, k + shift[i]]
+            end = 1.0 - part[i]
+            inside = cut[i] > end
+            before[i] = earlier[i] if inside else now[i]
+            after[i] = later if next_cut < end else now[i]
+            old = (cut[i] - end) if inside else 0.0
+            kept = next_cut if next_cut < end else end
+            mean = earlier[i] * old + now[i] * (part[i] - old + kept) + later * (end - kept)
+            apart = before[i] - after[i]
+            apart = apart if abs(apart) > 1e-12 else 1.0
+            x = (mean - after[i]) / apart
+            x = x if x > 0.0 else 0.0
+            share[i] = x if x < 1.0 else 1.0
+            earlier[i], now[i], cut[i] = now[i], later, next_cut
         if profile:
             for i in range(LANES):
-                way = c[i] - s[i]
-                fastest = np.sqrt(2.0 * p[7, i] * abs(way))
-                fastest = fastest if fastest < p[6, i] / h else p[6, i] / h
-                rate[i] += clip(clip(way * (1.0 / h), fastest) - rate[i], p[7, i] * h)
-                follows = not p[7, i] < np.inf
-                s[i] = s[i] + clip(way, p[6, i]) if follows else s[i] + rate[i] * h
+                limited = p[7, i] < np.inf
+                most = p[7, i] if limited else 0.0
+                mean = 0.0
+                for half in range(2):
+                    weight = share[i] if half == 0 else 1.0 - share[i]
+                    way = (before[i] if half == 0 else after[i]) - s[i]
+                    long = h * weight if weight > 1e-6 else 1e-6 * h
+                    # from which the profile comes to rest at the command
+                    brake = 0.5 * long * most
+                    fastest = np.sqrt(brake * brake + 2.0 * most * abs(way)) - brake
+                    fastest = fastest if fastest < p[6, i] / h else p[6, i] / h
+                    change = clip(clip(way / long, fastest) - rate[i], most * long)
+                    rate[i] += change
+                    move = (rate[i] - 0.5 * change) * long
+                    move = move if limited else clip(way, p[6, i] * weight)
+                    mean += weight * (s[i] + 0.5 * move)
+                    s[i] += move
+                straight = not (limited or p[6, i] < np.inf)
+                one[i] = before[i] if straight else mean
+                two[i] = after[i] if straight else mean
         elif slew:
             for i in range(LANES):
-                s[i] += clip(c[i] - s[i], p[6, i])
+                first = clip(before[i] - s[i], p[6, i] * share[i])
+                mean = share[i] * (s[i] + 0.5 * first)
+                s[i] += first
+                then = clip(after[i] - s[i], p[6, i] * (1.0 - share[i]))
+                mean += (1.0 - share[i]) * (s[i] + 0.5 * then)
+                s[i] += then
+                one[i] = mean
+                two[i] = mean
         else:
             for i in range(LANES):
-                s[i] = c[i]
+                one[i] = before[i]
+                two[i] = after[i]
         if plain:
             for i in range(LANES):
-                wanted = (s[i] - y[i]) * p[0, i] - p[1, i] * v[i]
-                force = clip(wanted, p[2, i])
-                step = braked[i] if force == wanted else clipped[i]
-                force -= p[3, i] * v[i]
-                force += clip((v[i] * (1.0 / h) + force) * stop, p[5, i])
-                v[i] += force * step
-                y[i] += v[i] * h
+                middle = y[i] + v[i] * (0.5 * h)
+                damped = p[1, i] * v[i]
+                wanted = (one[i] - middle) * p[0, i] - damped
+                drive = clip(wanted, p[2, i])
+                free = share[i] if drive == wanted else 0.0
+                force = drive * share[i]
+                wanted = (two[i] - middle) * p[0, i] - damped
+                drive = clip(wanted, p[2, i])
+                free += 1.0 - share[i] if drive == wanted else 0.0
+                force += drive * (1.0 - share[i])
+                step = clipped[i] + (braked[i] - clipped[i]) * free
+                v[i] = _rubbed(v[i], force - p[3, i] * v[i], p[5, i], step)
+                y[i] = middle + v[i] * (0.5 * h)
                 track[k + 1, i] = y[i]
         else:
             volt = 1.0
@@ -161,36 +230,39 @@ def _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, par
                 _delayed(held, 1, k, shift, part, on)
                 volt = held[2, k + pad]
             for i in range(LANES):
-                error = s[i] - y[i]
-                begin = 0.0
-                if firmware:
-                    error -= clip(error, p[16, i])
-                    begin = p[17, i] * clip(error * (1.0 / START_ERROR_RAD), 1.0)
-                wanted = error * p[0, i] - p[1, i] * v[i] + begin
-                drive = clip(wanted, p[2, i])
-                back, step, given = p[3, i], braked[i], 1.0
-                inner = step if drive == wanted else clipped[i]
+                middle = y[i] + v[i] * (0.5 * h)
+                drive, free = 0.0, 0.0
+                for half in range(2):
+                    error = (one[i] if half == 0 else two[i]) - middle
+                    weight = share[i] if half == 0 else 1.0 - share[i]
+                    begin = 0.0
+                    if firmware:
+                        error -= clip(error, p[16, i])
+                        begin = p[17, i] * clip(error * (1.0 / START_ERROR_RAD), 1.0)
+                    wanted = error * p[0, i] - p[1, i] * v[i] + begin
+                    reached = clip(wanted, p[2, i])
+                    drive += reached * weight
+                    free += weight if reached == wanted else 0.0
+                back, step, given = p[3, i], clipped[i] + (braked[i] - clipped[i]) * free, 1.0
                 if supply:
                     given = volt * on[i]
                     back *= p[15, i] + (1.0 - p[15, i]) * on[i]
-                    damping = p[1, i] * given if drive == wanted else 0.0
-                    inner = h / (1.0 + h * (damping + back))
+                    step = _acting(h * (p[1, i] * given * free + back), h)
                 drawn = drive * given - back * v[i]
                 motor = clip(drawn, p[14, i])
-                step = inner if motor == drawn else h
+                step = step if motor == drawn else h
                 force, limit = motor, p[5, i]
-                weight = 0.0
+                pull = 0.0
                 if gravity:
-                    weight = -p[18, i] * _sin(y[i] - p[19, i])
-                    force += weight
+                    pull = -p[18, i] * _sin(middle - p[19, i])
+                    force += pull
                 if friction:
                     standing = 1.0 / (1.0 + v[i] * v[i] * p[9, i])
-                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(weight)
+                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(pull)
                     limit += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
                     limit += p[12, i] * motor * motor
-                force += clip((v[i] * (1.0 / h) + force) * stop, limit)
-                v[i] += force * step
-                y[i] += v[i] * h
+                v[i] = _rubbed(v[i], force, limit, step)
+                y[i] = middle + v[i] * (0.5 * h)
                 track[k + 1, i] = y[i]
         if backlash:
             for i in range(LANES):
@@ -257,13 +329,13 @@ def _sparse(values, who, held, start, steps, h, shift, part, track):
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _simulate(kind, values, dead_time, who, held, gain, load, start, steps, pad, h, stop, track):
+def _simulate(kind, values, dead_time, who, held, edges, gain, load, start, steps, pad, h, track):
     part, shift = np.zeros(LANES), np.zeros(LANES, np.int64)
     for i in range(LANES):
         whole = int(np.floor(dead_time[who[i]]))
         shift[i], part[i] = pad - whole, dead_time[who[i]] - whole
     if kind == SERVO:
-        _servo(values, who, held, gain, load, start, steps, pad, h, stop, shift, part, track)
+        _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, part, track)
     elif kind == SPARSE:
         _sparse(values, who, held, start, steps, h, shift, part, track)
     else:
@@ -285,7 +357,7 @@ _NONE, _NO_TABLE = np.empty(0), np.empty((0, 0))
 
 @njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def _evaluate(
-    task, kind, values, dead_time, held, gain, load, start, pad, h, stop, step, reading, noise,
+    task, kind, values, dead_time, held, edges, gain, load, start, pad, h, step, reading, noise,
     later, out, total,
 ):  # fmt: skip
     """Simulate each candidate and do one of four tasks: one function, compiled once."""
@@ -297,7 +369,9 @@ def _evaluate(
     offset, cost = np.zeros(LANES), np.zeros(LANES)
     for first in range(0, count, LANES):
         used = _fill_lanes(first, count, who)
-        _simulate(kind, values, dead_time, who, held, gain, load, start, steps, pad, h, stop, track)
+        _simulate(
+            kind, values, dead_time, who, held, edges, gain, load, start, steps, pad, h, track
+        )
         for i in range(LANES):
             offset[i], cost[i] = values[who[i], last], 0.0
         if task == _POSITIONS:
@@ -337,7 +411,7 @@ def _evaluate(
                         total[m, first + i] += error * error
 
 
-Simulated = tuple[int, NDArray, NDArray, NDArray, float, NDArray, float, int, float, float]
+Simulated = tuple[int, NDArray, NDArray, NDArray, NDArray, float, NDArray, float, int, float]
 """What every task takes: candidates on one run.
 
 kind : int
@@ -347,8 +421,10 @@ values : ndarray, shape (candidates, columns)
 dead_time : ndarray, shape (candidates,)
     In steps.
 held : ndarray, shape (1 or 3, pad + steps)
-    Command of each step [rad], after `pad` steps of rest; then, where they are not always 1, the
-    share of the step for which the torque is on, and the supply voltage over the reference.
+    Mean command of each step [rad], after `pad` steps of rest; then, where they are not always 1,
+    the share of the step for which the torque is on, and the supply voltage over the reference.
+edges : ndarray, shape (2, pad + steps)
+    Command at the end of each step [rad], and the share of the step before it came (`edges_of`).
 gain : float
     P gain over the one that `stiffness` is for.
 load : ndarray, shape (3,)
@@ -358,14 +434,32 @@ start : float
 pad : int
 h : float
     Duration of a step [s].
-stop : float
-    Minus the share of the speed that dry friction removes in a step.
 """
+
+
+def edges_of(
+    mean: NDArray[np.float64], end: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """When within each step a held command changed, shape (2, steps): see `Simulated`.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (steps,)
+        Command of each step [rad].
+    end : ndarray, shape (steps,), optional
+        Command at the end of each step [rad]; by default commands change on steps.
+    """
+    if end is None:
+        return np.stack([mean, np.zeros_like(mean)])
+    before = np.concatenate([end[:1], end[:-1]])
+    apart = before - end
+    share = (mean - end) / np.where(apart == 0, 1.0, apart)
+    return np.stack([end, np.clip(share, 0.0, 1.0)])
 
 
 def positions(*simulated: *Simulated) -> NDArray[np.float64]:
     """Readings at the edges of the steps, shape (steps + 1, candidates) [rad]."""
-    values, held, pad = simulated[1], simulated[3], simulated[7]
+    values, held, pad = simulated[1], simulated[3], simulated[8]
     out = np.empty((held.shape[1] - pad + 1, len(values)))
     _evaluate(_POSITIONS, *simulated, _NONE, _NONE, 1.0, _NONE, out, _NO_TABLE)
     return out

@@ -17,12 +17,12 @@ differential evolution. Statistics and Computing 16: 239–249.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import logsumexp, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.tones import least_squares
@@ -31,17 +31,21 @@ from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Fit, Problem, curvature, local
 from pupper_sysid.sysid.fit.structure import Structure
 
-STEPPING_SD_S = 0.5 * TIME_STEP_S
+STEPPING_SD_S = 0.1 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
-standard deviation over random emulated servos with half that step."""
+the shift that suits random servos simulated in steps of 0.1 ms best is 0 to 0.25 ms."""
 _STEPPING_SHARE = 0.006
 """Relative error of torques that physics steps leave, whatever the number of readings: standard
 deviation over random emulated pendulums that move in other steps."""
 _HARMONICS = (1, 2, 3)
-_CHAINS = 32
-_SETTLING, _DRAWING = 250, 250
-_JUMP_EVERY = 10  # a jump by a whole difference lets chains change between optima
-_NOISE = 1e-3  # of a proposal, in fitted coordinates
+R_HAT, EFFECTIVE = 1.03, 400.0
+"""Split-R̂ at most, and effective draws at least, of draws that have converged."""
+_POPULATION, _ROUNDS, _ENOUGH = 384, 8, 300.0  # points a round, rounds, effective points
+_CENTRES, _LEAST_CENTRES, _BANDWIDTH, _FREEDOM = 192, 48, 0.5, 5.0
+_BETTER = 4.0  # log-likelihood by which another optimum has to be better
+_CHAINS, _GENERATIONS, _BLOCKS = 16, 200, 5
+_NOISE = 1e-3  # of a proposal, over the standard deviation
+_STEP = 0.01
 PHASE_SD_S = 0.0003
 """Standard deviation of the date error that all readings of a polled run share [s], about that of
 the phase of a poll estimated from a few seconds."""
@@ -50,9 +54,31 @@ LEAST_FOLDS = 3
 """Fits without a part, below which their scatter says nothing."""
 _MEDIAN_OF_NORMAL = float(ndtri(0.75))  # of the size of a standard normal number
 _CURVATURE_STEP = 0.03  # the slope over a likely error, not of one kink
-_OVERDISPERSED, _WIDEST = 1.5, 0.7  # of the first points, over a Gaussian's; and at most
+_OVERDISPERSED, _WIDEST = 1.3, 0.7  # of the first points, over a Gaussian's; and at most
 _REMEMBERED_S = 0.5
 _Z = float(ndtri(0.5 + LEVEL / 2))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of a structure's parameters, and whether they can be trusted.
+
+    Attributes
+    ----------
+    points : ndarray, shape (draws, parameters)
+        In fitted coordinates.
+    best : Fit
+        The likeliest point that was met.
+    r_hat : float
+        Largest split-R̂ over the parameters: spread between chains over that within.
+    effective : float
+        Smallest number of independent draws that those of a parameter are worth.
+    """
+
+    points: NDArray[np.float64]
+    best: Fit
+    r_hat: float
+    effective: float
 
 
 def sample(
@@ -60,69 +86,215 @@ def sample(
     best: Fit,
     temperature: float,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> Posterior:
     """Draw parameters from their posterior.
+
+    Importance sampling finds where the posterior is: from a t distribution as the curvature at the
+    optimum says, then from mixtures about the points that weigh most (population Monte Carlo).
+    Chains from there propose points of the last mixture and steps along differences of two of its
+    points, until they agree.
 
     Parameters
     ----------
     problem : Problem
     best : Fit
     temperature : float
-        By which the cost of the readings is divided, at least 1.
+        By which the cost of the readings is divided.
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    points : ndarray, shape (draws, parameters)
-        In fitted coordinates.
-    cost : ndarray, shape (draws,)
-        Tempered.
     """
     low, high = problem.structure.box
 
     def tempered(points: NDArray, ceiling: NDArray | float = np.inf) -> NDArray[np.float64]:
-        prior = problem.prior(points)
-        whole = problem.costs(points, (ceiling - prior) * temperature + prior)
-        return (whole - prior) / temperature + prior
+        inside = ((points >= low) & (points <= high)).all(axis=1)
+        cost = np.full(len(points), np.inf)
+        if inside.any():
+            own = points[inside]
+            prior = problem.prior(own)
+            most = ceiling if np.isscalar(ceiling) else ceiling[inside]
+            whole = problem.costs(own, (most - prior) * temperature + prior)
+            cost[inside] = (whole - prior) / temperature + prior
+        return cost
 
-    z = np.clip(_around(problem, best, temperature, rng), low, high)
-    z[0] = best.point
-    chains, k = z.shape
-    cost = tempered(z)
-    everyone = np.arange(chains)
-    kept, kept_cost = [], []
-    for generation in range(_SETTLING + _DRAWING):
-        one = (everyone + rng.integers(1, chains, chains)) % chains
-        two = (everyone + rng.integers(1, chains, chains)) % chains
-        gamma = 1.0 if generation % _JUMP_EVERY == 0 else 2.38 / np.sqrt(2 * k)
-        scale = gamma * rng.uniform(0.6, 1.1, (chains, 1))
-        proposal = z + scale * (z[one] - z[two]) + _NOISE * rng.standard_normal(z.shape)
-        inside = ((proposal >= low) & (proposal <= high)).all(axis=1)
-        most = cost - np.log(rng.random(chains))
-        accepted = inside & ((new := tempered(np.clip(proposal, low, high), most)) < most)
-        z = np.where(accepted[:, None], proposal, z)
-        cost = np.where(accepted, new, cost)
-        if generation >= _SETTLING:
+    points, cost, start, mixture = _populate(problem, tempered, best, temperature, rng)
+    z, log_density, k = points.copy(), mixture.log_density(points), points.shape[1]
+    kept: list[NDArray] = []
+    for block in range(_BLOCKS):
+        for generation in range(_GENERATIONS):
+            if generation % 2:
+                trial, trial_density = mixture.draw(len(z), rng)
+                most = cost + log_density - trial_density - np.log(rng.random(len(z)))
+            else:
+                one, two = rng.integers(0, len(mixture.centres), (2, len(z)))
+                gamma = 2.38 / np.sqrt(2 * k) * rng.uniform(0.3, 1.1, (len(z), 1))
+                trial = z + gamma * (mixture.centres[one] - mixture.centres[two])
+                trial += _NOISE * mixture.spread * rng.standard_normal(z.shape)
+                trial_density = mixture.log_density(trial)
+                most = cost - np.log(rng.random(len(z)))
+            new = tempered(trial, most)
+            accepted = new < most
+            z = np.where(accepted[:, None], trial, z)
+            cost = np.where(accepted, new, cost)
+            log_density = np.where(accepted, trial_density, log_density)
             kept.append(z)
-            kept_cost.append(cost)
-    return np.concatenate(kept), np.concatenate(kept_cost)
+            first = int(np.argmin(cost))
+            if cost[first] < start.cost:
+                start = Fit(z[first], float(cost[first]))
+        draws = np.array(kept)
+        r_hat, effective = convergence(draws)
+        if r_hat <= R_HAT and effective >= EFFECTIVE:
+            break
+        if block == 0:  # where the chains went says more than where they began
+            cloud = draws.reshape(-1, k)
+            mixture = _mixture_of(cloud, np.full(len(cloud), 1.0 / len(cloud)), mixture.wide, rng)
+            log_density = mixture.log_density(z)
+            kept = []
+    whole = float(problem.costs(start.point[None])[0])
+    return Posterior(draws.reshape(-1, k), Fit(start.point, whole), r_hat, effective)
 
 
-def _around(
-    problem: Problem, best: Fit, temperature: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """Points to begin from, shape (chains, parameters), wider than a Gaussian about the optimum."""
+@dataclass(frozen=True)
+class _Mixture:
+    """t distributions about centres that weigh alike, and one wide one."""
+
+    centres: NDArray[np.float64]
+    root: NDArray[np.float64]  # of their covariance
+    wide: NDArray[np.float64]  # of the covariance of the wide one
+    middle: NDArray[np.float64]
+    share: float  # of the wide one
+
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """Standard deviation of each coordinate."""
+        return np.sqrt(np.sum(self.wide**2, axis=1))
+
+    def draw(self, count: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+        """Points (count, parameters) and the logarithm of their density."""
+        k = len(self.middle)
+        steps = rng.standard_normal((count, k))
+        steps /= np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
+        about = self.centres[rng.integers(0, len(self.centres), count)] + steps @ self.root.T
+        widely = self.middle + steps @ self.wide.T
+        points = np.where(rng.random((count, 1)) < self.share, widely, about)
+        return points, self.log_density(points)
+
+    def log_density(self, points: NDArray) -> NDArray[np.float64]:
+        """Up to a constant, shape (points,)."""
+
+        def student(apart: NDArray, root: NDArray) -> NDArray:
+            size = np.sum(np.linalg.solve(root, apart.reshape(-1, k).T) ** 2, axis=0)
+            power = -0.5 * (_FREEDOM + k) * np.log1p(size / _FREEDOM)
+            return power.reshape(apart.shape[:-1]) - np.linalg.slogdet(root)[1]
+
+        k = len(self.middle)
+        wide = student(points - self.middle, self.wide) + np.log(self.share)
+        if self.share >= 1.0:
+            return wide
+        near = student(points[:, None, :] - self.centres, self.root)
+        near = logsumexp(near, axis=1) - np.log(len(self.centres)) + np.log1p(-self.share)
+        return np.logaddexp(wide, near)
+
+
+def _populate(
+    problem: Problem, tempered: Callable[..., NDArray], best: Fit, temperature: float,
+    rng: np.random.Generator,
+) -> tuple[NDArray, NDArray, Fit, _Mixture]:  # fmt: skip
+    """Points of equal weight, their cost, the best one met, and a mixture about them."""
+    k = len(best.point)
+    start = Fit(best.point, float(tempered(best.point[None])[0]))
+    root = _root(problem, start.point, temperature)
+    mixture = _Mixture(start.point[None], root, root, start.point, 1.0)
+    points, cost = np.empty((0, k)), np.empty(0)
+    mixtures: list[_Mixture] = []
+    log_density = np.empty((0, 0))  # (mixtures, points)
+    for turn in range(_ROUNDS):
+        drawn, _ = mixture.draw(_POPULATION, rng)
+        own = tempered(drawn)
+        first = int(np.argmin(own))
+        # an optimum beside: begin again there
+        if own[first] < start.cost - _BETTER and turn < _ROUNDS // 2:
+            fit = local(problem, drawn[first : first + 1], _DATE_ITERATIONS, _CURVATURE_STEP)[0]
+            start = Fit(fit.point, float(tempered(fit.point[None])[0]))
+            root = _root(problem, start.point, temperature)
+            mixture = _Mixture(start.point[None], root, root, start.point, 1.0)
+            points, cost, mixtures = np.empty((0, k)), np.empty(0), []
+            log_density = np.empty((0, 0))
+            continue
+        mixtures.append(mixture)
+        old = [m.log_density(drawn) for m in mixtures]
+        log_density = np.block([
+            [np.vstack([log_density, mixture.log_density(points)[None]]) if len(points) else
+             np.empty((1, 0)), np.array(old)]
+        ])  # fmt: skip
+        points, cost = np.concatenate([points, drawn]), np.concatenate([cost, own])
+        log_weight = -cost - logsumexp(log_density, axis=0)
+        weight = np.exp(log_weight - log_weight.max())
+        weight /= weight.sum()
+        effective = 1.0 / np.sum(weight**2)
+        mixture = _mixture_of(points, weight, root, rng)
+        if effective >= _ENOUGH:
+            break
+    chosen = rng.choice(len(points), _CHAINS, p=weight)
+    return points[chosen], cost[chosen], start, mixture
+
+
+def _mixture_of(
+    points: NDArray, weight: NDArray, root: NDArray, rng: np.random.Generator
+) -> _Mixture:
+    """The next mixture about weighted points; `root` is that of the last covariance."""
+    # clipped, so that a single point does not carry it
+    flat = np.minimum(weight, 1.0 / _LEAST_CENTRES)
+    flat = flat / flat.sum()
+    centres = points[rng.choice(len(points), _CENTRES, p=flat)]
+    middle = flat @ points
+    apart = points - middle
+    covariance = (flat * apart.T) @ apart + (1e-6 * root) @ root.T
+    wide = np.linalg.cholesky(covariance + 1e-18 * np.eye(len(middle)))
+    return _Mixture(centres, _BANDWIDTH * wide, 1.3 * wide, middle, 0.3)
+
+
+def _root(problem: Problem, point: NDArray, temperature: float) -> NDArray[np.float64]:
+    """Root of the covariance at an optimum by the curvature of the tempered cost."""
     precision = np.diag(problem.structure.prior[1])
-    bent = (curvature(problem, best.point, _CURVATURE_STEP) - precision) / temperature + precision
+    bent = (curvature(problem, point, _STEP) - precision) / temperature + precision
     values, vectors = np.linalg.eigh(bent)
-    reach = np.minimum(_OVERDISPERSED / np.sqrt(np.maximum(values, 1e-12)), _WIDEST)
-    return best.point + (rng.standard_normal((_CHAINS, len(values))) * reach) @ vectors.T
+    return vectors * np.minimum(_OVERDISPERSED / np.sqrt(np.maximum(values, 1e-12)), _WIDEST)
+
+
+def convergence(draws: NDArray[np.float64]) -> tuple[float, float]:
+    """Largest split-R̂ and smallest number of effective draws over the parameters.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (generations, chains, parameters)
+
+    References
+    ----------
+    Gelman, A. et al. (2013). Bayesian Data Analysis, 3rd ed., section 11.4–11.5.
+    """
+    half = len(draws) // 2
+    x = np.concatenate([draws[:half], draws[half : 2 * half]], axis=1)
+    within = x.var(axis=0, ddof=1).mean(axis=0)
+    between = half * x.mean(axis=0).var(axis=0, ddof=1)
+    total = (half - 1) / half * within + between / half
+    total = np.maximum(total, 1e-300)
+    r_hat = np.sqrt(total / np.maximum(within, 1e-300))
+    rho = np.empty((half - 1, x.shape[2]))
+    for lag in range(1, half):
+        variogram = np.mean((x[lag:] - x[:-lag]) ** 2, axis=(0, 1))
+        rho[lag - 1] = 1.0 - variogram / (2.0 * total)
+    # Geyer's initial positive sequence: pairs of autocorrelations while their sum is positive
+    pairs = rho[: 2 * (len(rho) // 2)].reshape(-1, 2, x.shape[2]).sum(axis=1)
+    memory = 1.0 + 2.0 * np.sum(np.cumprod(pairs > 0, axis=0) * np.maximum(pairs, 0), axis=0)
+    return float(r_hat.max()), float((half * x.shape[1] / memory).min())
 
 
 def temperature_of(
     residuals: Sequence[NDArray[np.float64]], runs: Sequence[Run], parameters: int
 ) -> float:
-    """Readings per independent one, at least 1.
+    """By which the cost of readings is divided: readings per independent one, over their weight.
+
+    A soft-L1 cost weighs each reading less than its noise deserves. The ratio of the variance of
+    its slope to its mean curvature (Godambe) makes up for that: 0.57 for normal noise.
 
     What counts against a parameter is the power of residuals where its effect is. Of a tone that is
     at the tone and its harmonics: their power there over their power elsewhere. Of other motions it
@@ -137,11 +309,16 @@ def temperature_of(
     parameters : int
         Fitted to them: so many numbers less are left of the power at the harmonics.
     """
+    every = np.concatenate([np.empty(0), *residuals])
+    if not len(every):
+        return 1.0
+    bent = np.mean((1.0 + every**2) ** -1.5)
+    weight = float(np.mean(every**2 / (1.0 + every**2)) / max(bent, 1e-12))
     pairs = list(zip(residuals, runs, strict=True))
     tones = [(r, run) for r, run in pairs if run.tone > 0 and len(r) >= 4 * len(_HARMONICS)]
     if sum(len(r) for r, _ in tones) > sum(len(r) for r, _ in pairs) / 2:
-        return _at_harmonics(tones, parameters)
-    return _autocorrelation([(r, run) for r, run in pairs if len(r) > 1])
+        return weight * _at_harmonics(tones, parameters)
+    return weight * _autocorrelation([(r, run) for r, run in pairs if len(r) > 1])
 
 
 def _at_harmonics(tones: Sequence[tuple[NDArray, Run]], parameters: int) -> float:
@@ -255,19 +432,18 @@ def as_wide_as_folds(
 # ------------------------------------------------------------------------------- intervals
 
 
-def interval_of(name: str, value: float, draws: NDArray, continuous: NDArray) -> Interval:
-    """Interval of one number, from its draws and what they are of a servo without steps.
+def interval_of(name: str, value: float, draws: NDArray) -> Interval:
+    """Interval of one number from its draws, no narrower than the simulation's steps allow.
 
     Parameters
     ----------
     name : str
     value : float
         As fitted.
-    draws, continuous : ndarray, shape (draws,)
-        In the fit's physics steps, and in continuous time: a step makes gains look larger.
+    draws : ndarray, shape (draws,)
     """
-    both = [Interval.of_draws(value, x) for x in (draws, continuous)]
-    low, high = min(value, *(i.low for i in both)), max(value, *(i.high for i in both))
+    own = Interval.of_draws(value, draws)
+    low, high = min(value, own.low), max(value, own.high)
     if name == "dead_time_s":
         grain = _Z * STEPPING_SD_S
     elif name.endswith(("hanging_rad", "offset_rad")) or value <= 0:
@@ -276,51 +452,3 @@ def interval_of(name: str, value: float, draws: NDArray, continuous: NDArray) ->
         grain = _Z * _STEPPING_SHARE * value
     low, high = value - float(np.hypot(value - low, grain)), value + np.hypot(high - value, grain)
     return Interval(value, max(low, 0.0), float(high))
-
-
-def in_continuous_time(
-    structure: Structure, values: NDArray[np.float64], inertia: NDArray[np.float64] | float = 1.0
-) -> NDArray[np.float64]:
-    """Parameters (draws, parameters) of physics steps as those of a servo without steps.
-
-    In a step h the drive acts over h / (1 + h d) at damping d over the inertia, in continuous time
-    over (1 - exp(-h d')) / d' with exp(-h d') = 1 / (1 + h d): stiffness, damping and friction are
-    smaller by d' / d. While the torque is clipped, the same holds with the back-EMF alone.
-
-    Parameters
-    ----------
-    structure : Structure
-    values : ndarray, shape (draws, parameters)
-    inertia : ndarray, shape (draws,), or float
-        Of armature and load; 1 without a known load.
-    """
-    at = {name: j for j, name in enumerate(structure.names)}
-    place = {
-        term: at[name] for term, names in _BRAKED.items() for name in names if name in at
-    }  # fmt: skip
-    if not {"stiffness", "friction", "effort"} <= place.keys():
-        return values
-    exact, h = values.copy(), TIME_STEP_S
-    brake = np.zeros(len(values))
-    if "speed" in place:
-        brake = values[:, place["effort"]] / values[:, place["speed"]] / inertia
-        exact[:, place["effort"]] *= _shorter(h * brake)
-    damping = values[:, place["damping"]] / inertia if "damping" in place else 0.0
-    total = damping + brake
-    for term in ("stiffness", "friction"):
-        exact[:, place[term]] *= _shorter(h * total)
-    if "damping" in place:
-        own = (np.log1p(h * total) - np.log1p(h * brake)) / h
-        exact[:, place["damping"]] = np.maximum(own, 1e-3 * damping) * inertia
-    return exact
-
-
-_BRAKED = {
-    "stiffness": ("stiffness", "stiffness_per_s2"), "speed": ("no_load_speed_rad_s",),
-    "friction": ("friction_loss", "friction_rad_s2"), "damping": ("damping", "damping_per_s"),
-    "effort": ("stall_torque", "effort_rad_s2"),
-}  # fmt: skip
-
-
-def _shorter(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(x > 1e-9, np.log1p(x) / np.maximum(x, 1e-9), 1.0)

@@ -36,6 +36,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate, with_voltage
@@ -397,7 +398,11 @@ class _Servo:
     @classmethod
     def of(cls, calibration: Calibration, joint: str) -> _Servo:
         own = calibration.joint(joint)
-        dead_time = own.actuator.dead_time_s.value
+        # the servo's own numbers, of an older file, too
+        fitted_step_s = own.actuator.fitted_step_s
+        numbers = at_step(own.actuator.parameters, CONTINUOUS_S, fitted_step_s)
+        pd = {name: float(np.squeeze(x)) for name, x in numbers.arrays().items()}
+        dead_time = pd["dead_time_s"]
         slowest = own.actuator.velocity_limit_rad_s.value
         limit = slowest if slowest < NO_SPEED_LIMIT_RAD_S else np.inf
         block = own.under_load
@@ -406,8 +411,7 @@ class _Servo:
             hanging = block.hanging_rad.value if block.hanging_rad else 0.0
             volts = block.reference_voltage_v or math.nan
             return cls(block.servo(dead_time), None, (gravity, hanging), limit, volts)
-        pd = own.actuator.parameters.arrays()
-        stall = min(float(pd["effort_limit"]), _NO_LIMIT_NM)
+        stall = min(pd["effort_limit"], _NO_LIMIT_NM)
         parameters = LoadedServoParameters(
             duty_per_rad=pd["stiffness"] / stall,
             duty_s_per_rad=pd["damping"] / stall,

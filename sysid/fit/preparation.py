@@ -97,6 +97,15 @@ class PreparedJoint:
         """The same generator for every fit, so that a fit does not depend on those before it."""
         return deepcopy(self.rng)
 
+    def as_any_servo(self) -> PreparedJoint:
+        """The same joint as one that may carry an unknown load, with a first fit of such a servo.
+
+        For a joint in free air that DelayedPD does not describe.
+        """
+        scales = replace(scales_of(self.recorded, self.runs), known_load=False, p_gain=1.0)
+        first = _first_fits(scales, self.runs, self.noise_rad, self.fit_rng())
+        return replace(self, scales=scales, first=first, reference_voltage_v=float("nan"))
+
     def problem(self, structure: Structure) -> Problem:
         """The fit of a structure to all runs."""
         return Problem(structure, self.runs, self.noise_rad)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.common.results import Result, derived, flat, internal
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, whole_steps
+from pupper_sysid.common.results import Result, flat, internal
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.fit.goodness import overall
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.scores import Scores
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
@@ -164,6 +164,10 @@ class JointCalibrationResult(Result):
     presets : dict of str to Scores
         Published settings, scored in the same way.
     warnings : tuple of str
+    goodness : dict of str to float
+        Residual of the model over the noise of readings, by motion: 1 where it explains the servo.
+    r_hat, effective_draws : float
+        Split-R̂ of the draws behind the intervals, and how many independent ones they are worth.
     loaded : LoadedFit or None
         The servo at any gain and load, where the recordings tell of a load or several gains.
     runs : tuple of Run
@@ -179,6 +183,9 @@ class JointCalibrationResult(Result):
     lag: LagBudget
     presets: dict[str, Scores]
     warnings: tuple[str, ...]
+    goodness: dict[str, float] = field(default_factory=dict)
+    r_hat: float = float("nan")
+    effective_draws: float = float("nan")
     loaded: LoadedFit | None = None
     runs: tuple[Run, ...] = internal(default=())
 
@@ -199,20 +206,17 @@ class JointCalibrationResult(Result):
         assert self.lag.dead_time_s is not None
         return self.lag.dead_time_s
 
-    @derived
-    def delay_steps(self) -> tuple[int, int]:
-        """Dead-time interval in whole physics steps, rounded outward."""
-        return whole_steps(self.dead_time_s.low, self.dead_time_s.high, TIME_STEP_S)
-
     def __str__(self) -> str:
         scores, model, unseen = self.delayed_pd.scores, "DelayedPD", "unseen frequencies"
         if np.isfinite(scores.rmse_unseen_runs_rad):
             unseen = "runs left out of the fit"
+        ratio = overall(self.goodness)
+        noise = f" ({ratio:.1f} times their noise)" if np.isfinite(ratio) else ""
         if self.loaded is not None:
             model = f"servo under load ({self.loaded.structure})"
         return (
             f"{model} with {1e3 * self.dead_time_s.value:.1f} ms dead time, free-run error "
-            f"{1e3 * scores.rmse_fresh_rad:.1f} mrad on fresh readings, "
+            f"{1e3 * scores.rmse_fresh_rad:.1f} mrad on fresh readings{noise}, "
             f"{1e3 * scores.rmse_unseen_rad:.1f} mrad on {unseen}"
         )
 

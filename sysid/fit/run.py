@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, TIME_STEP_S
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, Readings, readings
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S, Structure
@@ -44,6 +44,8 @@ class Run:
         Per step, after a rest longer than any dead time: command [rad], truncated as the bus does
         and averaged over the step; then, where they are not always 1, share of the step for which
         the torque is on and supply voltage over the reference.
+    edges : ndarray, shape (2, pad + steps)
+        When within a step the command changed (`kernel.edges_of`).
     pad : int
         Steps of rest.
     start_rad : float
@@ -68,6 +70,7 @@ class Run:
     p_gain: float
     load: NDArray[np.float64]
     held: NDArray[np.float64]
+    edges: NDArray[np.float64]
     pad: int
     start_rad: float
     sample_step: NDArray[np.float64]
@@ -152,7 +155,7 @@ def prepare(
     sent = trial.send_time_s - start
     held = np.ones((3, pad + steps))
     held[0, :pad] = trial.initial_command_rad
-    held[0, pad:] = averaged(sent, whole_counts(trial), steps)
+    edges, held[0, pad:] = _commanded(sent, whole_counts(trial), held[0], pad)
     if trial.torque_enabled is not None:
         on = trial.torque_enabled.astype(float)
         held[1, :pad] = on[0]
@@ -175,6 +178,7 @@ def prepare(
             [load.inertia_kg_m2, load.gravity_nm, load.hanging_rad]
         ),
         held=held,
+        edges=edges,
         pad=pad,
         start_rad=float(known[0]) if len(known) else trial.initial_command_rad,
         sample_step=to_step(reading.time_s[inside]),
@@ -185,6 +189,17 @@ def prepare(
         ramp_share=1.0 if ramp is None or np.isfinite(ramp) else float("inf"),
         ramp_known=ramp is not None,
     )  # fmt: skip
+
+
+def _commanded(
+    sent_s: NDArray, command: NDArray, rest: NDArray, pad: int, step_s: float = TIME_STEP_S
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Edges of all steps, and the mean command of those after the rest."""
+    mean = averaged(sent_s, command, len(rest) - pad, step_s)
+    ends = step_s * (1.0 + np.arange(len(mean)))
+    last = np.searchsorted(sent_s, ends, side="left") - 1
+    whole = np.concatenate([rest[:pad], command[np.maximum(last, 0)]])
+    return kernel.edges_of(np.concatenate([rest[:pad], mean]), whole), mean
 
 
 def averaged(
@@ -226,8 +241,8 @@ def with_late_commands(run: Run, trial: Trial, jitter_s: float, rng: np.random.G
     sent = np.concatenate([[0.0], sent])
     command = np.concatenate([[run.rest_rad], whole_counts(trial)])
     held = run.held.copy()
-    held[0, run.pad :] = averaged(sent, command, run.steps, run.step_s)
-    return replace(run, held=held)
+    edges, held[0, run.pad :] = _commanded(sent, command, held[0], run.pad, run.step_s)
+    return replace(run, held=held, edges=edges)
 
 
 def _voltage(
@@ -361,6 +376,6 @@ def _simulated(
         columns = columns.copy()
         columns[:, _ACCELERATION] *= run.ramp_share
     return (
-        kind, columns, dead_time_s / run.step_s, run.held, run.p_gain, run.load, run.start_rad,
-        run.pad, run.step_s, -FRICTION_IMPEDANCE,
+        kind, columns, dead_time_s / run.step_s, run.held, run.edges, run.p_gain, run.load,
+        run.start_rad, run.pad, run.step_s,
     )  # fmt: skip

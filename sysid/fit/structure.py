@@ -147,24 +147,24 @@ class Term:
     free: tuple[float, float, float, float] | None = None
 
 
-# Free air: the priors cover hobby servos. Speed: data sheets say 0.08 to 0.2 s per 60 degrees, 13
-# to 5 rad/s, about a geometric mean of 8.3. The rest: stiff enough to hold a leg, and torque enough
-# to bring it to that speed within a few hundredths of a second.
+# Free air: wide priors, from a weak hobby servo on a long link to a stiff joint of a BLDC motor.
+# Two standard deviations of the speed go from 1 to 130 rad/s, so that a limit may be out of reach;
+# of the stiffness from 450 to 180,000 1/s², of the torque from 50 to 6,600 rad/s².
 SERVO_TERMS = {t.name: t for t in (
     Term("dead_time_s", "dead_time_s", "", "", 0.015, 1e-4, LONGEST_DEAD_TIME_S, 1.5,
          (0.02, 0.001, LONGEST_DEAD_TIME_S, np.inf)),
     Term("stiffness", "stiffness_per_s2", "stiffness", "torque", 5, 0.02, 2000, 2.0,
-         (9000.0, 30.0, 200000.0, 1.0)),
+         (9000.0, 30.0, 200000.0, 1.5)),
     Term("damping", "damping_per_s", "damping", "torque", 0.05, 1e-5, 200, 2.0,
-         (90.0, 0.05, 2000.0, 1.0)),
+         (60.0, 0.05, 2000.0, 1.5)),
     Term("friction_loss", "friction_rad_s2", "friction_loss", "torque", 0.1, 1e-5, 10, 2.0,
-         (120.0, 0.1, 10000.0, 1.2)),
+         (50.0, 0.1, 10000.0, 1.7)),
     Term("stall_torque", "effort_rad_s2", "effort_limit", "torque", 3, 0.05, 300, 1.2,
-         (450.0, 5.0, 20000.0, 0.6)),
+         (575.0, 5.0, 50000.0, 1.2)),
     Term("velocity_limit_rad_s", "velocity_limit_rad_s", "velocity_limit", "",
-         8.3, 0.3, 200.0, 0.8, (8.3, 0.3, 60.0, 0.3)),
+         8.3, 0.3, 200.0, 0.8, (11.5, 0.3, 500.0, 1.2)),
     Term("no_load_speed_rad_s", "no_load_speed_rad_s", "back_emf", "", 9.0, 0.3, 200.0, 0.8,
-         (9.0, 0.3, 60.0, 0.4)),
+         (11.5, 0.3, 500.0, 1.2)),
     Term("armature", "armature", "armature", "inertia", 0.3, 1e-4, 300, 2.0),
     Term("backlash_rad", "backlash_rad", "backlash_rad", "", 0.01, 5e-4, 0.15, 1.0),
     Term("hanging_rad", "hanging_rad", "hanging_rad", "", 0.0, -0.3, 0.3, 0.03),

@@ -39,9 +39,7 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """The lag budget per joint."""
     rows = []
     for result in results.values():
-        low, high = result.delay_steps
-        (row,) = result.lag.rows()
-        rows.append(row | {"delay_steps_min": low, "delay_steps_max": high})
+        rows += result.lag.rows()
     columns = (
         KEY,
         number("raw, ms", "raw_lag_s", 1, _MS),

@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
+from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Problem, search
@@ -47,10 +49,12 @@ def delayed_pd_fits(
             own.append(model.decode(search(problem, rng, keep=keep, final=final)[0].point))
         v = np.array(own).T
         shifts = np.array([_truncation_shift(data, joint) for joint in data.joints])
-        fits.append(
-            dict(zip(_NAMES, v, strict=False))
-            | {"armature": np.ones_like(v[0]), "offset_rad": v[6] + shifts}
+        servos = DelayedPDParameters(
+            **dict(zip(_NAMES, v, strict=False)), armature=np.ones_like(v[0])
         )
+        stepped = at_step(servos, TIME_STEP_S).arrays()
+        del stepped["back_emf"]  # the structure has none
+        fits.append(stepped | {"offset_rad": v[6] + shifts})
     return fits
 
 

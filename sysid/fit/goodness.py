@@ -1,0 +1,153 @@
+"""Goodness of fit: residuals of a servo against the noise of its readings, found without the servo.
+
+The residuals of a fit cannot say how noisy the readings are, because they hold the model's error,
+too. `reading_noise` finds the noise without a model: whatever moves a joint is smooth and follows
+its commands, so a weighted sum of a few consecutive readings and of earlier commands can be nearly
+zero, and what is left is noise. The weights of the readings with the smallest sum of squares are
+found on half of the readings and applied to the other half (Koopmans-Levin). Applied to the
+residuals of a model, the same finds what of them no smooth function explains, which is closer to
+the noise where readings are few.
+
+References
+----------
+Levin, M. J. (1964). Estimation of a system pulse transfer function in the presence of noise. IEEE
+Transactions on Automatic Control 9: 229–235.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.fit.run import Run, fresh_residuals
+from pupper_sysid.sysid.fit.structure import Structure
+
+DESCRIBED = 1.6
+"""Residual over noise up to which a servo describes a recording: in twins from an independent
+simulator (facts of `benchmarks/wide_twins.py`) servos of the fitted structure stay below."""
+
+_STRIDE_S = 0.005  # between the readings of a sum, at least
+_REACH_S = 0.12  # of earlier commands: dead time and settling of a servo
+_ORDER = 4  # earlier readings of a sum
+_IRREGULAR = 0.35  # of the usual interval: a longer or shorter one spoils a sum
+_LEAST_ROWS = 4  # per weight
+_OUTLIER_MAD = 4.0 * 1.4826
+
+
+def reading_noise(runs: Sequence[Run], residuals: Sequence[NDArray[np.float64]]) -> float:
+    """Standard deviation of the noise of readings that count, an upper bound [rad].
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Of one kind of motion.
+    residuals : sequence of ndarray, shape (samples,) each
+        Of the best model known [rad].
+
+    Returns
+    -------
+    float
+        NaN where there are too few readings.
+    """
+    found = [
+        _noise([_sums(run, values) for run, values in zip(runs, of_runs, strict=True)])
+        for of_runs in ([run.sample_rad for run in runs], residuals)
+    ]
+    return float(np.fmin(*found))
+
+
+def _sums(run: Run, values: NDArray[np.float64]) -> tuple[NDArray, NDArray] | None:
+    """Consecutive values (rows, order + 1), and what is known of each row: commands before it."""
+    time, count = run.sample_step * run.step_s, len(values)
+    if count < 10 * _ORDER:
+        return None
+    apart = float(np.median(np.diff(time)))
+    if not apart > 0:
+        return None
+    stride = max(1, round(_STRIDE_S / apart))
+    interval = stride * apart
+    reach = int(np.clip(np.ceil(_REACH_S / interval), 3, max(count // 12, 3)))
+    row = np.arange(_ORDER * stride, count)
+    back = row[:, None] - stride * np.arange(_ORDER + 1)
+    if not len(row):
+        return None
+    regular = (np.abs(-np.diff(time[back], axis=1) - interval) < _IRREGULAR * interval).all(axis=1)
+    # means of the held command over intervals before each reading
+    clock = run.step_s * np.arange(run.steps + 1)
+    area = np.concatenate([[0.0], np.cumsum(run.command * run.step_s)])
+    edges = time[row][:, None] - interval * np.arange(reach + 1)
+    sums = np.interp(edges, clock, area) + np.minimum(edges, 0.0) * run.rest_rad
+    means = -np.diff(sums, axis=1) / interval
+    known = np.concatenate([means, np.ones((len(row), 1))], axis=1)
+    return values[back][regular], known[regular]
+
+
+def _noise(parts: Sequence[tuple[NDArray, NDArray] | None]) -> float:
+    rows = [part for part in parts if part is not None and len(part[0])]
+    if not rows:
+        return float("nan")
+    width = min(known.shape[1] for _, known in rows)
+    values = np.concatenate([v for v, _ in rows])
+    known = np.concatenate(
+        [np.concatenate([k[:, : width - 1], k[:, -1:]], axis=1) for _, k in rows]
+    )
+    if len(values) < 2 * _LEAST_ROWS * (width + _ORDER + 1):
+        return float("nan")
+    half = (np.arange(len(values)) // max(20, len(values) // 16)) % 2 == 0
+    squares = []
+    for fitted, tested in ((half, ~half), (~half, half)):
+        u, s, v = np.linalg.svd(known[fitted], full_matrices=False)
+        kept = s > 1e-4 * s[0]
+        effect = (v[kept].T / s[kept]) @ (u[:, kept].T @ values[fitted])
+        rest = values[fitted] - known[fitted] @ effect
+        weights = np.linalg.svd(rest, full_matrices=False)[2][-1]
+        sums = (values[tested] - known[tested] @ effect) @ weights
+        squares.append(_clipped_square(sums))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _clipped_square(values: NDArray[np.float64]) -> float:
+    most = _OUTLIER_MAD * float(np.median(np.abs(values)))
+    return float(np.mean(np.minimum(np.abs(values), most) ** 2))
+
+
+def goodness_of_fit(
+    structure: Structure,
+    values: NDArray[np.float64],
+    runs: Sequence[Run],
+    quantum_rad: float,
+) -> dict[str, float]:
+    """Residual over noise of each kind of motion: 1 where the servo explains all but noise.
+
+    Parameters
+    ----------
+    structure : Structure
+    values : ndarray, shape (parameters,)
+    runs : sequence of Run
+    quantum_rad : float
+        Quantisation step of readings: their noise is not below that of rounding.
+
+    Returns
+    -------
+    dict of str to float
+        By tone, or label of the run; NaN where the noise is not known.
+    """
+    residuals = fresh_residuals(structure, values, runs)
+    least = quantum_rad / np.sqrt(12.0)
+    kinds = [f"{r.tone:g} Hz" if r.tone > 0 else r.label for r in runs]
+    ratios = {}
+    for kind in dict.fromkeys(kinds):
+        own = [n for n, k in enumerate(kinds) if k == kind]
+        parts = [residuals[n] for n in own]
+        size = np.sqrt(_clipped_square(np.concatenate(parts)))
+        noise = reading_noise([runs[n] for n in own], parts)
+        ratios[kind] = float(size / max(noise, least, 1e-12)) if np.isfinite(noise) else np.nan
+    return ratios
+
+
+def overall(ratios: dict[str, float]) -> float:
+    """Root mean square over the motions; NaN where none is known."""
+    known = np.array([r for r in ratios.values() if np.isfinite(r)])
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
