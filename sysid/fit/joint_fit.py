@@ -54,13 +54,12 @@ from pupper_sysid.sysid.fit.search import (
     Fit,
     Problem,
     curvature,
-    evolve,
+    evolved,
     fit_folds,
     folds_of,
     group_count,
     in_blocks,
     refine,
-    refined,
     search,
     search_widely,
 )
@@ -224,7 +223,7 @@ def _fitted(
     if ready.scales.free_air:
         best = search_widely(problem, rng, np.array(more), short)
     else:  # the first structure was searched for
-        best = evolve(problem, refined(problem, np.array(more)), rng, short)
+        best = evolved(problem, np.array(more), rng, short)
     return Fitted(structure, best)
 
 

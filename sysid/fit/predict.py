@@ -410,7 +410,8 @@ class _Servo:
             gravity = block.gravity_nm.value if block.gravity_nm else 0.0
             hanging = block.hanging_rad.value if block.hanging_rad else 0.0
             volts = block.reference_voltage_v or math.nan
-            return cls(block.servo(dead_time), None, (gravity, hanging), limit, volts)
+            stated = own.actuator.dead_time_s.value  # the numbers of a block are the servo's own
+            return cls(block.servo(stated), None, (gravity, hanging), limit, volts)
         stall = min(pd["effort_limit"], _NO_LIMIT_NM)
         parameters = LoadedServoParameters(
             duty_per_rad=pd["stiffness"] / stall,

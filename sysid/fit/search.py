@@ -102,6 +102,11 @@ class Problem:
             for run, noise in zip(self.runs, self.noise_rad, strict=True)
         ])  # fmt: skip
 
+    @cached_property
+    def coarse(self) -> Problem:
+        """The same fit in steps of twice the length (`Run.coarser`)."""
+        return replace(self, runs=tuple(run.coarser() for run in self.runs))
+
     def only(self, use: Sequence[bool] | NDArray[np.bool_]) -> Problem:
         """The same fit to some of the runs."""
         kept = [i for i, used in enumerate(use) if used]
@@ -170,11 +175,33 @@ def search_widely(
     short : bool
         Fewer generations.
     """
-    crowd = Starts(problem, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
+    crowd = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
     starts = crowd[:_KEEP]
     if more is not None and len(more):
         starts = np.concatenate([starts, more])
-    return evolve(problem, refined(problem, starts), rng, short, crowd)
+    return evolved(problem, starts, rng, short, crowd)
+
+
+def evolved(
+    problem: Problem,
+    starts: NDArray[np.float64],
+    rng: np.random.Generator,
+    short: bool = False,
+    crowd: NDArray[np.float64] | None = None,
+) -> Fit:
+    """The best fit from starts, searched in coarse steps and fitted to the end in fine ones.
+
+    Parameters
+    ----------
+    problem : Problem
+    starts : ndarray, shape (starts, parameters)
+        In fitted coordinates; those of simpler structures are kept as they are, too.
+    rng, short, crowd
+        As for `evolve`.
+    """
+    best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
+    near = np.concatenate([best.point[None], starts[-_FINAL:]])
+    return refine(problem, near[np.argsort(problem.costs(near))[:2]])
 
 
 def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:

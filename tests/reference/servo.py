@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE
 from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
 from pupper_sysid.sysid.fit.kernel import ABSENT, COLUMNS
 
@@ -30,10 +29,26 @@ def delayed(held: NDArray[np.float64], dead_time: float, pad: int) -> NDArray[np
     return held[k] + part * (held[k - 1] - held[k])
 
 
+def window(edges: NDArray[np.float64], at: float) -> list[tuple[float, float]]:
+    """Values of a held command and for how long, from `at` to `at + 1` steps."""
+    changes = {0.0: edges[0, 0]}  # time of a change: the value from there on
+    for m in range(max(int(at) - 2, 0), int(at) + 3):
+        if m < edges.shape[1]:
+            changes[m + edges[1, m]] = edges[0, m]
+    times = sorted(changes)
+    parts = []
+    for start, stop in zip(times, [*times[1:], np.inf], strict=True):
+        long = min(stop, at + 1) - max(start, at)
+        if long > 0:
+            parts.append((changes[start], long))
+    return parts
+
+
 def servo(
     row: NDArray[np.float64],
     dead_time: float,
     held: NDArray[np.float64],
+    edges: NDArray[np.float64],
     gain: float,
     load: NDArray[np.float64],
     start: float,
@@ -43,38 +58,60 @@ def servo(
     """Readings at the edges of the steps, shape (steps + 1,); parameters as for the kernel."""
     w = dict(zip(COLUMNS, row, strict=True))
     inertia = w["armature"] + load[0]
-    command = delayed(held[0], dead_time, pad)
-    on = delayed(held[1], dead_time, pad) if len(held) > 1 else np.ones(len(command))
-    volts = held[2, pad:] if len(held) > 1 else np.ones(len(command))
+    on = delayed(held[1], dead_time, pad) if len(held) > 1 else np.ones(held.shape[1] - pad)
+    volts = held[2, pad:] if len(held) > 1 else np.ones(len(on))
     y = setpoint = shown = start - w["offset_rad"]
     v = rate = 0.0
     out = [shown]
-    for k in range(len(command)):
-        way = command[k] - setpoint
-        if np.isfinite(w["acceleration_limit"]):
-            fastest = min(np.sqrt(2 * w["acceleration_limit"] * abs(way)), w["velocity_limit"])
-            wanted_rate = np.clip(way / h, -fastest, fastest)
-            change = w["acceleration_limit"] * h
-            rate += np.clip(wanted_rate - rate, -change, change)
-            setpoint += rate * h
-        else:
-            setpoint += np.clip(way, -w["velocity_limit"] * h, w["velocity_limit"] * h)
-        error = setpoint - y
-        error -= np.clip(error, -w["dead_zone_rad"], w["dead_zone_rad"])
-        begin = (
-            w["start_duty"] * np.clip(error / START_ERROR_RAD, -1, 1) if w["start_duty"] else 0.0
+    for k in range(len(on)):
+        commands = window(edges, pad + k - dead_time)
+        first, last = commands[0][0], commands[-1][0]
+        mean = sum(c * long for c, long in commands)
+        share = (
+            np.clip((mean - last) / (first - last), 0, 1)
+            if abs(first - last) > 1e-12
+            else (np.clip(mean - last, 0, 1))
         )
+        targets, moved = [], 0.0
+        for command, part in ((first, share), (last, 1 - share)):
+            way = command - setpoint
+            if np.isfinite(limit := w["acceleration_limit"]):
+                long = h * max(part, 1e-6)
+                fastest = np.sqrt((limit * long / 2) ** 2 + 2 * limit * abs(way)) - limit * long / 2
+                fastest = min(fastest, w["velocity_limit"])
+                wanted_rate = np.clip(way / long, -fastest, fastest)
+                change = np.clip(wanted_rate - rate, -limit * long, limit * long)
+                rate += change
+                move = (rate - change / 2) * long
+            else:
+                most = w["velocity_limit"] * h * part if part > 0 else 0.0
+                move = np.clip(way, -most, most)
+            moved += part * (setpoint + move / 2)
+            setpoint += move
+        limited = np.isfinite(w["velocity_limit"]) or np.isfinite(w["acceleration_limit"])
+        targets = [moved, moved] if limited else [first, last]
+        middle = y + v * h / 2
         effort = w["effort_limit"]
-        wanted = w["stiffness"] * gain * error - w["damping"] * v + begin * effort
-        drive = np.clip(wanted, -effort, effort)
-        share = volts[k] * on[k]
+        drive = free = 0.0
+        for target, part in zip(targets, (share, 1 - share), strict=True):
+            error = target - middle
+            error -= np.clip(error, -w["dead_zone_rad"], w["dead_zone_rad"])
+            begin = w["start_duty"] * np.clip(error / START_ERROR_RAD, -1, 1) * effort
+            wanted = w["stiffness"] * gain * error - w["damping"] * v + begin
+            drive += part * np.clip(wanted, -effort, effort)
+            free += part * (abs(wanted) <= effort)
         back = w["back_emf"] * (w["off_brake"] + (1 - w["off_brake"]) * on[k])
-        drawn = drive * share - back * v
+        supply = volts[k] * on[k]
+        drawn = drive * supply - back * v
         motor = np.clip(drawn, -w["torque_limit"], w["torque_limit"])
-        damping = back + (w["damping"] * share if drive == wanted else 0.0)
+        if len(held) > 1:
+            acting = over(h * (w["damping"] * supply * free + back) / inertia, h)
+        else:
+            braked = over(h * (w["damping"] + back) / inertia, h)
+            acting = over(h * back / inertia, h) * (1 - free) + braked * free
         if motor != drawn:
-            damping = 0.0
-        weight = -(load[1] + w["gravity_nm"]) * np.sin(y - load[2] - w["hanging_rad"])
+            acting = h
+        weight = -(load[1] + w["gravity_nm"]) * np.sin(middle - load[2] - w["hanging_rad"])
         standing = 1 / (1 + (v / w["stribeck_speed"]) ** 2)
         friction = w["friction_loss"] + w["stribeck_friction"] * standing
         friction += (1 + w["load_friction_static"] * standing) * (
@@ -82,11 +119,22 @@ def servo(
         )
         friction += w["load_friction_quadratic"] * motor**2
         force = motor + weight
-        stop = -FRICTION_IMPEDANCE * (inertia * v / h + force)
-        force += np.clip(stop, -friction, friction)
-        v += force * h / (inertia + h * damping)
-        y += v * h
+        way = np.sign(v) if v else np.sign(force)
+        slowed = v + (force - way * friction) / inertia * acting
+        if v == 0 and abs(force) <= friction:
+            new = 0.0
+        elif slowed * way > 0:
+            new = slowed
+        else:  # friction turns where the velocity does
+            rest = slowed / (slowed - v)
+            new = (force - np.clip(force, -friction, friction)) / inertia * acting * rest
+        v, y = new, middle + new * h / 2
         half = w["backlash_rad"] / 2
         shown = min(max(shown, y - half), y + half)
         out.append(shown)
     return np.array(out) + w["offset_rad"]
+
+
+def over(x: float, h: float) -> float:
+    """(1 - exp(-x)) / x of a step h, by the same approximation."""
+    return h / (1 + x / 2 + x * x / 12)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S
 
@@ -25,9 +26,10 @@ def run_of(
 ) -> Run:
     """A run in free air under `command` [rad], one a step; its rows are its samples by default."""
     row_step = sample_step if row_step is None else row_step
+    held = np.concatenate([np.full(PAD, rest_rad), command])
     return Run(
         label="trial 0", frequency_hz=frequency_hz, p_gain=1.0, load=np.zeros(3),
-        held=np.concatenate([np.full(PAD, rest_rad), command])[None], pad=PAD, start_rad=rest_rad,
+        held=held[None], edges=edges_of(held), pad=PAD, start_rad=rest_rad,
         sample_step=sample_step, sample_rad=sample_rad, row_step=row_step,
         held_step=row_step if held_step is None else held_step,
         row_rad=sample_rad if row_rad is None else row_rad,

@@ -13,7 +13,7 @@ from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
 
-LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.002, 0.02, 600
+LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.0004, 0.02, 600
 JUMPS, CHIRP = "jumps", "chirp"
 
 
@@ -41,11 +41,11 @@ def recording(
     servo = LoadedServo(random_servo(limit, seed), 16.0, time_step_s=STEP_S)
     servo.reset(command[0])
     per = round(LOOP_S / STEP_S)
-    moved = servo.rollout(np.repeat(command, per))[per - 2 :: per]
+    moved = servo.rollout(np.repeat(command, per))[per - 6 :: per]
     count = 2 * np.pi / 4096
     table = pd.DataFrame(
         {
-            "send_time_s": time, "read_time_s": time + LOOP_S - STEP_S, "trial": 0, "joint": "j",
+            "send_time_s": time, "read_time_s": time + LOOP_S - 5 * STEP_S, "trial": 0, "joint": "j",
             "frequency_hz": np.nan, "command_rad": command,
             "position_rad": np.round(moved / count) * count,
         }

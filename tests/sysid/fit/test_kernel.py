@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from reference.servo import columns, delayed, servo
 
-from pupper_sysid.servo_models.delayed_pd import (
-    FRICTION_IMPEDANCE,
-    DelayedPD,
-    DelayedPDParameters,
-)
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.sparse_equation import SparseEquation
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.structure import candidate
@@ -52,17 +46,22 @@ def held(rows: int = 1) -> np.ndarray:
     return signal
 
 
+def edges(signal: np.ndarray) -> np.ndarray:
+    """The command changes within each step, where it goes up after 0.3 of it."""
+    return np.stack([signal[0], np.where(np.arange(signal.shape[1]) % 3 == 0, 0.3, 0.0)])
+
+
 def compiled(rows, dead_time, signal, gain=1.0, load=NO_LOAD, start=0.1):
     return kernel.positions(
-        kernel.SERVO, np.atleast_2d(rows), np.atleast_1d(dead_time), signal, gain, load, start,
-        PAD, STEP_S, -FRICTION_IMPEDANCE,
+        kernel.SERVO, np.atleast_2d(rows), np.atleast_1d(dead_time), signal, edges(signal), gain,
+        load, start, PAD, STEP_S,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", TERMS)
 def test_every_term_moves_as_its_equation_says(name):
     row = columns(**BASE, **TERMS[name], offset_rad=0.03)
-    expected = servo(row, 7.3, held(), 1.5, NO_LOAD, 0.1, PAD, STEP_S)
+    expected = servo(row, 7.3, held(), edges(held()), 1.5, NO_LOAD, 0.1, PAD, STEP_S)
     assert np.abs(compiled(row, 7.3, held(), 1.5)[:, 0] - expected).max() < 1e-7
     without = compiled(columns(**BASE, offset_rad=0.03), 7.3, held(), 1.5)[:, 0]
     assert np.abs(without - expected).max() > 1e-3  # the motion shows the term
@@ -73,25 +72,39 @@ def test_all_terms_together_under_a_load_with_the_torque_off_and_a_sagging_suppl
     for more in TERMS.values():
         numbers |= more
     row, load = columns(**numbers), np.array([1.4, 90.0, -0.2])
-    expected = servo(row, 4.6, held(3), 0.7, load, 0.1, PAD, STEP_S)
+    expected = servo(row, 4.6, held(3), edges(held(3)), 0.7, load, 0.1, PAD, STEP_S)
     assert np.abs(compiled(row, 4.6, held(3), 0.7, load)[:, 0] - expected).max() < 1e-7
 
 
-def test_a_servo_in_free_air_is_delayed_pd():
+@pytest.mark.parametrize("more", [{"velocity_limit": 6.0}, {}, {"friction_loss": 2.0}])
+def test_two_milliseconds_move_as_delayed_pd_does_in_continuous_time(more):
+    numbers = BASE | more
     parameters = DelayedPDParameters(
-        stiffness=9000.0, damping=90.0, friction_loss=120.0, armature=1.0, effort_limit=450.0,
-        velocity_limit=6.0, dead_time_s=0.0146, back_emf=20.0,
-    )  # fmt: skip
-    own = DelayedPD(parameters, STEP_S)
-    own.reset(0.1)
-    expected = own.rollout(held()[0, PAD:])
-    found = compiled(columns(**BASE, velocity_limit=6.0), 7.3, held())[1:, 0]
-    assert np.abs(found - expected).max() < 1e-9
-    doubled = replace(parameters.scaled(2.0), velocity_limit=6.0).arrays()
-    row = columns(
-        **{name: float(doubled[name]) for name in (*BASE, "armature")}, velocity_limit=6.0
+        armature=1.0, dead_time_s=0.0146, **({"velocity_limit": np.inf} | numbers)
     )
-    assert np.abs(compiled(row, 7.3, held())[1:, 0] - expected).max() < 1e-9
+    signal = held()[0, PAD:]
+    late = (PAD + np.arange(STEPS)) % 3 == 0  # as in `edges`
+    tracks = {}
+    for times in (1, 25):
+        stepped = DelayedPD(parameters, STEP_S / times)
+        stepped.reset(0.1)
+        stairs = np.repeat(signal, times).reshape(STEPS, times)
+        before = np.concatenate([[0.1], signal[:-1]])
+        stairs[late, : round(0.3 * times)] = before[late, None]
+        tracks[times] = stepped.rollout(stairs.ravel())[times - 1 :: times]
+    own = compiled(columns(**numbers), 7.3, held())[1:, 0]
+    assert rms(own - tracks[25]) < 0.2 * rms(tracks[1] - tracks[25])
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_a_scaled_inertia_moves_alike():
+    doubled = {name: 2.0 * value for name, value in BASE.items()}
+    one = compiled(columns(**BASE, velocity_limit=6.0), 7.3, held())
+    two = compiled(columns(**doubled, armature=2.0, velocity_limit=6.0), 7.3, held())
+    assert np.abs(one - two).max() < 1e-9
 
 
 def test_candidates_do_not_depend_on_their_neighbours():
@@ -128,8 +141,8 @@ def test_linear_models_move_about_their_first_reading(name, values):
     rest = 0.1 - 0.02
     expected = rest + linear(name, row, delayed(held()[0], 5.5, PAD) - rest, STEP_S) + 0.02
     found = kernel.positions(
-        candidate(name).kind, row[None], np.array([5.5]), held(), 1.0, NO_LOAD, 0.1, PAD,
-        STEP_S, -FRICTION_IMPEDANCE,
+        candidate(name).kind, row[None], np.array([5.5]), held(), edges(held()), 1.0,
+        NO_LOAD, 0.1, PAD, STEP_S,
     )  # fmt: skip
     np.testing.assert_allclose(found[:, 0], expected, atol=1e-12)
 
@@ -143,8 +156,8 @@ def test_the_sparse_equation_is_that_of_the_servo_model():
     own = SparseEquation(numbers, 5.5 * STEP_S, 0.0, STEP_S)
     own.reset(0.1)
     found = kernel.positions(
-        kernel.SPARSE, np.array([[*numbers.values(), 0.0]]), np.array([5.5]), held(), 1.0, NO_LOAD,
-        0.1, PAD, STEP_S, -FRICTION_IMPEDANCE,
+        kernel.SPARSE, np.array([[*numbers.values(), 0.0]]), np.array([5.5]), held(),
+        edges(held()), 1.0, NO_LOAD, 0.1, PAD, STEP_S,
     )  # fmt: skip
     np.testing.assert_allclose(found[1:, 0], own.rollout(held()[0, PAD:]), atol=1e-9)
 
@@ -156,7 +169,7 @@ def test_residuals_costs_and_moments_are_of_the_same_motion():
     reading = rng.uniform(-0.3, 0.6, 60)
     dead_time = rng.uniform(0.5, 30.0, len(rows))
     simulated = (
-        kernel.SERVO, rows, dead_time, held(), 1.0, NO_LOAD, 0.1, PAD, STEP_S, -FRICTION_IMPEDANCE,
+        kernel.SERVO, rows, dead_time, held(), edges(held()), 1.0, NO_LOAD, 0.1, PAD, STEP_S,
     )  # fmt: skip
     track = kernel.positions(*simulated)
 
