@@ -278,6 +278,20 @@ class Stretch:
 RAMP_S, LEAD_IN_S = 0.5, 0.3
 
 
+class Reach(NamedTuple):
+    """Largest excursion, speed and acceleration of the commands (steps have the first only)."""
+
+    size_rad: float
+    speed_rad_s: float
+    acceleration_rad_s2: float
+
+    def at(self, hz: Array | float) -> Array:
+        """Largest amplitude of a tone [rad]."""
+        turn = 2 * np.pi * np.asarray(hz)
+        most = np.minimum(self.size_rad, self.speed_rad_s / turn)
+        return np.minimum(most, self.acceleration_rad_s2 / turn**2)
+
+
 def _log(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
@@ -290,23 +304,17 @@ def _tone(centre: float, size: float, hz: float) -> Callable[[Array], Array]:
     return lambda t: centre + size * _envelope(t) * np.sin(2 * np.pi * hz * (t - LEAD_IN_S))
 
 
-def _tones(rng: np.random.Generator, total: float, centre: float, size: float, peak: float):
+def _tones(rng: np.random.Generator, total: float, centre: float, reach: Reach):
     edges = np.geomspace(1.0, 8.0, 5)
     tones = [round(_log(rng, *edges[i : i + 2]), 2) for i in range(4)]
     return [
-        Stretch(
-            max(total / 4, 5.0 / hz + 1.5),
-            _tone(centre, min(size, peak / (2 * np.pi * hz)), hz),
-            hz,
-        )
+        Stretch(max(total / 4, 5.0 / hz + 1.5), _tone(centre, float(reach.at(hz)), hz), hz)
         for hz in tones
     ]
 
 
-def _one_after_another(
-    rng: np.random.Generator, total: float, centre: float, size: float, peak: float
-):
-    parts = _tones(rng, total, centre, size, peak)
+def _one_after_another(rng: np.random.Generator, total: float, centre: float, reach: Reach):
+    parts = _tones(rng, total, centre, reach)
     ends = np.cumsum([p.duration_s for p in parts])
 
     def command(time: Array) -> Array:
@@ -319,7 +327,7 @@ def _one_after_another(
     return [Stretch(float(ends[-1]), command)]
 
 
-def _walk(rng: np.random.Generator, total: float, centre: float, size: float, peak: float):
+def _walk(rng: np.random.Generator, total: float, centre: float, reach: Reach):
     grid = np.arange(0, total + 0.01, 0.01)
     knots = np.arange(0, total + 4, rng.uniform(2, 4))
     rate = np.interp(grid, knots, rng.uniform(1.5, 2.5, len(knots)))
@@ -333,23 +341,17 @@ def _walk(rng: np.random.Generator, total: float, centre: float, size: float, pe
 
     circle = wave(np.linspace(0, 2 * np.pi, 2000))
     fastest = np.abs(np.gradient(circle, 2 * np.pi / 1999)).max() * 2 * np.pi * 2.5
-    scale = min(size / np.abs(circle).max(), 2 * peak / fastest)
+    scale = min(reach.size_rad / np.abs(circle).max(), 2 * reach.speed_rad_s / fastest)
     strength = np.interp(grid, knots, rng.uniform(0.7, 1.0, len(knots)))
-    return [
-        Stretch(
-            total,
-            lambda t: (
-                centre
-                + scale
-                * _envelope(t)
-                * np.interp(t, grid, strength)
-                * wave(np.interp(t, grid, phase))
-            ),
-        )
-    ]
+
+    def command(time: Array) -> Array:
+        size = scale * _envelope(time) * np.interp(time, grid, strength)
+        return centre + size * wave(np.interp(time, grid, phase))
+
+    return [Stretch(total, command)]
 
 
-def _teleop(rng: np.random.Generator, total: float, centre: float, size: float, peak: float):
+def _teleop(rng: np.random.Generator, total: float, centre: float, reach: Reach):
     step = 0.01
     count = int(total / step) + 2
     moving, at = np.zeros(count), int(0.5 / step)
@@ -369,7 +371,8 @@ def _teleop(rng: np.random.Generator, total: float, centre: float, size: float, 
         speed[k] = state[2] if moving[k] or abs(state[2]) > 1e-4 * np.abs(speed).max() else 0.0
         angle[k] = angle[k - 1] + step * speed[k]
         angle[k] -= moving[k] * 2 * np.pi * slowest * step * angle[k - 1]
-    angle *= min(size / np.abs(angle).max(), 1.5 * peak / np.abs(np.diff(angle) / step).max())
+    fastest = np.abs(np.diff(angle)).max() / step
+    angle *= min(reach.size_rad / np.abs(angle).max(), 1.5 * reach.speed_rad_s / fastest)
     grid = step * np.arange(count)
     return [Stretch(total, lambda t: centre + np.interp(t, grid, angle))]
 
@@ -387,25 +390,25 @@ def _levels(
     return np.array(starts), values
 
 
-def _steps(rng: np.random.Generator, total: float, centre: float, size: float, peak: float):
-    starts, values = _levels(rng, total, size, 0.5, 1.2, False)
+def _steps(rng: np.random.Generator, total: float, centre: float, reach: Reach):
+    starts, values = _levels(rng, total, reach.size_rad, 0.5, 1.2, False)
     return [Stretch(total, lambda t: centre + values[np.searchsorted(starts, t, "right") - 1])]
 
 
-def _prbs(rng: np.random.Generator, total: float, centre: float, size: float, peak: float):
+def _prbs(rng: np.random.Generator, total: float, centre: float, reach: Reach):
     clock = rng.uniform(0.1, 0.25)
-    starts, values = _levels(rng, total, 0.5 * size, clock, clock, True)
+    starts, values = _levels(rng, total, 0.5 * reach.size_rad, clock, clock, True)
     return [Stretch(total, lambda t: centre + values[np.searchsorted(starts, t, "right") - 1])]
 
 
-def _chirp(rng: np.random.Generator, total: float, centre: float, size: float, peak: float):
+def _chirp(rng: np.random.Generator, total: float, centre: float, reach: Reach):
     low, high = rng.uniform(0.3, 0.8), rng.uniform(5, 9)
 
     def command(time: Array) -> Array:
         growth = np.log(high / low)
         hz = low * np.exp(growth * time / total)
         turn = 2 * np.pi * low * total / growth * (np.exp(growth * time / total) - 1)
-        return centre + np.minimum(size, peak / (2 * np.pi * hz)) * _envelope(time) * np.sin(turn)
+        return centre + reach.at(hz) * _envelope(time) * np.sin(turn)
 
     return [Stretch(total, command)]
 
@@ -471,8 +474,6 @@ class Twin:
     servo: Servo
     bus: Bus
     stretches: list[Stretch]
-    peak_rad_s: float
-    size_rad: float
 
 
 LAWS = ("slew", "back_emf", "no_limit")
@@ -545,7 +546,7 @@ def _featured(rng: np.random.Generator, kind: str, servo: Servo, size: float) ->
             )
         w, reduced = 2 * np.pi * 150, m * (1 - m)
         return two._replace(
-            link_stiffness=w * w * reduced, link_damping=0.6 * w * reduced,
+            link_stiffness=w * w * reduced, link_damping=1.6 * w * reduced,
             play=min(_log(rng, 0.005, 0.05), 0.3 * size), read_on_motor=0.0,
             loop_on_motor=float(rng.random() < 0.5),
         )  # fmt: skip
@@ -631,8 +632,10 @@ def draw_twin(kind: str, motion: str, number: int, seed: int) -> tuple[Twin, Pat
         servo = _featured(rng, kind, servo, size)
         bus = _bus(rng, kind, number)
         total = min(_log(rng, 10, 40), MOST_ROWS / bus.rate_hz)
-        stretches = MOTIONS[motion](rng, total, rng.uniform(-0.5, 0.5), size, peak)
-        twin = Twin(kind, motion, number, seed, servo, bus, stretches, peak, size)
+        # far above its limit a profile's motion depends on every rounding
+        reach = Reach(size, peak, servo.acceleration_limit * _log(rng, 0.5, 4))
+        stretches = MOTIONS[motion](rng, total, rng.uniform(-0.5, 0.5), reach)
+        twin = Twin(kind, motion, number, seed, servo, bus, stretches)
         if servo.back_emf > 0 and servo.effort / servo.back_emf < 2.0:
             continue  # no joint is that slow
         sent, commands, _ = sends(twin)
@@ -659,8 +662,9 @@ def sends(twin: Twin) -> tuple[Array, Array, NDArray[np.int64]]:
         count = int(stretch.duration_s * twin.bus.rate_hz)
         late = twin.bus.jitter * period * np.abs(rng.standard_normal(count))
         late += np.where(rng.random(count) < 0.005, rng.uniform(0.3, 1.5, count) * period, 0)
-        own = np.maximum.accumulate(period * np.arange(count) + late)
-        own += 1e-6 * np.arange(count)
+        # turns after a late one are made up for, each in a fifth of a period at least
+        least = 0.2 * period * np.arange(count)
+        own = np.maximum.accumulate(period * np.arange(count) + late - least) + least
         # a program computes commands for its turns; they go out when they go out
         value = stretch.command(own)
         times += [start + own, [start + own[-1] + period]]
@@ -708,7 +712,8 @@ def readings(twin: Twin, path: Path) -> Rows:
     sent, commands, trial = sends(twin)
     own = trial >= 0
     sent, commands, trial = sent[own], commands[own], trial[own]
-    read = sent + bus.read_after_s + 1e-4 * np.abs(rng.standard_normal(len(sent)))
+    slow = np.minimum(1e-4 * np.abs(rng.standard_normal(len(sent))), 0.05 / bus.rate_hz)
+    read = sent + bus.read_after_s + slow
     measured = read - bus.age_s
     if bus.poll_s > 0:
         polls = np.arange(sent[0] - 10 * bus.poll_s, read[-1], bus.poll_s)
