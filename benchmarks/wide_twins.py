@@ -13,7 +13,8 @@ calibration file calls identified is compared with the truth.
 `--out` is a file of JSON lines, one twin each, written as they end; `--resume` continues it.
 Definitions: a number *holds* where its 90 % interval touches the truth, which is an interval itself
 where the servo has no single number (`wide_servo.truths`); a miss counts as the factor (times: ms)
-between the nearer ends; *identified* is what the file calls so, `ratio only` included.
+between the nearer ends; *identified* is what the file calls so, `ratio only` included; *stretch* is
+the factor by which intervals must grow about their values for 90 % to hold.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
@@ -211,7 +212,7 @@ def miss(quantity: str, answer: dict[str, Any], truth: list[float]) -> float:
 # ----------------------------------------------------------------------------------------- tables
 
 
-WORDS = ("identified", "holds", "beyond a factor 2", "worst miss", "median width")
+WORDS = ("identified", "holds", "beyond a factor 2", "worst miss", "median width", "stretch")
 Answer = tuple[str, dict[str, Any], list[float], dict[str, Any]]
 """Quantity, answer of the file, truth, and the twin's record."""
 
@@ -245,11 +246,13 @@ def coverage(rows: list[Answer]) -> dict[str, Any]:
     inside = [r for r in known if holds(r[1], r[2])]
     misses = [miss(_named(q), a, t) for q, a, t, _ in known]
     widths = [width(_named(q), a) for q, a, _, _ in known]
+    scores = [stretch(_named(q), a, t) for q, a, t, _ in known]
     return {
         "all": len(rows), "identified": len(known), "holds": len(inside),
         "misses": [m for (q, a, t, _), m in zip(known, misses, strict=True) if not holds(a, t)],
         "worst": max(misses, default=math.nan),
         "width": float(np.median(widths)) if widths else math.nan,
+        "stretch": float(np.quantile(scores, 0.9, method="higher")) if scores else math.nan,
     }  # fmt: skip
 
 
@@ -265,6 +268,23 @@ def width(quantity: str, answer: dict[str, Any]) -> float:
     return high / low if low > 0 else math.inf
 
 
+def stretch(quantity: str, answer: dict[str, Any], truth: list[float]) -> float:
+    """Factor by which an interval must grow about its value to touch the truth (conformal score).
+
+    In logarithms where the quantity's errors are factors.
+    """
+    if math.isinf(truth[0]):
+        return 0.0 if holds(answer, truth) else math.inf
+    ends = np.array([answer["low"], answer["value"], answer["high"], *truth], float)
+    if quantity not in DIFFERENCES:
+        ends = np.log(np.maximum(ends, 1e-12))
+    low, value, high, first, last = ends
+    if first <= value <= last:
+        return 0.0
+    part, whole = (first - value, high - value) if first > value else (value - last, value - low)
+    return float(part / whole) if whole > 0 else math.inf
+
+
 def share(part: int, whole: int) -> str:
     """Counts, with the percentage."""
     return f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else "–"
@@ -275,7 +295,8 @@ def size(quantity: str, value: float) -> str:
     if math.isnan(value):
         return "–"
     unit = DIFFERENCES.get(_named(quantity))
-    return f"{value:.3g} {unit[1]}" if unit else f"× {value:.3g}".replace("inf", "∞")
+    digits = f"{value:.3g}" if unit or not 1 < value < 1.1 else f"{value:.4f}"
+    return f"{digits} {unit[1]}" if unit else f"× {digits}".replace("inf", "∞")
 
 
 def table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
@@ -363,6 +384,7 @@ def quantity_row(quantity: str, rows: list[Answer]) -> tuple[str, ...]:
     return (
         quantity, share(c["identified"], c["all"]), share(c["holds"], c["identified"]), far,
         size(quantity, c["worst"]) if c["misses"] else "–", size(quantity, c["width"]),
+        size("", c["stretch"]),
     )  # fmt: skip
 
 
@@ -383,20 +405,27 @@ def cells(rows: list[Answer]) -> tuple[str, ...]:
 
 
 def goodness(records: list[dict[str, Any]]) -> None:
-    """Print medians of what the files say of their fit, by kind, where they say anything."""
-    numbers = defaultdict(lambda: defaultdict(list))
+    """Print what the files say of their fit by kind: medians of numbers, the commonest word."""
+    by_name = defaultdict(lambda: defaultdict(list))
     for record in records:
         for name, value in (record.get("goodness") or {}).items():
-            if isinstance(value, (int, float)) and not isinstance(value, bool):
-                numbers[name][record["kind"]].append(value)
-    common = [n for n, by in numbers.items() if sum(map(len, by.values())) >= len(records) / 4][:8]
+            if value is not None:
+                by_name[name][record["kind"]].append(value)
+    common = [n for n, by in by_name.items() if sum(map(len, by.values())) >= len(records) / 4][:10]
     if common:
-        kinds = [k for k in KINDS if any(k in numbers[n] for n in common)]
-        table(
-            ("median of", *common),
-            ((k, *(f"{np.median(numbers[n][k]):.3g}" if numbers[n][k] else "–" for n in common))
-             for k in kinds),
-        )  # fmt: skip
+        kinds = [k for k in KINDS if any(by_name[n][k] for n in common)]
+        rows = ((k, *(summary(by_name[n][k]) for n in common)) for k in kinds)
+        table(("goodness of fit", *common), rows)
+
+
+def summary(values: list[Any]) -> str:
+    """Median of numbers, or the commonest of other values with its share."""
+    if not values:
+        return "–"
+    if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
+        return f"{np.median(values):.3g}"
+    word, count = Counter(map(str, values)).most_common(1)[0]
+    return f"{word[:30]}, {share(count, len(values))}"
 
 
 def print_comparison(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> None:
