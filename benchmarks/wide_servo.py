@@ -216,7 +216,7 @@ def _run(servo, command, dt, angle, motor, link, set_points):
 
 @dataclass(frozen=True)
 class Path:
-    """Motion of a servo on the simulator's steps; times are the end of each step.
+    """Motion of a servo on the simulator's steps.
 
     Attributes
     ----------
@@ -260,7 +260,8 @@ def simulate(
     part = motor if servo.read_on_motor > 0.5 else link
     slopes = servo.slope(part)
     ends = (float(slopes.min()), float(slopes.max()))
-    return Path(time, servo.measured(part), set_point, arrivals - sent_s, ends)
+    # kick and drift: angles are ahead by half a step
+    return Path(time + 0.5 * step_s, servo.measured(part), set_point, arrivals - sent_s, ends)
 
 
 # ------------------------------------------------------------------------------------------ motions
@@ -685,7 +686,7 @@ def _follows(twin: Twin, path: Path, sent: Array, commands: Array) -> bool:
     held = commands[np.searchsorted(sent, grid, "right") - 1]
     moved = np.interp(grid, path.time_s, path.angle)
     gain = moved.std() / held.std()
-    if not 0.3 < gain < 3.0:
+    if not 0.3 < gain < 2.0 or any(t["gain"] > 2 for t in tone_truths(twin, path, sent, commands)):
         return False
     best = max(np.corrcoef(held[: len(held) - n], moved[n:])[0, 1] for n in range(0, 200, 5))
     return bool(best > 0.6)
@@ -762,11 +763,11 @@ def truths(twin: Twin, path: Path) -> dict[str, Band]:
 
     A band has a width where the servo has no single number: two masses (per total inertia … per
     that of the motor), a bent potentiometer (its slopes), static and Coulomb friction, torque up
-    and down, a command that waits for the loop.
+    and down, a command that waits for the loop, the age of live readings, which no stamp shows.
     """
     s = twin.servo
     wait = max(s.loop_s, s.latch_s)
-    dead = (s.dead_time_s, s.dead_time_s + wait + s.dead_time_drift_s)
+    dead = (s.dead_time_s, s.dead_time_s + wait + s.dead_time_drift_s + age_s(twin.bus))
     if s.dead_time_jitter_s > 0:
         dead = (float(np.median(path.delays_s)), float(path.delays_s.mean()))
     low, high = path.slopes
@@ -792,27 +793,30 @@ def truths(twin: Twin, path: Path) -> dict[str, Band]:
     }  # fmt: skip
 
 
+def age_s(bus: Bus) -> float:
+    """Age of live readings, which no recording tells from lag [s]."""
+    return 0.0 if bus.poll_s > 0 else bus.age_s
+
+
 def tone_truths(twin: Twin, path: Path, sent: Array, commands: Array) -> list[dict]:
     """True lag of each named tone: phase delay from the held command to the motion [s]."""
-    lags, start, near = [], 0.0, None
-    bounds = sends(twin)
-    order = sorted(range(len(twin.stretches)), key=lambda i: twin.stretches[i].frequency_hz)
-    starts = {i: float(bounds[0][bounds[2] == i][0]) for i in order}
-    for i in order:
-        hz = twin.stretches[i].frequency_hz
+    times, _, trials = sends(twin)
+    lags, near = [], None
+    for i, stretch in sorted(enumerate(twin.stretches), key=lambda x: x[1].frequency_hz):
+        hz = stretch.frequency_hz
         if not hz > 0:
             continue
-        start, stop = starts[i] + LEAD_IN_S + RAMP_S + 0.3, float(bounds[0][bounds[2] == i][-1])
-        stop = start + np.floor((stop - start) * hz) / hz
-        grid = np.arange(start, stop, 5e-4)
+        rows = times[trials == i]
+        start = rows[0] + LEAD_IN_S + RAMP_S + 0.3
+        grid = np.arange(start, start + np.floor((rows[-1] - start) * hz) / hz, 5e-4)
         held = commands[np.searchsorted(sent, grid, "right") - 1]
-        ratio = _phasor(grid, np.interp(grid, path.time_s, path.angle), hz) / _phasor(
-            grid, held, hz
-        )
+        moved = np.interp(grid, path.time_s, path.angle)
+        response = _phasor(grid, moved, hz) / _phasor(grid, held, hz)
+        # the lowest tone settles its own period, each other one is near the tone below
         near = 0.4 / hz if near is None else near
-        turned = np.angle(ratio * np.exp(2j * np.pi * hz * near))
-        near = near - turned / (2 * np.pi * hz)
-        lags.append({"trial": i, "frequency_hz": hz, "truth": near, "gain": abs(ratio)})
+        near -= float(np.angle(response * np.exp(2j * np.pi * hz * near))) / (2 * np.pi * hz)
+        truth = near + age_s(twin.bus)
+        lags.append({"trial": i, "frequency_hz": hz, "truth": truth, "gain": float(abs(response))})
     return lags
 
 
@@ -824,7 +828,9 @@ def _phasor(time: Array, value: Array, hz: float) -> complex:
     return complex(fit[1], fit[2])
 
 
-def lag_truth(path: Path, sent: Array, commands: Array, longest_s: float = 0.6) -> float:
+def lag_truth(
+    twin: Twin, path: Path, sent: Array, commands: Array, longest_s: float = 0.6
+) -> float:
     """Time shift at which the motion and the held command correlate best [s]."""
     step = 0.001
     grid = np.arange(sent[0] - longest_s, path.time_s[-1], step)
@@ -838,4 +844,4 @@ def lag_truth(path: Path, sent: Array, commands: Array, longest_s: float = 0.6) 
         scores.append(window @ (earlier - earlier.mean()) / max(earlier.std(), 1e-12))
     top = int(np.clip(np.argmax(scores), 1, len(scores) - 2))
     a, b, c = scores[top - 1 : top + 2]
-    return float(step * (top + 0.5 * (a - c) / (a - 2 * b + c)))
+    return float(step * (top + 0.5 * (a - c) / (a - 2 * b + c))) + age_s(twin.bus)

@@ -109,7 +109,7 @@ def measured(kind: str, motion: str, number: int, seed: int) -> dict[str, Any]:
         "bus": {k: v for k, v in vars(twin.bus).items() if k != "setup"},
         "stated_registers": bool((twin.bus.setup or {}).get("registers")),
         "rows": len(rows.sent_s), "truth": truths(twin, path),
-        "lag_truth": lag_truth(path, sent, commands), "refused": None,
+        "lag_truth": lag_truth(twin, path, sent, commands), "refused": None,
     }  # fmt: skip
     tones = tone_truths(twin, path, sent, commands)
     wall, processor = time.perf_counter(), _processor_s()
