@@ -340,14 +340,7 @@ def print_tables(records: list[dict[str, Any]], detail: bool = False) -> None:
             print(f"\n{name}")
             quantities = grouped(part, lambda r: r[0])
             table(
-                (
-                    "quantity",
-                    "identified",
-                    "holds",
-                    "beyond a factor 2",
-                    "worst miss",
-                    "median width",
-                ),
+                ("quantity", *WORDS),
                 (quantity_row(q, quantities[q]) for q in sorted(quantities, key=order)),
             )
     heads = ("dead time: identified", "holds", "worst", "width",
@@ -546,7 +539,7 @@ def self_test() -> None:
         rough, fine = (simulate(plain, sent, commands, stop, rng, step) for step in (2e-4, 5e-5))
         difference = rough.angle - np.interp(rough.time_s, fine.time_s, fine.angle)
         name = f"0.2 against 0.05 ms, {kind} [share of the motion]"
-        most = max(0.02, twin.servo.play / fine.angle.std())
+        most = max(0.005, twin.servo.play / fine.angle.std())
         checks.append((name, difference.std() / fine.angle.std(), most))
     for name, error, most in checks:
         print(f"{'ok  ' if error <= most else 'FAIL'} {name}: {error:.2g} (at most {most:g})")
