@@ -47,7 +47,7 @@ from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
 from pupper_sysid.sysid.plan.planner import PlannedTrial
 from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.importers.shared.options import read_mapping
+from pupper_sysid.sysid.recordings.importers.options import read_mapping
 from pupper_sysid.sysid.sweep.playback import playback
 from support.saved_servo_models import saved
 

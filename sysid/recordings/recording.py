@@ -23,8 +23,8 @@ from pupper_sysid.common.joints import in_order
 from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.shared.times import READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.recordings.table import (
@@ -94,6 +94,8 @@ class Trial:
         What the header says of the servo.
     load : PendulumLoad or None
         What the joint carried; None where the header does not say.
+    unit_stated : bool
+        Whether the unit of the angles was stated, so that they may be of several turns.
     """
 
     joint: str
@@ -113,6 +115,7 @@ class Trial:
     voltage_v: NDArray[np.float64] | None = None
     servo: ServoSetup = field(default_factory=ServoSetup)
     load: PendulumLoad | None = None
+    unit_stated: bool = False
 
     def powered(self) -> Trial:
         """Its longest stretch of rows with the torque on; all of it where it always was."""
@@ -292,7 +295,7 @@ class Recording:
         tidy, known, warnings = convert(name, Parsed(given, table, faults=faults), options)
         others = tidy.columns.difference(REQUIRED_COLUMNS, sort=False)
         tidy = tidy.reindex(columns=[*REQUIRED_COLUMNS, *others])
-        tidy, more = check(name, tidy)
+        tidy, more = check(name, tidy, given | known)
         digest = hashlib.sha256(tidy.to_csv(index=False).encode()).hexdigest()
         return cls(tidy, given | known, name, None, digest, (*warnings, *more))
 
@@ -387,6 +390,7 @@ class Recording:
                     columns.get("voltage_v"),
                     servo,
                     loads.get(joint),
+                    self.metadata.get("angle_unit") == "stated",
                 )
             )
         # Any: type checkers see this module under two names

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.shared.log import (
+from pupper_sysid.sysid.recordings.importers.log import (
     Log,
     joint_names,
     number,

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.recordings.importers.shared.log import (
+from pupper_sysid.sysid.recordings.importers.log import (
     Log,
     joint_names,
     number,
     numbers,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.shared.times import doubt_of_a_turn
+from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
 
 LAYOUT = "ktune JSON"
 

@@ -23,20 +23,20 @@ from pupper_sysid.common.border import parse_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.common.reading.names import distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.parquet import read_columns
-from pupper_sysid.sysid.recordings.importers.shared.log import (
+from pupper_sysid.sysid.recordings.importers.log import (
     Log,
     joint_names,
     number,
     read_files,
     rows,
-    text_of,
 )
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.shared.times import one_after_another
-from pupper_sysid.sysid.recordings.importers.shared.units import COUNT_RAD, smallest_step
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.parquet import read_columns
+from pupper_sysid.sysid.recordings.importers.times import one_after_another
+from pupper_sysid.sysid.recordings.importers.units import COUNT_RAD, smallest_step
 
 LAYOUT = "LeRobot dataset"
 
@@ -68,7 +68,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         )
     refuse_more(folder, len(data_paths), _MOST_FILES, "data files", "Give a part of it.")
     contents, digest = read_files(folder, [info_path, *data_paths])
-    info = parse_json(text_of(info_path, contents[info_path]), str(info_path))
+    info = parse_json(decoded(info_path, contents[info_path]), str(info_path))
     names = _names(info_path, info)
     fps = number(info_path, info.get("fps"), "fps")
     if not 1 <= fps <= 10_000:

@@ -9,21 +9,23 @@ from typing import Any
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.importers import (
+    arrays,
     bam,
     ktune,
     lerobot,
-    numpy_file,
     parquet,
     ros,
     ros_files,
     sage,
 )
-from pupper_sysid.sysid.recordings.importers.shared.log import Log, joint_names, text_of
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
-_ENDINGS = (".csv", ".json", ".mcap", ".db3", ".npz", ".parquet")
+_ENDINGS = (".csv", ".tsv", ".json", ".mcap", ".db3", ".npz", ".parquet", ".pt")
+_PACKED = (".gz", ".bz2", ".xz")
 
 
 def is_log_folder(folder: Path) -> bool:
@@ -62,7 +64,8 @@ def is_fleet(path: Path) -> bool:
 
 
 def _may_be_log(path: Path) -> bool:
-    return path.is_file() and path.suffix in _ENDINGS and not path.name.endswith(".truth.csv")
+    name = Path(path.stem) if path.suffix in _PACKED else path
+    return path.is_file() and name.suffix in _ENDINGS and not name.name.endswith(".truth.csv")
 
 
 def read_folder(folder: Path, options: LogOptions) -> Log:
@@ -101,13 +104,13 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         return replace(ros.read_mcap(path, data, options), sha256=digest)
     if data.startswith(ros_files.SQLITE):
         return replace(ros.read_sqlite(path, options), sha256=digest)
-    if data.startswith(numpy_file.MAGIC):
-        return replace(numpy_file.read_npz(path, data, options), sha256=digest)
+    if data.startswith((arrays.ZIP, arrays.NPY)):
+        return replace(arrays.read_arrays(path, data, options), sha256=digest)
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
     if start[:1] in (b"{", b"["):
-        found = border.parse_json(text_of(path, data), str(path), "Give the log as it was written.")
+        found = border.parse_json(decoded(path, data), str(path), "Give the log as it was written.")
         for layout, known, read in (
             (bam.LAYOUT, bam.is_bam, bam.read_bam),
             (ktune.LAYOUT, ktune.is_ktune, ktune.read_ktune),

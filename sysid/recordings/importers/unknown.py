@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers import wide
+from pupper_sysid.sysid.recordings.importers.tables import has_time, missing
 
 OURS = (
     "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
@@ -27,15 +27,16 @@ FILES = (
 """Layouts other than tables of text."""
 
 
-def unknown_columns(names: Sequence[str]) -> str:
+def unknown_columns(names: Sequence[str], timed: bool = False) -> str:
     """Why a table has no known layout; empty where it may have one.
 
-    Every tabular layout is listed with the columns that it lacks here.
+    Every tabular layout is listed with the columns that it lacks here. `timed` tables have their
+    times from elsewhere.
     """
     own = set(names)
-    lacks_pair = wide.missing(names)
-    has_time = wide.has_time(names)
-    if lacks_pair == "" and has_time:
+    lacks_pair = missing(names)
+    timed = timed or has_time(names)
+    if lacks_pair == "" and timed:
         return ""
     if {n.lower() for n in own} >= _IMU and lacks_pair.startswith("no column"):
         return (
@@ -43,7 +44,7 @@ def unknown_columns(names: Sequence[str]) -> str:
             "nothing of a servo can be measured with it. Give a log of commands and positions."
         )
     lacks = [lacks_pair] if lacks_pair else []
-    lacks += [] if has_time else [f"no column is a time ({', '.join(wide.TIMES[:4])} …)"]
+    lacks += [] if timed else ["no column is a time (time, timestamp, t …)"]
     parts = [
         f"any table: {' and '.join(lacks)}",
         *(
@@ -57,8 +58,8 @@ def unknown_columns(names: Sequence[str]) -> str:
     ]
     return (
         f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
-        f"{_hint(names)}Name the columns with `pupper-sysid import` --time, --command and "
-        f"--position. Other layouts: {'; '.join(FILES)}."
+        f"{_hint(names)}Name the columns with `pupper-sysid import` --time (or --rate), --command "
+        f"and --position. Other layouts: {'; '.join(FILES)}."
     )
 
 

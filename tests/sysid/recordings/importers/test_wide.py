@@ -7,8 +7,8 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.importers.recognise import logs_in
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.package import ROOT
 from support.refusals import assert_each_refused
