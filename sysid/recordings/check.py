@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
 
 _LEAST_ROWS = 20
+_COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
 _FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
 _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
 _MANY_REPEATED = 0.1  # of the rows
@@ -51,7 +53,7 @@ def check(
         If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
     """
     warnings: list[str] = []
-    if strange := strange_joint(table["joint"].unique().tolist()):
+    if strange := strange_joint(table["joint"].unique().tolist(), "columns" in metadata):
         raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
     lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
@@ -139,10 +141,19 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Check the unit, or take the start's angle off."
         )
+    known = table[column].to_numpy(float)
+    known = known[np.isfinite(known)]
+    turn = next((n for n in _COUNTS if known.max() < n), 0)
+    if turn and largest > _FEWEST_COUNTS and (known >= 0).all() and (known % 1 == 0).all():
+        unit = f"counts:{turn}"
+        kind = f"counts of an encoder with {turn} a turn"
+    else:
+        unit, kind = "deg", "degrees"
     raise InputError(
-        f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks "
-        "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533, or "
-        "convert the log with `pupper-sysid import --unit deg` (counts:4096, …)."
+        f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
+        f"{kind}. Angles must be radians: multiply degrees by 0.0174533, or convert the log with "
+        f"`pupper-sysid import {shlex.quote(Path(path).name)} --unit {unit}` (or deg, turns, "
+        "counts:4096, scale:…; rad if the joint turns so far)."
     )
 
 

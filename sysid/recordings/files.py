@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,12 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
     InputError
         If it is not a recording or cannot be used; the message names the line and column.
     """
+    if not isinstance(path, str | PurePath):
+        kind = type(path).__name__
+        raise InputError(
+            f"load takes the path of one log, not a {kind}. Several: [load(p) for p in paths]; a "
+            "table or arrays in memory: Recording.from_frame, Recording.from_arrays."
+        )
     path, options = Path(path), options or LogOptions()
     if path.is_dir():
         return _imported(path, read_folder(path, options))

@@ -27,7 +27,12 @@ from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import Table, read_table, unknown_numbers
+from pupper_sysid.sysid.recordings.importers.tables import (
+    Table,
+    read_table,
+    spread,
+    unknown_numbers,
+)
 from pupper_sysid.sysid.recordings.importers.times import PAUSE_S, READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_columns
 from pupper_sysid.sysid.recordings.table import REQUIRED_COLUMNS, Parsed, require
@@ -61,11 +66,11 @@ def convert(
         require(path, parsed.table, PLAYBACK)
         options.refuse("Mini Pupper playback", ())
         return _playback(path, parsed)
-    table = _table(parsed)
+    table = spread(path, _table(parsed), options)
     if not options.command:
         if parsed.numbered:
             raise InputError(f"{path}: {unknown_numbers(path, table)}")
-        if text := unknown_columns(table.names, bool(options.time or options.rate)):
+        if text := unknown_columns(path, table.names, bool(options.time or options.rate)):
             raise InputError(f"{path}: {text}")
     log = read_table(path, table, options)
     # what the log's own header says of its robot counts

@@ -27,15 +27,16 @@ WORDS: dict[str, str] = {
     for kind, words in (
         (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
                   "setpoint setpoints sp reference references ref refs demand demanded requested "
-                  "action actions soll sollwert"),
+                  "action actions soll sollwert sv"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
                 "observation observations obs state states estimate estimated est real encoder enc "
-                "reading readings sensed sensor response resp ist istwert"),
+                "reading readings sensed sensor response resp "
+                "potentiometer pot resolver pv ist istwert"),
         (MAYBE_STATE, "y output outputs read rx follower received"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ"),
-        (OTHER, "velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
+        (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
                 "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
                 "current currents curr amps ampere voltage volt volts temperature temperatures "
                 "temp temps pwm duty power pw error errors err deviation mode status flag flags "
@@ -45,12 +46,12 @@ WORDS: dict[str, str] = {
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop"),
         (TIME, "time times timestamp timestamps t stamp stamps clock elapsed seconds secs sec "
-               "millis micros nanos nsec ns us µs ms date datetime utc epoch"),
+               "millis micros nanos nsec ns us µs ms date datetime utc epoch at"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
                "turns rev revs revolution revolutions mrad"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
-                "header array"),
+                "header array low"),
         (DERIVED, "filtered filt filter smoothed smooth sim simulated simulation model modeled "
                   "modelled predicted prediction pred mean avg relative rel next raw"),
     )
@@ -68,6 +69,7 @@ UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad":
 _UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5}
 _SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"-]+")
 _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
+_SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
 _LETTERS = frozenset("qput")  # that begin a word such as qdes or tcmd
 _LONGEST = 200
 
@@ -79,8 +81,8 @@ class Column:
     Attributes
     ----------
     name : str
-    kind : {"command", "position", "time", ""}
-        Empty where it is none of them.
+    kind : {"command", "position", "time", "unknown", ""}
+        Empty for another quantity, and unknown where no word of the name is known.
     joint : str
         The words that name a joint, as in the column's name, joined by `_`; empty for none.
     key : str
@@ -119,6 +121,9 @@ def _column(name: str) -> Column:
     if "d" in lower and "q" in lower and not kinds & {COMMAND, STATE}:  # q_d
         known[lower.index("d")] = COMMAND
         kinds.add(COMMAND)
+    if kinds & {COMMAND, STATE, ANGLE}:  # a joint that is called y
+        known = ["" if w in _SOLE_LETTERS else k for w, k in zip(lower, known, strict=True)]
+        kinds = set(known)
     angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}
                                 or "pos" in "".join(lower))  # fmt: skip
     if angle and lower[-1:] != ["current"]:  # current position, not a current
@@ -131,11 +136,14 @@ def _column(name: str) -> Column:
     if lower[-1:] == ["raw"]:
         unit = unit or "counts"
         known[-1] = UNIT
-    timed = TIME in kinds and not angle
+    timed = any(
+        k == TIME and (w != "t" or n == 0 or not angle)  # q_t is an angle
+        for n, (w, k) in enumerate(zip(lower, known, strict=True))
+    )
     if timed:  # time_s
         known = [UNIT if w == "s" and not k else k for w, k in zip(lower, known, strict=True)]
-    words = frozenset(w for w, k in zip(lower, known, strict=True)
-                      if k in (COMMAND, MAYBE_COMMAND, STATE, MAYBE_STATE))  # fmt: skip
+    telling = {COMMAND, MAYBE_COMMAND, STATE, MAYBE_STATE} | ({ANGLE} if timed else set())
+    words = frozenset(w for w, k in zip(lower, known, strict=True) if k in telling)
     kind = ""
     if OTHER in kinds and not (timed and not kinds & {UNIT}):
         kind = ""
@@ -147,9 +155,12 @@ def _column(name: str) -> Column:
         kind = "command"
     elif angle or STATE in kinds or MAYBE_STATE in kinds:
         kind = "position"
+    elif not kinds & {TIME, DERIVED} and "" in kinds:
+        kind = "unknown"
     sure = COMMAND in kinds if kind == "command" else bool(angle or STATE in kinds)
+    doubt = 0 if sure else 2 if lower == ["u"] else 1  # beside a reference, u is a drive's input
     style = (0 if angle and (STATE in kinds) else 1 if angle else 2) if kind == "position" else 0
-    rank = (int(DERIVED in set(known)), int(not sure), _UNIT_RANK[unit], style)
+    rank = (int(DERIVED in set(known)), doubt, _UNIT_RANK[unit], style)
     runs: list[list[tuple[str, str]]] = [[]]  # of words that are no others'
     for part, k in zip(parts, known, strict=True):
         if k in ("", JOINT):
@@ -160,7 +171,8 @@ def _column(name: str) -> Column:
     joint = "_".join(p for run in runs for p, _ in run)
     bare = [p for run in runs for p, k in run if k == ""]
     key = "_".join(f"{int(p)}" if p.isascii() and p.isdigit() else p.lower() for p in bare)
-    return Column(name, kind, joint, key, unit, rank, words, _template(name, bare))
+    template = name if kind == "unknown" else _template(name, bare)
+    return Column(name, kind, joint, key, unit, rank, words, template)
 
 
 def _parts(word: str) -> list[str]:

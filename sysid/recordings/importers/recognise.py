@@ -80,7 +80,7 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
         options.refuse(sage.LAYOUT)
         return chosen(folder, sage.read_sage(folder), options)
     if lerobot.is_lerobot(folder):
-        options.refuse(lerobot.LAYOUT, ("joints", "unit", "units"))
+        options.refuse(lerobot.LAYOUT, ("joints", "unit", "units", "rate", "readings"))
         return chosen(folder, lerobot.read_lerobot(folder, options), options)
     if ros.is_bag(folder):
         return ros.read_bag(folder, options)

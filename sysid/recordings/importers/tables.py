@@ -55,7 +55,7 @@ _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
 _SERIES = ("name", "signal", "variable", "topic", "field", "series", "metric", "key", "channel",
            "_field", "_measurement")  # fmt: skip
-_GROUPS = ("joint", "joint_name", "leg", "limb", "arm", "side", "motor", "motor_name", "servo",
+_GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
            "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
            "node_id", "id")  # fmt: skip
@@ -88,6 +88,8 @@ class Table:
         What names those joints, and how many.
     numbered : bool
         Whether the columns have no names but their numbers.
+    notes : tuple of str
+        What was assumed, in sentences.
     """
 
     columns: Mapping[str, NDArray[np.float64]]
@@ -96,6 +98,7 @@ class Table:
     widths: Mapping[str, int] = field(default_factory=dict)
     joint_names: tuple[str, int] | None = None
     numbered: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> list[str]:
@@ -192,7 +195,8 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
     """
     refuse_more(path, len(table.names), MOST_COLUMNS, "columns", "Split it by joint.")
     refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
-    table, notes = _spread(path, table, options)
+    table = spread(path, table, options)
+    notes = list(table.notes)
     pairs, texts = _pairs(path, table, options)
     notes += texts
     read_s, send_s, texts = _times(path, table, options)
@@ -274,7 +278,14 @@ def _pairs_by_words(
         ]  # fmt: skip
         best = sorted((_Pair(c, p) for c, p in product(*ranked)), key=lambda q: _cost(q, used))
         pair = _decided(path, table, best, used)
-        if len(best) > 1:
+        if (
+            sum(
+                other.command.rank[:2] == pair.command.rank[:2]
+                and other.position.rank[:2] == pair.position.rank[:2]
+                for other in best
+            )
+            > 1
+        ):
             notes.append(
                 f"of several columns {pair.command.name} was taken for the command and "
                 f"{pair.position.name} for the position. To take others: `pupper-sysid import` "
@@ -282,7 +293,7 @@ def _pairs_by_words(
             )
         pairs[key] = pair
         names.append(_joint_name(pair))
-        odd = pair.command.words | pair.position.words == {"setpoint", "estimate"}
+        odd = {"setpoint", "estimate"} <= pair.command.words | pair.position.words
         if odd and not pair.command.unit + pair.position.unit and not options.unit:
             notes.append(
                 "pos_setpoint and pos_estimate are names of ODrive, which counts turns; the values "
@@ -544,19 +555,20 @@ def _seconds(
 # ---------------------------------------------------------------------------------------- rows
 
 
-def _spread(path: Path | str, table: Table, options: LogOptions) -> tuple[Table, list[str]]:
+def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
     """A table with one value a row and its name (`time, name, value`) as columns by name.
 
-    Values are put at the times of the positions, commands as they were in force.
+    Values are put at the times of the positions, commands as they were in force. Other tables come
+    back as they are.
     """
     by_case = {n.lower(): n for n in table.texts}
     series = next((by_case[n] for n in _SERIES if n in by_case), None)
     value = table.first(("value", "values", "val", "_value", "data"))
     if series is None or value is None or options.command:
-        return table, []
+        return table
     codes, found = pd.factorize(np.array(table.texts[series], object))
     if len(found) > MOST_COLUMNS or missing([*map(str, found)]):
-        return table, []
+        return table
     read_s, _, notes = _times(path, table, options)
     values = table.numbers(path, value)
     own = {str(name): codes == k for k, name in enumerate(found)}
@@ -573,7 +585,7 @@ def _spread(path: Path | str, table: Table, options: LogOptions) -> tuple[Table,
         if column(name).kind in ("command", "position"):
             kept &= known
     columns = {name: v[kept] for name, v in columns.items()}
-    return Table(columns), [*notes, f"each row holds one value, named by {series}."]
+    return Table(columns, notes=(*notes, f"each row holds one value, named by {series}."))
 
 
 def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
@@ -589,7 +601,7 @@ def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
             for code, value in enumerate(values):
                 if word := value.strip():
                     own[word] = own.get(word, False) | (codes == code)
-        elif name in numbers and column(name).kind == "":
+        elif name in numbers and column(name).kind in ("", "unknown"):
             own = _numbered(path, table, numbers[name])
         else:
             continue
