@@ -30,7 +30,7 @@ _NAMES_OF = {"\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces", ",": "
 _USUAL = 0.9  # share of ASCII in tables of numbers that are not in UTF-8
 _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
 _COMMENT = re.compile(r"[ \t]*(#|%|//)")
-_COMMA_NUMBER = re.compile(r"[+-]?\d*,?\d+(?:[eE][+-]?\d+)?")
+_COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(
     r"[(\[<{]?\s*(s|sec|seconds?|ms|us|µs|ns|rad|radians?|deg|degrees?|°|counts?|ticks?|raw|turns?|"

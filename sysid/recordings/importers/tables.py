@@ -113,12 +113,13 @@ class Table:
         InputError
             If it holds text or an infinite value.
         """
+        shown = printable(name)[:60]
         if name not in self.columns:
-            fault = f"{path}, column {name}: its values are not numbers."
+            fault = f"{path}, column {shown}: its values are not numbers."
             raise InputError(self.faults.get(name, fault))
         values = np.asarray(self.columns[name], float)
         if np.isinf(values).any():
-            raise InputError(f"{path}, column {name}: a value is infinite.")
+            raise InputError(f"{path}, column {shown}: a value is infinite.")
         return values
 
     def first(self, names: Sequence[str]) -> str | None:

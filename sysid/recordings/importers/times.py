@@ -54,13 +54,14 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
     InputError
         If they are no times of a servo's log in any unit.
     """
+    shown = printable(name)[:60]
     if found := _UNIT.search(name):
         return Clock(_SCALES[found[1].lower()])
     steps = np.diff(values)
     steps = steps[steps > 0]
     if not len(steps):
         raise InputError(
-            f"column {name}: its values do not increase, so they are no times. Give the rows a "
+            f"column {shown}: its values do not increase, so they are no times. Give the rows a "
             "second with `rate`, or another column with `time`."
         )
     loop = float(np.median(steps))
@@ -69,8 +70,8 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
             if unit == "s":
                 break
             return Clock(scale, float(values[0]), [
-                f"column {name} names no unit; its values were taken as {unit}, since they are "
-                f"{loop:.4g} apart. Call it {name}_s, _ms, _us or _ns if that is wrong."
+                f"column {shown} names no unit; its values were taken as {unit}, since they are "
+                f"{loop:.4g} apart. Call it {shown}_s, _ms, _us or _ns if that is wrong."
             ])  # fmt: skip
     return Clock()
 
