@@ -248,6 +248,9 @@ SAVED = "# bench 3\n# " + WIDE.replace(",", " ")
 LABELLED = rows("start", lambda t, c, p: f"time:{t:.3f},cmd:{c:.6f},pos:{p:.6f}")
 DAYTIME = rows("date,cmd,pos", lambda t, c, p: f"2026-05-04T12:00:{t:06.3f},{c:.6f},{p:.6f}")
 MELTED = rows("time,name,value", lambda t, c, p: f"{t:.3f},k_cmd,{c:.6f}\n{t:.3f},k_pos,{p:.6f}")
+LISTS = rows("time,action,state", lambda t, c, p: f'{t:.3f},"[{c:.6f}, {p:.6f}]",[{p:.6f} {c:.6f}]')
+JSON_LINES = rows("", lambda t, c, p: json.dumps({"t": t, "cmd": {"k": c}, "pos": {"k": p}}))
+TABLE_JSON = json.dumps({"t": TIME.tolist(), "cmd": WAVE.tolist(), "pos": LATE.tolist()})
 BY_NUMBER = LogOptions("0", "1", "2", trial="3")
 LONG = rows("time,joint,goal,present_position", lambda t, c, p: f"{t:.3f},knee,{c:.6f},{p:.6f}")
 MAPPING = (
@@ -263,6 +266,9 @@ KINDS = {
     "pairs of name and number": Kind(text("log.txt", LABELLED), "log.txt", load),
     "times of day": Kind(text("log.csv", DAYTIME), "log.csv", load),
     "one value a row": Kind(text("log.csv", MELTED), "log.csv", load),
+    "lists in cells": Kind(text("log.csv", LISTS), "log.csv", load),
+    "JSON table": Kind(text("log.json", TABLE_JSON), "log.json", load),
+    "JSON Lines": Kind(text("log.jsonl", JSON_LINES), "log.jsonl", load),
     "gzip": Kind(packed("log.gz", gzip.compress), "log.gz", load),
     "bzip2": Kind(packed("log.bz2", bz2.compress), "log.bz2", load),
     "xz": Kind(packed("log.xz", lzma.compress), "log.xz", load),

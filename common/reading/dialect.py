@@ -29,7 +29,7 @@ _SEPARATORS = ("\t", ";", ",", "|", " ")
 _NAMES_OF = {"\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces", ",": "commas"}
 _USUAL = 0.9  # share of ASCII in tables of numbers that are not in UTF-8
 _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
-_COMMENT = re.compile(r"[ \t]*(#|%|//)")
+_COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
 _COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(
@@ -38,11 +38,17 @@ _UNIT = re.compile(
     r"\s*[)\]>}]?",
     re.IGNORECASE,
 )
-_PAIRS = re.compile(
-    r"\s*[A-Za-z_][\w./]*\s*[:=]\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*"
-    r"(?:[,;\t ]\s*[A-Za-z_][\w./]*\s*[:=]\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*)+[,;]?\s*"
+_PAIR = re.compile(
+    r"(?<![\w\"'])([A-Za-z_][\w./]*)\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?![\w:])"
 )
-_PAIR = re.compile(r"([A-Za-z_][\w./]*)\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)")
+_STAMPED = re.compile(
+    r"^[ \t]*\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?"
+    r"[ \t]*(?:->|[|:])?[ \t]+(?=\S)",
+    re.MULTILINE,
+)
+_NUMBERS = re.compile(r"[\s,;]+")
+_LONGEST_LIST = 1000
+_LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
 
 @dataclass(frozen=True)
@@ -90,8 +96,15 @@ def plain(text: str) -> Plain:
     if len(bare) < 3:
         return Plain(text)
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
-    if all(_PAIRS.fullmatch(row) for row in rows):
-        return _labelled(text)
+    names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
+    if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
+        return _labelled(text, list(names[0]))
+    if all(_STAMPED.match(row) for row in rows):  # of a serial monitor
+        inner = _shape([_STAMPED.sub("", row) for row in rows])
+        separator = inner.separator if inner else ","
+        return plain(_STAMPED.sub(lambda m: m[1].replace(" ", "T") + separator, text))
+    if all(_LIST.search(row) for row in rows) and (flat := _unlisted(text, lines, bare, rows)):
+        return plain(flat)
     shape = _shape(rows)
     if shape is None:
         return Plain(text)
@@ -112,7 +125,8 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
         cells = [row for row in split if len(row) == columns]
         if columns < 2 or len(cells) < _SAME_SHAPE * len(split):
             continue
-        for comma in (False, True) if separator != "," else (False,):
+        quoted = any('"' in row for row in rows)
+        for comma in (False, True) if separator != "," or quoted else (False,):
             shares = [
                 sum(_number(row[k], comma) for row in cells) / len(cells) for k in range(columns)
             ]
@@ -145,8 +159,15 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         columns = next((c for c in map(lambda x: _named_in(x, shape), comments[::-1]) if c), None)
         if columns is not None:
             notes.append("the names of its columns were taken from a comment")
+    while columns and len(before) > 1 and shape.separator != " " and not _distinct(columns):
+        above = _names(lines[before[-2]], shape)  # names in several lines, as of groups
+        if above is None or len(above) != shape.columns:
+            break
+        columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
+        lines[before.pop(-2)] = ""
     plain_names = (
-        shape.separator == "," and len(before) == 1 and not units
+        shape.separator == "," and len(before) == 1 and not units and not shape.comma
+        and columns == _split(lines[before[0]], ",")
         and not any(_COMMENT.match(line) and line[:1] != "#" for line in lines)
     )  # fmt: skip
     if plain_names and columns and columns[-1]:
@@ -162,7 +183,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     if units:
         notes.append("the row below the names was taken for their units")
     if len(before) > 1:
-        notes.append(f"{len(before) - 1} lines above the names of the columns were left out")
+        lines_above = f"{len(before) - 1} line{'s' if len(before) > 2 else ''}"
+        notes.append(f"{lines_above} above the names of the columns left out")
     if shape.separator != ",":
         notes.append(f"cells are separated by {_NAMES_OF[shape.separator]}")
     if shape.comma:
@@ -186,8 +208,9 @@ def _unnamed(body: str, names: str) -> str:
 
 def _cells(body: str, shape: _Shape, trailing: int) -> str:
     """Rows with commas between cells and points in numbers."""
-    body = re.sub(r"^[ \t]*(?:%|//).*$", "", body, flags=re.MULTILINE)
-    if shape.separator != "," and ('"' in body or ("," in body and not shape.comma)):
+    body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
+    quoted = '"' in body and (shape.separator != "," or shape.comma)
+    if quoted or (shape.separator != "," and "," in body and not shape.comma):
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         for line in body.split("\n"):
@@ -210,17 +233,57 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
     return body
 
 
-def _labelled(text: str) -> Plain:
-    """Lines such as `t:0.1,cmd:0.3` (serial plotters) as rows; others are left empty."""
-    columns: list[str] = []
-    rows = []
+def _labelled(text: str, columns: list[str]) -> Plain:
+    """Lines such as `t:0.1,cmd:0.3` (serial plotters, monitors) as rows; others are left empty."""
+    rows, others = [], 0
+    stamped = False
     for line in text.split("\n"):
-        pairs = _PAIR.findall(line) if _PAIRS.fullmatch(line) else []
-        if pairs and not columns:
-            columns = [name for name, _ in pairs]
+        pairs = _PAIR.findall(line)
         same = columns == [name for name, _ in pairs]
-        rows.append(",".join(value for _, value in pairs) if same else "")
-    return Plain("\n".join(rows), columns, notes=_sentence(["its lines are `name: number` pairs"]))
+        stamp = _STAMPED.match(line) if same else None
+        stamped = stamped or (stamp is not None and not rows)
+        cells = [value for _, value in pairs] if same else []
+        rows.append(",".join([stamp[1] if stamp else "", *cells] if stamped and same else cells))
+        others += not same and bool(line.strip())
+    notes = ["its lines are pairs of name and number"]
+    notes += [f"{others} other lines were left out"] if others else []
+    return Plain("\n".join(rows), ["time_of_day", *columns] if stamped else columns,
+                 notes=_sentence(notes))  # fmt: skip
+
+
+def _unlisted(text: str, lines: list[str], bare: list[int], rows: Sequence[str]) -> str | None:
+    """The text with a cell per number where a cell held a list (`"[0.1, 0.2]"`)."""
+
+    def count(found: re.Match[str]) -> str:
+        return f"@{len(_NUMBERS.split(found[1]))}"
+
+    counted = [_LIST.sub(count, row) for row in rows]
+    for separator in _SEPARATORS:
+        cells = _split(counted[0], separator)
+        names = _split(lines[bare[0]], separator)
+        alike = sum(_sizes(row, separator) == _sizes(counted[0], separator) for row in counted)
+        if len(cells) > 1 and len(names) == len(cells) and alike >= _SAME_SHAPE * len(rows):
+            break
+    else:
+        return None
+    wide = [
+        name if cell[:1] != "@" else separator.join(f"{name}.{k}" for k in range(int(cell[1:])))
+        for name, cell in zip(names, cells, strict=True)
+        if cell[:1] != "@" or int(cell[1:]) <= _LONGEST_LIST
+    ]
+    start = sum(len(line) + 1 for line in lines[: bare[0]])
+    head, body = text[:start], text[start + len(lines[bare[0]]) :]
+    body = _LIST.sub(lambda found: separator.join(_NUMBERS.split(found[1])), body)
+    return head + separator.join(wide) + body
+
+
+def _sizes(row: str, separator: str) -> list[str]:
+    """Cells of a row, those that are no lists left empty."""
+    return [cell if cell[:1] == "@" else "" for cell in _split(row, separator)]
+
+
+def _distinct(names: Sequence[str]) -> bool:
+    return all(names) and len(set(names)) == len(names)
 
 
 def _sentence(notes: Sequence[str]) -> list[str]:
@@ -278,7 +341,7 @@ def _names(line: str, shape: _Shape) -> list[str] | None:
 
 def _named_in(comment: str, shape: _Shape) -> list[str] | None:
     """Names of the columns in a comment; None if it has others, or none."""
-    text = re.sub(r"^[ \t]*(?:#|%|//)+[ \t]*", "", comment)
+    text = re.sub(r"^[ \t]*(?:#|%|//|!)+[ \t]*", "", comment)
     for part in (text, text.partition(":")[2]):
         cells = _names(part, shape) if part.strip() else None
         if cells is not None and len(cells) == shape.columns and len(set(cells)) == len(cells):

@@ -128,7 +128,7 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
     opened = plain(text)
     columns = opened.columns
     if columns is None:
-        columns = column_names(path, text)
+        columns = column_names(path, opened.text)
     if not columns:
         header(path, text)
         raise InputError(f"{path} has no rows: the recording never started. Record it again.")

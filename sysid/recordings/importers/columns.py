@@ -27,15 +27,16 @@ WORDS: dict[str, str] = {
     for kind, words in (
         (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
                   "setpoint setpoints sp reference references ref refs demand demanded requested "
-                  "action actions soll sollwert sv"),
+                  "action actions soll sollwert sv 目标 目標 指令"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
                 "observation observations obs state states estimate estimated est real encoder enc "
                 "reading readings sensed sensor response resp "
-                "potentiometer pot resolver pv ist istwert"),
+                "potentiometer pot resolver pv ist istwert 实际 実測 反馈"),
         (MAYBE_STATE, "y output outputs read rx follower received"),
-        (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ"),
+        (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
+                "角度 位置"),
         (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
                 "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
                 "current currents curr amps ampere voltage volt volts temperature temperatures "
@@ -44,9 +45,11 @@ WORDS: dict[str, str] = {
                 "gain gains kp ki kd stiffness damping limit limits lim max min seq index idx "
                 "frame iteration iter step overrun moving force feedforward ff tff integral prev "
                 "previous last offset home initial init delta diff frequency freq hz cov "
-                "covariance enable enabled reached done warning fault trial episode loop"),
+                "covariance enable enabled reached done warning fault trial episode loop "
+                "strom spannung"),
         (TIME, "time times timestamp timestamps t stamp stamps clock elapsed seconds secs sec "
-               "millis micros nanos nsec ns us µs ms date datetime utc epoch at"),
+               "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
+               "nanosec nanosecs nsecs usec usecs zeit 时间 時間"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
                "turns rev revs revolution revolutions mrad"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "

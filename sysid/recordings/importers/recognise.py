@@ -12,8 +12,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.importers import (
     arrays,
-    bam,
-    ktune,
+    json_logs,
     lerobot,
     parquet,
     ros,
@@ -24,7 +23,7 @@ from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
-_ENDINGS = (".csv", ".tsv", ".json", ".mcap", ".db3", ".npz", ".parquet", ".pt")
+_ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt")
 _PACKED = (".gz", ".bz2", ".xz")
 
 
@@ -109,17 +108,28 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start[:1] in (b"{", b"["):
-        found = border.parse_json(decoded(path, data), str(path), "Give the log as it was written.")
-        for layout, known, read in (
-            (bam.LAYOUT, bam.is_bam, bam.read_bam),
-            (ktune.LAYOUT, ktune.is_ktune, ktune.read_ktune),
-        ):
-            if known(found):
-                options.refuse(layout)
-                return chosen(path, replace(read(path, found), sha256=digest), options)
+    if start[:1] not in (b"{", b"["):
+        return None
+    found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
+    for layout, known, read in (
+        (json_logs.BAM, json_logs.is_bam, json_logs.read_bam),
+        (json_logs.KTUNE, json_logs.is_ktune, json_logs.read_ktune),
+    ):
+        if known(found):
+            options.refuse(layout)
+            return chosen(path, replace(read(path, found), sha256=digest), options)
+    log = json_logs.read_json_table(path, found, options)
+    if log is None:
         raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
-    return None
+    return replace(log, sha256=digest)
+
+
+def _whole_json(text: str) -> str:
+    """JSON Lines as one list; other JSON as it is."""
+    lines = text.strip().split("\n")
+    if len(lines) > 1 and all(line.strip()[:1] + line.strip()[-1:] == "{}" for line in lines[:2]):
+        return f"[{','.join(line for line in lines if line.strip())}]"
+    return text
 
 
 def chosen(path: Path, log: Log, options: LogOptions) -> Log:

@@ -61,6 +61,7 @@ _GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_
            "node_id", "id")  # fmt: skip
 LABELS = frozenset((*_SERIES, *_GROUPS, *_TRIALS))
 """Columns that may hold text, in lower case."""
+_SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
 _SOLE = "joint"  # of a log that names none
 _MOST_GROUPS = 1000
@@ -549,6 +550,13 @@ def _seconds(
     if name in table.texts:
         return times_of_day(path, name, table.texts[name]), 0.0, []
     values = table.numbers(path, name)
+    lower = {n.lower(): n for n in table.columns}
+    whole = re.fullmatch(r"(.*?)secs?", name.lower())
+    rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]
+    if rest:  # seconds and what is below one in a column of its own, as stamps of ROS have them
+        zero = float(np.nanmin(values))
+        below = table.numbers(path, rest[0])
+        return values - zero + clock(rest[0], below).scale * below, zero, []
     found = clock(name, values)
     return found.seconds(values), found.zero * found.scale, found.notes
 

@@ -25,7 +25,8 @@ PAUSE_S = 0.5
 
 _LONGEST_DOUBT_S = 1.0
 _KNOWN_ORDER_DOUBT_S = 0.001
-_SCALES = {"ns": 1e-9, "nsec": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0,
+_SCALES = {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9, "nsecs": 1e-9, "usec": 1e-6, "us": 1e-6,
+            "µs": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0,
            "secs": 1.0, "seconds": 1.0, "nanos": 1e-9, "micros": 1e-6, "millis": 1e-3}  # fmt: skip
 _UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE)
 _LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo

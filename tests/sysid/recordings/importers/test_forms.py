@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import gzip
 import io
+import json
 import lzma
 import zipfile
 
@@ -24,6 +25,7 @@ ROWS = 80
 TIME = np.round(0.005 * np.arange(ROWS) + 1e-4 * np.sin(np.arange(ROWS)), 6)
 COMMAND = np.round(0.3 * np.sin(8 * TIME), 6)
 POSITION = np.round(0.28 * np.sin(8 * (TIME - 0.03)), 6)
+ROWS_OF = list(zip(TIME.tolist(), COMMAND.tolist(), POSITION.tolist(), strict=True))
 COLUMNS = LogOptions("0", "1", "2")
 
 
@@ -122,6 +124,23 @@ FORMS = {
     "ISO times in UTC": clock("%Y-%m-%d %H:%M:%S.%fZ"),
     "times of day over midnight": clock("%H:%M:%S.%f"),
     "pairs of name and number": labelled(),
+    "a serial monitor's clock": "\n".join(
+        f"12:30:{t:09.6f} -> time: {t:.6f} cmd: {c:.6f} pos: {p:.6f}" for t, c, p in ROWS_OF),
+    "a firmware's log": "ets Jul 29 2019\n" + "\n".join(
+        f"I (37) servo: t={t:.6f}, goal={c:.6f}, pos={p:.6f}" for t, c, p in ROWS_OF),
+    "quoted decimal commas": "time,cmd,pos\n" + "\n".join(
+        f'"{t:.6f}","{c:.6f}","{p:.6f}"'.replace(".", ",") for t, c, p in ROWS_OF),
+    "names in two lines": ",cmd,pos\n,knee,knee\ntime,,\n" + joined(",", ()),
+    "lists in cells": "time,action,state\n" + "\n".join(
+        f'{t:.6f},"[{c:.6f}]",[{p:.6f}]' for t, c, p in ROWS_OF),
+    "seconds and nanoseconds": "header.stamp.sec,header.stamp.nanosec,cmd,pos\n" + "\n".join(
+        f"{1_700_000_000 + int(t)},{1e9 * (t % 1):.0f},{c:.6f},{p:.6f}" for t, c, p in ROWS_OF),
+    "German names": joined(";", ("Zeit [s]", "Sollwinkel [rad]", "Istwinkel [rad]"), comma=True),
+    "JSON, lists by name": json.dumps({"time": TIME.tolist(), "cmd": COMMAND.tolist(),
+                                       "pos": POSITION.tolist(), "about": {"rate": 200}}),
+    "JSON, records": json.dumps({"rows": [{"t": t, "cmd": c, "pos": p} for t, c, p in ROWS_OF]}),
+    "JSON Lines": "\n".join(
+        json.dumps({"t": t, "cmd": {"knee": c}, "pos": {"knee": p}}) for t, c, p in ROWS_OF),
     "each row four times": repeated(),
     "missing in words": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,None\n",
 }  # fmt: skip
