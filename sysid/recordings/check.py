@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.tables import import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
 
 _LEAST_ROWS = 20
@@ -152,8 +152,8 @@ def _refuse_degrees(
     raise InputError(
         f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
         f"{kind}. Angles must be radians: multiply degrees by 0.0174533, or convert the log with "
-        f"`pupper-sysid import {shlex.quote(Path(path).name)} --unit {unit}` (or deg, turns, "
-        "counts:4096, scale:…; rad if the joint turns so far)."
+        f"{import_line(path, unit=unit)} (or deg, turns, counts:4096, scale:…; rad if the joint "
+        "turns so far)."
     )
 
 

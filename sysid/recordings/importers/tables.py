@@ -290,8 +290,8 @@ def _pairs_by_words(
         ):
             notes.append(
                 f"of several columns {pair.command.name} was taken for the command and "
-                f"{pair.position.name} for the position. To take others: `pupper-sysid import` "
-                "with --command and --position."
+                f"{pair.position.name} for the position. To take others, name them with "
+                "`command` and `position`."
             )
         pairs[key] = pair
         names.append(_joint_name(pair))
@@ -299,7 +299,7 @@ def _pairs_by_words(
         if odd and not pair.command.unit + pair.position.unit and not options.unit:
             notes.append(
                 "pos_setpoint and pos_estimate are names of ODrive, which counts turns; the values "
-                "were taken as rad. If they are turns, say so with --unit turns; lag and dead time "
+                "were taken as rad. If they are turns, give `unit='turns'`; lag and dead time "
                 "are the same."
             )
     distinct(path, names, "joints")
@@ -388,11 +388,10 @@ def _refuse_choices(path: Path | str, why: str, pairs: Sequence[_Pair]) -> None:
 
 def import_line(path: Path | str, **options: str) -> str:
     """The command that imports a log with these options."""
-    words = [
-        f"--{name.replace('_', '-')} {shlex.quote(printable(v))}" for name, v in options.items()
-    ]
-    log = shlex.quote(Path(path).name)
-    return f"`pupper-sysid import {log} {' '.join(words)} --out rec.csv`"
+    words = [f"pupper-sysid import {shlex.quote(Path(path).name)}"]
+    for name, value in (options | {"out": "rec.csv"}).items():
+        words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value))}")
+    return f"`{' '.join(words)}`"
 
 
 def _stated_pairs(path: Path | str, table: Table, options: LogOptions) -> dict[str, _Pair]:
@@ -529,7 +528,8 @@ def _times(
     if command_time is None:
         if options.time is None and sent and time not in sent:
             notes.append(
-                f"commands may have been sent at {sent[0]}: if so, give --command-time {sent[0]}."
+                f"commands may have been sent at {sent[0]}: if so, "
+                f"{import_line(path, time=time, command_time=sent[0])}."
             )
         return read_s, None, notes
     command_time = _column_named(path, table, "command_time", command_time)

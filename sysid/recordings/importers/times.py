@@ -146,7 +146,7 @@ def turns(
         text = (
             f"the {things[0]} was taken as {order[0]} first and the {things[1]} as {order[1]} "
             f"{1e3 * READ_AFTER_SEND_S:g} ms later, in doubt by {1e3 * _KNOWN_ORDER_DOUBT_S:g} ms. "
-            f"If more lies between them, give it: --send-after {'' if before else '-'}3ms."
+            f"If more lies between them, give it: `send_after='{'' if before else '-'}3ms'`."
         )
         return send, read, _KNOWN_ORDER_DOUBT_S, [text]
     doubt, text = doubt_of_a_turn(stamp)
