@@ -17,9 +17,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict, create_model
 
 from pupper_sysid.common.border import read_yaml, validated
 from pupper_sysid.common.errors import InputError
@@ -146,24 +146,18 @@ class LogOptions:
             )
 
 
-class _MappingFile(BaseModel):
-    """A mapping file; see the module."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    time: str | None = None
-    command: str | None = None
-    position: str | None = None
-    trial: str | None = None
-    joints: list[str] | dict[str, str] = []
-    unit: str | None = None
-    units: dict[str, str] = {}
-    read_before_send: bool | None = None
-    stamp: Stamp | None = None
-    command_time: str | None = None
-    send_after: str | None = None
-    rate: float | None = None
-    readings: Readings | None = None
+_MappingFile = create_model(
+    "_MappingFile",
+    __config__=ConfigDict(extra="forbid", strict=True),
+    joints=(list[str] | dict[str, str], []),
+    units=(dict[str, str], {}),
+    **{
+        name: (kind, None)
+        for name, kind in get_type_hints(LogOptions).items()
+        if name not in ("joints", "units")
+    },
+)
+"""A mapping file holds what `LogOptions` does; see the module."""
 
 
 def read_mapping(path: Path) -> LogOptions:

@@ -25,8 +25,7 @@ def test_what_is_no_recording_is_refused_with_what_makes_one():
         (TABLE, "Recording.from_frame(table)"), (None, "not a NoneType"), (3, "not a int"),
         ([], "the list is empty"), ({"knee": TIME}, "not a dict"),
     ]  # fmt: skip
-    doors = (ps.lag, ps.examine, ps.calibrate, ps.frequency_response, ps.backlash, ps.fit_servo,
-             ps.sparse_equations, lambda value: ps.compare(value, {}))  # fmt: skip
+    doors = (ps.lag, ps.examine, ps.calibrate, ps.frequency_response, ps.backlash)
     for door in doors:
         assert_each_refused(cases, door)
     recording = ps.Recording.from_frame(TABLE)

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
@@ -262,6 +263,7 @@ def test_angles_of_several_turns_are_angles_where_their_unit_is_stated():
     recording = Recording.from_frame(table, options=LogOptions(unit="deg"))
     (trial,) = recording.trials("joint")
     assert trial.command_rad.max() == pytest.approx(3 * np.pi, rel=0.01) and trial.unit_stated
+    assert not any("degrees" in reason for reason in examine(recording)["joint"].reasons)
     with pytest.raises(InputError, match="more than a hundred turns"):
         Recording.from_frame(table * 100, options=LogOptions("time", unit="rad"))
 
