@@ -59,7 +59,7 @@ def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """Angles that cannot be radians, whatever their amplitude."""
     cure = "Angles must be radians: multiply degrees by 0.0174533."
     largest = max(float(np.max(np.abs(t.command_rad))) for t in trials)
-    if largest > _LARGEST_RAD:
+    if largest > _LARGEST_RAD and not all(t.unit_stated for t in trials):
         text = f"commands reach {largest:.1f}, which no joint can do in radians: they look"
     elif step > _COARSEST_RAD and _levels(trials) >= _LEVELS:
         text = f"readings come in steps of {step:.3g}, too coarse for radians: they look"

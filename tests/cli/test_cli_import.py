@@ -45,7 +45,7 @@ def test_a_log_is_imported_by_its_columns_and_says_what_was_assumed(capsys, arm)
 
 def test_joints_order_and_json(capsys, arm):
     code, out, _ = run(
-        capsys, "import", arm, *COLUMNS, "--joints", "pan", "--read-before-send", "--json"
+        capsys, "import", arm, *COLUMNS, "--joints", "pan", "--send-after", "0.5ms", "--json"
     )
     found = json.loads(out)
     assert code == 0 and found["joints"] == ["pan"] and found["written"] == "arm.csv"
