@@ -91,6 +91,7 @@ class GuardedBus:
         self.bus = bus
         self.name, self.joint_names = bus.name, bus.joint_names
         self.limits, self.metadata = bus.limits, bus.metadata
+        self.error_bits = getattr(bus, "error_bits", {})
         self.guard = limits or GuardLimits()
         self.report = GuardReport()
         self.spent = TimeSpent(bus.now)
@@ -191,12 +192,15 @@ class GuardedBus:
         Raises
         ------
         BusError
-            If a position is missing, a servo does not take a protection that it lacks, or a servo
+            If a servo's registers do not let it be driven (`SerialBus.refuse_unfit`), a position is
+            missing, a servo does not take a protection that it lacks, or a servo
             did not confirm that its torque is on; the torque of all is switched off then.
         """
         if not on:
             self._torque_off()
             return not self._left_on
+        if refuse := getattr(self.bus, "refuse_unfit", None):
+            refuse()
         if not self._on:
             # a limp robot may have been moved by hand since it was read
             self._present[self.bus.now() - self._present_s > _STALE_S] = np.nan

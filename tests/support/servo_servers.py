@@ -13,13 +13,13 @@ import numpy as np
 
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
-from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy": "mini_pupper_2"}
@@ -125,6 +125,13 @@ def still_servos(
     return Listening(bench, series, np.random.default_rng(0), ids, **keywords)
 
 
+def map_of(*ids: int, series: Series = STS3215) -> JointMap:
+    """Joint map of these servos of the Mini Pupper's layout."""
+    whole = load_joint_map(LAYOUTS[series.name]).per_servo()
+    servos = dict(zip(whole.joint_names, whole.ids, strict=True))
+    return whole.select([joint for joint, servo in servos.items() if servo in ids])
+
+
 def moving_servos(series: Series = STS3215, **keywords) -> Listening:
     """Servos with physics."""
     rng = np.random.default_rng(0)
@@ -140,10 +147,10 @@ def bench_of(emulator: FeetechEmulator | ProxyEmulator) -> StillBench:
 
 
 @contextmanager
-def on_a_port(emulator: FeetechEmulator) -> Iterator[FeetechPty]:
+def on_a_port(emulator: FeetechEmulator) -> Iterator[SerialPty]:
     """The servos behind a pseudo-terminal that is there for as long as the block."""
     with tempfile.TemporaryDirectory(prefix="fp") as folder:
-        server = FeetechPty(emulator, Path(folder) / "bus")
+        server = SerialPty(emulator, Path(folder) / "bus")
         thread = threading.Thread(target=server.serve, daemon=True)
         thread.start()
         try:
@@ -179,7 +186,7 @@ def wait_until(true: Callable[[], bool], seconds: float = 3.0) -> bool:
 
 
 @contextmanager
-def robot_behind(kind: str, folder: Path) -> Iterator[tuple[FeetechPty | ProxySocket, str]]:
+def robot_behind(kind: str, folder: Path) -> Iterator[tuple[SerialPty | ProxySocket, str]]:
     """A served robot whose servos are limp, behind `feetech` or `esp32`, and its address."""
     if kind == "feetech":
         with on_a_port(moving_servos()) as server:
@@ -193,13 +200,13 @@ def robot_behind(kind: str, folder: Path) -> Iterator[tuple[FeetechPty | ProxySo
         yield server, f"esp32:{folder / 's'}"
 
 
-def limp(server: FeetechPty | ProxySocket) -> bool:
+def limp(server: SerialPty | ProxySocket) -> bool:
     """Whether no servo has torque."""
     bench = server.emulator.bench
     return not any(bench.is_on(k) for k in bench.index_of_id.values())
 
 
-def let_go(server: FeetechPty | ProxySocket) -> None:
+def let_go(server: SerialPty | ProxySocket) -> None:
     """Switch all servos off, as after power-on: a driver that misses one does not drive it."""
     bench = server.emulator.bench
     for k in bench.index_of_id.values():

@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import say_remarks
 from pupper_sysid.cli.keyboard import Keyboard
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
@@ -81,6 +82,7 @@ class CalibrateJoints:
         wanted = None if self.joints == "all" else names
         bus = open_bus(address, given.per_servo() if given else None, wanted)
         try:
+            say_remarks(bus)
             start = given or load_joint_map(bus.metadata["joint_map"])
             # a line need not have all servos
             here = [n for n in names if n in bus.joint_names]

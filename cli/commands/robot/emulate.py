@@ -16,7 +16,7 @@ import tyro
 import yaml
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import parse_registers
+from pupper_sysid.cli.buses import parse_servo_registers
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.numbers import whole
@@ -28,9 +28,10 @@ from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
 from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
+from pupper_sysid.sim.emulator.servos.bench import SUPPLY_V, ServoBench
+from pupper_sysid.sim.emulator.servos.pendulum import REGISTERS
 from pupper_sysid.sim.emulator.servos.pendulum_bench import (
     BENCH_MAP,
     BenchSpec,
@@ -103,8 +104,15 @@ class Feetech(Common):
     backlash: float = 0.0
     """With --load: play of its gears [degrees]."""
     registers: str = ""
-    """With --load or a --joint-map of STS3215: registers that differ from the factory's, e.g.
-    p=16,goal_speed=400."""
+    """Registers that differ from the factory's, of all servos or of one id: p=16,5:mode=1. The
+    servos obey them; gains, ramps and torque limits need servos that have them, as with --load or
+    STS3215."""
+    double_id: int | None = None
+    """Two servos have this id, and destroy each other's answers."""
+    supply: float = SUPPLY_V
+    """Supply of the servos [V]."""
+    adapter_ms: float = 0.0
+    """Latency timer of the USB adapter [ms]: 16 for an FTDI as its driver sets it."""
     joint_map: str | None = None
     """Joint map of another robot, such as `init-robot` writes; its joints are in free air."""
     ids: str = "all"
@@ -132,11 +140,17 @@ class Feetech(Common):
         elif self.backlash:
             raise InputError("--backlash is of a bench: add --load (or --load none).")
         layout = load_joint_map(self.joint_map or preset)
-        loaded_servos = bool(self.load or (self.joint_map and has_registers(layout)))
-        if self.registers and not loaded_servos:
+        registers = parse_servo_registers(self.registers, series)
+        refuse_outside("--adapter-ms", self.adapter_ms, 0, 100, "ms")
+        refuse_outside("--supply", self.supply, 0, 25, "V")
+        moves = any(name in REGISTERS for own in registers.values() for name in own)
+        loaded_servos = bool(
+            self.load or (has_registers(layout) and (self.joint_map or moves) and not self.walking)
+        )
+        if moves and not loaded_servos:
             raise InputError(
-                "--registers: these servos have none that act. Add --load (or --load none), or a "
-                "--joint-map whose `servo` is STS3215."
+                "--registers: gains, ramps and torque limits of these servos do not act. Add "
+                "--load (or --load none), or choose STS3215 that do not walk."
             )
         if self.joint_map and self.walking:
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
@@ -153,7 +167,9 @@ class Feetech(Common):
                 rng, Pendulum(**(load.model_dump() if load else {})),
                 BenchSpec(
                     backlash_rad=math.radians(self.backlash),
-                    registers=tuple(parse_registers(self.registers).items()),
+                    registers=tuple(
+                        (k, v) for k, v in registers[None].items() if k in REGISTERS
+                    ),
                 ),
                 layout,
             )  # fmt: skip
@@ -167,12 +183,14 @@ class Feetech(Common):
             bench = _bench(self, robot, layout, rng)
         emulator = FeetechEmulator(
             bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
-            BusFaults.parse(self.faults, rng), self.echo,
+            BusFaults.parse(self.faults, rng), self.echo, registers,
+            () if self.double_id is None else (self.double_id,),
         )  # fmt: skip
+        bench.supply_v = self.supply
         link = self.link or Path(tempfile.mkdtemp()) / "servos"
         with (
             _imu_beside(bench, self.imu_socket, rng),
-            closing(FeetechPty(emulator, link)) as server,
+            closing(SerialPty(emulator, link, self.adapter_ms / 1e3)) as server,
             _hand_of(self, bench),
         ):
             _write_truth(self, bench)
@@ -187,7 +205,10 @@ class Feetech(Common):
                     f"  pupper-sysid sweep --load {self.load}{kind}{shown} --bus {bus}\n",
                 )  # fmt: skip
             else:
-                _serve(server, what, bus, self.walking, self.joint_map)
+                # without a map only a whole Mini Pupper is taken for one
+                part = len(emulator.servos) < len(layout.ids)
+                named = self.joint_map or (preset if part else None)
+                _serve(server, what, bus, self.walking, named)
 
 
 Emulate = (
@@ -248,7 +269,7 @@ def _write_truth(options: Common, bench: ServoBench) -> None:
 
 
 def _serve(
-    server: ProxySocket | FeetechPty,
+    server: ProxySocket | SerialPty,
     what: str,
     name: str,
     walking: bool,
@@ -260,7 +281,7 @@ def _serve(
     _serve_with(server, what, f"{sweep}  pupper-sysid monitor --bus {bus}\n")
 
 
-def _serve_with(server: ProxySocket | FeetechPty, what: str, commands: str) -> None:
+def _serve_with(server: ProxySocket | SerialPty, what: str, commands: str) -> None:
     """Serve until Ctrl-C; `commands` are what to type elsewhere."""
     terminal.out.print(what, soft_wrap=True)
     terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.", soft_wrap=True)
