@@ -36,8 +36,8 @@ from pupper_sysid.hardware.lock import lock_name, runtime_folder
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.serial_pty import SerialPty
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
