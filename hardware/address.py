@@ -54,6 +54,7 @@ KINDS = {
     for kind in (
         BusKind("esp32", "Mini Pupper 2", "hardware.esp32.bus", "Esp32Bus", str(SOCKET)),
         BusKind("feetech", "Feetech STS and SCS", "hardware.feetech.bus", "FeetechBus"),
+        BusKind("dynamixel", "Dynamixel X and MX", "hardware.dynamixel.bus", "DynamixelBus"),
     )
 }
 """All buses outside this program, by name."""

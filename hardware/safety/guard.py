@@ -115,6 +115,10 @@ class GuardedBus:
         """Sleep until `now()` has reached `time_s`; the watchdog gets its beats meanwhile."""
         while self._on and (left := time_s - self.bus.now()) > _HEARTBEAT_S:
             self._beat()
+            if alive := getattr(
+                self.bus, "keep_alive", None
+            ):  # servos with a watchdog of their own
+                alive()
             self.bus.sleep_until(self.bus.now() + min(_HEARTBEAT_S, left))
         self.bus.sleep_until(time_s)
 

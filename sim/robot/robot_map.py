@@ -20,7 +20,10 @@ from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.hardware.joint_map import SCHEMA, SCHEMA_VERSION, JointMap, joint_map_from
 from pupper_sysid.sim.robot.hinges import Hinge, hinges_of
 
-SERVOS = {"sts3215": (4096, 2 * np.pi), "scs0009": (1024, np.radians(300))}
+_TURN = (4096, 2 * np.pi)
+SERVOS = {"sts3215": _TURN, "scs0009": (1024, np.radians(300))} | dict.fromkeys(
+    ("xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"), _TURN
+)
 """Counts of the encoder, and the angle that they span [rad]."""
 
 _MARGIN_COUNTS = 20  # servos clip goals near the ends of their range

@@ -23,7 +23,9 @@ class InitRobot:
 
     model: tyro.conf.Positional[Path]
     """The robot's MJCF or URDF."""
-    servo: Literal["sts3215", "scs0009"] = "sts3215"
+    servo: Literal[
+        "sts3215", "scs0009", "xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28",
+    ] = "sts3215"  # fmt: skip
     """Which servos it has."""
     out: Path | None = None
     """Joint map to write; by default the model's name and .joints.yaml, in this folder."""
