@@ -192,9 +192,16 @@ class SerialBus(HostClock):
         for joint, servo in zip(self.joint_names, self._servos, strict=True):
             if servo.registers is None:
                 self._remember(servo)
+            if servo.registers is None and self.line.ping(servo.id) is not None:
+                level = servo.series.name_of("response_level")
+                raise BusError(
+                    f"{joint}: it answers pings, but no read: its register {level} (address "
+                    f"{servo.series.register(level).address}) is probably 0. Write "
+                    f"{self.family.acknowledges} into it with {self.family.tool}."
+                )
             if servo.registers is None:
                 raise BusError(
-                    f"{joint}: its registers could not be read, so nobody knows how it would move. "
+                    f"{joint}: its registers could not be read, so it must not be driven. "
                     "Check the cable and the power, then try again."
                 )
         if refused := [sentence for fault, sentence in self._faults() if fault.refused]:

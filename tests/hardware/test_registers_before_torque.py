@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.dynamixel.bus import DynamixelBus
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
-from support.servo_servers import Listening, bench_of, map_of, on_a_port, still_servos
+from pupper_sysid.sim.emulator.serial_line import LineEmulator
+from support.servo_servers import (
+    bench_of,
+    dynamixel_map,
+    map_of,
+    on_a_port,
+    still_dynamixels,
+    still_servos,
+)
 
 IDS = (4, 5)
 JOINTS = {4: "LF_hip", 5: "LF_thigh"}
@@ -27,18 +36,16 @@ def patience(monkeypatch):
 @pytest.fixture(scope="module")
 def lines() -> Iterator[dict]:
     """A line of each family, shared: a test changes registers and puts them back."""
-    servos = {
-        "STS3215": still_servos(STS3215, IDS), "SCS0009": still_servos(SCS0009, IDS),
-    }  # fmt: skip
-    with on_a_port(servos["STS3215"]) as sts, on_a_port(servos["SCS0009"]) as scs:
+    lines = (still_servos(STS3215, IDS), still_servos(SCS0009, IDS), still_dynamixels(IDS))
+    with ExitStack() as ports:
         yield {
-            "STS3215": (servos["STS3215"], sts.device),
-            "SCS0009": (servos["SCS0009"], scs.device),
+            servos.series.name: (servos, ports.enter_context(on_a_port(servos)).device)
+            for servos in lines
         }
 
 
 @contextmanager
-def set_to(servos: Listening, servo: int, **registers: int) -> Iterator[None]:
+def set_to(servos: LineEmulator, servo: int, **registers: int) -> Iterator[None]:
     """Registers of a servo for the block."""
     kept = bytes(servos.servos[servo].memory)
     for name, value in registers.items():
@@ -53,7 +60,10 @@ def set_to(servos: Listening, servo: int, **registers: int) -> Iterator[None]:
 
 def refusal(device: str, series) -> str:
     """Sentence with which the torque is refused."""
-    bus = GuardedBus(FeetechBus(device, 1_000_000, map_of(*IDS, series=series)))
+    if series.name.startswith("XL"):
+        bus = GuardedBus(DynamixelBus(device, 1_000_000, dynamixel_map(*IDS)))
+    else:
+        bus = GuardedBus(FeetechBus(device, 1_000_000, map_of(*IDS, series=series)))
     try:
         with pytest.raises(BusError) as refused:
             bus.torque(True)
@@ -76,6 +86,21 @@ CASES = [
      "Write 0 and 1023"),
     ("SCS0009", {"max_angle": 520}, "max_angle (address 11) is 520", "limits_counts"),
     ("SCS0009", {"response_level": 0}, "response_level (address 8) is 0", "Write 1"),
+    ("XL330-M288", {"operating_mode": 1}, "operating_mode (address 11) is 1: velocity mode",
+     "Write 3 into operating_mode"),
+    ("XL330-M288", {"operating_mode": 0}, "operating_mode (address 11) is 0: current mode",
+     "Write 3 into operating_mode"),
+    ("XL330-M288", {"max_position_limit": 2100}, "max_position_limit (address 48) is 2100",
+     "limits_counts"),
+    ("XL330-M288", {"min_position_limit": 0, "max_position_limit": 0},
+     "min_position_limit and max_position_limit (address 52, 48) is 0", "0 and 4095"),
+    ("XL330-M288", {"homing_offset": -2000}, "homing_offset (address 20) is -2000",
+     "Write 0 into homing_offset"),
+    ("XL330-M288", {"status_return_level": 1}, "status_return_level (address 68) is 1", "Write 2"),
+    ("XL330-M288", {"status_return_level": 0}, "status_return_level (address 68) is probably 0",
+     "Write 2"),
+    ("XL330-M288", {"operating_mode": 4, "homing_offset": 4096}, "present_position",
+     "Write 0 into homing_offset"),
 ]  # fmt: skip
 
 
@@ -153,6 +178,14 @@ def test_two_servos_of_one_id_are_named_instead_of_the_cables(series):
     servos = still_servos(series, (4, 5, 6), doubled=[5])
     with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
         FeetechBus(server.device, 1_000_000, map_of(4, 5, 6, series=series))
+    assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
+    assert (5, True) not in bench_of(servos).torques
+
+
+def test_two_dynamixels_of_one_id_are_named():
+    servos = still_dynamixels((4, 5, 6), doubled=[5])
+    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
+        DynamixelBus(server.device, 1_000_000, dynamixel_map(4, 5, 6))
     assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
     assert (5, True) not in bench_of(servos).torques
 
