@@ -324,14 +324,29 @@ class SerialBus(HostClock):
             if servo.registers is None:
                 continue
             entry = self.joint_map.file.joints[self.joint_names[k]]
-            limits = entry.limits_counts
-            for fault in register_faults(self.family, servo.series, servo.registers, limits):
+            faults = register_faults(
+                self.family, servo.series, servo.registers, entry.limits_counts
+            )
+            for fault in [*faults, *self._other_offset(servo, entry.homing_offset)]:
                 joints.setdefault((fault, servo.series.name), []).append(self.joint_names[k])
         series = {servo.series.name: servo.series for servo in self._servos}
         return [
             (fault, fault.sentence(", ".join(names), series[name]))
             for (fault, name), names in joints.items()
         ]
+
+    def _other_offset(self, servo: _Servo, expected: int | None) -> list[RegisterFault]:
+        """Fault of a homing offset that is not that of the joint map."""
+        name = servo.series.name_of("homing_offset")
+        value = (servo.registers or {}).get(name)
+        if expected is None or value is None or value == expected:
+            return []
+        meaning = f"the joint map holds with {expected} only, and all angles are off by the rest"
+        cure = (
+            f"Write {expected} into {name} with {self.family.tool} or LeRobot, or measure the map "
+            "anew with `pupper-sysid calibrate-joints`"
+        )
+        return [RegisterFault("homing_offset", value, meaning, cure)]
 
     def _status(self, servo: _Servo, reply: Reply) -> int:
         """Error bits of a reply."""

@@ -120,6 +120,8 @@ class LineEmulator:
                 self._set(servo_id, name, value)
                 if name in self._acting:
                     bench.set_register(k, 0.0, name, value)
+            if series.has("homing_offset") and "homing_offset" not in changed:
+                self._set(servo_id, "homing_offset", self._mapped_offset(servo_id))
             goal = int(np.clip(self._present(servo_id, 0.0), 0, series.counts - 1))
             self._set(servo_id, "goal_position", goal)
 
@@ -193,10 +195,16 @@ class LineEmulator:
         return bool(self._get(servo_id, "min_angle") or self._get(servo_id, "max_angle"))
 
     def _offset(self, servo_id: int) -> int:
-        """Encoder minus present position [counts]."""
+        """Counts of the bench minus present position: the offset that its map does not have."""
         if not self.series.has("homing_offset"):
             return 0
-        return self.series.offset_sign * self._get(servo_id, "homing_offset")
+        more = self._get(servo_id, "homing_offset") - self._mapped_offset(servo_id)
+        return self.series.offset_sign * more
+
+    def _mapped_offset(self, servo_id: int) -> int:
+        """Homing offset with which the bench's joint map holds."""
+        joint = self.bench.map.joint_names[self.bench.index_of_id[servo_id]]
+        return self.bench.map.file.joints[joint].homing_offset or 0
 
     def _present(self, servo_id: int, at: float) -> int:
         """Position that a servo reports [counts]."""

@@ -24,6 +24,7 @@ from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.lerobot_calibration import write_lerobot
 
 _PERIOD_S = 0.02
 _MEAN_OVER_S = 0.5
@@ -53,12 +54,16 @@ class CalibrateJoints:
     """Joint on which counts per radian are checked; by default the first."""
     scale_deg: float = 90.0
     """Angle that it is moved through for that [degrees]."""
+    lerobot_calibration: Path | None = None
+    """Also write LeRobot's calibration (.json), with the homing offsets that the servos have."""
     force: bool = False
-    """Replace the file if it exists."""
+    """Replace files that exist."""
 
     def run(self) -> None:
         """Guide through the steps and write the map."""
         refuse_overwrite(self.out, self.force)
+        if self.lerobot_calibration:
+            refuse_overwrite(self.lerobot_calibration, self.force)
         if self.out.suffix not in (".yaml", ".yml"):
             raise InputError(f"--out {self.out}: a joint map is a .yaml file.")
         if not 5 <= self.scale_deg <= 300:
@@ -105,6 +110,13 @@ class CalibrateJoints:
         terminal.warn(jc.doubts(new, offsets))
         guide.stay_limp()
         new.save(self.out, self.force)
+        if self.lerobot_calibration:
+            setups = getattr(guide.bus, "servo_setups", dict)()
+            offsets_there = {
+                name: setup.get("registers", {}).get("homing_offset", 0)
+                for name, setup in setups.items()
+            }
+            write_lerobot(self.lerobot_calibration, new, offsets_there, self.force)
         table = terminal.table(
             f"{self.out}: {new.file.name}", "joint", "id", "offset", "limits", "counts/rad"
         )

@@ -107,7 +107,8 @@ def test_hinges_that_an_actuator_drives_by_any_way_are_taken_and_others_named(ca
 
 def test_the_mini_pupper_s_own_model_has_its_twelve_joints(read_here):
     Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
-    layout, left_out = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
+    robot = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
+    layout, left_out = robot.joint_map, robot.left_out
     assert layout.joint_names == JOINT_NAMES and left_out == []
 
 
