@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.safety.limits import PositionLimits
-from pupper_sysid.hardware.serial_servos.series import bits_in_words
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, bits_in_words
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> N
 
 def error_words(bus: ServoBus, status: int) -> str:
     """Error bits of a sample's status in words, as the bus names them."""
-    return bits_in_words(status, getattr(bus, "error_bits", {}))
+    return bits_in_words(status, getattr(bus, "error_bits", ERROR_BITS))
 
 
 def header_entries(bus: ServoBus) -> dict[str, Any]:

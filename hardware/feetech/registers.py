@@ -13,13 +13,12 @@ import math
 from collections.abc import Mapping
 
 from pupper_sysid.common.data_sheet import counts_of
-from pupper_sysid.hardware.serial_servos.series import Profile, Register, Series
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Profile, Register, Series
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST_ID = 0xFE
 HIGHEST_ID = 253
 
-ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """By the value of the servo's baud register."""
 RETURN_DELAY_UNIT_S = 2e-6
@@ -83,8 +82,8 @@ STS3215 = Series(
         "present_position": Register(56, 2, 15),
         "current": Register(69, 2, 15),
     },
-    # bit 4 of the phase register: several turns are reported, instead of one (LeRobot clears it)
-    wraps=lambda get: not get("phase") & MULTI_TURN_FEEDBACK,
+    # several turns are reported, instead of one (LeRobot clears it)
+    multi_turn_bit=MULTI_TURN_FEEDBACK,
 )  # fmt: skip
 SERIES = {int.from_bytes(s.word(s.model), "little"): s for s in (SCS0009, STS3215)}
 """By model number, its bytes as little endian."""

@@ -30,6 +30,7 @@ from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.rates import RateLimit
 from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import Watchdog
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS
 
 _HEARTBEAT_S = 0.1
 _MOST_EVENTS = 500  # that a report keeps; all are counted
@@ -91,7 +92,7 @@ class GuardedBus:
         self.bus = bus
         self.name, self.joint_names = bus.name, bus.joint_names
         self.limits, self.metadata = bus.limits, bus.metadata
-        self.error_bits = getattr(bus, "error_bits", {})
+        self.error_bits = getattr(bus, "error_bits", ERROR_BITS)
         self.guard = limits or GuardLimits()
         self.report = GuardReport()
         self.spent = TimeSpent(bus.now)

@@ -104,11 +104,6 @@ class SerialLine:
     exclusive : bool
         Whether to refuse a port that another program has open.
 
-    Raises
-    ------
-    BusError
-        If the port cannot be opened or is in use, or the SDK is not installed.
-
     Attributes
     ----------
     latency_s : float
@@ -116,6 +111,11 @@ class SerialLine:
         has measured it.
     patience_s : float
         Time for which a reply is awaited beyond that.
+
+    Raises
+    ------
+    BusError
+        If the port cannot be opened or is in use, or the SDK is not installed.
     """
 
     reply_bytes: int

@@ -143,9 +143,9 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
     raise InputError(
         f"{line.device}: no joint map says which joint each servo moves, and these ({one.name}, "
         f"ids {ids}) are not the Mini Pupper's twelve. Make a map from your robot's URDF or MJCF "
-        "with `pupper-sysid init-robot ROBOT.urdf`, and add it with --joint-map; `pupper-sysid "
+        "with `pupper-sysid init-robot ROBOT.urdf` and name it as the joint map; `pupper-sysid "
         f"scan --bus {family.name}:{line.device}` lists the servos. A part of a Mini Pupper needs "
-        f"--joint-map {preset or 'sts3215'}, too."
+        f"its joint map ({preset or 'sts3215'}) named, too."
     )
 
 

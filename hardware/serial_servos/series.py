@@ -14,6 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
+"""Bits of a status byte in words, where a bus does not name others."""
+
 COMMON = (
     "model", "id", "p", "i", "d", "mode", "min_angle", "max_angle", "homing_offset",
     "response_level", "return_delay", "min_voltage", "max_voltage", "torque_enable",
@@ -56,8 +59,13 @@ class Series:
     """First address of the registers that are lost with the power."""
     offset_sign: int = 1
     """Encoder = present position + this * homing offset."""
-    wraps: Callable[[Callable[[str], int]], bool] = lambda get: False
-    """Whether counts wrap at the encoder's end with a homing offset, by the registers."""
+    multi_turn_bit: int | None = None
+    """Of the register phase: while it is clear, counts with a homing offset wrap at the encoder's
+    end; None where they never do."""
+
+    def wraps(self, get: Callable[[str], int]) -> bool:
+        """Whether counts wrap at the encoder's end, by the registers."""
+        return self.multi_turn_bit is not None and not get("phase") & self.multi_turn_bit
 
     def name_of(self, name: str) -> str:
         """The vendor's name of a register."""
