@@ -124,6 +124,17 @@ _SHEETS = (
         ),
     ),
     DataSheet(
+        "HD-1910", 0, 4096,  # its model number is not published
+        (
+            Rating(
+                7.4, 10 * _KG_CM, 110 * _RPM,
+                "vendor's sheet of the HD-1910-C001, 10 kg·cm and 0.09 s/60°, as quoted by "
+                "Microduck's builders, of whom others state 12 kg·cm",
+            ),
+        ),
+        (4.0, 8.4),
+    ),
+    DataSheet(
         "SCS0009", 1284, 1024 * 1.2,
         (
             Rating(

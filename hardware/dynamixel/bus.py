@@ -20,6 +20,7 @@ FAMILY = Family(
     rates=(1_000_000, 57_600, 2_000_000, 3_000_000, 4_000_000, 115_200),
     highest_id=registers.HIGHEST_ID,
     series=registers.SERIES,
+    profiles={},
     presets={},
     error_bits=registers.HARDWARE_ERRORS | {registers.ALERT: "hardware error"},
     present="present_pwm",

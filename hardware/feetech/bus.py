@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pupper_sysid.hardware.feetech import registers
 from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.feetech.registers import HD1910, SCS0009, STS3215
 from pupper_sysid.hardware.serial_servos.bus import SerialBus
-from pupper_sysid.hardware.serial_servos.series import Family
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Family
 
 FAMILY = Family(
     name="feetech",
@@ -14,8 +14,9 @@ FAMILY = Family(
     rates=(1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400),
     highest_id=registers.HIGHEST_ID,
     series=registers.SERIES,
+    profiles={HD1910.name: HD1910},
     presets={SCS0009.name: "mini_pupper_2_direct", STS3215.name: "sts3215"},
-    error_bits=registers.ERROR_BITS,
+    error_bits=ERROR_BITS,
     present="present_position",
     reading_bytes=(6, 7, 8, 9, 10, 11),  # position, speed, load; voltage; temperature; …
     memory_pieces=(16, 15, 14, 13, 9),  # registers 0 to 66

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from pupper_sysid.common.data_sheet import counts_of
-from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Profile, Register, Series
+from pupper_sysid.hardware.serial_servos.series import Profile, Register, Series
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST_ID = 0xFE
@@ -85,6 +86,15 @@ STS3215 = Series(
     # several turns are reported, instead of one (LeRobot clears it)
     multi_turn_bit=MULTI_TURN_FEEDBACK,
 )  # fmt: skip
+HD1910 = replace(
+    STS3215,
+    name="HD-1910",
+    model=0,
+    registers=STS3215.registers | {"p": Register(50), "d": Register(51)},
+    more_position_modes=frozenset({4}),  # as delivered, by a builder's notes on firmware 3.46
+)
+"""Microduck's Feetech servo: STS protocol, with the gains in use at 50 and 51. No source states its
+model number, so that a joint map has to name it."""
 SERIES = {int.from_bytes(s.word(s.model), "little"): s for s in (SCS0009, STS3215)}
 """By model number, its bytes as little endian."""
 

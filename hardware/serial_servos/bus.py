@@ -127,7 +127,9 @@ class SerialBus(HostClock):
             self.family, device, baud, ids, exclusive, patiently=wanted is not None
         )
         try:
-            series = known_series(self.family, models, device)
+            series = known_series(
+                self.family, models, device, wanted.file.servo if wanted else None
+            )
             if wanted is None:
                 wanted = default_map(self.family, self.line, series)
                 wanted = wanted.select(joints) if joints else wanted

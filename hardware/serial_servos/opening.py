@@ -58,22 +58,29 @@ def rates_in_words(family: Family, baud: int | None) -> str:
     return ", ".join(map(str, family.rates)) if baud is None else str(baud)
 
 
-def known_series(family: Family, models: dict[int, int], device: str) -> dict[int, Series]:
-    """Series of the servos that answered.
+def known_series(
+    family: Family, models: dict[int, int], device: str, named: str | None = None
+) -> dict[int, Series]:
+    """Series of the servos that answered; `named` is the servo of the joint map.
 
     Raises
     ------
     BusError
         If a model is unknown.
     """
+    profile = family.profiles.get(named or "")
     for servo, model in models.items():
-        if model not in family.series:
+        if model not in family.series and profile is None:
             known = ", ".join(f"{s.name} ({s.model})" for s in family.series.values())
             raise BusError(
                 f"{device}: servo {servo} has the model number {model}, which is not known; known "
                 f"are {known}. Registers differ between series, so nothing is sent to it."
             )
-    return {servo: family.series[model] for servo, model in models.items()}
+    return {
+        servo: series
+        for servo, model in models.items()
+        if (series := family.series.get(model, profile)) is not None
+    }
 
 
 def answering_joints(

@@ -59,6 +59,8 @@ class Series:
     """First address of the registers that are lost with the power."""
     offset_sign: int = 1
     """Encoder = present position + this * homing offset."""
+    more_position_modes: frozenset[int] = frozenset()
+    """Values of the mode register beside the family's at which it goes where it is commanded."""
     multi_turn_bit: int | None = None
     """Of the register phase: while it is clear, counts with a homing offset wrap at the encoder's
     end; None where they never do."""
@@ -141,6 +143,8 @@ class Family:
     highest_id: int
     series: Mapping[int, Series]
     """By model number."""
+    profiles: Mapping[str, Series]
+    """By the servo's name in a joint map, for servos whose model number is not published."""
     presets: Mapping[str, str]
     """Joint map of the Mini Pupper's layout, by series' name."""
     error_bits: Mapping[int, str]

@@ -156,7 +156,8 @@ def register_faults(
     faults: list[RegisterFault] = []
     mode = get("mode", family.position_mode)
     free = mode in family.turns_freely
-    if mode in family.modes or not (free or mode == family.position_mode):
+    holds = free or mode == family.position_mode or mode in series.more_position_modes
+    if not holds:
         words = family.modes.get(mode, "a mode that is not known here")
         meaning = f"{words}, in which the servo does not go to the positions that it is commanded"
         faults.append(RegisterFault("mode", mode, meaning, write(family.position_mode, "mode")))

@@ -20,7 +20,7 @@ from pupper_sysid.hardware.feetech.registers import (
 )
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, Pieces
 
-_OVERLOAD = 32  # of `hardware.feetech.registers.ERROR_BITS`
+_OVERLOAD = 32  # of `hardware.serial_servos.series.ERROR_BITS`
 
 _SCS0009 = {
     "firmware_major": 0, "firmware_minor": 16, "return_delay": 0, "response_level": 1,
@@ -43,7 +43,9 @@ class FeetechEmulator(LineEmulator):
 
     family = FAMILY
     memory_bytes = 80
-    factory: ClassVar = {"SCS0009": _SCS0009, "STS3215": _STS3215}
+    factory: ClassVar = {
+        "SCS0009": _SCS0009, "STS3215": _STS3215, "HD-1910": _STS3215 | {"mode": 4},
+    }  # fmt: skip
 
     def _new_reader(self) -> FrameReader:
         return FrameReader()

@@ -191,7 +191,8 @@ class LineEmulator:
         """Whether a servo goes to the positions that it is commanded, by its mode."""
         mode = self._get(servo_id, "mode") if self.series.has("mode") else None
         if mode is not None:
-            return mode == self.family.position_mode or mode in self.family.turns_freely
+            own = {self.family.position_mode, *self.series.more_position_modes}
+            return mode in own or mode in self.family.turns_freely
         return bool(self._get(servo_id, "min_angle") or self._get(servo_id, "max_angle"))
 
     def _offset(self, servo_id: int) -> int:

@@ -26,7 +26,7 @@ from pupper_sysid.sim.robot.hinges import Hinge, hinges_of
 
 _TURN = (4096, 2 * np.pi)
 SERVOS = {"sts3215": _TURN, "scs0009": (1024, np.radians(300))} | dict.fromkeys(
-    ("xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"), _TURN
+    ("hd-1910", "xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"), _TURN
 )
 """Counts of the encoder, and the angle that they span [rad]."""
 

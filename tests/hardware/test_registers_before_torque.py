@@ -12,6 +12,7 @@ from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.dynamixel.bus import DynamixelBus
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.serial_line import LineEmulator
@@ -198,3 +199,21 @@ def test_without_a_map_servos_of_another_robot_are_never_moved(lines):
             FeetechBus(device, 1_000_000, joints=joints)
         assert "ids 4, 5" in str(refused.value) and "scan --bus feetech:" in str(refused.value)
     assert bench_of(servos).goals == []
+
+
+def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_names_it():
+    servos = still_servos(STS3215, IDS)
+    for servo in IDS:
+        servos._set(servo, "model", 3333)
+        servos._set(servo, "mode", 4)
+        servos.servos[servo].memory[50:52] = bytes([16, 8])
+    data = map_of(*IDS).file.model_dump(by_alias=True) | {"servo": "HD-1910"}
+    layout = joint_map_from(data, "microduck").per_servo().select(["LF_hip", "LF_thigh"])
+    with on_a_port(servos) as server:
+        with pytest.raises(BusError, match="model number 3333, which is not known"):
+            FeetechBus(server.device, 1_000_000, map_of(*IDS))
+        bus = GuardedBus(FeetechBus(server.device, 1_000_000, layout))
+        assert bus.torque(True)
+        setup = bus.servo_setups()["LF_hip"]
+        bus.close()
+    assert (setup["model"], setup["p_gain"], setup["d_gain"]) == ("HD-1910", 16, 8)

@@ -24,7 +24,8 @@ class InitRobot:
     model: tyro.conf.Positional[Path]
     """The robot's MJCF or URDF."""
     servo: Literal[
-        "sts3215", "scs0009", "xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28",
+        "sts3215", "scs0009", "hd-1910", "xl330-m288", "xl430-w250", "xm430-w350",
+        "xm430-w210", "mx-28",
     ] = "sts3215"  # fmt: skip
     """Which servos it has."""
     lerobot_calibration: Path | None = None
