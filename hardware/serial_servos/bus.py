@@ -148,7 +148,9 @@ class SerialBus(HostClock):
             self.limits = self.joint_map.position_limits()
             for servo in self._servos:
                 self._remember(servo)
-            if doubled := self.line.doubled([s.id for s in self._servos]):
+            if doubled := self.line.doubled(
+                [servo.id for servo in self._servos], self._first, self.family.reading_bytes[0]
+            ):
                 raise BusError(" ".join(two_of_one_id(self.line, servo) for servo in doubled))
             self._setups = {
                 joint: setup_of(servo.id, self.family, servo.series, servo.registers)

@@ -51,7 +51,7 @@ _REOPEN_S = 0.01
 _ATTEMPTS = 4
 _MORE_PATIENCE = 10
 _MEASURED_ON = 4  # servos
-_GARBLED_AT_LEAST = 3
+_GARBLED_AT_LEAST, _CONFIRMED_BY = 3, 6
 
 
 class Frame(Protocol):
@@ -134,8 +134,9 @@ class SerialLine:
         self.answered: Counter[int] = Counter()
         """Replies by id, of exchanges with one servo."""
         self.garbled: Counter[int] = Counter()
-        """Exchanges with one servo that gave bytes, and no reply or two different ones."""
+        """Exchanges with one servo that gave bytes and no frame, or two different ones."""
         self._port = self._new_port(device, baud, exclusive)
+        self._fastest_s: dict[tuple[int, int], float] = {}
         self._retry_s = self._busy_s = 0.0
         try:
             self._port.openPort()
@@ -290,20 +291,34 @@ class SerialLine:
         reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes)
         return int.from_bytes(reply[servo].frame.data[:2], "little") if servo in reply else None
 
-    def doubled(self, servos: Sequence[int]) -> list[int]:
-        """Ids at which most exchanges were garbled while those of the other ids were clean.
+    def doubled(self, servos: Sequence[int], address: int, size: int) -> list[int]:
+        """Ids whose replies are garbled while those of the other ids are clean.
 
-        Two servos of one id answer at the same time, and destroy each other's replies.
+        Two servos of one id answer at the same time, and destroy each other's replies. Suspects are
+        read again, patiently: a late or half reply is no sign of a second servo.
+
+        Parameters
+        ----------
+        servos : sequence of int
+        address, size : int
+            Registers in which two servos differ: their positions.
         """
-        garbled = [
-            servo
-            for servo in servos
-            if self.garbled[servo] >= max(_GARBLED_AT_LEAST, self.answered[servo] / 4)
-        ]
-        others = [servo for servo in servos if servo not in garbled]
-        clean = sum(self.answered[servo] for servo in others)
+        suspects = [servo for servo in servos if self.garbled[servo] >= _GARBLED_AT_LEAST]
+        others = [servo for servo in servos if servo not in suspects]
         noisy = sum(self.garbled[servo] for servo in others)
-        return garbled if garbled and noisy <= clean / 20 else []
+        if noisy > sum(self.answered[servo] for servo in others) / 20:
+            return []
+        usual_s, self.patience_s = self.patience_s, max(self.patience_s, SLOWEST_ADAPTER_S)
+        doubled = []
+        for servo in suspects:
+            before = self.garbled[servo]
+            for _ in range(_CONFIRMED_BY):
+                self._arrived(_CONFIRMED_BY * self.reply_bytes)  # what is late, to be discarded
+                self.read(servo, address, size)
+            if self.garbled[servo] - before >= _CONFIRMED_BY / 2:
+                doubled.append(servo)
+        self.patience_s = usual_s
+        return doubled
 
     def close(self) -> None:
         """Release the port; may be called twice."""
@@ -394,33 +409,45 @@ class SerialLine:
         owed = self._port.sent if self.echoes else b""
         replies: dict[int, tuple[Frame, float]] = {}
         contradicted: set[int] = set()
-        arrived = 0
+        arrived = b""
         try:
             while len(replies) < len(wanted) and time.monotonic() < deadline:
                 data = self._port.read_some()
                 if owed:
                     data, owed = _strip(data, owed)
-                arrived += len(data)
+                arrived += data
                 for frame in reader.feed(data):
                     first = replies.setdefault(frame.id, (frame, time.monotonic()))
                     if first[0] != frame:
                         contradicted.add(frame.id)
         except PORT_ERRORS:
             self._drop_port()
-        if len(servos) == 1:
-            good = bool(replies) and not contradicted and reader.rejected_bytes == 0
-            counted = self.answered if good else self.garbled
-            counted[servos[0]] += arrived > 0
+        if len(servos) == 1 and arrived:
+            self._count(servos[0], arrived, bool(replies), bool(contradicted), reader)
         # replies come evenly, in the order of the request; the host's buffers blur each arrival
         begin = max(before, self._busy_s) + asked * self._byte_s()
         last = max((k for k, servo in enumerate(servos) if servo in replies), default=0)
         after = max((at for _, at in replies.values()), default=begin)
         share = max(after - begin, 0.0) / (last + 1)
+        # what exceeds the fastest exchange of this kind was spent on the way back to this program
+        kind = size, len(servos)
+        if len(replies) == len(wanted):
+            self._fastest_s[kind] = min(share, self._fastest_s.get(kind, share))
+        share = min(share, self._fastest_s.get(kind, share))
         return {
             servo: Reply(replies[servo][0], begin + k * share, begin + (k + 1) * share)
             for k, servo in enumerate(servos)
             if servo in replies and servo not in contradicted
         }
+
+    def _count(
+        self, servo: int, arrived: bytes, replied: bool, contradicted: bool, reader: Reader
+    ) -> None:
+        """Count a reply, or what is no reply at all; a late reply to another request is neither."""
+        if replied and not contradicted and not reader.rejected_bytes:
+            self.answered[servo] += 1
+        elif contradicted or not self._reader(lambda servo, size: True).feed(arrived):
+            self.garbled[servo] += 1
 
     def _new_port(self, device: str, baud: int, exclusive: bool) -> Any:
         """Port of the SDK, without busy waiting.

@@ -89,7 +89,7 @@ def scan_line(
                 continue
             first = first or rate
             servos += [_report(family, line, servo, model) for servo, model in answering.items()]
-            remarks += _doubled(line, answering)
+            remarks += _doubled(family, line, answering)
             if slow := slow_adapter(line):
                 remarks.append(slow)
         finally:
@@ -164,8 +164,13 @@ def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoRe
     )
 
 
-def _doubled(line: SerialLine, answering: dict[int, int]) -> list[str]:
-    ids = line.doubled(list({*answering, *line.garbled}))
+def _doubled(family: Family, line: SerialLine, answering: dict[int, int]) -> list[str]:
+    """Sentences about ids that two servos have."""
+    series = next((family.series[m] for m in answering.values() if m in family.series), None)
+    if series is None:
+        return []
+    where = series.register(family.present).address
+    ids = line.doubled(list({*answering, *line.garbled}), where, family.reading_bytes[0])
     return [two_of_one_id(line, servo) for servo in ids]
 
 
