@@ -41,7 +41,7 @@ class CalibrateJoints:
     """
 
     bus: str
-    """esp32 (on the robot) or feetech:DEVICE."""
+    """esp32 (on the robot), feetech:DEVICE or dynamixel:DEVICE."""
     joint_map: str | None = None
     """Joint map to start from, a file or a preset: its ids, signs and limits_rad are kept. By
     default the preset that fits the bus."""

@@ -43,7 +43,7 @@ class Monitor:
     """
 
     bus: str
-    """esp32 (on the robot), feetech:DEVICE, or emulated."""
+    """esp32 (on the robot), feetech:DEVICE, dynamixel:DEVICE, or emulated."""
     joint_map: str | None = None
     """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
     fits the bus."""

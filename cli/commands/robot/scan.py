@@ -25,7 +25,8 @@ class Scan:
     """
 
     bus: str | None = None
-    """feetech:DEVICE (with @BAUD if known) or esp32; by default every serial port is tried."""
+    """feetech:DEVICE, dynamixel:DEVICE (with @BAUD if known) or esp32; by default every serial port
+    is tried."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
