@@ -82,7 +82,8 @@ def test_a_calibration_of_the_joints_is_rehearsed_to_its_end(tmp_path):
         assert bus
         out = tmp_path / "joints.yaml"
         guide = Typed(
-            "calibrate-joints", "--bus", bus[1], "--joints", "LF", "--out", str(out)
+            "calibrate-joints", "--bus", bus[1], "--joints", "LF", "--out", str(out),
+            "--joint-map", "sts3215",
         )  # fmt: skip
         for words, keys in (
             ("will go limp", ""), ("Hold it still", ""), ("Step 2 of 3", "DDD0AAA0"),

@@ -224,7 +224,7 @@ def test_every_command_that_opens_a_bus_is_stopped_as_by_ctrl_c():
         "open_bus", "open_bus_of", "open_guarded", "connect", "Esp32Bus", "scan_line",
         "switch_off",
     }  # fmt: skip
-    servers = {"FeetechPty", "ProxySocket"}
+    servers = {"SerialPty", "ProxySocket"}
     for word, command in COMMANDS.items():
         module = command.where.split(":")[0].replace(".", "/")
         tree = ast.parse((ROOT / f"cli/commands/{module}.py").read_text())
