@@ -437,9 +437,9 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(calibration, 
     state = types.SimpleNamespace(joint_q=torch.full((20,), 0.3), joint_qd=torch.ones(18))
     control = types.SimpleNamespace(joint_f=torch.zeros(18))
     for _ in range(20):
-        servos.command(torch.full((2, 3), 0.31), state, control)
+        servos.command(torch.full((2, 3), 0.33), state, control)
     efforts = control.joint_f.view(2, 9)
-    wanted = own.stiffness_nm_per_rad.value * 0.01 - own.damping_nm_s_per_rad.value
+    wanted = own.stiffness_nm_per_rad.value * 0.03 - own.damping_nm_s_per_rad.value
     assert torch.allclose(efforts[:, 6], torch.tensor(wanted), rtol=1e-4)
     assert not efforts[:, :6].any()
     builder.joint_label = labels[:2]
