@@ -28,8 +28,8 @@ from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import hold
 
-TONES_HZ, AMPLITUDE_RAD, TONE_S = (0.7, 1.7, 2.7, 3.7), 0.25, 2.0
-WALK_S, LOOP_S = 4.0, 0.02
+TONES_HZ, AMPLITUDE_RAD, TONE_S = (1.7, 2.7, 3.7), 0.25, 1.0
+WALK_S, LOOP_S = 2.0, 0.02
 _SETTLE_S = 0.5
 _MODEL_DEFAULTS = '<joint damping="0.6" frictionloss="0.05"/><position kp="20"/>'
 
@@ -73,7 +73,7 @@ def check(servos: ExportedServos) -> Check:
         If the step is too long for the servos.
     """
     names = servos.calibration.joint_names
-    tones = np.concatenate([_tone(hz) for hz in TONES_HZ])
+    tones = unseen_tones()
     walk = walk_commands()
     model = compiled(servos)
     ours = {name: own_model(servos.moving.joint(name)) for name in names}
@@ -185,8 +185,10 @@ def walk_commands() -> NDArray[np.float64]:
     return (rows["LF_thigh_command_rad"] - rows["LF_thigh_command_rad"][0])[row]
 
 
-def _tone(hz: float) -> NDArray[np.float64]:
-    return AMPLITUDE_RAD * np.sin(2 * np.pi * hz * np.arange(0.0, TONE_S, LOOP_S))
+def unseen_tones() -> NDArray[np.float64]:
+    """Commands of the tones, one after the other [rad]."""
+    time = np.arange(0.0, TONE_S, LOOP_S)
+    return AMPLITUDE_RAD * np.sin(2 * np.pi * np.outer(TONES_HZ, time)).ravel()
 
 
 def _counts_apart(

@@ -14,8 +14,8 @@ from __future__ import annotations
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.cards.bam import motor_of
 from pupper_sysid.servo_models.delayed_pd import whole_steps
-from pupper_sysid.servo_models.step_size import Engine
 from pupper_sysid.sim.export.shared import (
+    CALIBRATED_PD,
     EXPLICIT_PD,
     NOT_CARRIED,
     ExportedServos,
@@ -25,9 +25,6 @@ from pupper_sysid.sim.export.shared import (
     feedback_block,
     torch_module,
 )
-
-CALIBRATED_PD = Engine(implicit=False)
-"""The class that `to_isaaclab` writes: set-points of limited speed, torque before each step."""
 
 _IMPORTS = """\
 from isaaclab.actuators import DelayedPDActuatorCfg, IdealPDActuator, IdealPDActuatorCfg

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
@@ -228,15 +229,14 @@ def link_inertias(model: Any, joints: Sequence[str]) -> dict[str, float]:
     """
     from pupper_sysid.sim.robot.engine import mujoco
 
-    data = mujoco.MjData(model)
-    armature, model.dof_armature[:] = model.dof_armature.copy(), 0.0
-    geared, model.actuator_armature[:] = model.actuator_armature.copy(), 0.0
-    tendons, model.tendon_armature[:] = model.tendon_armature.copy(), 0.0
-    mujoco.mj_forward(model, data)
-    full = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, full)
-    model.dof_armature[:], model.actuator_armature[:] = armature, geared
-    model.tendon_armature[:] = tendons
+    bare = copy(model)
+    for armatures in (bare.dof_armature, bare.actuator_armature, bare.tendon_armature):
+        armatures[:] = 0.0
+    data = mujoco.MjData(bare)
+    mujoco.mj_setConst(bare, data)  # a free-standing body's inertia is kept in the model
+    mujoco.mj_forward(bare, data)
+    full = np.zeros((bare.nv, bare.nv))
+    mujoco.mj_fullM(bare, data, full)
     places = {name: int(model.joint(name).dofadr[0]) for name in joints}
     return {name: float(full[place, place]) for name, place in places.items()}
 

@@ -1,16 +1,15 @@
 """A calibration for Newton: a Python module that puts the servos into a model and feeds them.
 
-Newton's joints have a drive of their own, which its solvers integrate implicitly, as MuJoCo does:
-gains, effort limit, armature, dry friction and back-EMF (as damping) are joint attributes. What
-they lack, dead times of any fraction of a step and set-points of limited speed, is computed on
-torch before each physics step. Names are those of Newton 1.8.0;
-`benchmarks/peers/check_exports.py` holds them against the release.
+Armature, dry friction and back-EMF (as damping) are attributes of Newton's joints. Dead times of
+any fraction of a step, set-points of limited speed and the PD are computed on torch before each
+physics step, as efforts: the joints' own drives clip their effort at the joint, where their damping
+goes on acting, which makes a servo at its limit too slow (8 mrad on the sample's tones). Names are
+those of Newton 1.8.0; `benchmarks/peers/check_exports.py` holds them against the release.
 """
 
 from __future__ import annotations
 
-from pupper_sysid.servo_models.step_size import MUJOCO
-from pupper_sysid.sim.export.shared import NOT_CARRIED, ExportedServos, torch_module
+from pupper_sysid.sim.export.shared import CALIBRATED_PD, NOT_CARRIED, ExportedServos, torch_module
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
 _IMPORTS = "import warp as wp"
@@ -24,13 +23,11 @@ def add_servos(builder):
     for name, servo in SERVOS.items():
         joint = _joint(builder.joint_label, name)
         dof = builder.joint_qd_start[joint]
-        builder.joint_target_ke[dof] = servo["stiffness"]
-        builder.joint_target_kd[dof] = servo["damping"]
-        builder.joint_effort_limit[dof] = servo["effort_limit"]
+        builder.joint_target_ke[dof] = builder.joint_target_kd[dof] = 0.0
         builder.joint_armature[dof] = servo["armature"]
         builder.joint_friction[dof] = servo["friction_loss"]
         builder.joint_damping[dof] = servo["back_emf"]
-        builder.joint_target_mode[dof] = 1  # JointTargetMode.POSITION
+        builder.joint_target_mode[dof] = 0  # JointTargetMode.NONE: `Servos` gives the efforts
         for key, value in FRICTION.items():
             attribute = builder.custom_attributes.get(key)
             if attribute is not None:
@@ -63,14 +60,20 @@ class Servos:
         self.dof = [builder.joint_qd_start[j] for j in joints]
         self.worlds, device = num_worlds, str(wp.device_to_torch(model.device))
         self.bank = ServoBank(SERVOS, FEEDBACK, list(SERVOS), num_worlds, PHYSICS_DT, device)
+        self.gains = {
+            key: torch.tensor([servo[key] for servo in SERVOS.values()], device=device)
+            for key in ("stiffness", "damping", "effort_limit")
+        }
 
     def command(self, commands, state, control):
-        """Set the joints' targets for the next physics step."""
-        targets = wp.to_torch(control.joint_target_q).view(self.worlds, -1)
-        positions = targets.shape[1] == wp.to_torch(state.joint_q).numel() // self.worlds
-        targets[:, self.at if positions else self.dof] = self.bank.command(
-            commands, self._position(state)
-        )
+        """Set the joints' efforts for the next physics step."""
+        position = self._position(state)
+        velocity = wp.to_torch(state.joint_qd).view(self.worlds, -1)[:, self.dof]
+        error = self.bank.command(commands, position) - position
+        effort = self.gains["stiffness"] * error - self.gains["damping"] * velocity
+        limit = self.gains["effort_limit"]
+        efforts = wp.to_torch(control.joint_f).view(self.worlds, -1)
+        efforts[:, self.dof] = torch.minimum(torch.maximum(effort, -limit), limit)
 
     def read(self, state):
         """What the servos report, in place of the joint positions."""
@@ -96,7 +99,8 @@ def to_newton(servos: ExportedServos) -> str:
     notes = (
         "Take SolverMuJoCo with integrator='implicitfast' and steps of PHYSICS_DT. Delays are any "
         "fraction of a step, interpolated linearly, with a latency of its own for each command "
-        "where its jitter is known; the set-point's speed is limited.",
+        "where its jitter is known; the set-point's speed is limited. The PD is computed once per "
+        "physics step, before it, so keep steps at 5 ms or less.",
         "Not carried over by other solvers: friction as hard as gears.",
         NOT_CARRIED,
     )
@@ -107,4 +111,4 @@ def to_newton(servos: ExportedServos) -> str:
         "}\n"
         '"""Friction that stops a joint within one physics step; of SolverMuJoCo."""\n\n'
     )
-    return torch_module(servos, MUJOCO, "Newton", notes, _IMPORTS, f"{friction}{_CODE}")
+    return torch_module(servos, CALIBRATED_PD, "Newton", notes, _IMPORTS, f"{friction}{_CODE}")

@@ -26,7 +26,7 @@ from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.step_size import MUJOCO, Engine, delay_at_step
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
@@ -35,7 +35,9 @@ TORQUE_KEYS = (
     "effort_limit_nm", "back_emf_nm_s_per_rad",
 )  # fmt: skip
 EXPLICIT_PD = Engine(slews=False, implicit=False)
-"""Isaac Lab's and Newton's own PDs: torque before each step, set-points of unlimited speed."""
+"""Isaac Lab's own PDs: torque before each step, set-points of unlimited speed."""
+CALIBRATED_PD = Engine(implicit=False)
+"""The classes for Isaac Lab and Newton: set-points of limited speed, torque before each step."""
 UNITS = "Units: N·m, rad, s, kg·m²; delays in steps are in physics steps."
 NOT_CARRIED = (
     "The feedback is no part of an actuator, and without it the simulated robot sees more than the "
@@ -136,14 +138,19 @@ class ExportedServos:
         """
         if engine in self._delays:
             return self._delays[engine]
-        delays = self._delays[engine] = {}
-        for name, joint in self.moving.joints.items():
-            a = joint.actuator
-            (fitting,) = delay_at_step(a.parameters, self.physics_step_s, a.physics_step_s, engine)
-            more = float(fitting) - a.dead_time_s.value
-            ends = (max(t + more, 0.0) for t in (a.dead_time_s.value, *a.dead_time_interval_s))
-            delays[name] = Interval(*ends)
-        return delays
+        delays = {}
+        joints = {name: joint.actuator for name, joint in self.moving.joints.items()}
+        for fitted_s in {a.physics_step_s for a in joints.values()}:
+            names = [name for name, a in joints.items() if a.physics_step_s == fitted_s]
+            servos = self.moving.delayed_pd(names).parameters
+            fitting = delay_at_step(servos, self.physics_step_s, fitted_s, engine)
+            for name, delay_s in zip(names, fitting, strict=True):
+                a = joints[name]
+                more = float(delay_s) - a.dead_time_s.value
+                ends = (a.dead_time_s.value, *a.dead_time_interval_s)
+                delays[name] = Interval(*(max(t + more, 0.0) for t in ends))
+        self._delays[engine] = {name: delays[name] for name in joints}
+        return self._delays[engine]
 
     def head(self, engine: Engine, *target: str) -> list[str]:
         """Sentences of a file's head, those about the `target` last."""
@@ -189,17 +196,17 @@ class ExportedServos:
 
     def whole_step_costs(self, engine: Engine = EXPLICIT_PD) -> dict[str, float]:
         """The same of each joint [rad]."""
-        delays, costs = self.delays(engine), {}
-        time = TIME_STEP_S * np.arange(round(1.0 / TIME_STEP_S))
-        tone = _AMPLITUDE_RAD * np.sin(2 * np.pi * _FASTEST_HZ * time)
-        late, turn = time > 0.5, 2 * np.pi * _FASTEST_HZ
-        for name, joint in self.moving.joints.items():
-            servo = DelayedPD(joint.actuator.parameters)
-            servo.reset(0.0)
-            phasor = fit_sine(turn * time[late], servo.rollout(tone)[late]).phasor
-            h = self.physics_step_s
-            shift = turn * (h * round(delays[name].value / h) - delays[name].value)
-            costs[name] = float(2 * abs(np.sin(shift / 2)) * abs(phasor) / np.sqrt(2))
+        delays, h, turn = self.delays(engine), self.physics_step_s, 2 * np.pi * _FASTEST_HZ
+        time = TIME_STEP_S * np.arange(round(0.75 / TIME_STEP_S))
+        servo = self.moving.delayed_pd()
+        servo.reset(np.zeros(servo.batch))
+        moved = servo.rollout(_AMPLITUDE_RAD * np.sin(turn * time)[:, None])
+        late = time >= 0.25  # two whole periods of the tone
+        amplitudes = np.abs(fit_sine(turn * time[late], moved[late]).phasor)
+        costs = {}
+        for (name, delay), amplitude in zip(delays.items(), amplitudes, strict=True):
+            shift = turn * (h * round(delay.value / h) - delay.value)
+            costs[name] = float(2 * abs(np.sin(shift / 2)) * amplitude / np.sqrt(2))
         return costs
 
     def _scales(self) -> Iterator[str]:

@@ -425,23 +425,23 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(calibration, 
         **{
             f"joint_{name}": [0.0] * 9
             for name in (
-                "armature", "friction", "damping", "target_ke", "target_kd", "effort_limit",
-                "target_mode",
+                "armature", "friction", "damping", "target_ke", "target_kd", "target_mode",
             )
         },
     )  # fmt: skip
     space["add_servos"](builder)
     own = calibration.joint("LF_hip").actuator
     assert builder.joint_armature[6] == own.armature_kg_m2.value
-    assert builder.joint_target_ke[6] == own.stiffness_nm_per_rad.value
-    assert builder.joint_target_mode[6:] == [1, 1, 1] and sorted(attribute.values) == [6, 7, 8]
+    assert sorted(attribute.values) == [6, 7, 8]
     servos = space["Servos"](builder, types.SimpleNamespace(device=None), num_worlds=2)
-    state = types.SimpleNamespace(joint_q=torch.full((20,), 0.3))
-    control = types.SimpleNamespace(joint_target_q=torch.zeros(20))
+    state = types.SimpleNamespace(joint_q=torch.full((20,), 0.3), joint_qd=torch.ones(18))
+    control = types.SimpleNamespace(joint_f=torch.zeros(18))
     for _ in range(20):
-        servos.command(torch.full((2, 3), 0.4), state, control)
-    targets = control.joint_target_q.view(2, 10)
-    assert torch.allclose(targets[:, 7:], torch.tensor(0.4)) and not targets[:, :7].any()
+        servos.command(torch.full((2, 3), 0.33), state, control)
+    efforts = control.joint_f.view(2, 9)
+    wanted = own.stiffness_nm_per_rad.value * 0.03 - own.damping_nm_s_per_rad.value
+    assert torch.allclose(efforts[:, 6], torch.tensor(wanted), rtol=1e-4)
+    assert not efforts[:, :6].any()
     builder.joint_label = labels[:2]
     with pytest.raises(ValueError, match="joints are called"):
         space["add_servos"](builder)
