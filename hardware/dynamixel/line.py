@@ -31,12 +31,6 @@ class DynamixelLine(SerialLine):
         reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes).get(servo)
         return reply.frame if reply else None  # pyright: ignore[reportReturnType]
 
-    def read(self, servo: int, address: int, size: int) -> Reply | None:
-        """`size` bytes of the memory of `servo`, or None if they did not come complete."""
-        return self._exchange(
-            lambda: self._packets.readTx(self._port, servo, address, size), [servo], size
-        ).get(servo)
-
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request."""
         ids = list(servos)
@@ -44,14 +38,6 @@ class DynamixelLine(SerialLine):
             lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids), False),
             ids, size,
         )  # fmt: skip
-
-    def write(self, servo: int, address: int, data: bytes) -> bool:
-        """Write to one servo; whether it acknowledged."""
-        sent = self._exchange(
-            lambda: self._packets.writeTxOnly(self._port, servo, address, len(data), list(data)),
-            [servo], 0,
-        )  # fmt: skip
-        return servo in sent
 
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
         """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""

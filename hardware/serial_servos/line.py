@@ -126,6 +126,8 @@ class SerialLine:
     """Data of the reply to `ask_model`; the first two are the model number."""
     rates_in_words: str
     """Rates that the SDK can set."""
+    _packets: Any
+    """The SDK's packet handler."""
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
         self.device, self.baud, self.echoes = device, baud, False
@@ -179,16 +181,8 @@ class SerialLine:
         """Status frame of `servo`, or None if it does not answer."""
         raise NotImplementedError
 
-    def read(self, servo: int, address: int, size: int) -> Reply | None:
-        """`size` bytes of the memory of `servo`, or None if they did not come complete."""
-        raise NotImplementedError
-
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request."""
-        raise NotImplementedError
-
-    def write(self, servo: int, address: int, data: bytes) -> bool:
-        """Write to one servo; whether it acknowledged."""
         raise NotImplementedError
 
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
@@ -200,6 +194,20 @@ class SerialLine:
         raise NotImplementedError
 
     # ----- what all share
+
+    def read(self, servo: int, address: int, size: int) -> Reply | None:
+        """`size` bytes of the memory of `servo`, or None if they did not come complete."""
+        return self._exchange(
+            lambda: self._packets.readTx(self._port, servo, address, size), [servo], size
+        ).get(servo)
+
+    def write(self, servo: int, address: int, data: bytes) -> bool:
+        """Write to one servo; whether it acknowledged."""
+        sent = self._exchange(
+            lambda: self._packets.writeTxOnly(self._port, servo, address, len(data), list(data)),
+            [servo], 0,
+        )  # fmt: skip
+        return servo in sent
 
     def detect_echo(self) -> bool:
         """Whether the adapter echoes requests; the echo is removed from then on."""

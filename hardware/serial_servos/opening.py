@@ -151,8 +151,8 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
         f"{line.device}: no joint map says which joint each servo moves, and these ({one.name}, "
         f"ids {ids}) are not the Mini Pupper's twelve. Make a map from your robot's URDF or MJCF "
         "with `pupper-sysid init-robot ROBOT.urdf` and name it as the joint map; `pupper-sysid "
-        f"scan --bus {family.name}:{line.device}` lists the servos. A part of a Mini Pupper needs "
-        f"its joint map ({preset or 'sts3215'}) named, too."
+        f"scan --bus {family.name}:{line.device}` lists the servos."
+        + (f" A part of a Mini Pupper needs its joint map ({preset}) named, too." if preset else "")
     )
 
 
