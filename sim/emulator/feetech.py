@@ -138,7 +138,7 @@ class FeetechEmulator:
         list of (time, bytes)
             Pieces in order of the time at which they have arrived.
         """
-        byte_s = 10.0 / (self.baud if baud is None else baud)
+        byte_s = 10.0 / (baud or self.baud)
         end = max(now, self._free_at) + len(data) * byte_s
         self._free_at = end
         pieces = [(end, data)] if self.echo else []

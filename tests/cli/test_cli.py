@@ -170,6 +170,7 @@ def test_one_frequency_is_calibrated_with_a_warning(capsys, tmp_path):
     assert any("one frequency only" in w for w in joint["warnings"])
 
 
+@pytest.mark.slow
 def test_a_sweep_killed_half_way_leaves_a_file_that_is_read(capsys, tmp_path):
     path = tmp_path / "killed.csv"
     sweep = subprocess.Popen(

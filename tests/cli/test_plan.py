@@ -148,6 +148,7 @@ def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
     assert "5.0 (dead_time:2ms): more is to be recorded" in err
 
 
+@pytest.mark.slow
 def test_rounds_that_were_cut_short_are_continued(capsys, widths):
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
     run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms")

@@ -112,6 +112,7 @@ def fallen(rollout: Rollout, robots: list[int], after_s: float) -> Rollout:
     return replace(rollout, **parts | changed)
 
 
+@pytest.mark.slow
 def test_replay_is_of_the_robots_that_walked_and_only_while_they_did(walker):
     policy, trial = walker
     plain = trial.walk(policy)
