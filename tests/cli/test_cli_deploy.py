@@ -102,6 +102,7 @@ def late(here) -> Path:
     return Path("late.yaml")
 
 
+@pytest.mark.slow
 def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here, late):
     arguments = (POLICY, "--seconds", 0.1, "--name", "walk", "--force", "--json")
     code, out, err = run_program(capsys, pupper_deploy, *arguments, "--actuator", CALIBRATION)

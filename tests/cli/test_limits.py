@@ -29,8 +29,13 @@ def test_a_file_beyond_a_limit_names_the_option_that_reads_it(capsys, tmp_path):
     said = refused(capsys, pupper_sysid, "import", path)
     assert "has 3,000 columns; at most 2,000 columns are read" in said
     assert said.endswith("raise the limits of reading with --read-limit 2.")
-    raised = refused(capsys, pupper_sysid, "import", path, "--read-limit", "2")
-    assert "columns are read" not in raised
+
+
+@pytest.mark.slow
+def test_a_raised_limit_reads_the_file(capsys, tmp_path):
+    for words in (("--read-limit", "2"), ("--read-limit=2",)):
+        said = refused(capsys, pupper_sysid, "import", wide(tmp_path, 3000), *words)
+        assert "columns are read" not in said
 
 
 def test_the_limit_of_reading_is_a_number_from_1_to_1000(capsys):

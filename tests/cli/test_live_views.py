@@ -84,6 +84,8 @@ def test_a_sweep_writes_both_files_as_it_records(tmp_path, monkeypatch, capsys):
     )  # fmt: skip
     counts = recording.metadata["completed"]["guard"]
     assert bool(texts) == any(counts[k] for k in ("clipped", "slowed", "unsent"))
+    shown = entities.get("/guard|text", ([], []))[1]
+    assert np.ravel(shown).tolist() == texts
     # joints that stand still are shown, too
     assert len(topics["RF_thigh", "position_rad"][0]) == 2 * len(recording.table) / 2
     # the calf that was swept turns by its amplitude, the trunk stays
@@ -146,7 +148,7 @@ def test_a_bus_in_virtual_time_waits_for_the_writer(tmp_path):
 def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
     bus = emulated()
     far = bus.limits.clip(np.full(12, 9.0)) + 1.0
-    wanted = Wanted(str(tmp_path / "a.rrd"), tmp_path / "a.mcap")
+    wanted = Wanted(None, tmp_path / "a.mcap")
     with pytest.raises(SafetyStop), live_views(bus, wanted, waits=True) as views:
         bus.torque(True)
         hold(bus, views, 3)
@@ -155,7 +157,6 @@ def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
     _, texts = topics_of(tmp_path / "a.mcap")
     assert texts[0] == "Guard: a command held at the limits."
     assert "Guard: 1 commands held at the limits." in texts and texts[-1] == "LF_hip: it burns."
-    assert np.ravel(entities_of(tmp_path / "a.rrd")["/guard|text"][1]).tolist() == texts
 
 
 @pytest.mark.slow
@@ -300,12 +301,13 @@ def test_monitor_writes_what_it_reads_and_sends_nothing(tmp_path, monkeypatch, c
     assert code == 2 and "Give one of the two" in err
 
 
+@pytest.mark.slow
 def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     policy = str(Path(__file__).parents[2] / "data/samples/policies/mlp")
-    words = (policy, "--seconds", "0.6", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
+    words = (policy, "--seconds", "1", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
     code, _, err = run_program(capsys, pupper_deploy, *words)
     assert code == 0 and "Wrote w.mcap." in err and "dropped" not in err
     topics, texts = topics_of(tmp_path / "w.mcap")

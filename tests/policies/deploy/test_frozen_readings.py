@@ -68,7 +68,7 @@ def walk(
     ("from_s", "command", "seconds", "found"),
     [
         (5.5, (0.0, 0.0, 0.5), 4.0, True),
-        (99.0, (0.0, 0.0, 0.5), 4.0, False),
+        pytest.param(99.0, (0.0, 0.0, 0.5), 4.0, False, marks=pytest.mark.slow),
         # within the dead band of its friction a hip does not move: nothing can be told
         pytest.param(8.0, (0.15, 0.0, 0.0), 7.0, False, marks=pytest.mark.slow),
     ],

@@ -96,6 +96,7 @@ def test_the_teachers_commands_are_corrected_until_the_policy_walks_at_the_given
     assert (error() < 0.2 * before).all()
 
 
+@pytest.mark.slow
 def test_imitation_brings_the_policy_nearer_to_the_trot():
     rounds = 6
     run = tiny_run(
