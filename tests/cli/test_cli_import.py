@@ -92,7 +92,14 @@ def test_a_folder_of_another_projects_logs_is_one_robot(tmp_path):
     assert not is_fleet(tmp_path / "bam")
 
 
-@pytest.mark.parametrize("folder", ["ktune_robstride", "mini_pupper_full_band", "lerobot_so101"])
+@pytest.mark.parametrize(
+    "folder",
+    [
+        "mini_pupper_full_band",
+        pytest.param("ktune_robstride", marks=pytest.mark.slow),
+        pytest.param("lerobot_so101", marks=pytest.mark.slow),
+    ],
+)
 def test_folders_of_real_logs_are_examined_without_renaming_anything(capsys, folder):
     code, out, err = run(capsys, "doctor", real_folder(folder), "--json")
     assert code == 0, err

@@ -73,6 +73,7 @@ def test_only_limp_joints_move_and_they_stay_where_they_were_put():
     assert servos.hand_rad[1] == 0.0
 
 
+@pytest.mark.slow
 def test_a_calibration_of_the_joints_is_rehearsed_to_its_end(tmp_path):
     robot = Typed("emulate", "feetech", "--by-hand", "--ids", "4-6", "--seed", "1")
     try:
