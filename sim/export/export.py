@@ -94,8 +94,9 @@ def exported_text(
     out: Path = Path("servos.xml"),
     sha256: str | None = None,
 ) -> tuple[str, ExportedServos]:
-    """Text of an export, and the servos that it holds; parameters as of `export` and
-    `ExportedServos.of`.
+    """Text of an export, and the servos that it holds.
+
+    Parameters are those of `export` and `ExportedServos.of`.
 
     Raises
     ------

@@ -162,9 +162,13 @@ def to_model(
         Where the text will be written: paths to assets are relative to it.
     physics_step_s : float, optional
         By default the model's own.
-    gain, link_inertia, sha256
-        As of `ExportedServos.of`. The inertia of links is by default what the model's bodies put
-        on the joint in its reference pose, of armatures that hold it.
+    gain : float, optional
+        As of `ExportedServos.of`.
+    link_inertia : dict of str to float, optional
+        The same; by default what the model's bodies put on the joint in its reference pose, of
+        armatures that hold it.
+    sha256 : str, optional
+        As of `ExportedServos.of`.
 
     Returns
     -------
