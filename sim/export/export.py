@@ -96,7 +96,7 @@ def exported_text(
 ) -> tuple[str, ExportedServos]:
     """Text of an export, and the servos that it holds.
 
-    Parameters are those of `export` and of `ExportedServos.of`.
+    Parameters are those of `export` and `ExportedServos.of`.
 
     Raises
     ------

@@ -163,12 +163,12 @@ def to_model(
     physics_step_s : float, optional
         By default the model's own.
     gain : float, optional
-        P gain; by default the servo's own.
+        As of `ExportedServos.of`.
     link_inertia : dict of str to float, optional
-        Inertia of links [kg·m²]; by default what the model's bodies put on the joint in its
-        reference pose, of armatures that hold it.
+        The same; by default what the model's bodies put on the joint in its reference pose, of
+        armatures that hold it.
     sha256 : str, optional
-        Of the calibration's file.
+        As of `ExportedServos.of`.
 
     Returns
     -------
