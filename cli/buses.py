@@ -17,6 +17,7 @@ from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.hardware.serial_servos.series import Series
 
 JOINTS_FILE = Path("joints.yaml")
+_LARGEST_REGISTER = 1 << 20  # of a Dynamixel in its extended position mode
 
 
 def chosen_map(text: str | None) -> JointMap | None:
@@ -87,8 +88,14 @@ def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None
         digits = value.removeprefix("-")
         number = whole(value) if digits.isascii() and digits.isdecimal() else None
         one = whole(servo) if colon and servo.isascii() and servo.isdecimal() else None
-        fits = number is not None and abs(number) <= 1 << 20 and bool(colon) == (one is not None)
-        if name not in known or not fits or (number < 0 and ":" not in example):
+        whose = bool(colon) == (one is not None) and (":" in example or not colon)
+        least = -_LARGEST_REGISTER if ":" in example else 0
+        if (
+            name not in known
+            or not whose
+            or number is None
+            or not least <= number <= _LARGEST_REGISTER
+        ):
             raise InputError(
                 f"--registers: '{part}' sets no register that acts here; write {example}, and of "
                 f"these: {', '.join(known)}."

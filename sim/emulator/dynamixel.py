@@ -158,7 +158,7 @@ class DynamixelEmulator(LineEmulator):
             error = table.DATA_LENGTH
         elif code == ACTION:
             kept = servo.state.pop("registered", None)
-            error = self._try_store(servo_id, *kept, at) if kept else table.RESULT_FAIL
+            error = self._try_store(servo_id, kept[0], kept[1], at) if kept else table.RESULT_FAIL
         elif code == REBOOT:
             error = 0
             self._set(servo_id, "hardware_error_status", 0)

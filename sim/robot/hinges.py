@@ -105,11 +105,11 @@ def _read(path: str) -> list[Hinge]:
     zero = _zero_ranges(path)
     found = []
     for j in hinges:
-        ends = [float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j]]
+        low, high = (float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j])
         limited = bool(model.jnt_limited[j])
         name = model.joint(j).name
         follows = model.joint(leaders[j]).name if j in leaders else ""
-        found.append(Hinge(name, limited, *ends, j in driven, follows, name in zero))
+        found.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
     return found
 
 

@@ -111,8 +111,11 @@ def _with_sound_limits(joints: list[Hinge]) -> tuple[list[Hinge], list[str]]:
     sound, degrees, zero = [], [], []
     for hinge in joints:
         low, high = hinge.low, hinge.high
-        stated = hinge.limited and low is not None and high is not None
-        if stated and max(abs(low), abs(high)) > _FARTHEST_RAD and low < high:
+        if low is None or high is None:
+            sound.append(hinge)
+            continue
+        far = max(abs(low), abs(high)) > _FARTHEST_RAD
+        if hinge.limited and far and low < high:
             degrees.append(f"{hinge.name} ({low:g} to {high:g})")
             hinge = replace(hinge, low=float(np.radians(low)), high=float(np.radians(high)))
         elif hinge.zero_range:
