@@ -19,8 +19,8 @@ exports and needs only torch (`tests/sim` holds each to the mean age above).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,9 +48,11 @@ class HeldFeedback:
     loss: float = 0.0
     quantum_rad: float = 0.0
     offset_rad: float = 0.0
-    _state: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _state: ClassVar[dict[str, Any]]
 
     def __post_init__(self):
+        # the simulation's state, no part of the value
+        object.__setattr__(self, "_state", {})
         if not self.poll_period_s >= 0 or not np.isfinite(self.poll_period_s):
             raise InputError(
                 f"HeldFeedback: poll_period_s is {self.poll_period_s}; it must be ≥ 0."

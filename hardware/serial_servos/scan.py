@@ -185,7 +185,11 @@ def two_of_one_id(line: SerialLine, servo: int) -> str:
 
 
 def _slow_returns(servos: list[ServoReport]) -> list[str]:
-    slow = [s for s in servos if (s.return_delay_us or 0) > 1e6 * _SLOW_RETURN_S]
+    slow = [
+        s
+        for s in servos
+        if s.return_delay_us is not None and s.return_delay_us > 1e6 * _SLOW_RETURN_S
+    ]
     if not slow:
         return []
     return [

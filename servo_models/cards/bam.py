@@ -337,8 +337,7 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
     )
     if not emf > 0:
         raise InputError(
-            "This servo was fitted without a back-EMF, so its kt is unknown. Export it with "
-            "`--to isaaclab`."
+            "This servo was fitted without a back-EMF, so its kt is unknown. Export it to isaaclab."
         )
     kt = emf / per_volt
     static = value["load_friction_static"]

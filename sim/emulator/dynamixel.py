@@ -91,7 +91,9 @@ class DynamixelEmulator(LineEmulator):
         pieces = super().receive(data, now, baud)
         for servo_id in self._reader.crc_errors:
             if servo_id in self.servos:
-                byte_s = 10.0 / (baud or self.baud)
+                byte_s = 10.0 / (
+                    self.baud if baud is None or baud <= 0 else baud
+                )  # 0: without a name
                 pieces += self._answer(servo_id, 0, 0, byte_s, table.CRC)
         self._reader.crc_errors.clear()
         return pieces

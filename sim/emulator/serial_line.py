@@ -178,7 +178,7 @@ class LineEmulator:
         list of (time, bytes)
             Pieces in order of the time at which they have arrived.
         """
-        byte_s = 10.0 / (baud or self.baud)
+        byte_s = 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
         end = max(now, self._free_at) + len(data) * byte_s
         self._free_at = end
         pieces = [(end, data)] if self.echo else []

@@ -181,7 +181,7 @@ def to_isaaclab_bam(servos: ExportedServos) -> str:
         if joint.under_load is None:
             raise InputError(
                 f"{name} was not fitted under load, so its motor's kt and R are unknown; export it "
-                "with `--to isaaclab`, or record it with a load (`sweep --load`)."
+                "to isaaclab, or record it with a known load."
             )
         loaded = joint.under_load
         motor, beyond = motor_of(loaded)

@@ -268,9 +268,9 @@ def without_link(name: str, joint: JointCalibration, inertia_kg_m2: float) -> Jo
         raise InputError(
             f"{name}: a link of {inertia_kg_m2:.4g} kg·m² cannot be taken off an armature of "
             f"{armature.value:.4g} kg·m² that holds it. Either the link of the recording was "
-            "another one (--link-inertia takes its inertia), or the torque scale is wrong "
-            f"({actuator.scale.anchor} {actuator.scale.value_nm:g} N·m): record with a known load "
-            "(`sweep --load`), or give `calibrate` the servo's own stall torque."
+            "another one (its inertia can be stated), or the torque scale is wrong "
+            f"({actuator.scale.anchor} {actuator.scale.value_nm:g} N·m): record with a known load, "
+            "or give `calibrate` the servo's own stall torque."
         )
     ends = {
         end: None if value is None else max(value - inertia_kg_m2, 1e-12)

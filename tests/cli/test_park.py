@@ -21,16 +21,16 @@ from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import clock
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.servo_servers import limp, robot_behind, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENT = """
-from pupper_sysid.hardware.feetech import line
+from pupper_sysid.hardware.serial_servos import line
 line.REPLY_TIMEOUT_S = 0.1
 """
 """Servos that share a busy machine with what asks them answer too late."""
@@ -60,7 +60,7 @@ while True:
 def robot(request, tmp_path, monkeypatch):
     """A served emulated robot and its address."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
     with robot_behind(request.param, tmp_path) as served:
         yield served
 

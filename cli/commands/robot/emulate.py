@@ -211,7 +211,9 @@ class Feetech(SerialLine):
             robot = draw_robot(rng, spec, layout if self.joint_map else None)
             bench = _bench(self, robot, layout, rng)
         usual = 1_000_000 if series is STS3215 else 500_000
-        emulator = self.line(FeetechEmulator, series, bench, rng, self.baud or usual)
+        emulator = self.line(
+            FeetechEmulator, series, bench, rng, usual if self.baud is None else self.baud
+        )
         with _imu_beside(bench, self.imu_socket, rng):
             imu = f"; IMU at {self.imu_socket}." if self.imu_socket else "."
             # without a map only a whole Mini Pupper is taken for one
@@ -255,7 +257,9 @@ class Dynamixel(SerialLine):
             )
         spec = dynamixel_bench(series.name)
         bench = self.on_bench(rng, spec, layout)
-        emulator = self.line(DynamixelEmulator, series, bench, rng, self.baud or 1_000_000)
+        emulator = self.line(
+            DynamixelEmulator, series, bench, rng, 1_000_000 if self.baud is None else self.baud
+        )
         _serve_line(replace(self, link=place), emulator, bench, ".", own_map)
 
 

@@ -209,7 +209,7 @@ class Export:
         from pupper_sysid.sim.export.check import check
         from pupper_sysid.sim.export.shared import ExportedServos
 
-        step = self.physics_step or 0.002
+        step = 0.002 if self.physics_step is None else self.physics_step
         servos = ExportedServos.of(calibration, step, self.gain, links)
         checked = check(servos)
         if self.json:
