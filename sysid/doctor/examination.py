@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -31,13 +31,12 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.rows import moving_rows
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
-from pupper_sysid.sysid.recordings.excitation import describe, named_tones
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
     as_sequence,
     chosen_joints,
-    recorded_trials,
+    joint_trials,
 )
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -174,7 +173,7 @@ def examine(
     rng = np.random.default_rng(seed)
     limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
     limit = max(float(each or _USUAL_SPEED_RAD_S) for each in limits)
-    recorded = {joint: recorded_trials(given, joint) for joint in chosen_joints(given, joints)}
+    recorded = {joint: joint_trials(given, joint) for joint in chosen_joints(given, joints)}
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
     found = {
         joint: _examine_joint(joint, trials, mixed.get(joint), limit, rng, (lags or {}).get(joint))
@@ -217,16 +216,14 @@ def _examine_joint(
     seen = np.concatenate([np.isfinite(t.position_rad) for t in trials])
     fresh = sum(len(fresh_rows(t)) for t in trials)
     usable = all(f.verdict != REFUSE for f in found)
-    tones = [replace(t, number=n) for n, t in enumerate(named_tones(recorded))]
-    tones = long_enough(tones)
     lattice = PollLattice(kind="unresolved", fresh_fraction=fresh / len(seen))
     hold_share = math.nan
     speed = peak_speed(trials)
     if usable:
-        lattice = lag.feedback if lag else find_poll_lattice(tones, rng)
-        hold_share = _hold_share(joint, tones, lattice, rng, lag)
-        found += [*_held(lattice, hold_share), *_slips(tones, lattice)]
-        found += [*_excitation(trials), *_coverage(tones, speed, limit_rad_s)]
+        lattice = lag.feedback if lag else find_poll_lattice(trials, rng)
+        hold_share = _hold_share(joint, trials, lattice, rng, lag)
+        found += [*_held(lattice, hold_share), *_slips(trials, lattice)]
+        found += _coverage(trials, speed, limit_rad_s)
     found = sorted(found, key=lambda f: VERDICTS.index(f.verdict))
     return JointExamination(
         verdict=found[0].verdict if found else USE,
@@ -297,19 +294,6 @@ def _slips(trials: Sequence[Trial], lattice: PollLattice) -> list[Finding]:
                                   f"{slip.time_s:.2f} s ({slip.nats:.0f} nats); readings before "
                                   "and after it are dated apart."))  # fmt: skip
     return found
-
-
-def _excitation(trials: Sequence[Trial]) -> list[Finding]:
-    """What was found in commands that the log does not name."""
-    if all(t.frequency_hz > 0 for t in trials):
-        return []
-    kinds = describe([t for t in trials if not t.frequency_hz > 0])
-    hz = sorted({float(f"{f:.3g}") for f in kinds.get("tone", ())})
-    if not hz:
-        return []
-    listed = ", ".join(f"{f:g}" for f in hz)
-    return [Finding(USE, f"tones were found in the command ({listed} Hz): lags and gains are by "
-                         "frequency.")]  # fmt: skip
 
 
 def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Finding]:

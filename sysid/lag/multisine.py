@@ -1,10 +1,8 @@
-"""Responses of one trial at every frequency of its command: tones in turn, or a multisine.
+"""Response at every line of a multisine, from one trial.
 
-`line_responses` fits the tones that a log names or that are found in its command, one after the
-other (`sysid.lag.tone`), and else the lines of a multisine (`multisine_responses`). Those lines are
-found in the command: the strongest is fitted and subtracted until next to nothing is left. A chirp,
-steps or a walk leave too much and are no multisine. All lines are then fitted to the fresh readings
-together, because sines at irregular times are not orthogonal.
+The lines are found in the command: the strongest is fitted and subtracted until next to nothing is
+left. A chirp, steps or a walk leave too much and are no multisine. All lines are then fitted to the
+fresh readings together, because sines at irregular times are not orthogonal.
 """
 
 from __future__ import annotations
@@ -15,35 +13,15 @@ from numpy.typing import NDArray
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.lag.held_command import HeldCommand
-from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
-from pupper_sysid.sysid.recordings.excitation import split_tones
+from pupper_sysid.sysid.lag.tone import ToneResponse
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_LINES = 24
 _LEFT_OVER = 0.005  # of the command's variance: quantisation, no signal
-_APART = 1.5  # periods over the trial: closer lines are what a random motion looks like
 _SETTLE_S = 0.5  # past the soft start: several times the servo's slowest pole
 _ROWS_PER_UNKNOWN = 3
 _BLOCK_S = 0.5
 _GRID_S = 1e-3
-
-
-def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) -> list[ToneResponse]:
-    """Response at every frequency that the command of `trial` is made of; empty if it is of none.
-
-    Parameters
-    ----------
-    trial : Trial
-    reading : Readings
-        Of the same trial: when its fresh rows were measured.
-    rng : numpy.random.Generator
-        Weights the periods.
-    """
-    parts = split_tones(trial)
-    if not parts[0].frequency_hz > 0:
-        return multisine_responses(trial, reading, rng)
-    tones = [tone_response(part, reading, rng) for part in parts]
-    return [tone for tone in tones if tone is not None]
 
 
 def multisine_responses(
@@ -103,7 +81,7 @@ def _lines(time: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[n
         strength = np.abs(np.fft.rfft(np.interp(even, time, left), 8 * len(even)))
         lines = np.append(lines, spectrum_hz[int(np.argmax(strength * usable))])
         lines, left = _sharpened(time, command, lines)
-        if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < _APART / span:
+        if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < 0.5 / span:
             return np.zeros(0)
     return np.sort(lines)
 

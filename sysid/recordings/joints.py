@@ -14,7 +14,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
-from pupper_sysid.sysid.recordings.excitation import named_tones
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 Recordings = Recording | Sequence[Recording]
@@ -71,15 +70,9 @@ def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
     return select_joints(joints if isinstance(joints, str) else ",".join(joints), recorded)
 
 
-def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
-    """All trials of `joint` as they were recorded, renumbered."""
-    trials = [trial for recording in as_sequence(recordings) for trial in recording.trials(joint)]
-    return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
-
-
 def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
-    """All trials of `joint`, each tone that is found in a command as its own, renumbered."""
-    trials = named_tones(recorded_trials(recordings, joint))
+    """All trials of `joint`, renumbered."""
+    trials = [trial for recording in as_sequence(recordings) for trial in recording.trials(joint)]
     return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
 
 
@@ -97,9 +90,9 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
     InputError
         If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
-    chosen = chosen_joints(recordings, joints)
-    refuse_unusable({j: recorded_trials(recordings, j) for j in chosen})
-    return {j: joint_trials(recordings, j) for j in chosen}
+    trials = {j: joint_trials(recordings, j) for j in chosen_joints(recordings, joints)}
+    refuse_unusable(trials)
+    return trials
 
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:
