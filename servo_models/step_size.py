@@ -110,11 +110,11 @@ def at_step(
 ) -> DelayedPDParameters:
     """Numbers with which servos in steps of `time_step_s` move as in those of `fitted_step_s`.
 
-    In a step h at damping d over the inertia, MuJoCo's drive acts over h / (1 + h d), in continuous
-    time over (1 - exp(-h d')) / d' with exp(-h d') = 1 / (1 + h d). Stiffness, damping and friction
-    are larger in steps, therefore; while the torque is clipped, the same holds of the effort limit
-    and the back-EMF alone. The dead time is that of `delay_at_step`. Between steps of two lengths,
-    neither of them `CONTINUOUS_S`, only the dead time changes.
+    A damping d over the inertia slows a servo by exp(-h d) in a time h; a step of MuJoCo slows it
+    by 1 / (1 + h d'), one with the torque from before by 1 - h d'. The drive of a step acts over
+    h / (1 + h d') or h instead of (1 - exp(-h d)) / d. Damping, stiffness and friction of steps
+    follow from these; while the torque is clipped, back-EMF is the only damping, so the same holds
+    of it and the effort limit. The dead time is that of `delay_at_step`.
 
     Parameters and errors as for `delay_at_step`.
 
@@ -126,10 +126,10 @@ def at_step(
     if time_step_s == fitted_step_s and engine == MUJOCO:
         return parameters
     moved = parameters
-    if fitted_step_s <= CONTINUOUS_S < time_step_s and engine.implicit:
-        moved = _discrete(parameters, time_step_s)
-    elif time_step_s <= CONTINUOUS_S < fitted_step_s:
-        moved = _continuous(parameters, fitted_step_s)
+    if fitted_step_s > CONTINUOUS_S:
+        moved = _continuous(moved, fitted_step_s)
+    if time_step_s > CONTINUOUS_S:
+        moved = _discrete(moved, time_step_s, engine.implicit)
     fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
     there, rest = tones_in_steps_of(moved, time_step_s, engine)
     if not (rest - usual < _UNSTABLE).all():
@@ -138,16 +138,16 @@ def at_step(
     return replace(moved, dead_time_s=np.maximum(delay, 0.0))
 
 
-def _discrete(parameters: DelayedPDParameters, h: float) -> DelayedPDParameters:
-    v = parameters.arrays()
-    brake = h * v["back_emf"] / v["armature"]
-    total = brake + h * v["damping"] / v["armature"]
-    longer, longer_clipped = _longer(total), _longer(brake)
+def _discrete(parameters: DelayedPDParameters, h: float, implicit: bool) -> DelayedPDParameters:
+    v, sign = parameters.arrays(), 1.0 if implicit else -1.0
+    brake = sign * h * v["back_emf"] / v["armature"]
+    total = sign * h * v["damping"] / v["armature"] + brake
+    drive, drive_clipped = _mean_exp(total), _mean_exp(brake)
     return replace(
-        parameters, stiffness=v["stiffness"] * longer, friction_loss=v["friction_loss"] * longer,
-        effort_limit=v["effort_limit"] * longer_clipped,
-        back_emf=np.expm1(brake) / h * v["armature"],
-        damping=(np.exp(total) - np.exp(brake)) / h * v["armature"],
+        parameters, stiffness=v["stiffness"] * drive, friction_loss=v["friction_loss"] * drive,
+        effort_limit=v["effort_limit"] * drive_clipped,
+        back_emf=sign * np.expm1(brake) / h * v["armature"],
+        damping=sign * (np.exp(total) - np.exp(brake)) / h * v["armature"],
     )  # fmt: skip
 
 
@@ -155,17 +155,18 @@ def _continuous(parameters: DelayedPDParameters, h: float) -> DelayedPDParameter
     v = parameters.arrays()
     brake = np.log1p(h * v["back_emf"] / v["armature"])
     total = np.log1p(h * (v["back_emf"] + v["damping"]) / v["armature"])
-    shorter, shorter_clipped = 1.0 / _longer(total), 1.0 / _longer(brake)
+    drive, drive_clipped = 1.0 / _mean_exp(total), 1.0 / _mean_exp(brake)
     return replace(
-        parameters, stiffness=v["stiffness"] * shorter, friction_loss=v["friction_loss"] * shorter,
-        effort_limit=v["effort_limit"] * shorter_clipped, back_emf=brake / h * v["armature"],
+        parameters, stiffness=v["stiffness"] * drive, friction_loss=v["friction_loss"] * drive,
+        effort_limit=v["effort_limit"] * drive_clipped, back_emf=brake / h * v["armature"],
         damping=(total - brake) / h * v["armature"],
     )  # fmt: skip
 
 
-def _longer(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(exp(x) - 1) / x."""
-    return np.where(x > 1e-9, np.expm1(x) / np.maximum(x, 1e-9), 1.0)
+def _mean_exp(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of exp over [0, x], which is (exp(x) - 1) / x."""
+    safe = np.where(np.abs(x) > 1e-9, x, 1.0)
+    return np.where(np.abs(x) > 1e-9, np.expm1(safe) / safe, 1.0)
 
 
 def delay_at_step(
