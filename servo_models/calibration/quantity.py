@@ -21,6 +21,9 @@ UNIT_OF_NAME = {
     "duty_per_rad": "1/rad",
     "duty_s_per_rad": "s/rad",
     "load_friction_quadratic_per_nm": "1/(N·m)",
+    "residual_over_noise": "1",
+    "r_hat": "1",
+    "effective_draws": "draws",
     "delay_steps_min": "physics steps",
     "delay_steps_max": "physics steps",
 }

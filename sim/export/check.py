@@ -123,8 +123,8 @@ def own_model(joint: JointCalibration) -> DelayedPD | LoadedServo:
     actuator = joint.actuator
     if joint.under_load is not None:
         servo = joint.under_load.servo(actuator.dead_time_s.value)
-        return LoadedServo(servo, joint.under_load.p_gain, time_step_s=actuator.physics_step_s)
-    return DelayedPD(actuator.parameters, actuator.physics_step_s)
+        return LoadedServo(servo, joint.under_load.p_gain, time_step_s=actuator.fitted_step_s)
+    return DelayedPD(actuator.parameters, actuator.fitted_step_s)
 
 
 def compiled(servos: ExportedServos, defaults: str = _MODEL_DEFAULTS) -> Any:

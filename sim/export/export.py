@@ -40,21 +40,22 @@ def to_json(servos: ExportedServos) -> str:
     InputError
         If the step is too long for the servos.
     """
-    calibration, delays = servos.calibration, servos.delays()
+    calibration, stepped = servos.calibration, servos.actuators()
     joints = {}
     for name, joint in calibration.joints.items():
-        a, f = joint.actuator, joint.feedback
-        low, high = whole_steps(delays[name].low, delays[name].high, servos.physics_step_s)
-        keys = (*TORQUE_KEYS, "velocity_limit_rad_s", "dead_time_s", "command_jitter_s")
+        own, f, a = joint.actuator, joint.feedback, stepped[name]
+        low, high = whole_steps(*a.dead_time_interval_s, servos.physics_step_s)
+        keys = (*TORQUE_KEYS, "velocity_limit_rad_s", "command_jitter_s")
         joints[name] = {
             "operating_point": joint.holds_at.model_dump(mode="json"),
             "link_taken_off_kg_m2": servos.links.get(name, 0.0),
             "actuator": {key: getattr(a, key).model_dump(mode="json") for key in keys}
             | {
-                "delay_s": delays[name].value, "delay_steps_min": low, "delay_steps_max": high,
+                "dead_time_s": own.dead_time_s.model_dump(mode="json"),
+                "delay_s": a.dead_time_s.value, "delay_steps_min": low, "delay_steps_max": high,
             },
             "feedback": {key: getattr(f, key).model_dump(mode="json") for key in FEEDBACK_KEYS},
-            "torque_scale": a.scale.model_dump(mode="json"),
+            "torque_scale": own.scale.model_dump(mode="json"),
         }  # fmt: skip
     return json.dumps(
         {
@@ -64,8 +65,8 @@ def to_json(servos: ExportedServos) -> str:
             "inputs": [f.model_dump(mode="json") for f in calibration.inputs],
             "notes": servos.head(
                 MUJOCO,
-                "delay_s is the dead time for this step in MuJoCo; delays in steps are rounded "
-                "outward.",
+                "Torques and delay_s are for this step in MuJoCo, dead_time_s is the servo's own; "
+                "delays in steps are rounded outward.",
             ),
             "units": calibration.units, "physics_step_s": servos.physics_step_s, "joints": joints,
         },

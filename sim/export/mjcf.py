@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -27,7 +26,6 @@ from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.cards.card import CardCalibration
-from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.step_size import MUJOCO
 from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, TORQUE_KEYS, ExportedServos, known_text
 from pupper_sysid.sim.robot.hinges import hinges_of
@@ -450,8 +448,8 @@ def compiled_numbers(model: Any, servos: ExportedServos) -> dict[str, tuple[Any,
     """Numbers of compiled joints and actuators, each beside the servo's: (compiled, wanted)."""
     driven = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
     found: dict[str, tuple[Any, Any]] = {}
-    for name, joint in servos.calibration.joints.items():
-        servo = servos.actuators()[name].parameters
+    for name, actuator in servos.actuators().items():
+        servo = actuator.parameters
         j, dof = model.joint(name).id, int(model.joint(name).dofadr[0])
         i = driven[j]
         pairs = {

@@ -254,17 +254,16 @@ class ExportedServos:
         """The step that the numbers are for, and what was changed for its length."""
         h = 1e3 * self.physics_step_s
         yield f"Made for physics steps of {h:g} ms; others: export again."
-        pairs = [
-            (stepped.parameters.arrays(), self.calibration.joints[name].actuator.parameters.arrays())
-            for name, stepped in self.actuators(engine).items()
-        ]
-        later = 1e3 * np.mean([new["dead_time_s"] - old["dead_time_s"] for new, old in pairs])
+        fitted = [joint.actuator.parameters.arrays() for joint in self.calibration.joints.values()]
+        stepped = [a.parameters.arrays() for a in self.actuators(engine).values()]
+        pairs = list(zip(fitted, stepped, strict=True))
+        later = 1e3 * np.mean([new["dead_time_s"] - old["dead_time_s"] for old, new in pairs])
         gains = {
-            words: np.mean([new[words] / old[words] for new, old in pairs if old[words] > 0] or [1.0])
-            for words in ("stiffness", "damping")
+            name: np.mean([new[name] / old[name] for old, new in pairs if old[name] > 0] or [1.0])
+            for name in ("stiffness", "damping")
         }
         if later or any(gain != 1.0 for gain in gains.values()):
-            changes = [f"{words} x {gain:.2f}" for words, gain in gains.items()]
+            changes = [f"{name} x {gain:.2f}" for name, gain in gains.items()]
             yield (
                 f"Numbers below are those with which steps of {h:g} ms here move like the servo: "
                 f"{', '.join(changes)} and delays {later:+.1f} ms (means of the joints) of the "

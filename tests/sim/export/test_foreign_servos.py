@@ -14,6 +14,8 @@ from pupper_sysid.servo_models.cards.compare import implausible, motion_of, serv
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sim.export.export import exported_text
 from pupper_sysid.sim.export.foreign import foreign_servo
+from pupper_sysid.sim.export.mjlab import BUILTIN_PD
+from pupper_sysid.sim.export.shared import EXPLICIT_PD, ExportedServos
 from support.command_line import refused, run_program
 
 CALIBRATED = Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml"
@@ -58,13 +60,13 @@ def test_a_configuration_is_read_and_not_run(tmp_path):
     assert any("states no armature" in note for note in head.notes)
 
 
-@pytest.mark.parametrize("target", ["isaaclab", "mjlab"])
-def test_our_own_exports_are_read_back_as_the_calibration(target, tmp_path):
+@pytest.mark.parametrize(("target", "engine"), [("isaaclab", EXPLICIT_PD), ("mjlab", BUILTIN_PD)])
+def test_our_own_exports_are_read_back_as_they_were_written(target, engine, tmp_path):
     calibration = load_calibration(CALIBRATED)
     path = tmp_path / "exported.py"
     path.write_text(exported_text(calibration, target, 0.002)[0])
     servo = foreign_servo(path, "LF_thigh")
-    own = calibration.joint("LF_thigh").actuator
+    own = ExportedServos.of(calibration, 0.002).actuators(engine)["LF_thigh"]
     assert servo.pd.stiffness_nm_per_rad.value == own.stiffness_nm_per_rad.value
     assert servo.pd.armature_kg_m2.value == own.armature_kg_m2.value
 

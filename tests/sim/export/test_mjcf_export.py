@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.sim.export.check import LOOP_S, compiled, held, moved_by
 from pupper_sysid.sim.export.mjcf import compiled_numbers, link_inertias, to_mjcf, to_model
 from pupper_sysid.sim.export.shared import ExportedServos
@@ -172,10 +171,10 @@ def test_what_joints_and_options_state_themselves_is_overruled(calibration, tmp_
     assert model.opt.disableflags == 0
     names = calibration.joint_names
     there = moved_by(model, names, STEP_RAD, 0.004)
-    delays = [servos.delays()[n].value for n in names]
-    own_servo = DelayedPD(
-        replace(calibration.delayed_pd(names).parameters, dead_time_s=np.array(delays)), 0.004
-    )
+    exported = [servos.actuators()[name].parameters.arrays() for name in names]
+    numbers = {key: np.array([servo[key] for servo in exported]) for key in exported[0]}
+    numbers["armature"] = calibration.delayed_pd(names).parameters.armature
+    own_servo = DelayedPD(DelayedPDParameters(**numbers), 0.004)
     own_servo.reset(np.zeros(3))
     wanted = own_servo.rollout(np.repeat(held(STEP_RAD, 0.004)[:, None], 3, axis=1))
     np.testing.assert_allclose(there, wanted, atol=1e-3)

@@ -22,10 +22,11 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.servo_models.step_size import MUJOCO
 from pupper_sysid.sim.export.check import check, held, walk_commands
 from pupper_sysid.sim.export.export import SIMULATORS, exported_text
 from pupper_sysid.sim.export.mjlab import BUILTIN_PD
-from pupper_sysid.sim.export.shared import EXPLICIT_PD, ExportedServos
+from pupper_sysid.sim.export.shared import CALIBRATED_PD, EXPLICIT_PD, ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, rest_at
 from pupper_sysid.sysid.recordings.files import load
@@ -95,17 +96,17 @@ def test_an_export_lags_as_long_as_the_calibration_says_in_any_steps_and_engine(
     more = ExportedServos.of(calibration, 0.005).delays()
     for name, joint in calibration.joints.items():
         assert 0.0015 < more[name].value - joint.actuator.dead_time_s.value < 0.004
-    own_delays = ExportedServos.delays
+    own = ExportedServos.actuators
     for engine in (EXPLICIT_PD, BUILTIN_PD):  # which do not limit the speed of set points
 
         def as_they_do(text: str, engine=engine) -> str:
             text = re.sub(r' slewmax="[^"]*"', ' slewmax="0"', text)
             return text if engine.implicit else text.replace(INTEGRATOR, "Euler")
 
-        def their_delays(servos, _=None, engine=engine):
-            return own_delays(servos, engine)
+        def theirs(servos, _=None, engine=engine):
+            return own(servos, engine)
 
-        monkeypatch.setattr(ExportedServos, "delays", their_delays)
+        monkeypatch.setattr(ExportedServos, "actuators", theirs)
         there = lags_s(calibration, 0.005, as_they_do)
         np.testing.assert_allclose(there, expected, atol=1e-3)
 
@@ -252,17 +253,20 @@ def braking(calibration):
 
 
 def test_back_emf_brakes_in_every_simulator(braking, monkeypatch):
+    servos = ExportedServos.of(braking, 0.005)
+    explicit, implicit = ([a.back_emf_nm_s_per_rad.value for a in servos.actuators(e).values()]
+                          for e in (EXPLICIT_PD, MUJOCO))  # fmt: skip
     space = isaac_lab(text_of(braking, "isaaclab"), monkeypatch)
-    assert set(space["ACTUATORS"]["servos"].viscous_friction.values()) == {0.0321}
+    assert list(space["ACTUATORS"]["servos"].viscous_friction.values()) == explicit
     whole = space["WHOLE_STEP_ACTUATORS"].values()
-    assert all(made["viscous_friction"] == 0.0321 for made in whole)
+    assert [made["viscous_friction"] for made in whole] == explicit
     space = mjlab(text_of(braking, "mjlab"), monkeypatch)
-    assert [made["viscous_damping"] for made in space["WHOLE_STEP_ACTUATORS"]] == [0.0321] * 3
-    for to in ("mjlab", "newton"):
-        assert text_of(braking, to).count('"back_emf": 0.0321') == 3
+    assert [made["viscous_damping"] for made in space["WHOLE_STEP_ACTUATORS"]] == implicit
+    for to, brakes in (("mjlab", implicit), ("newton", explicit)):
+        assert all(f'"back_emf": {brake!r}' in text_of(braking, to) for brake in brakes)
     assert text_of(braking, "mjcf", 0.002).count('damping="0.0321 0 0"') == 3
     joints = json.loads(text_of(braking, "json"))["joints"]
-    assert all(j["actuator"]["back_emf_nm_s_per_rad"]["value"] == 0.0321 for j in joints.values())
+    assert [j["actuator"]["back_emf_nm_s_per_rad"]["value"] for j in joints.values()] == implicit
 
 
 def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
@@ -271,10 +275,11 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     text = text_of(calibration, "isaaclab")
     space = isaac_lab(text, monkeypatch)
     assert list(space["WHOLE_STEP_ACTUATORS"]) == list(calibration.joint_names)
-    delays = ExportedServos.of(calibration, 0.005).delays(EXPLICIT_PD)
+    exported = ExportedServos.of(calibration, 0.005)
+    delays, actuators = exported.delays(EXPLICIT_PD), exported.actuators(EXPLICIT_PD)
     servos = space["ACTUATORS"]["servos"]
     for name, made in space["WHOLE_STEP_ACTUATORS"].items():
-        own = calibration.joint(name).actuator
+        own = actuators[name]
         assert made["joint_names_expr"] == [name]
         assert made["stiffness"] == servos.stiffness[name] == own.stiffness_nm_per_rad.value
         assert made["armature"] == servos.armature[name] == own.armature_kg_m2.value
@@ -283,7 +288,7 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
         assert made["max_delay"] - made["min_delay"] <= 2
     assert space["FEEDBACK"]["LF_hip"]["loss"] == calibration.joint("LF_hip").feedback.loss.value
     # the name of the torque limit is that of the release that is installed
-    limits = [j.actuator.effort_limit_nm.value for j in calibration.joints.values()]
+    limits = [a.effort_limit_nm.value for a in actuators.values()]
     assert list(servos.effort_limit.values()) == limits
     newer = isaac_lab(text, monkeypatch, ISAACLAB_3)["ACTUATORS"]["servos"]
     assert list(newer.actuator_effort_limit.values()) == limits
@@ -291,13 +296,14 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
 
 def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibration, monkeypatch):
     space = mjlab(text_of(calibration, "mjlab"), monkeypatch)
-    delays = ExportedServos.of(calibration, 0.005).delays(BUILTIN_PD)
-    for made, (name, joint) in zip(
-        space["WHOLE_STEP_ACTUATORS"], calibration.joints.items(), strict=True
+    servos = ExportedServos.of(calibration, 0.005)
+    delays = servos.delays(BUILTIN_PD)
+    for made, (name, actuator) in zip(
+        space["WHOLE_STEP_ACTUATORS"], servos.actuators(BUILTIN_PD).items(), strict=True
     ):
         assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value / 0.005)
         assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
-        assert made["frictionloss"] == joint.actuator.friction_loss_nm.value
+        assert made["frictionloss"] == actuator.friction_loss_nm.value
         low, high = space["DELAY_STEPS"][name]
         assert low <= made["delay_min_lag"] <= high
 
@@ -430,7 +436,7 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(calibration, 
         },
     )  # fmt: skip
     space["add_servos"](builder)
-    own = calibration.joint("LF_hip").actuator
+    own = ExportedServos.of(calibration, 0.005).actuators(CALIBRATED_PD)["LF_hip"]
     assert builder.joint_armature[6] == own.armature_kg_m2.value
     assert sorted(attribute.values) == [6, 7, 8]
     servos = space["Servos"](builder, types.SimpleNamespace(device=None), num_worlds=2)
