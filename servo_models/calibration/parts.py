@@ -209,7 +209,7 @@ class Scores(Part):
     """Free-run error over the noise of readings, which is found without the model: about 1 where
     the model describes the servo."""
     r_hat: NotNegative | None = None
-    """Split-R̂ of the draws behind the intervals: they have converged where it is below 1.03."""
+    """R̂ of the draws behind the intervals: they have converged where it is below 1.03."""
     effective_draws: NotNegative | None = None
     """Independent draws that those of each number are worth, at least."""
 

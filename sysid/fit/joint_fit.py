@@ -30,8 +30,10 @@ from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
+    FEW_ROUNDS,
     LEAST_FOLDS,
     R_HAT,
+    ROUNDS,
     as_wide_as_folds,
     interval_of,
     sample,
@@ -264,7 +266,9 @@ def _compared(
     structure, problem = fitted.structure, ready.searched(fitted.structure)
     best = refine(problem, fitted.fit.point[None])
     temperature = _temperature(problem, best)
-    posterior = sample(problem, best, temperature, rng)
+    misfit = overall(_goodness(ready, replace(fitted, fit=best)))
+    rounds = FEW_ROUNDS if misfit > DESCRIBED else ROUNDS
+    posterior = sample(problem, best, temperature, rng, rounds)
     points = posterior.points
     best = min(best, refine(problem, posterior.best.point[None]), key=lambda f: f.cost)
     parents = [
@@ -572,7 +576,7 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
     own = choice.carried
     if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
         yield (
-            f"{joint}: the draws have not converged (split-R̂ {own.r_hat:.2f}, {own.effective:.0f} "
+            f"{joint}: the draws have not converged (R̂ {own.r_hat:.2f}, {own.effective:.0f} "
             "effective); intervals may be too narrow."
         )
 

@@ -1,23 +1,17 @@
-"""Posterior of a structure's parameters by an ensemble of Markov chains: intervals that hold.
+"""Posterior of a structure's parameters by population Monte Carlo: intervals that hold.
 
-The cost of a servo with dry friction is rugged, and many servos move alike: a long, curved ridge of
-parameters explains a recording equally well. Its curvature at the optimum, or refits from there,
-see one dent of it. The compiled simulation is fast enough to walk along the whole ridge instead:
-`sample` draws parameters in proportion to prior and likelihood by differential evolution Markov
-chains, from a population as wide as the curvature at the optimum says.
+Many servos move alike: a long, curved ridge of parameters explains a recording equally well. Its
+curvature at the optimum, or refits from there, see one end of it. The compiled simulation is fast
+enough to weigh thousands of points instead: `sample` draws parameters in proportion to prior and
+likelihood by population Monte Carlo, until the draws have converged.
 
 Residuals are not white; the likelihood, not the prior, is tempered by `temperature_of`: how many
 readings count as one.
-
-References
-----------
-ter Braak, C. J. F. (2006). A Markov chain Monte Carlo version of the genetic algorithm
-differential evolution. Statistics and Computing 16: 239–249.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +22,7 @@ from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.fit.run import Run
-from pupper_sysid.sysid.fit.search import Fit, Problem, curvature, local
+from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, local
 from pupper_sysid.sysid.fit.structure import Structure
 
 STEPPING_SD_S = 0.1 * TIME_STEP_S
@@ -39,12 +33,14 @@ _STEPPING_SHARE = 0.006
 deviation over random emulated pendulums that move in other steps."""
 _HARMONICS = (1, 2, 3)
 R_HAT, EFFECTIVE = 1.03, 400.0
-"""Split-R̂ at most, and effective draws at least, of draws that have converged."""
-_POPULATION, _ROUNDS, _ENOUGH = 384, 8, 300.0  # points a round, rounds, effective points
-_CENTRES, _LEAST_CENTRES, _BANDWIDTH, _FREEDOM = 192, 48, 0.5, 5.0
+"""R̂ at most, and effective draws at least, of draws that have converged."""
+ROUNDS, FEW_ROUNDS = 32, 8
+"""Populations at most; and of a joint that the model does not describe, whose gains are not known
+however exactly its posterior is."""
+_POPULATION, _DRAWS = 384, 2000
+_CENTRES, _WIDE_ONES, _FREEDOM, _GROUPS = 12, 3, 5.0, 8
+_RISE = (0.5, 400.0)  # by which an axis is made longer or shorter, squared
 _BETTER = 4.0  # log-likelihood by which another optimum has to be better
-_CHAINS, _GENERATIONS, _BLOCKS = 16, 200, 4
-_NOISE = 1e-3  # of a proposal, over the standard deviation
 _STEP = 0.01
 PHASE_SD_S = 0.0003
 """Standard deviation of the date error that all readings of a polled run share [s], about that of
@@ -70,7 +66,7 @@ class Posterior:
     best : Fit
         The likeliest point that was met.
     r_hat : float
-        Largest split-R̂ over the parameters: spread between chains over that within.
+        Largest R̂ over the parameters: spread of and within parts of the points, over that within.
     effective : float
         Smallest number of independent draws that those of a parameter are worth.
     """
@@ -86,13 +82,14 @@ def sample(
     best: Fit,
     temperature: float,
     rng: np.random.Generator,
+    rounds: int = ROUNDS,
 ) -> Posterior:
-    """Draw parameters from their posterior.
+    """Draw parameters from their posterior by population Monte Carlo.
 
-    Importance sampling finds where the posterior is: from a t distribution as the curvature at the
-    optimum says, then from mixtures about the points that weigh most (population Monte Carlo).
-    Chains from there propose points of the last mixture and steps along differences of two of its
-    points, until they agree.
+    Each population is drawn from a mixture of t distributions, and weighed by posterior over the
+    density of all mixtures so far (deterministic mixture weights). The next mixture stands about
+    points drawn by weight, each with the covariance that the curvature of the cost has there, so
+    that it bends with a ridge. This goes on until the weighted points are worth enough draws.
 
     Parameters
     ----------
@@ -101,191 +98,154 @@ def sample(
     temperature : float
         By which the cost of the readings is divided.
     rng : numpy.random.Generator
+    rounds : int
+        Populations, at most.
+
+    References
+    ----------
+    Cappé, O. et al. (2008). Adaptive importance sampling in general mixture classes. Statistics and
+    Computing 18: 447–459.
+    Ionides, E. L. (2008). Truncated importance sampling. Journal of Computational and Graphical
+    Statistics 17: 295–311.
     """
-    low, high = problem.structure.box
-
-    def tempered(points: NDArray, ceiling: NDArray | float = np.inf) -> NDArray[np.float64]:
-        inside = ((points >= low) & (points <= high)).all(axis=1)
-        cost = np.full(len(points), np.inf)
-        if inside.any():
-            own = points[inside]
-            prior = problem.prior(own)
-            most = ceiling if np.isscalar(ceiling) else ceiling[inside]
-            whole = problem.costs(own, (most - prior) * temperature + prior)
-            cost[inside] = (whole - prior) / temperature + prior
-        return cost
-
-    points, cost, start, mixture = _populate(problem, tempered, best, temperature, rng)
-    z, log_density, k = points.copy(), mixture.log_density(points), points.shape[1]
-    kept: list[NDArray] = []
-    for block in range(_BLOCKS):
-        for generation in range(_GENERATIONS):
-            if generation % 2:
-                trial, trial_density = mixture.draw(len(z), rng)
-                most = cost + log_density - trial_density - np.log(rng.random(len(z)))
-            else:
-                one, two = rng.integers(0, len(mixture.centres), (2, len(z)))
-                gamma = 2.38 / np.sqrt(2 * k) * rng.uniform(0.3, 1.1, (len(z), 1))
-                trial = z + gamma * (mixture.centres[one] - mixture.centres[two])
-                trial += _NOISE * mixture.spread * rng.standard_normal(z.shape)
-                trial_density = mixture.log_density(trial)
-                most = cost - np.log(rng.random(len(z)))
-            new = tempered(trial, most)
-            accepted = new < most
-            z = np.where(accepted[:, None], trial, z)
-            cost = np.where(accepted, new, cost)
-            log_density = np.where(accepted, trial_density, log_density)
-            kept.append(z)
-            first = int(np.argmin(cost))
-            if cost[first] < start.cost:
-                start = Fit(z[first], float(cost[first]))
-        draws = np.array(kept)
-        r_hat, effective = convergence(draws)
+    least = float(_tempered(problem, best.point[None], temperature)[0])
+    mixture = _Mixture.about(problem, best.point[None], temperature)
+    mixtures: list[_Mixture] = []
+    points, cost, density = np.empty((0, len(best.point))), np.empty(0), np.empty(0)
+    for turn in range(rounds):
+        drawn = mixture.draw(_POPULATION, rng)
+        own = _tempered(problem, drawn, temperature)
+        first = int(np.argmin(own))
+        if own[first] < least - _BETTER and turn < rounds // 2:  # an optimum beside: begin there
+            fit = local(problem, drawn[first : first + 1], _DATE_ITERATIONS, _CURVATURE_STEP)[0]
+            least = float(_tempered(problem, fit.point[None], temperature)[0])
+            mixture, mixtures = _Mixture.about(problem, fit.point[None], temperature), []
+            points, cost, density = points[:0], cost[:0], density[:0]
+            continue
+        density = np.logaddexp(density, mixture.log_density(points))
+        mixtures.append(mixture)
+        of_drawn = logsumexp([m.log_density(drawn) for m in mixtures], axis=0)
+        points, cost = np.concatenate([points, drawn]), np.concatenate([cost, own])
+        density = np.concatenate([density, of_drawn])
+        weight = np.exp(-cost - density - np.max(-cost - density))
+        weight /= weight.sum()
+        r_hat, effective = convergence(points, weight)
         if r_hat <= R_HAT and effective >= EFFECTIVE:
             break
-        if block == 0:  # where the chains went says more than where they began
-            cloud = draws.reshape(-1, k)
-            mixture = _mixture_of(cloud, np.full(len(cloud), 1.0 / len(cloud)), mixture.wide, rng)
-            log_density = mixture.log_density(z)
-            kept = []
-    whole = float(problem.costs(start.point[None])[0])
-    return Posterior(draws.reshape(-1, k), Fit(start.point, whole), r_hat, effective)
+        mixture = _Mixture.of(problem, points, weight, temperature, rng)
+    likeliest = points[int(np.argmin(cost))]
+    whole = float(problem.costs(likeliest[None])[0])
+    # truncated, so that few points do not stand for all where there was no convergence
+    weight = np.minimum(weight, 1.0 / np.sqrt(len(weight)))
+    draws = points[rng.choice(len(points), _DRAWS, p=weight / weight.sum())]
+    return Posterior(draws, Fit(likeliest, whole), r_hat, effective)
+
+
+def _tempered(problem: Problem, points: NDArray, temperature: float) -> NDArray[np.float64]:
+    """Minus the logarithm of the posterior's density; infinite outside of the box."""
+    low, high = problem.structure.box
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    cost = np.full(len(points), np.inf)
+    if inside.any():
+        prior = problem.prior(points[inside])
+        cost[inside] = (problem.costs(points[inside]) - prior) / temperature + prior
+    return cost
 
 
 @dataclass(frozen=True)
 class _Mixture:
-    """t distributions about centres that weigh alike, and one wide one."""
+    """t distributions that weigh alike.
+
+    Attributes
+    ----------
+    centres : ndarray, shape (components, parameters)
+    roots : ndarray, shape (components, parameters, parameters)
+        Of their scale matrices.
+    """
 
     centres: NDArray[np.float64]
-    root: NDArray[np.float64]  # of their covariance
-    wide: NDArray[np.float64]  # of the covariance of the wide one
-    middle: NDArray[np.float64]
-    share: float  # of the wide one
+    roots: NDArray[np.float64]
 
-    @property
-    def spread(self) -> NDArray[np.float64]:
-        """Standard deviation of each coordinate."""
-        return np.sqrt(np.sum(self.wide**2, axis=1))
+    @classmethod
+    def about(cls, problem: Problem, centres: NDArray, temperature: float) -> _Mixture:
+        """As wide at each centre as the tempered cost says: by its curvature, then along the axes.
 
-    def draw(self, count: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
-        """Points (count, parameters) and the logarithm of their density."""
-        k = len(self.middle)
+        A ridge bends, so a step of one standard deviation along an axis of the curvature often
+        costs far more than half a unit of log-likelihood; the axis is made shorter then.
+        """
+        precision, k = np.diag(problem.structure.prior[1]), centres.shape[1]
+        bent = (curvatures(problem, centres, _STEP) - precision) / temperature + precision
+        values, axes = np.linalg.eigh(bent)
+        sizes = np.minimum(1.0 / np.sqrt(np.maximum(values, 1e-12)), _WIDEST)
+        steps = np.swapaxes(axes * sizes[:, None, :], 1, 2)
+        ends = np.concatenate([centres[:, None] + steps, centres[:, None] - steps], axis=1)
+        ends = np.clip(ends, *problem.structure.box).reshape(-1, k)
+        cost = _tempered(problem, np.concatenate([centres, ends]), temperature)
+        middle, ends = cost[: len(centres)], cost[len(centres) :].reshape(-1, 2, k)
+        rise = ends.sum(axis=1) - 2.0 * middle[:, None]  # 1 of a normal distribution
+        sizes = np.minimum(sizes / np.sqrt(np.clip(rise, *_RISE)), _WIDEST)
+        return cls(centres, axes * (_OVERDISPERSED * sizes)[:, None, :])
+
+    @classmethod
+    def of(
+        cls, problem: Problem, points: NDArray, weight: NDArray, temperature: float,
+        rng: np.random.Generator,
+    ) -> _Mixture:  # fmt: skip
+        """About points drawn by weight, and one as wide as all of them."""
+        # clipped, so that no single point carries it
+        flat = np.minimum(weight, 1.0 / _CENTRES)
+        flat = flat / flat.sum()
+        centres = points[rng.choice(len(points), _CENTRES, p=flat)]
+        narrow = cls.about(problem, centres, temperature)
+        middle = flat @ points
+        apart = points - middle
+        covariance = (flat * apart.T) @ apart + 1e-12 * np.eye(len(middle))
+        wide = _OVERDISPERSED * np.linalg.cholesky(covariance)
+        return cls(
+            np.concatenate([centres, np.tile(middle, (_WIDE_ONES, 1))]),
+            np.concatenate([narrow.roots, np.tile(wide, (_WIDE_ONES, 1, 1))]),
+        )
+
+    def draw(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Points (count, parameters)."""
+        k = self.centres.shape[1]
         steps = rng.standard_normal((count, k))
         steps /= np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
-        about = self.centres[rng.integers(0, len(self.centres), count)] + steps @ self.root.T
-        widely = self.middle + steps @ self.wide.T
-        points = np.where(rng.random((count, 1)) < self.share, widely, about)
-        return points, self.log_density(points)
+        component = rng.integers(0, len(self.centres), count)
+        return self.centres[component] + np.einsum("nij,nj->ni", self.roots[component], steps)
 
     def log_density(self, points: NDArray) -> NDArray[np.float64]:
         """Up to a constant, shape (points,)."""
-
-        def student(apart: NDArray, root: NDArray) -> NDArray:
-            size = np.sum(np.linalg.solve(root, apart.reshape(-1, k).T) ** 2, axis=0)
-            power = -0.5 * (_FREEDOM + k) * np.log1p(size / _FREEDOM)
-            return power.reshape(apart.shape[:-1]) - np.linalg.slogdet(root)[1]
-
-        k = len(self.middle)
-        wide = student(points - self.middle, self.wide) + np.log(self.share)
-        if self.share >= 1.0:
-            return wide
-        near = student(points[:, None, :] - self.centres, self.root)
-        near = logsumexp(near, axis=1) - np.log(len(self.centres)) + np.log1p(-self.share)
-        return np.logaddexp(wide, near)
+        k = self.centres.shape[1]
+        inverse = np.linalg.inv(self.roots)
+        white = np.einsum("cij,cnj->cni", inverse, points[None] - self.centres[:, None])
+        power = -0.5 * (_FREEDOM + k) * np.log1p(np.sum(white**2, axis=2) / _FREEDOM)
+        log_det = np.linalg.slogdet(self.roots)[1]
+        return logsumexp(power - log_det[:, None], axis=0) - np.log(len(self.centres))
 
 
-def _populate(
-    problem: Problem, tempered: Callable[..., NDArray], best: Fit, temperature: float,
-    rng: np.random.Generator,
-) -> tuple[NDArray, NDArray, Fit, _Mixture]:  # fmt: skip
-    """Points of equal weight, their cost, the best one met, and a mixture about them."""
-    k = len(best.point)
-    start = Fit(best.point, float(tempered(best.point[None])[0]))
-    root = _root(problem, start.point, temperature)
-    mixture = _Mixture(start.point[None], root, root, start.point, 1.0)
-    points, cost = np.empty((0, k)), np.empty(0)
-    mixtures: list[_Mixture] = []
-    log_density = np.empty((0, 0))  # (mixtures, points)
-    for turn in range(_ROUNDS):
-        drawn, _ = mixture.draw(_POPULATION, rng)
-        own = tempered(drawn)
-        first = int(np.argmin(own))
-        # an optimum beside: begin again there
-        if own[first] < start.cost - _BETTER and turn < _ROUNDS // 2:
-            fit = local(problem, drawn[first : first + 1], _DATE_ITERATIONS, _CURVATURE_STEP)[0]
-            start = Fit(fit.point, float(tempered(fit.point[None])[0]))
-            root = _root(problem, start.point, temperature)
-            mixture = _Mixture(start.point[None], root, root, start.point, 1.0)
-            points, cost, mixtures = np.empty((0, k)), np.empty(0), []
-            log_density = np.empty((0, 0))
-            continue
-        mixtures.append(mixture)
-        old = [m.log_density(drawn) for m in mixtures]
-        log_density = np.block([
-            [np.vstack([log_density, mixture.log_density(points)[None]]) if len(points) else
-             np.empty((1, 0)), np.array(old)]
-        ])  # fmt: skip
-        points, cost = np.concatenate([points, drawn]), np.concatenate([cost, own])
-        log_weight = -cost - logsumexp(log_density, axis=0)
-        weight = np.exp(log_weight - log_weight.max())
-        weight /= weight.sum()
-        effective = 1.0 / np.sum(weight**2)
-        mixture = _mixture_of(points, weight, root, rng)
-        if effective >= _ENOUGH:
-            break
-    chosen = rng.choice(len(points), _CHAINS, p=weight)
-    return points[chosen], cost[chosen], start, mixture
+def convergence(points: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, float]:
+    """Largest R̂ and smallest number of effective draws over the parameters, of weighted points.
 
-
-def _mixture_of(
-    points: NDArray, weight: NDArray, root: NDArray, rng: np.random.Generator
-) -> _Mixture:
-    """The next mixture about weighted points; `root` is that of the last covariance."""
-    # clipped, so that a single point does not carry it
-    flat = np.minimum(weight, 1.0 / _LEAST_CENTRES)
-    flat = flat / flat.sum()
-    centres = points[rng.choice(len(points), _CENTRES, p=flat)]
-    middle = flat @ points
-    apart = points - middle
-    covariance = (flat * apart.T) @ apart + (1e-6 * root) @ root.T
-    wide = np.linalg.cholesky(covariance + 1e-18 * np.eye(len(middle)))
-    return _Mixture(centres, _BANDWIDTH * wide, 1.3 * wide, middle, 0.3)
-
-
-def _root(problem: Problem, point: NDArray, temperature: float) -> NDArray[np.float64]:
-    """Root of the covariance at an optimum by the curvature of the tempered cost."""
-    precision = np.diag(problem.structure.prior[1])
-    bent = (curvature(problem, point, _STEP) - precision) / temperature + precision
-    values, vectors = np.linalg.eigh(bent)
-    return vectors * np.minimum(_OVERDISPERSED / np.sqrt(np.maximum(values, 1e-12)), _WIDEST)
-
-
-def convergence(draws: NDArray[np.float64]) -> tuple[float, float]:
-    """Largest split-R̂ and smallest number of effective draws over the parameters.
+    The variance of a mean over independent weighted points is the weighted mean square of
+    w (x − mean); R̂ is that between `_GROUPS` parts of the points and within them.
 
     Parameters
     ----------
-    draws : ndarray, shape (generations, chains, parameters)
-
-    References
-    ----------
-    Gelman, A. et al. (2013). Bayesian Data Analysis, 3rd ed., section 11.4–11.5.
+    points : ndarray, shape (points, parameters)
+    weight : ndarray, shape (points,)
+        Their sum is 1.
     """
-    half = len(draws) // 2
-    x = np.concatenate([draws[:half], draws[half : 2 * half]], axis=1)
-    within = x.var(axis=0, ddof=1).mean(axis=0)
-    between = half * x.mean(axis=0).var(axis=0, ddof=1)
-    total = (half - 1) / half * within + between / half
-    total = np.maximum(total, 1e-300)
-    r_hat = np.sqrt(total / np.maximum(within, 1e-300))
-    rho = np.empty((half - 1, x.shape[2]))
-    for lag in range(1, half):
-        variogram = np.mean((x[lag:] - x[:-lag]) ** 2, axis=(0, 1))
-        rho[lag - 1] = 1.0 - variogram / (2.0 * total)
-    # Geyer's initial positive sequence: pairs of autocorrelations while their sum is positive
-    pairs = rho[: 2 * (len(rho) // 2)].reshape(-1, 2, x.shape[2]).sum(axis=1)
-    memory = 1.0 + 2.0 * np.sum(np.cumprod(pairs > 0, axis=0) * np.maximum(pairs, 0), axis=0)
-    return float(r_hat.max()), float((half * x.shape[1] / memory).min())
+    middle = weight @ points
+    apart = points - middle
+    variance = np.maximum(weight @ apart**2, 1e-300)
+    effective = variance / np.maximum(weight**2 @ apart**2, 1e-300)
+    means = []
+    for part in range(_GROUPS):
+        own = weight[part::_GROUPS]
+        means.append(own @ points[part::_GROUPS] / max(own.sum(), 1e-300))
+    between = np.var(means, axis=0, ddof=1)
+    return float(np.sqrt(1.0 + between / variance).max()), float(effective.min())
 
 
 def temperature_of(

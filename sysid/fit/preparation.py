@@ -26,7 +26,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 from pupper_sysid.sysid.feedback.slips import Motion
 from pupper_sysid.sysid.feedback.upsets import Upset, find_upsets
 from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
-from pupper_sysid.sysid.fit.loads import droops, tells_of_load
+from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import reference_gain
 from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals, prepare
@@ -166,7 +166,7 @@ def prepare_joint(
     """
     trials = tuple(trials)
     if free_air is None:
-        free_air = not (tells_of_load(trials) or droops(trials))
+        free_air = not loaded_joints({joint: trials})
     rng = joint_rng(seed, joint)
     lattice = find_poll_lattice(trials, rng.spawn(1)[0])
     lag = _lag(joint, trials, deepcopy(rng), lattice, free_air)

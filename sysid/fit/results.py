@@ -167,7 +167,7 @@ class JointCalibrationResult(Result):
     goodness : dict of str to float
         Residual of the model over the noise of readings, by motion: 1 where it explains the servo.
     r_hat, effective_draws : float
-        Split-R̂ of the draws behind the intervals, and how many independent ones they are worth.
+        R̂ of the draws behind the intervals, and how many independent ones they are worth.
     loaded : LoadedFit or None
         The servo at any gain and load, where the recordings tell of a load or several gains.
     runs : tuple of Run

@@ -333,7 +333,12 @@ def local(
 
 def curvature(problem: Problem, point: NDArray[np.float64], difference: float) -> NDArray:
     """Hessian of the cost at a point, Gauss-Newton's, shape (parameters, parameters)."""
-    return _slopes(problem, point[None], difference)[2][0]
+    return curvatures(problem, point[None], difference)[0]
+
+
+def curvatures(problem: Problem, points: NDArray[np.float64], difference: float) -> NDArray:
+    """The same at points (n, parameters), shape (n, parameters, parameters)."""
+    return _slopes(problem, points, difference)[2]
 
 
 def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArray, ...]:
