@@ -193,7 +193,7 @@ def fit_structures(ready: PreparedJoint, stage: str) -> list[Fitted]:
     rng = ready.fit_rng()
     if not ready.scales.free_air:
         return _ladder(ready, rng)
-    structure = candidate(stage)
+    structure = candidate(stage, ready.scales)
     tried = {s.features: Fitted(s, fit) for s, fit in ready.first.values() if structure.contains(s)}
     fitted = _fitted(ready, structure, tried, rng, ready.first[stage][1])
     return [*tried.values(), _compared(ready, fitted, tried, rng)]
@@ -230,9 +230,15 @@ def _fitted(
 
 
 def _ladder(
-    ready: PreparedJoint, rng: np.random.Generator, ladder: Sequence[tuple[str, ...]] = LADDER
+    ready: PreparedJoint,
+    rng: np.random.Generator,
+    ladder: Sequence[tuple[str, ...]] = LADDER,
+    most: float = float("inf"),
 ) -> list[Fitted]:
-    """The structures under load that the likelihood does not rule out, the best of all first."""
+    """Structures of a motor, those with draws that the likelihood does not rule out.
+
+    None of them if the best one leaves more than `most` of residual over noise.
+    """
     scales = ready.scales
     stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
     plain, first = next(iter(ready.first.values()))
@@ -249,6 +255,8 @@ def _ladder(
         if addition not in best:
             try_out(*best, addition, short=True)
     best = min(tried.values(), key=lambda f: f.fit.cost)
+    if overall(_goodness(ready, best)) > most:
+        return []
     nats = _nats(ready, tried.values())
     likely = sorted(plausible(nats), key=lambda name: nats[name])[:_MOST_COMPARED]
     return [
@@ -442,10 +450,10 @@ def conclude(
         return result
     # DelayedPD does not describe it: one with a profile, gravity or other friction may
     ready = ready.as_any_servo()
-    every = _ladder(ready, ready.fit_rng(), SHORT_LADDER)
-    other = _under_load(ready, every, _choice(ready, every))
-    better = overall(other.goodness) < _DESCRIBES_BETTER * overall(result.goodness)
-    return other if better else result
+    every = _ladder(
+        ready, ready.fit_rng(), SHORT_LADDER, _DESCRIBES_BETTER * overall(result.goodness)
+    )
+    return _under_load(ready, every, _choice(ready, every)) if every else result
 
 
 def _in_free_air(
@@ -455,7 +463,7 @@ def _in_free_air(
     by_name = {f.structure.name: f for f in every}
     results = {name: _candidate_fit(ready, f, folds) for name, f in by_name.items()}
     least = [f.scores.rmse_unseen_rad for n, f in results.items() if n in SIMULATED]
-    for structure in CANDIDATES:
+    for structure in (candidate(name, ready.scales) for name in CANDIDATES):
         if structure.name in SIMULATED:
             continue
         rng, problem = ready.fit_rng(), ready.problem(structure)
@@ -473,7 +481,7 @@ def _in_free_air(
             fitted = replace(fitted, folds=fit_folds(problem, folds, rng, None, own))
         by_name[structure.name] = fitted
         results[structure.name] = _candidate_fit(ready, fitted, folds)
-    results = {s.name: results[s.name] for s in CANDIDATES}
+    results = {name: results[name] for name in CANDIDATES}
     carried = choice.carried.structure
     goodness = _goodness(ready, choice.carried)
     lag = choice.lag
@@ -563,6 +571,8 @@ def _with_misfit(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, f
     assert own is not None
     low = own.value - ratio * (own.value - own.low) - hidden
     high = own.value + ratio * (own.high - own.value) + hidden
+    if np.isfinite(choice.lag.lag_s.high):  # the dynamics lag, too
+        high = max(min(high, choice.lag.lag_s.high), own.high)
     wide = Interval(own.value, max(float(low), 0.0), float(high))
     return replace(choice.lag, dead_time_s=wide)
 

@@ -38,7 +38,7 @@ ROUNDS, FEW_ROUNDS = 32, 8
 """Populations at most; and of a joint that the model does not describe, whose gains are not known
 however exactly its posterior is."""
 _POPULATION, _DRAWS = 384, 2000
-_CENTRES, _WIDE_ONES, _FREEDOM, _GROUPS = 12, 3, 5.0, 8
+_CENTRES, _BY_WEIGHT, _WIDE_ONES, _FREEDOM, _GROUPS = 12, 4, 3, 5.0, 8
 _RISE = (0.5, 400.0)  # by which an axis is made longer or shorter, squared
 _BETTER = 4.0  # log-likelihood by which another optimum has to be better
 _STEP = 0.01
@@ -191,11 +191,14 @@ class _Mixture:
         cls, problem: Problem, points: NDArray, weight: NDArray, temperature: float,
         rng: np.random.Generator,
     ) -> _Mixture:  # fmt: skip
-        """About points drawn by weight, and one as wide as all of them."""
-        # clipped, so that no single point carries it
-        flat = np.minimum(weight, 1.0 / _CENTRES)
+        """About points drawn by weight, the heaviest points, and as wide as all of them.
+
+        A heavy point is one where the mixtures so far have too few.
+        """
+        flat = np.minimum(weight, 1.0 / _CENTRES)  # clipped, so that no single point carries it
         flat = flat / flat.sum()
-        centres = points[rng.choice(len(points), _CENTRES, p=flat)]
+        heaviest = np.argsort(-weight)[: _CENTRES - _BY_WEIGHT]
+        centres = points[np.append(rng.choice(len(points), _BY_WEIGHT, p=flat), heaviest)]
         narrow = cls.about(problem, centres, temperature)
         middle = flat @ points
         apart = points - middle

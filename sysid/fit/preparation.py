@@ -14,8 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.joints import JOINT_NAMES, NO_LOAD_SPEED_RAD_S
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
@@ -32,7 +34,6 @@ from pupper_sysid.sysid.fit.operating_point import reference_gain
 from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals, prepare
 from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
 from pupper_sysid.sysid.fit.structure import (
-    FREE_AIR,
     SIMULATED,
     Scales,
     Structure,
@@ -174,7 +175,7 @@ def prepare_joint(
     recorded, runs = _dated(trials, lattice, volts, free_air)
     if not runs:
         raise InputError(f"{joint}: no readings; record again.")
-    scales = FREE_AIR if free_air else scales_of(recorded, runs)
+    scales = _in_free_air(joint, recorded) if free_air else scales_of(recorded, runs)
     # fits of a noise-free servo still meet rounding: a third of a quantisation step
     least = max(quantum(trials) / 3, _LEAST_NOISE_RAD)
     scale = max(lag.noise_rad, least) if free_air and np.isfinite(lag.noise_rad) else _NOISE_RAD
@@ -182,7 +183,7 @@ def prepare_joint(
     if known is None:
         first = _first_fits(scales, runs, noise, rng)
     else:
-        models = {name: candidate(name) for name in known}
+        models = {name: candidate(name, scales) for name in known}
         first = {n: (models[n], Fit(models[n].encode(v), 0.0)) for n, v in known.items()}
     upsets: tuple[Upset, ...] = ()
     for _ in range(_ROUNDS):
@@ -235,6 +236,15 @@ def reference_voltage(trials: Sequence[Trial]) -> float:
     if ripple and np.median(ripple) < _RIPPLE:
         return float("nan")
     return float(np.median(medians))
+
+
+def _in_free_air(joint: str, trials: Sequence[Trial]) -> Scales:
+    """Scales of free air, with the speed of the servo's model or of a Mini Pupper's joint."""
+    model, supply = trials[0].servo.model, trials[0].servo.supply_voltage_v
+    speed = no_load_speed(model, supply) if model else None
+    if model is None and joint in JOINT_NAMES:
+        speed = NO_LOAD_SPEED_RAD_S
+    return Scales() if speed is None else Scales(top_speed_rad_s=speed)
 
 
 def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
@@ -335,7 +345,7 @@ def _first_fits(
     scales: Scales, runs: tuple[Run, ...], noise: tuple[float, ...], rng: np.random.Generator
 ) -> dict[str, tuple[Structure, Fit]]:
     structures = (
-        [candidate(name) for name in ("dc_servo", *SIMULATED)]
+        [candidate(name, scales) for name in ("dc_servo", *SIMULATED)]
         if scales.free_air
         else [servo_structure(("back-EMF", "load friction"), scales)]
     )

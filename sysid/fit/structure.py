@@ -81,6 +81,8 @@ class Scales:
         Whether a run has the torque switched off.
     acceleration_rad_s2 : float
         Limit on the set-point's acceleration that headers state; NaN if none.
+    top_speed_rad_s : float
+        Speed without load by the data sheet of the servo's model; NaN if that is not known.
     """
 
     torque: float = 1.0
@@ -90,6 +92,7 @@ class Scales:
     known_load: bool = False
     torque_off: bool = False
     acceleration_rad_s2: float = float("nan")
+    top_speed_rad_s: float = float("nan")
 
     @property
     def gravity(self) -> bool:
@@ -195,6 +198,10 @@ SERVO_TERMS = {t.name: t for t in (
 
 _LEAST_SCALE = 0.02  # of angles [rad]
 _STATED_SD = 0.03  # of the logarithm of a limit that a register states
+_SPEEDS = ("velocity_limit_rad_s", "no_load_speed_rad_s")
+_DATA_SHEET_SD = 0.35
+"""Of the logarithm of a speed by a data sheet: supplies from 4.8 to 7.4 V are 20 % either way,
+units and sheets of one class differ by as much, and friction takes its share."""
 _KNOWN_OFFSET_SD_RAD = 0.002  # where command and reading share the encoder's zero
 _BASE = ("dead_time_s", "stiffness", "damping", "friction_loss", "stall_torque")
 _NEUTRAL = {
@@ -362,7 +369,10 @@ def servo_structure(
 def _parameter(term: Term, scales: Scales) -> Parameter:
     """The number of the table as it is fitted."""
     if scales.free_air and term.free is not None:
-        return Parameter(term.free_name, *term.free)
+        nominal, low, high, sd = term.free
+        if term.name in _SPEEDS and np.isfinite(scales.top_speed_rad_s):
+            nominal, sd = scales.top_speed_rad_s, _DATA_SHEET_SD
+        return Parameter(term.free_name, nominal, low, high, sd)
     name = term.name if scales.known_load else term.free_name
     # per inertia, torques are about those of a joint that gains 10 rad/s within 0.1 s
     torque = scales.torque if scales.known_load else 100.0
@@ -403,19 +413,22 @@ SIMULATED = (PREFERRED, "delayed_pd_back_emf")
 """Structures in free air that simulators and training can run: DelayedPD with one limit on its
 speed."""
 
-CANDIDATES = (
-    *LINEAR,
-    servo_structure(("back-EMF",), name="dc_servo"),
-    servo_structure(("damping", "slew"), name=PREFERRED),
-    servo_structure(("damping", "back-EMF"), name=SIMULATED[1]),
-    servo_structure(("damping", "slew", "backlash"), name="delayed_pd_backlash"),
-)
+CANDIDATES = (*(s.name for s in LINEAR), "dc_servo", *SIMULATED, "delayed_pd_backlash")
 """What is fitted to a joint in free air, simplest first."""
 
+_FEATURES_OF = {
+    "dc_servo": ("back-EMF",),
+    PREFERRED: ("damping", "slew"),
+    SIMULATED[1]: ("damping", "back-EMF"),
+    "delayed_pd_backlash": ("damping", "slew", "backlash"),
+}
 
-def candidate(name: str) -> Structure:
-    """The candidate of free air called `name`."""
-    return next(s for s in CANDIDATES if s.name == name)
+
+def candidate(name: str, scales: Scales = FREE_AIR) -> Structure:
+    """The candidate of free air called `name`, one of `CANDIDATES`."""
+    if name in _FEATURES_OF:
+        return servo_structure(_FEATURES_OF[name], scales, name)
+    return next(s for s in LINEAR if s.name == name)
 
 
 def loaded_servo(columns: NDArray[np.float64], dead_time_s: float) -> LoadedServoParameters:

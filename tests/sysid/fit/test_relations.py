@@ -213,7 +213,10 @@ def test_scores_depend_neither_on_neighbours_nor_on_the_order_of_files():
 
 
 def test_every_number_of_a_structure_is_a_row_of_the_table():
-    for structure in (*CANDIDATES[3:], servo_structure(("back-EMF", "load friction", "static"))):
+    for structure in (
+        *map(candidate, CANDIDATES[3:]),
+        servo_structure(("back-EMF", "load friction", "static")),
+    ):
         low, high = structure.box
         assert (low < high).all()
         columns = structure.columns(np.array([[p.nominal for p in structure.parameters]]))

@@ -90,7 +90,7 @@ def result_of(joint: str = "LF_thigh", **changes) -> JointCalibrationResult:
         rmse_by_left_out_frequency_rad={"1": 0.015, "2": 0.015}, fit_percent=95.0,
     )  # fmt: skip
     raw_best = replace(scores, rmse_fresh_rad=0.150, rmse_raw_rad=0.100)
-    candidates = {m.name: fitted(m.name, scores) for m in CANDIDATES}
+    candidates = {name: fitted(name, scores) for name in CANDIDATES}
     tones = tuple(
         FrequencyLag(
             frequency_hz=f, gain=1.02, phase_deg=-15.0 * f, lag_s=interval(0.042),
@@ -296,7 +296,7 @@ def test_the_tables_have_the_numbers_of_the_result(written):
     assert float(transfer["dead_time_s"]["high"]) == pytest.approx(0.11)
     assert float(transfer["gain"]["chi2_per_dof"]) == 1.5
     models = {r["model"]: r for r in rows_of(written, "candidate_models")}
-    assert list(models) == [*(r.name for r in CANDIDATES), "paper"]
+    assert list(models) == [*CANDIDATES, "paper"]
     assert [m for m, r in models.items() if r["is_chosen"] == "True"] == ["delayed_pd"]
     assert float(models["paper"]["rmse_fresh_rad"]) == pytest.approx(0.150)
     assert float(models["delayed_pd"]["rmse_raw_rad"]) == pytest.approx(0.120)
