@@ -91,8 +91,10 @@ LADDER = (
     ("load friction", "quadratic", "torque limit"),
 )
 """Friction of a motor under load, simplest first; then `ADDITIONS` to the best of them."""
-SHORT_LADDER = ((), ("acceleration",), ("load friction",))
+SHORT_LADDER = ((), ("load friction",))
 """For a joint in free air that DelayedPD does not describe."""
+_PROFILE_NATS = 10.0
+"""Log-likelihood by which a limited acceleration is better, from which on all rungs have it."""
 _DESCRIBES_BETTER = 0.75
 """Errors over those of DelayedPD, below which a servo with more terms is carried."""
 ADDITIONS = ("damping", "acceleration", "slew", "dead zone", "stribeck", "start duty")
@@ -248,8 +250,15 @@ def _ladder(
         structure = servo_structure(("back-EMF", *features), scales)
         tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
 
+    if not stated:  # first, because friction that grows with the load imitates a profile
+        try_out()
+        try_out("acceleration")
+        nats = _nats(ready, tried.values())
+        if nats["base"] - nats["acceleration"] > _PROFILE_NATS:
+            stated = ("acceleration",)
     for features in ladder:
-        try_out(*features, *stated)
+        if servo_structure(("back-EMF", *features, *stated), scales).features not in tried:
+            try_out(*features, *stated)
     for addition in ADDITIONS:
         best = min(tried.values(), key=lambda f: f.fit.cost).structure.features[1:]
         if addition not in best:

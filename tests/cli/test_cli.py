@@ -45,7 +45,7 @@ def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys, h
     joint = found["joints"]["LF_hip"]
     assert code == 0
     assert {
-        "model", "candidate_models", "lag", "presets", "delay_steps", "warnings"
+        "model", "candidate_models", "lag", "presets", "warnings"
     } <= set(joint)  # fmt: skip
     assert {
         "rmse_fresh_rad", "rmse_held_rad", "rmse_raw_rad", "rmse_leave_one_frequency_out_rad",

@@ -12,6 +12,7 @@ import yaml
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.operating_point import ARMATURES, OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sysid.compare import truth as module
@@ -64,8 +65,8 @@ def with_numbers(**numbers: Quantity):
     return made.model_copy(update={"joints": {JOINT: joint}})
 
 
-def truth_of(**changes: float) -> dict:
-    """Truth of one joint: stiffness over armature 12,000, loss 0.4, …"""
+def truth_of(step_s: float = TIME_STEP_S, **changes: float) -> dict:
+    """Truth of one joint in steps of the calibration's: stiffness 12,000, loss 0.4, …"""
     actuator = {
         "stiffness": 12.0, "damping": 0.1, "friction_loss": 0.2, "armature": 1e-3,
         "effort_limit": 0.4, "velocity_limit": 7.5, "dead_time_s": 0.025,
@@ -74,12 +75,12 @@ def truth_of(**changes: float) -> dict:
         "poll_period_s": 0.027, "loss": 0.4, "mean_age_s": 0.0315, "quantum_rad": math.pi / 550,
         "offset_rad": 0.003,
     }  # fmt: skip
-    parts = {"actuator": actuator, "feedback": feedback}
-    for part in parts.values():
+    parts: dict = {"actuator": actuator, "feedback": feedback}
+    for part in (actuator, feedback):
         part |= {k: v for k, v in changes.items() if k in part}
     if "back_emf" in changes:
         actuator["back_emf"] = changes["back_emf"]
-    return {"joints": {JOINT: parts}}
+    return {"joints": {JOINT: parts | {"physics_step_s": step_s}}}
 
 
 def quantity(value, low=None, high=None, identified="yes") -> Quantity:
@@ -111,7 +112,8 @@ def test_a_servo_with_back_emf_instead_of_a_speed_limit_is_compared_by_that():
 
 
 def test_the_true_dead_time_is_that_of_the_calibrations_physics_steps():
-    (row,) = [r for r in truth_table(with_numbers(), truth_of()) if r.quantity == "dead_time_s"]
+    truth = truth_of(step_s=0.001)
+    (row,) = [r for r in truth_table(with_numbers(), truth) if r.quantity == "dead_time_s"]
     # the emulator steps 1 ms, the calibration 2 ms: about half of the difference earlier
     assert 0.0 < row.truth - 0.025 < 0.002
 
@@ -181,6 +183,7 @@ BENCH = {
     "feedback": {"quantum_rad": 0.0015},
     "loaded_servo": {"armature_kg_m2": 0.011, "load_inertia_kg_m2": 0.002},
     "registers": {"p": 32},
+    "physics_step_s": TIME_STEP_S,
 }  # fmt: skip
 
 

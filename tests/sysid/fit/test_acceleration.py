@@ -13,7 +13,7 @@ from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
 
-LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.0004, 0.02, 600
+LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.0001, 0.02, 600
 JUMPS, CHIRP = "jumps", "chirp"
 
 
@@ -34,7 +34,7 @@ def recording(
     """What a random servo does, in counts; no load is stated."""
     time = LOOP_S * np.arange(ROWS)
     if motion == CHIRP:
-        command = 0.15 * np.sin(2 * np.pi * np.cumsum(np.linspace(0.2, 4.0, ROWS)) * LOOP_S)
+        command = 0.1 * np.sin(2 * np.pi * np.cumsum(np.linspace(0.2, 3.2, ROWS)) * LOOP_S)
     else:
         rng = np.random.default_rng(seed)
         command = np.repeat(rng.choice([-0.12, 0.12], ROWS // 30), 30)
@@ -45,8 +45,8 @@ def recording(
     count = 2 * np.pi / 4096
     table = pd.DataFrame(
         {
-            "send_time_s": time, "read_time_s": time + LOOP_S - 5 * STEP_S, "trial": 0, "joint": "j",
-            "frequency_hz": np.nan, "command_rad": command,
+            "send_time_s": time, "read_time_s": time + LOOP_S - 5 * STEP_S, "trial": 0,
+            "joint": "j", "frequency_hz": np.nan, "command_rad": command,
             "position_rad": np.round(moved / count) * count,
         }
     )  # fmt: skip

@@ -10,6 +10,7 @@ import pytest
 
 from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import (
@@ -18,6 +19,7 @@ from pupper_sysid.sysid.fit.calibration_file import (
     torque_anchors,
 )
 from pupper_sysid.sysid.fit.dead_time import lag
+from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
 from pupper_sysid.sysid.fit.results import plausible
 from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.recordings.files import load
@@ -51,13 +53,13 @@ def servo_recording(seed: int, frequencies=(1.0, 2.0, 3.0, 4.0)) -> Recording:
     rng, trials = np.random.default_rng(seed), []
     for trial in tone_trials(0.04, rng, frequencies, duration_s=3.0):
         start = trial.send_time_s[0]
-        steps = np.arange(0.0, 3.0, TIME_STEP_S)
+        steps = np.arange(0.0, 3.0, CONTINUOUS_S)
         row = np.clip(np.searchsorted(trial.send_time_s - start, steps, "right") - 1, 0, None)
-        motion = DelayedPD(TRUE).rollout(trial.command_rad[row])
+        motion = DelayedPD(TRUE, CONTINUOUS_S).rollout(trial.command_rad[row])
         polls = np.arange(rng.uniform(0, 0.02685), 3.0, 0.02685)
         polls = np.concatenate([[-1.0], polls[rng.random(len(polls)) >= 0.42]])
         seen = polls[np.searchsorted(polls, trial.read_time_s - start, "right") - 1]
-        position = np.interp(seen, steps + TIME_STEP_S, motion, left=0.0)
+        position = np.interp(seen, steps + CONTINUOUS_S, motion, left=0.0)
         trials.append(replace(trial, position_rad=np.round(position / 0.0057) * 0.0057))
     return recorded(trials)
 
@@ -76,8 +78,10 @@ def test_delayed_pd_is_recovered_from_lossy_readings(result):
     ratio = pd_fit.values["damping_per_s"] / pd_fit.values["stiffness_per_s2"]
     assert ratio == pytest.approx(100 / 12000, abs=2.5e-3)
     assert result.dead_time_s.low <= 0.025 <= result.dead_time_s.high
-    low, high = result.delay_steps
-    assert low <= 12.5 <= high and high - low <= 8
+    actuator = to_calibration({JOINT: result}, [], 0).joint(JOINT).actuator
+    # in steps of 2 ms the servo responds earlier by up to a step, so its delay is longer
+    low, high = actuator.delay_steps_min, actuator.delay_steps_max
+    assert low <= 13.5 and 12.5 <= high and high - low <= 8
     # friction and the speed limit only add to dead time and linear dynamics
     linear = 0.025 + 100 / 12000
     assert linear < result.lag.lag_s.value < linear + 0.015
@@ -185,7 +189,8 @@ def test_the_real_sweeps_reach_the_best_published_figures(real_sweeps):
         # either limit on the speed explains these tones: 18 to 20 ms with slew, 26 to 29 with
         # back-EMF
         assert len(plausible(own.structure_nats)) == 2
-        assert 0.013 <= own.dead_time_s.low <= 0.020 < 0.027 <= own.dead_time_s.high <= 0.038
+        assert 0.010 <= own.dead_time_s.low <= 0.020 < 0.027 <= own.dead_time_s.high <= 0.038
+        assert own.r_hat <= R_HAT and own.effective_draws >= EFFECTIVE
         assert 0.97 <= own.lag.by_frequency[-1].gain <= 1.06
         assert own.candidate_models["delayed_pd"].scores.rmse_held_rad <= held
         chosen = own.candidate_models[own.model].scores

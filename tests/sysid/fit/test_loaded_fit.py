@@ -26,7 +26,8 @@ TRUE = LoadedServoParameters(
     duty_per_rad=0.06, duty_s_per_rad=0.0, stall_torque=2.0, back_emf=0.28, armature=0.012,
     friction_loss=0.08, dead_time_s=0.014, off_brake=0.3,
 )  # fmt: skip
-STEP_S, LOOP_S = 0.002, 0.01
+STEP_S, LOOP_S = 0.0002, 0.01
+READ_S = 0.002  # after its command
 
 
 @cache
@@ -41,11 +42,11 @@ def recording(gain: float, seed: int = 0, steps: int = 300) -> Recording:
     servo.reset(0.0)
     per = round(LOOP_S / STEP_S)
     moved = servo.rollout(np.repeat(command, per), np.repeat(on, per))
-    position = np.concatenate([[0.0], moved])[1::per][:steps]
+    position = np.concatenate([[0.0], moved])[round(READ_S / STEP_S) :: per][:steps]
     time = LOOP_S * np.arange(steps)
     table = pd.DataFrame(
         {
-            "send_time_s": time, "read_time_s": time + STEP_S, "trial": 0, "joint": "knee",
+            "send_time_s": time, "read_time_s": time + READ_S, "trial": 0, "joint": "knee",
             "frequency_hz": np.nan, "command_rad": command, "torque_enabled": on,
             "position_rad": np.round(position * 4096 / (2 * np.pi)) * 2 * np.pi / 4096,
         }
@@ -77,6 +78,7 @@ def calibration(gains: tuple[float, ...] = (8.0, 32.0)) -> Calibration:
             "back_emf_nm_s_per_rad": known(0.28),
             "velocity_limit_rad_s": known(1000.0),
             "dead_time_s": known(0.014),
+            "numbers_in": "continuous time",
         }
     )
     block = UnderLoad(

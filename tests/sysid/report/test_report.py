@@ -287,8 +287,6 @@ def test_the_tables_have_the_numbers_of_the_result(written):
     for name, value in (("raw_lag_s", 0.081), ("stale_lag_s", 0.0275), ("dead_time_s_low", 0.0205),
                         ("dynamics_s", 0.020)):  # fmt: skip
         assert float(row[name]) == pytest.approx(value)
-    # 20.5 to 27.5 ms in steps of 2 ms, rounded outward
-    assert (row["delay_steps_min"], row["delay_steps_max"]) == ("10", "14")
     tones = rows_of(written, "by_frequency")
     assert [float(r["frequency_hz"]) for r in tones] == [1.0, 2.0]
     assert float(tones[1]["phase_deg"]) == pytest.approx(-30.0)
@@ -303,9 +301,11 @@ def test_the_tables_have_the_numbers_of_the_result(written):
     parameters = {(r["part"], r["parameter"]): r for r in rows_of(written, "parameters")}
     delay = parameters["actuator", "dead_time_s"]
     assert (float(delay["value"]), float(delay["low"]), delay["unit"]) == (0.024, 0.0205, "s")
-    # stiffness = ratio × armature, and armature = stall torque / effort ratio: 9000 × 0.35 / 450
+    # stiffness = ratio × armature, and armature = stall torque / effort ratio
+    nominal = {p.name: p.nominal for p in candidate("delayed_pd").parameters}
+    expected = nominal["stiffness_per_s2"] * 0.35 / nominal["effort_rad_s2"]
     stiffness = parameters["actuator", "stiffness_nm_per_rad"]
-    assert float(stiffness["value"]) == pytest.approx(7.0)
+    assert float(stiffness["value"]) == pytest.approx(expected)
     assert stiffness["identified"] == "ratio only"
     assert parameters["actuator", "effort_limit_nm"]["identified"] == "no"
 
