@@ -13,7 +13,7 @@ from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
 
-LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.0004, 0.02, 600
+LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.0004, 0.02, 450
 JUMPS, CHIRP = "jumps", "chirp"
 
 

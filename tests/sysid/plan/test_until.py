@@ -81,8 +81,9 @@ def test_rounds_end_when_two_of_them_did_not_help(tmp_path):
 
 
 def test_rounds_end_where_a_plan_promises_nothing(tmp_path):
-    robot = Robot(tmp_path, {"LF_hip": [1.66]})
-    outcome = robot.run(1.65)
+    least_ms = 1e3 * LEAST_HALF_WIDTH_S
+    robot = Robot(tmp_path, {"LF_hip": [1.02 * least_ms]})
+    outcome = robot.run(1.01 * least_ms)
     assert robot.plans == [] and "no trial within the limits" in outcome.joints["LF_hip"].why
 
 
