@@ -60,7 +60,7 @@ from wide_servo import (
 
 import pupper_sysid as ps
 
-JOINT = "servo"
+JOINT = "knee"
 RATIOS = ("stiffness", "damping", "back_emf", "damping_sum", "friction_loss", "effort_limit")
 QUANTITIES = ("dead_time_s", *RATIOS, "speed_limit", "acceleration_limit", "offset_rad")
 DIFFERENCES = {"dead_time_s": (1e3, "ms"), "offset_rad": (1e3, "mrad"), "lag": (1e3, "ms")}

@@ -119,6 +119,9 @@ def sample(
         drawn = mixture.draw(_POPULATION, rng)
         own = _tempered(problem, drawn, temperature)
         first = int(np.argmin(own))
+        if not np.isfinite(own[first]):  # all beyond the bounds
+            mixture = replace(mixture, roots=0.5 * mixture.roots)
+            continue
         if own[first] < least - _BETTER and turn < rounds // 2:  # an optimum beside: begin there
             fit = local(problem, drawn[first : first + 1], _DATE_ITERATIONS, _CURVATURE_STEP)[0]
             least = float(_tempered(problem, fit.point[None], temperature)[0])
@@ -152,7 +155,7 @@ def _tempered(problem: Problem, points: NDArray, temperature: float) -> NDArray[
     if inside.any():
         prior = problem.prior(points[inside])
         cost[inside] = (problem.costs(points[inside]) - prior) / temperature + prior
-    return cost
+    return np.where(np.isfinite(cost), cost, np.inf)
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,7 @@ class _Mixture:
         cost = _tempered(problem, np.concatenate([centres, ends]), temperature)
         middle, ends = cost[: len(centres)], cost[len(centres) :].reshape(-1, 2, k)
         rise = ends.sum(axis=1) - 2.0 * middle[:, None]  # 1 of a normal distribution
+        rise = np.where(np.isfinite(rise), rise, _RISE[1])
         sizes = np.minimum(sizes / np.sqrt(np.clip(rise, *_RISE)), _WIDEST)
         return cls(centres, axes * (_OVERDISPERSED * sizes)[:, None, :])
 
