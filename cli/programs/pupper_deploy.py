@@ -26,6 +26,7 @@ from pupper_sysid.cli.policy_choice import (
     show_match,
     show_servos,
     trained_actuator,
+    trained_commands,
 )
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
@@ -43,6 +44,8 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
+    from pupper_sysid.policies.deploy.commands import Commands
+    from pupper_sysid.policies.network.policy_file import CommandRanges
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -87,7 +90,8 @@ class Deploy:
     rate: float | None = None
     """Hz of the loop, instead of the policy's own; its time then runs faster or slower."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
-    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    """Forward and sideways speed [m/s], turn rate [rad/s]. Commands, also of --script and
+    --keyboard, are clipped to what the policy was trained for."""
     script: Path | None = None
     """CSV of commands with the columns seconds,forward_m_s,left_m_s,turn_rad_s, one after the
     other, instead of --command."""
@@ -165,13 +169,15 @@ def _run(options: Deploy) -> None:
     if options.replay:
         _replay(options.replay, policy)
         return
+    trained = trained_commands(policy, run)
+    commands = _commands(options, trained)
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
     with ExitStack() as open_things:
         bus, imu, joint_map, truth = _open(options, open_things)
         actuator = chosen_actuator(options.policy, policy, run, options.actuator)
-        trained, known = trained_actuator(options.policy, policy, run)
+        of_training, known = trained_actuator(options.policy, policy, run)
         parts = assemble(
-            policy, stack, joint_map, actuator, options.servo, trained if known else None
+            policy, stack, joint_map, actuator, options.servo, of_training if known else None
         )
         if stack.observer == "readings" and options.actuator is None:
             err.print(
@@ -192,9 +198,24 @@ def _run(options: Deploy) -> None:
             show_servos(match, policy.contract.servo is not None)
         header = parts.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
-            "servo_match": match and match.to_dict(),
+            "servo_match": match and match.to_dict(), "commands": trained.model_dump(mode="json"),
         }  # fmt: skip
-        _walk(options, bus, imu, parts, header, folder, truth)
+        _walk(options, bus, imu, parts, commands, header, folder, truth)
+
+
+def _commands(options: Deploy, trained: CommandRanges) -> Commands:
+    """Commands within what the policy was trained for."""
+    from pupper_sysid.cli.drive import Driver
+    from pupper_sysid.policies.deploy.commands import constant, script
+
+    say = partial(err.print, soft_wrap=True)
+    if options.keyboard:
+        return Driver(trained)
+    return (
+        script(options.script, trained, say)
+        if options.script
+        else constant(options.command, trained, say)
+    )
 
 
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
@@ -276,17 +297,15 @@ def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
 
 
 def _walk(
-    options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, header: dict[str, Any],
-    folder: Path, truth: Any,
+    options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, commands: Commands,
+    header: dict[str, Any], folder: Path, truth: Any,
 ) -> None:  # fmt: skip
     """Walk, log, and show the result."""
     from pupper_sysid.cli.drive import Driver
-    from pupper_sysid.policies.deploy.commands import constant, script
     from pupper_sysid.policies.deploy.deployment import deploy
     from pupper_sysid.policies.deploy.emulated_walk import ERRORS, WalkScore
     from pupper_sysid.sysid.recordings.files import RecordingWriter
 
-    commands = script(options.script) if options.script else constant(options.command)
     score = WalkScore(bus, truth) if truth else None
     log, table = folder / "walk.csv", folder / "recording.csv"
     about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
@@ -296,9 +315,9 @@ def _walk(
         if options.bus != EMULATED:
             err.print(f"Running with {priority}.")
         watchers: list[Any] = [parts.frozen_readings, *([score] if score else [])]
-        if options.keyboard:
-            driver = open_things.enter_context(Driver().driving())
-            commands, watchers = driver, [*watchers, driver.watch]
+        if isinstance(commands, Driver):
+            open_things.enter_context(commands.driving())
+            watchers.append(commands.watch)
         if options.live:
             watchers += _live(open_things, bus)
         if options.views:
@@ -338,13 +357,14 @@ def _walk(
         "guard": outcome.guard,
         "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},
         "servo_match": header["servo_match"],
+        "commands": header["commands"],
         "log": str(log),
     }  # fmt: skip
     if options.json:
         print_json(found)
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
-    del found["servo_match"]  # it was shown before the walk
+    del found["servo_match"], found["commands"]  # shown before the walk, where they matter
     for key, value in found.items():
         shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)
