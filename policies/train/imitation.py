@@ -9,6 +9,7 @@ contain nothing of the teacher.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from itertools import chain
 
 import numpy as np
@@ -20,15 +21,29 @@ from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.teachers import Teacher
 
 
-def imitate(learner: Learner, teacher: Teacher, how: Imitation, round_: int) -> float:
+def imitate(
+    learner: Learner,
+    teacher: Teacher,
+    how: Imitation,
+    round_: int,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> float | None:
     """One round: act, query the teacher, learn; root mean square difference to it.
 
     In early rounds the teacher acts in some environments, so that the data contain a walk; once the
     policy walks alone, its speeds correct the teacher's commands.
+
+    Returns None where a stop was requested within the round, which then is incomplete: the policy
+    plays, but learning goes on from what was saved before.
     """
     ppo = learner.ppo
     share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
-    rollouts = [_shown(learner, teacher, share) for _ in range(how.rollouts)]
+    rollouts = []
+    for _ in range(how.rollouts):
+        rollout = _shown(learner, teacher, share, stop_requested)
+        if rollout is None:
+            return None
+        rollouts.append(rollout)
     teacher.adapt(0.0 if share else how.correction_rate)
     networks = (ppo.actor, ppo.critic)
     for rollout in rollouts:
@@ -46,6 +61,8 @@ def imitate(learner: Learner, teacher: Teacher, how: Imitation, round_: int) -> 
     optimisers = _optimisers([p for n in networks for p in n.parameters() if p.requires_grad])
     errors = []
     for step, batch in enumerate(ordered):
+        if stop_requested():
+            return None
         done = (round_ + step / steps) / how.iterations
         for optimiser in optimisers:
             for group in optimiser.param_groups:
@@ -65,8 +82,10 @@ def imitate(learner: Learner, teacher: Teacher, how: Imitation, round_: int) -> 
     return float(np.sqrt(np.mean(errors[-parts * how.rollouts :])))
 
 
-def _shown(learner: Learner, teacher: Teacher, share: float) -> RolloutStorage:
-    """One rollout, with the teacher's actions in place of those taken.
+def _shown(
+    learner: Learner, teacher: Teacher, share: float, stop_requested: Callable[[], bool]
+) -> RolloutStorage | None:
+    """One rollout, with the teacher's actions in place of those taken; None if it was stopped.
 
     The teacher acts for a share of the robots.
     """
@@ -76,6 +95,8 @@ def _shown(learner: Learner, teacher: Teacher, share: float) -> RolloutStorage:
     targets: list[torch.Tensor] = []
     with torch.inference_mode():
         for _ in range(learner.hyper.steps_per_environment):
+            if stop_requested():
+                return None
             shown = teacher.actions(learner.observations)
             targets.append(shown)
             centre = learner.act() - learner.env.noise

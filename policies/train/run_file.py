@@ -70,7 +70,8 @@ class Run:
     iterations: int = 400
     """Updates of PPO, after imitation; training ends when they are done."""
     minutes: float = 120.0
-    """Training ends after this time, too."""
+    """Training ends after this time, too, of which the first gait and a teacher are parts; the
+    policy so far is saved and plays."""
     threads: int = 0
     """Of physics and of torch, each; 0 for all cores (one per process with torchrun)."""
     device: Device = "cpu"

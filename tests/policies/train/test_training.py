@@ -14,18 +14,21 @@ import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from pupper_sysid.cli.policy_choice import policy_at
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.checkpoint import read_checkpoint
 from pupper_sysid.policies.train.curves import PROGRESS
+from pupper_sysid.policies.train.imitation import imitate
 from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import load_run
@@ -234,10 +237,52 @@ def test_a_termination_signal_ends_a_long_update_within_a_second(tmp_path):
     train(tmp_path / "run", None)
 
 
-def test_time_that_is_up_ends_a_run_with_everything_saved(tmp_path):
+def test_time_that_is_up_ends_a_run_within_its_first_gait_with_a_policy_that_plays(tmp_path):
     train(tmp_path, tiny_run(minutes=0.001))
     found = read_checkpoint(tmp_path / LAST)
-    assert found["iteration"] == 0 and found["more"]["imitated"] == 2
+    assert found["iteration"] == 0 and found["more"]["imitated"] < 2
+    policy, _ = policy_at(tmp_path)
+    policy.reset(np.zeros((1, 12)))
+    assert np.isfinite(policy.act(np.zeros((1, 60)))).all()
+
+
+def test_a_round_that_was_left_is_repeated_and_the_run_is_that_without_a_stop(
+    tmp_path, uninterrupted, monkeypatch
+):
+    def left_in_the_second_round(learner, teacher, how, round_, ends):
+        steps = count()
+        late = round_ == 1
+        return imitate(learner, teacher, how, round_, lambda: late and next(steps) > 6)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "imitate", left_in_the_second_round)
+        train(tmp_path, tiny_run())
+    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 1
+    # seven steps: the rollout was whole, and one minibatch was learned from
+    weights = load_policy(tmp_path / "policy_last").network.state_dict()
+    kept = read_checkpoint(tmp_path / LAST)["actor_state_dict"]
+    assert not torch.equal(weights["mlp.0.weight"], kept["mlp.0.weight"])
+    train(tmp_path, None)
+    straight = read_checkpoint(uninterrupted() / LAST)
+    assert different(straight, read_checkpoint(tmp_path / LAST)) == []
+
+
+def test_the_last_policy_is_on_disk_after_each_round_of_imitation(tmp_path):
+    rounds = []
+
+    def watch(now):
+        if now.phase == "ppo":
+            rounds.append(load_policy(tmp_path / "policy_last").contract.training)
+
+    train(tmp_path, tiny_run(iterations=1), watch)
+    assert [r["imitation_rounds"] for r in rounds] == [2]
+
+
+def test_time_before_a_run_counts(tmp_path):
+    train(tmp_path, tiny_run(minutes=60.0), stop_after("imitation", 1), spent_s=100.0)
+    assert read_checkpoint(tmp_path / LAST)["more"]["elapsed_s"] > 100.0
+    train(tmp_path / "late", tiny_run(minutes=60.0), spent_s=3600.0)
+    assert read_checkpoint(tmp_path / "late" / LAST)["more"]["imitated"] == 0
 
 
 def test_a_watcher_is_told_where_the_run_stands(tmp_path):
