@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
     from pupper_sysid.policies.deploy.commands import Commands
     from pupper_sysid.policies.network.policy_file import CommandRanges
+    from pupper_sysid.sim.emulator.robot import EmulatedRobot
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -77,8 +78,9 @@ class Deploy:
     servo: Path | None = None
     """Servo model's folder, for `lstm-servo`."""
     actuator: str | None = None
-    """Calibration of this robot, for `mlp-observer` and for a comparison with the policy's training
-    before the start; by default that of the training."""
+    """Calibration of this robot: an emulated one has its servos; on any, for `mlp-observer` and for
+    a comparison with the policy's training before the start. By default that of the training, and
+    for an emulated robot servos drawn from published measurements."""
     observer: ObserverKind | None = None
     """Instead of the stack's."""
     lowpass_hz: float | None = None
@@ -248,11 +250,10 @@ def _changes(options: Deploy) -> dict[str, Any]:
 def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:
     """Bus, IMU, joint map, and the emulated robot if it is one."""
     if options.bus == EMULATED:
-        from pupper_sysid.sim.emulator.robot import draw_robot
         from pupper_sysid.sim.walking.bus import WalkingBus
 
         rng = np.random.default_rng(options.seed)
-        inner = WalkingBus(draw_robot(rng), rng, real_time=options.in_real_time)
+        inner = WalkingBus(_emulated(options, rng), rng, real_time=options.in_real_time)
         bus = open_things.enter_context(closing(GuardedBus(inner)))
         return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
     address = parse_address(options.bus)
@@ -267,6 +268,26 @@ def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, Joi
         return bus, bus.bus, joint_map, None
     other = open_things.enter_context(closing(Esp32Bus(options.imu or SOCKET)))
     return bus, other, joint_map, None
+
+
+def _emulated(options: Deploy, rng: np.random.Generator) -> EmulatedRobot:
+    """An emulated robot with the user's servos, else with published ones."""
+    from pupper_sysid.sim.emulator.robot import draw_robot
+    from pupper_sysid.sim.walking.bus import calibrated_robot
+    from pupper_sysid.sim.walking.servo_ranges import check_actuator, is_servo_model, servo_ranges
+
+    if options.actuator is None:
+        return draw_robot(rng)
+    check_actuator(options.actuator)
+    if is_servo_model(options.actuator):
+        err.print(
+            f"{options.actuator} is a learned model, which the emulated robot cannot have: its "
+            "servos are drawn from published measurements.",
+            soft_wrap=True,
+        )
+        return draw_robot(rng)
+    err.print(f"The emulated robot has the servos of {options.actuator}.", soft_wrap=True)
+    return calibrated_robot(servo_ranges(options.actuator), rng)
 
 
 def _replay(path: Path, policy: Any) -> None:
