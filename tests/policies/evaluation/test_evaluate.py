@@ -19,8 +19,14 @@ from pupper_sysid.policies.evaluation.evaluate import (
     walk,
 )  # fmt: skip
 from pupper_sysid.policies.evaluation.falls import in_short
-from pupper_sysid.policies.evaluation.figures import figures_of, share_interval
-from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, evaluation_task
+from pupper_sysid.policies.evaluation.figures import Recorder, figures_of, share_interval
+from pupper_sysid.policies.walks.conditions import (
+    DIRECTIONS,
+    RANDOM,
+    Condition,
+    evaluation_task,
+)
+from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Curriculum, Walking
@@ -74,12 +80,10 @@ def test_a_fall_counts_once_and_its_error_is_that_of_standing_to_the_end_of_the_
 
 
 def test_a_trot_clears_the_ground_and_works_and_a_standing_robot_does_neither():
-    task = evaluation_task(Walking(), 2.5)
-    servos, forward = servo_ranges(CALIBRATION), (0.15, 0.0, 0.0)
-    trot, still = (
-        figures_of(walk(None, task, servos, 4, 3, forward, threads=1, walker=walker), forward)
-        for walker in ("trot", "standing")
-    )
+    task, forward = evaluation_task(Walking(), 2.0), (0.15, 0.0, 0.0)
+    both = [Condition(task, 2, forward, walker=walker) for walker in ("trot", "standing")]
+    walks = walk_together(None, servo_ranges(CALIBRATION), both, 2.0, 3, 1, Recorder)
+    trot, still = (figures_of(walked, forward) for walked in walks)
     # no foot rises above the lift of its set-points, but for what the trunk rocks
     assert 0.0 < trot.clearance_p10_m < trot.clearance_p50_m < 1.5 * Trot().lift_m
     assert 0.0 <= trot.low_swing_share < 0.5
