@@ -150,15 +150,13 @@ def _run(options: Options, given: list[str]) -> None:
         refuse_taken(folder)
         run = _with_first_gait(run, ranks)
     with _bar() as watch:
+        notice = (lambda text: warn([text])) if ranks.rank == 0 else (lambda text: None)
         stopping = (lambda text: err.print(text)) if ranks.rank == 0 else (lambda text: None)
         if options.resume:
-            learner = train(
-                folder, None, watch, *_extension(options, given), lambda text: warn([text]),
-                stopping,
-            )  # fmt: skip
+            learner = train(folder, None, watch, *_extension(options, given), notice, stopping)
         else:
             spent_s = time.monotonic() - begun
-            learner = train(folder, run, watch, stopping=stopping, spent_s=spent_s)
+            learner = train(folder, run, watch, notice=notice, stopping=stopping, spent_s=spent_s)
     if ranks.rank > 0:
         return
     on = (

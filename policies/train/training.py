@@ -49,6 +49,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 LAST, BEST = "last.pt", "best.pt"
 _TEACHER, _POLICY_LAST = "teacher", "policy_last"
 _SAVE_EVERY = 10
+_IMITATING, _FEWEST_ROUNDS = 0.75, 3  # of the time after a first round; rounds of imitation
 _JUDGE_EVERY = 50
 
 
@@ -149,7 +150,7 @@ def train(
     iterations, minutes : optional
         New end of a resumed run.
     notice : callable
-        Called with a sentence where a run does not go on exactly.
+        Called with a sentence where a run does not go on exactly, or its time is short.
     stopping : callable
         Called after the first Ctrl-C with what it does.
     spent_s : float
@@ -165,7 +166,7 @@ def train(
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run
     with finishing(stopping) as stop_requested:
-        session = _Session(folder, settings, resumed, watch, spent_s)
+        session = _Session(folder, settings, resumed, watch, spent_s, notice)
         if not session.learner.exact and session.ranks.rank == 0:
             notice(
                 f"{folder} was begun with another model of the robot, by an older version: it goes "
@@ -186,7 +187,9 @@ class _Session:
         resumed: bool,
         watch: Callable[[Progress], None] | None,
         spent_s: float = 0.0,
+        notice: Callable[[str], None] = lambda text: None,
     ):
+        self.notice = notice
         begun = time.monotonic()
         self.ranks = Ranks.join()
         self.folder, self.watch = folder, watch
@@ -240,24 +243,49 @@ class _Session:
 
     def learn_first_gait(self, ends: Callable[[], bool]) -> bool:
         """The remaining rounds of imitation; whether all that was learned is in a checkpoint."""
-        learner, rounds = self.learner, self.run.imitation.iterations
-        if self.counters["imitated"] >= rounds or ends():
+        learner = self.learner
+        if self.counters["imitated"] >= self.rounds or ends():
             return True
         teacher = self.teacher(ends)
         self.phase_began = time.monotonic()
-        while teacher and self.counters["imitated"] < rounds and not ends():
-            before = learner.networks()
-            error = imitate(learner, teacher, self.run.imitation, self.counters["imitated"], ends)
+        while teacher and self.counters["imitated"] < self.rounds and not ends():
+            before, begun = learner.networks(), time.monotonic()
+            how = replace(self.run.imitation, iterations=self.rounds)
+            error = imitate(learner, teacher, how, self.counters["imitated"], ends)
             if error is None:
                 self.refuse_nan(before, [])
                 return False
             self.refuse_nan(before, [error])
             self.counters["imitated"] += 1
             self.counters["teacher"] = teacher.state
-            self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
+            if self.counters["imitated"] == 1:
+                self.plan_rounds(time.monotonic() - begun)
+            self.report("imitation", self.counters["imitated"], self.rounds, {"difference": error})
             self.save(LAST)
             self.write_policy(_POLICY_LAST)
         return True
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of imitation; fewer than the run's where its minutes are too few for them."""
+        return self.counters.get("rounds", self.run.imitation.iterations)
+
+    def plan_rounds(self, round_s: float) -> None:
+        """After the first of its rounds, plan as many as most of the time is enough for.
+
+        The learning rate falls to 0 with the last round: one that was cut off would walk worse than
+        one of fewer rounds.
+        """
+        wanted = self.run.imitation.iterations
+        remaining_s = 60 * self.run.minutes - (time.monotonic() - self.started)
+        fit = 1 + int(_IMITATING * remaining_s / max(self.ranks.mean(round_s), 1e-9))
+        planned = int(self.ranks.mean(max(fit, _FEWEST_ROUNDS)))
+        if planned < wanted:
+            self.counters["rounds"] = planned
+            self.notice(
+                f"A round of the first gait takes {round_s:.0f} s, so that {planned} of {wanted} "
+                f"are made within --minutes {self.run.minutes:g}."
+            )
 
     def teacher(self, ends: Callable[[], bool]) -> Teacher | None:
         """What shows the first gait; a teacher of the run's own is trained first, or to its end.
@@ -298,7 +326,7 @@ class _Session:
 
     def improve(self, ends: Callable[[], bool]) -> None:
         """Updates of PPO, until they are done, time is up or a stop is requested."""
-        if self.counters["imitated"] < self.run.imitation.iterations:
+        if self.counters["imitated"] < self.rounds:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
         if ends():

@@ -278,6 +278,27 @@ def test_the_last_policy_is_on_disk_after_each_round_of_imitation(tmp_path):
     assert [r["imitation_rounds"] for r in rounds] == [2]
 
 
+def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero_with_the_last(
+    tmp_path, monkeypatch
+):
+    rates, said = [], []
+
+    def slow(learner, teacher, how, round_, ends):
+        rates.append(how.iterations)
+        training.time.sleep(0.1)
+        return imitate(learner, teacher, how, round_, ends)
+
+    monkeypatch.setattr(training, "imitate", slow)
+    run = tiny_run(imitation=Imitation(40, rollouts=1, epochs=1, minibatches=2), minutes=0.02)
+    train(tmp_path, run, stop_after("imitation", 3), notice=said.append)
+    planned = read_checkpoint(tmp_path / LAST)["more"]["rounds"]
+    # 1.2 s are enough for twelve rounds of 0.1 s, of which three quarters are for imitation
+    assert 3 <= planned <= 12 and rates == [40, planned, planned]
+    assert len(said) == 1 and f"{planned} of 40 are made within --minutes 0.02" in said[0]
+    train(tmp_path, None, stop_after("ppo", 1), minutes=60.0)
+    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == planned
+
+
 def test_time_before_a_run_counts(tmp_path):
     train(tmp_path, tiny_run(minutes=60.0), stop_after("imitation", 1), spent_s=100.0)
     assert read_checkpoint(tmp_path / LAST)["more"]["elapsed_s"] > 100.0
