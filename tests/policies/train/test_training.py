@@ -292,13 +292,13 @@ def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero
     monkeypatch.setattr(training, "imitate", slow)
     ticking = SimpleNamespace(monotonic=lambda: clock.now_s, perf_counter=time.perf_counter)
     monkeypatch.setattr(training, "time", ticking)
-    run = tiny_run(imitation=Imitation(40, rollouts=1, epochs=1, minibatches=2), minutes=2.0)
-    train(tmp_path, run, stop_after("imitation", 3), notice=said.append)
-    # of the 110 s after the first round three quarters are enough for eight of 10 s
-    assert read_checkpoint(tmp_path / LAST)["more"]["rounds"] == 9 and rates == [40, 9, 9]
-    assert len(said) == 1 and "9 of 40 are made within --minutes 2" in said[0]
-    train(tmp_path, None, stop_after("ppo", 1), minutes=60.0)
-    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 9 and set(rates[3:]) == {9}
+    run = tiny_run(imitation=Imitation(40, rollouts=1, epochs=1, minibatches=2), minutes=1.0)
+    train(tmp_path, run, stop_after("imitation", 2), notice=said.append)
+    # of the 50 s after the first round three quarters are enough for three of 10 s
+    assert read_checkpoint(tmp_path / LAST)["more"]["rounds"] == 4 and rates == [40, 4]
+    assert len(said) == 1 and "4 of 40 are made within --minutes 1" in said[0]
+    train(tmp_path, None, stop_after("imitation", 4), minutes=60.0)
+    assert rates == [40, 4, 4, 4]
 
 
 def test_time_before_a_run_counts(tmp_path):
