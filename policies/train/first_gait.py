@@ -46,6 +46,8 @@ POOR_SCORE = 0.6
 """Score below which a trot is fitted to the servos; on the shipped calibration it has 0.7."""
 FORWARD = (0.9, 1.1)
 """Shares of the commanded forward speed within which a trot need not be fitted."""
+LOW_SWINGS = 0.25
+"""Share of low swings above which a trot is fitted."""
 
 _SEED = 4_000_037  # of robots that neither trainings nor judges nor evaluations have
 _SECONDS, _IGNORED_S = 4.0, 1.0
@@ -93,7 +95,7 @@ _LIMITS: dict[str, dict[str, float]] = {
     "dead time": {"dead_time_s": 0.3},
 }
 """Factors on the servos' numbers that take away one of their limits."""
-_WORTH = 0.03  # of the score: less is not what limits a gait
+_WORTH = 0.05  # of the merit: less is not what limits a gait
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +126,7 @@ class GaitScore(Result):
     def poor(self) -> bool:
         """Whether a better gait is to be searched."""
         fits = FORWARD[0] <= self.forward_share <= FORWARD[1]
-        return self.score < POOR_SCORE or not fits
+        return self.score < POOR_SCORE or not fits or self.low_swing_share > LOW_SWINGS
 
     def __str__(self) -> str:
         return (
@@ -211,8 +213,8 @@ def _sentence(found: FirstGait) -> str:
     }
     why = f" What limits it most is {because[limit]}." if limit else ""
     return (
-        f"These servos do not walk at the commanded speeds with an open-loop trot.{why} Training "
-        "goes on from this gait; commands of less speed (--task.commands.forward-m-s) are easier."
+        f"These servos carry no better open-loop trot than this.{why} Training begins with it; "
+        "commands of less speed (--task.commands.forward-m-s -0.1 0.1) are easier."
     )
 
 
@@ -530,7 +532,11 @@ def _limit(
     """Which of the servos' limits the trot would walk best without; None if that is of no use."""
     if servo_model_of(servos.source, task.control_step_s) is not None:
         return None  # a learned model has no numbers
-    names = list(_LIMITS)
-    scores = judge_trots([trot] * len(names), task, servos, seed, threads, list(_LIMITS.values()))
-    best = int(np.argmax([s.score for s in scores]))
-    return names[best] if scores[best].score > own.score + _WORTH else None
+    names, changes = list(_LIMITS), list(_LIMITS.values())
+    walked = _judged([trot] * len(names), task, servos, seed, threads, changes)
+    # servos without a limit go farther than the gains expect, which says nothing against them
+    trots = [_corrected(trot, one) for one in walked]
+    walked = _judged(trots, task, servos, seed, threads, changes)
+    merits = [_merit(_score(one)) for one in walked]
+    best = int(np.argmax(merits))
+    return names[best] if merits[best] > _merit(own) + _WORTH else None

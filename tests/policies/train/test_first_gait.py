@@ -160,6 +160,7 @@ def test_a_poor_gait_is_searched_where_there_is_time_and_the_user_reads_why(monk
         (GOOD, tiny_run(first_gait="fit"), True, "2.5 Hz, duty 0.70, lift 20 mm"),
         (replace(GOOD, forward_share=0.85), tiny_run(), True, "Searching"),
         (replace(GOOD, forward_share=1.2), tiny_run(), True, "Searching"),
+        (replace(GOOD, low_swing_share=0.4), tiny_run(), True, "Searching"),
     )
     for judged, run, searched, sentence in cases:
         own[:], said = [judged], list[str]()
