@@ -49,6 +49,9 @@ FORWARD = (0.9, 1.1)
 LOW_SWINGS = 0.25
 """Share of low swings above which a trot is fitted."""
 
+_FORWARD_M_S, _TURN_RAD_S = 0.15, 0.4
+_LARGEST = np.array([0.2, 0.1, 0.5])
+"""Commands of a usual task, within which those of the walks are [m/s, m/s, rad/s]."""
 _SEED = 4_000_037  # of robots that neither trainings nor judges nor evaluations have
 _SECONDS, _IGNORED_S = 4.0, 1.0
 _EACH = 2  # robots per command of the judge
@@ -106,9 +109,13 @@ class GaitScore(Result):
     """That of `policies.train.selection.Judge`: 1 without errors, 0 for a robot that stands."""
     falls: float
     forward_share: float
-    """Mean forward speed at 0.15 m/s over that."""
+    """Mean forward speed over the commanded `forward_m_s`."""
     turn_share: float
-    """Mean turn rate at 0.4 rad/s on the spot over that."""
+    """Mean turn rate on the spot over the commanded `turn_rad_s`."""
+    forward_m_s: float = _FORWARD_M_S
+    """Or three quarters of the largest command of the task, where that is less."""
+    turn_rad_s: float = _TURN_RAD_S
+    """Or four fifths of the largest."""
     speed_error_m_s: float
     """Mean distance of the velocity from the commanded one of robots that are to move."""
     mean_speed_error_m_s: float
@@ -130,8 +137,9 @@ class GaitScore(Result):
 
     def __str__(self) -> str:
         return (
-            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of 0.15 m/s forward, "
-            f"{100 * self.turn_share:.0f} % of 0.4 rad/s on the spot, {100 * self.falls:.0f} % "
+            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of {self.forward_m_s:g} m/s "
+            f"forward, {100 * self.turn_share:.0f} % of {self.turn_rad_s:g} rad/s on the spot, "
+            f"{100 * self.falls:.0f} % "
             f"fell; clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
             f"{100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "
             f"torque limit {100 * self.saturated_share:.0f} % of the time"
@@ -298,7 +306,14 @@ def fit_trot(
             drawn[half:] = _LOW + (strata + rng.random(strata.shape)) / half * (_HIGH - _LOW)
         trots = [_trot(task.trot, values) for values in drawn]
         walked = _walk(
-            trots, quick, servos, _SEARCH_COMMANDS, _SEARCH_S, _SEARCH_IGNORED_S, seed, threads
+            trots,
+            quick,
+            servos,
+            _within(task, _SEARCH_COMMANDS),
+            _SEARCH_S,
+            _SEARCH_IGNORED_S,
+            seed,
+            threads,
         )
         costs = [_cost(one) for one in walked]
         order = np.argsort(costs, kind="stable")[:_ELITE]
@@ -332,16 +347,30 @@ def _judged(
     trots: Sequence[Trot], task: Walking, servos: ServoRanges, seed: int, threads: int,
     changes: Sequence[dict[str, float]] = (),
 ) -> list[_Walked]:  # fmt: skip
+    command = _within(task, np.repeat(COMMANDS, _EACH, axis=0))
     return _walk(
-        trots, _gentle(task, _SECONDS), servos, np.repeat(COMMANDS, _EACH, axis=0), _SECONDS,
-        _IGNORED_S, seed, threads, changes,
+        trots, _gentle(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
+        changes,
     )  # fmt: skip
+
+
+def _within(task: Walking, commands: Array) -> Array:
+    """Commands as far within the ranges of a task as they are within usual ones."""
+    return commands * _scale(task)
+
+
+def _scale(task: Walking) -> Array:
+    """Largest commands of a task over usual ones, at most 1, of each part."""
+    own = task.commands
+    ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
+    return np.minimum(ends / _LARGEST, 1.0)
 
 
 def _gentle(task: Walking, seconds: float) -> Walking:
     """The task as it is evaluated, on the servos themselves: their scale is not drawn."""
     found = evaluation_task(task, 2 * seconds)  # longer, so that no episode ends but by a fall
-    return replace(found, randomisation=replace(found.randomisation, torque_scale=(1.0, 1.0)))
+    random = replace(found.randomisation, torque_scale=(1.0, 1.0))
+    return replace(found, commands=task.commands, randomisation=random)
 
 
 def _quick(task: Walking, servos: ServoRanges) -> Walking:
@@ -372,6 +401,8 @@ def _trot(begun: Trot, values: Array) -> Trot:
 class _Walked:
     """Robots with one trot, those of `command`, without the start."""
 
+    scale: Array
+    """Of the commands, over usual ones; shape (3,)."""
     command: Array
     velocity: Array
     """Shape (steps, n, 3)."""
@@ -391,7 +422,7 @@ def _walk(
     ignored_s: float, seed: int, threads: int, changes: Sequence[dict[str, float]] = (),
 ) -> list[_Walked]:  # fmt: skip
     """Walk with every trot on the same robots, one for each row of `command`."""
-    n, count = len(command), len(trots)
+    n, count, scale = len(command), len(trots), _scale(task)
     step_s = task.control_step_s
     steps, first = round(seconds / step_s), round(ignored_s / step_s)
     number = np.tile(np.arange(n), count)
@@ -428,7 +459,7 @@ def _walk(
         clearance = own["clearance"][walks]
         found.append(
             _Walked(
-                command, own["velocity"], own["stride"], own["up"],
+                scale, command, own["velocity"], own["stride"], own["up"],
                 clearance[np.isfinite(clearance)],
                 _mean(own["saturated"][walks][:, 1:]), _mean(own["square"][walks]),
                 _mean(own["sway"][walks] ** 2) ** 0.5,
@@ -460,21 +491,30 @@ def _shown(one: _Walked) -> tuple[Array, Array]:
 
 
 def _share(one: _Walked, chosen: NDArray[np.bool_]) -> float:
-    """Mean motion of some robots along their commands, over these: least squares."""
+    """Mean motion of some robots along their commands, over these: least squares; 1 of none."""
     mean, wanted = _shown(one)[0].mean(axis=0)[chosen], one.command[chosen]
-    return float((mean * wanted).sum() / (wanted**2).sum())
+    size = float((wanted**2).sum())
+    return float((mean * wanted).sum()) / size if size else 1.0
+
+
+def _relative(one: _Walked) -> dict[str, float]:
+    """Score of walks as if their commands were usual ones, and their errors in proportion."""
+    scale = np.where(one.scale > 0, one.scale, 1.0)
+    return scored(one.velocity / scale, one.up, one.command / scale)
 
 
 def _score(one: _Walked) -> GaitScore:
-    command = one.command
-    found = scored(one.velocity, one.up, command)
-    moves, ahead = command.any(axis=1), np.isclose(command, [0.15, 0, 0]).all(axis=1)
+    command, found = one.command, _relative(one)
+    forward, _, turn = one.scale * [_FORWARD_M_S, 0.0, _TURN_RAD_S]
+    moves = command.any(axis=1)
+    ahead = moves & np.isclose(command, [forward, 0, 0]).all(axis=1)
+    turning = moves & ~command[:, :2].any(axis=1)
     instant, stride = (np.abs(v - command)[:, moves] for v in _shown(one))
     planar = [np.linalg.norm(e[..., :2], axis=-1).mean() for e in (instant, stride)]
     clearance = one.clearance_m
     return GaitScore(
         score=found["score"], falls=found["score_falls"], forward_share=_share(one, ahead),
-        turn_share=found["score_turn"],
+        turn_share=_share(one, turning), forward_m_s=float(forward), turn_rad_s=float(turn),
         speed_error_m_s=float(planar[0]), mean_speed_error_m_s=float(planar[1]),
         turn_error_rad_s=float(instant[..., 2].mean()),
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
@@ -491,7 +531,7 @@ def _cost(one: _Walked) -> float:
         "clearance": _lacking(clearance), "torque": one.torque_square,
         "saturation": one.saturated, "sway": one.sway_rad_s / _SWAY_RAD_S,
     }  # fmt: skip
-    error = 1.0 - scored(one.velocity, one.up, one.command)["score"]
+    error = 1.0 - _relative(one)["score"]
     return error + sum(_WEIGHTS[name] * value for name, value in parts.items())
 
 

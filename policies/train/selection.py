@@ -121,7 +121,7 @@ def scored(
     up : ndarray of bool, shape (steps, n)
         Whether the robot has not fallen so far.
     command : ndarray, shape (n, 3)
-        `COMMANDS`, or others of which some are to turn on the spot.
+        `COMMANDS`, or others.
     """
     fell = ~up[-1]
     # a robot that fell has the errors of one that stands, from then on
@@ -137,5 +137,5 @@ def scored(
         "score_vx_m_s": float(instant[0]),
         "score_vy_m_s": float(instant[1]),
         "score_yaw_rad_s": float(instant[2]),
-        "score_turn": float(turn.mean()),
+        "score_turn": float(turn.mean()) if len(turn) else float("nan"),
     }

@@ -21,7 +21,7 @@ from pupper_sysid.policies.train.first_gait import (
 from pupper_sysid.policies.train.run_file import preset, teacher_of
 from pupper_sysid.policies.train.selection import COMMANDS
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.tiny_training import CALIBRATION, tiny_run
 
@@ -38,7 +38,9 @@ def walked(command, shares) -> first_gait._Walked:
     """Robots that move at `shares`, shape (n, 3), of their commands, and stay up."""
     velocity = np.tile(command * shares, (5, 1, 1))
     up = np.ones(velocity.shape[:2], bool)
-    return first_gait._Walked(command, velocity, velocity, up, np.array([0.006]), 0.2, 0.3, 0.1)
+    return first_gait._Walked(
+        np.ones(3), command, velocity, velocity, up, np.array([0.006]), 0.2, 0.3, 0.1
+    )
 
 
 def test_gains_are_corrected_by_the_share_of_the_speed_that_was_reached_in_each_direction():
@@ -83,6 +85,20 @@ def test_trots_are_judged_on_the_same_robots_and_with_servos_that_are_changed_fo
     assert usual.score > weak.score + 0.3
     assert usual.saturated_share < weak.saturated_share
     assert usual.clearance_p10_m > weak.clearance_p10_m
+
+
+def test_a_task_of_slower_commands_is_judged_by_slower_walks_with_the_same_relative_errors():
+    task = Walking(commands=Commands((-0.1, 0.1), (0.0, 0.0), (-0.5, 0.5)))
+    np.testing.assert_allclose(first_gait._scale(task), [0.5, 0.0, 1.0])
+    assert (first_gait._scale(Walking(commands=Commands((-9, 9), (-9, 9), (-9, 9)))) == 1).all()
+    usual = walked(COMMANDS, np.full((len(COMMANDS), 3), 0.8))
+    slower = walked(first_gait._within(task, COMMANDS), np.full((len(COMMANDS), 3), 0.8))
+    slower = replace(slower, scale=first_gait._scale(task))
+    a, b = first_gait._score(usual), first_gait._score(slower)
+    assert (b.forward_m_s, b.turn_rad_s) == (0.075, 0.4) and "of 0.075 m/s forward" in str(b)
+    assert a.forward_share == b.forward_share == pytest.approx(0.8)
+    # nothing is missing sideways, where nothing is commanded
+    assert (1 - b.score) == pytest.approx(2 / 3 * (1 - a.score))
 
 
 @pytest.mark.slow
