@@ -22,6 +22,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -475,10 +476,10 @@ def _mean(values: Array) -> float:
 def _actions(trots: Sequence[Trot], env: PupperEnv, command: Array, steps: int) -> Array:
     """Actions of all robots at every step, shape (steps, n, 12)."""
     n, span = len(command), env.config.control_step_s
-    time_s = np.repeat(span * np.arange(steps), n)
+    time_s: Array = np.repeat(span * np.arange(steps, dtype=float), n)
     commands = np.tile(command, (steps, 1))
     joints = [
-        trot.joints(2 * np.pi * trot.frequency_hz * time_s, commands).reshape(steps, n, -1)
+        trot.joints(time_s * (2 * np.pi * trot.frequency_hz), commands).reshape(steps, n, -1)
         for trot in trots
     ]
     return (np.concatenate(joints, axis=1) - env.default) / env.config.action_scale
@@ -507,8 +508,8 @@ def _score(one: _Walked) -> GaitScore:
     command, found = one.command, _relative(one)
     forward, _, turn = one.scale * [_FORWARD_M_S, 0.0, _TURN_RAD_S]
     moves = command.any(axis=1)
-    ahead = moves & np.isclose(command, [forward, 0, 0]).all(axis=1)
-    turning = moves & ~command[:, :2].any(axis=1)
+    ahead = np.asarray(moves & np.isclose(command, [forward, 0, 0]).all(axis=1))
+    turning = np.asarray(moves & ~command[:, :2].any(axis=1))
     instant, stride = (np.abs(v - command)[:, moves] for v in _shown(one))
     planar = [np.linalg.norm(e[..., :2], axis=-1).mean() for e in (instant, stride)]
     clearance = one.clearance_m
@@ -553,8 +554,8 @@ def _corrected(trot: Trot, one: _Walked) -> Trot:
     x, y, turn = one.command.T
     alone = (one.command != 0).sum(axis=1) == 1
 
-    def wrong_by(chosen: NDArray[np.bool_]) -> float:
-        share = _share(one, alone & chosen)
+    def wrong_by(chosen: Any) -> float:
+        share = _share(one, np.asarray(alone & chosen))
         return 1.0 / min(max(share, 1.0 / _MOST_CORRECTION), _MOST_CORRECTION)
 
     ahead, back, aside = wrong_by(x > 0), wrong_by(x < 0), wrong_by(y != 0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import torch
@@ -154,8 +155,8 @@ class Float32Muon(torch.optim.Optimizer):
         super().__init__(parameters, {"lr": 1e-3})
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:
-        """Move every matrix along its gradients so far."""
+    def step(self, closure: Any = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Move every matrix along its gradients so far; a closure is not called."""
         for group in self.param_groups:
             for matrix in group["params"]:
                 if matrix.grad is None:
