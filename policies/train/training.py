@@ -49,6 +49,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 LAST, BEST = "last.pt", "best.pt"
 _TEACHER, _POLICY_LAST = "teacher", "policy_last"
 _SAVE_EVERY = 10
+_UNDONE_SAID, _UNDONE_END = 10, 50  # updates in a row that are taken back
 _IMITATING, _FEWEST_ROUNDS = 0.75, 3  # of the time after a first round; rounds of imitation
 _JUDGE_EVERY = 50
 
@@ -189,7 +190,7 @@ class _Session:
         spent_s: float = 0.0,
         notice: Callable[[str], None] = lambda text: None,
     ):
-        self.notice = notice
+        self.notice, self.undone = notice, 0  # updates in a row that were taken back
         begun = time.monotonic()
         self.ranks = Ranks.join()
         self.folder, self.watch = folder, watch
@@ -364,9 +365,30 @@ class _Session:
             )
             if judged:
                 self.keep_best()
+            if self.stuck():
+                return
             if learner.iteration % _SAVE_EVERY == 0:
                 self.save(LAST)  # after the best, or a resumed run would not know its best
                 self.write_policy(_POLICY_LAST)
+
+    def stuck(self) -> bool:
+        """Whether PPO's updates are taken back again and again, so that the policy stays as it is.
+
+        It is said when they repeat, and what helps when the run ends for it.
+        """
+        self.undone = self.undone + 1 if self.learner.taken_back else 0
+        if self.undone not in (_UNDONE_SAID, _UNDONE_END):
+            return False
+        ends = self.undone == _UNDONE_END
+        kl = self.run.learner.desired_kl
+        self.notice(
+            f"The last {self.undone} updates of PPO were taken back, because each changed the "
+            "actions too much: the policy stays as it is. "
+            + ("The run ends here. " if ends else f"The run ends after {_UNDONE_END} of them. ")
+            + f"Begin one with a larger step per update, --learner.desired-kl {2 * kl:g}, or with "
+            "more noise, --learner.exploration.std."
+        )
+        return ends
 
     def keep_best(self) -> None:
         """Save the policy if it walks better than those before."""

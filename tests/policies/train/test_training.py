@@ -308,6 +308,24 @@ def test_time_before_a_run_counts(tmp_path):
     assert read_checkpoint(tmp_path / "late" / LAST)["more"]["imitated"] == 0
 
 
+def test_updates_that_are_all_taken_back_are_said_and_end_the_run_with_what_helps(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(training, "_UNDONE_SAID", 2)
+    monkeypatch.setattr(training, "_UNDONE_END", 4)
+    hyper = replace(tiny_run().learner, desired_kl=1e-12, learning_rates=(1e-3, 1e-3))
+    said = []
+    run = tiny_run(learner=hyper, iterations=10, imitation=Imitation(iterations=0))
+    learner = train(tmp_path, run, notice=said.append)
+    assert learner.iteration == 4 and read_checkpoint(tmp_path / LAST)["iteration"] == 4
+    assert "The last 2 updates" in said[0] and "ends after 4" in said[0]
+    assert "The last 4 updates" in said[1] and "--learner.desired-kl 2e-12" in said[1]
+    # with the weights, Adam's memory goes back, but for that of its first update
+    steps = [s["step"] for s in learner.ppo.optimizer.state_dict()["state"].values()]
+    each = run.learner.epochs * run.learner.minibatches
+    assert min(steps) == each and max(steps) == 4 * each, "of the policy, and of the critic"
+
+
 def test_a_watcher_is_told_where_the_run_stands(tmp_path):
     seen = []
     train(tmp_path, tiny_run(), seen.append)
