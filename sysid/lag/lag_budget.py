@@ -7,9 +7,9 @@
 (`sysid.fit.joint_fit`). Only the dead time is the servo's own: the lag moves with gain,
 amplitude and load.
 
-* Tones (`sysid.lag.tone`), named, found in the command, or the lines of a multisine: the phase slope of fresh rows at their measurement times, against the
-  zero-order-held command, without the staircase's ripple. Intervals are from a bootstrap over
-  periods.
+* Tones (`sysid.lag.tone`), named, found in the command, or the lines of a multisine: the phase
+  slope of fresh rows at their measurement times, against the zero-order-held command, without the
+  staircase's ripple. Intervals are from a bootstrap over periods.
 * Any other motion (`sysid.lag.time_shift`): the time shift of the held command that resembles the
   motion best, through an impulse response fitted to the readings.
 

@@ -2,8 +2,9 @@
 
 `line_responses` fits the tones that a log names or that are found in its command, one after the
 other (`sysid.lag.tone`), and else the lines of a multisine (`multisine_responses`). Those lines are
-found in the command: the strongest is fitted and subtracted until next to nothing is left. A chirp, steps or a walk leave too much and are no multisine. All lines are then fitted to the
-fresh readings together, because sines at irregular times are not orthogonal.
+found in the command: the strongest is fitted and subtracted until next to nothing is left. A chirp,
+steps or a walk leave too much and are no multisine. All lines are then fitted to the fresh readings
+together, because sines at irregular times are not orthogonal.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ _LEAST_ROWS = 20
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LATEST_S = 1e11
+_MANY_ROWS = 5  # that lie apart from the others
 _FEW_TRIALS = 10  # that are named one by one
 
 
@@ -105,12 +106,26 @@ def _refuse_odd_numbers(path: Path | str, table: pd.DataFrame) -> None:
 
 def _refuse_degrees(path: Path | str, column: str, values: NDArray[np.float64]) -> None:
     largest = float(np.nanmax(np.abs(values)))
-    if largest > LARGEST_RAD:
+    if largest > LARGEST_RAD and not (column == "position_rad" and _in_two_places(values)):
         raise InputError(
             f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
             "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533, or "
             "convert the log with `pupper-sysid import --unit deg` (counts:4096, …)."
         )
+
+
+def _in_two_places(values: NDArray[np.float64]) -> bool:
+    """Whether angles lie in two places that each could be a joint's: a number that overflows.
+
+    `doctor` says which number, and how to read it.
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    at = int(np.argmax(np.diff(ordered))) + 1 if len(ordered) > 1 else 0
+    parts = ordered[:at], ordered[at:]
+    return (
+        min(map(len, parts)) >= _MANY_ROWS and max(float(np.ptp(p)) for p in parts) < LARGEST_RAD
+        and min(float(np.abs(p).max()) for p in parts) < LARGEST_RAD
+    )  # fmt: skip
 
 
 def _refuse_disorder(path: Path | str, table: pd.DataFrame, own: NDArray[np.int64]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
+from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
 from pupper_sysid.sysid.recordings.excitation import named_tones
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
@@ -50,8 +51,8 @@ def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
 
 
 def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
-    """All trials of `joint`, each tone that is found in a command as its own, renumbered."""
-    trials = named_tones(recorded_trials(recordings, joint))
+    """All trials of `joint` without bad readings, each tone of a command as its own, renumbered."""
+    trials = named_tones([without_bad_readings(t) for t in recorded_trials(recordings, joint)])
     return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
 
 

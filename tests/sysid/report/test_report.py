@@ -235,7 +235,7 @@ def test_what_the_page_says_is_what_was_found(page):
     assert "Use with care. Two frequencies only." in page.text
     assert (
         "raw lag 81 ms = 28 ms stale readings + 10 ms command hold + 44 ms servo "
-        "(24 ms dead time + 20 ms dynamics)." in page.text
+        "(24 ms dead time + 20 ms dynamics)" in page.text
     )
     assert "It prefers preset “paper” on LF_thigh." in page.text  # the raw score
 
