@@ -46,6 +46,7 @@ _UNITS = {
 }  # fmt: skip
 _SAME_SCALE = 0.35  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
+_CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
 _SMOOTH = 0.6  # autocorrelation of what is left
 _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
@@ -116,7 +117,11 @@ def relation_findings(
     ranked = relations(trials, step, base)
     servo = next(r.servo for r in ranked if not r.code)
     best, second = ranked[0], ranked[1]
-    if best.code and best.servo.nats > servo.nats - CLEAR_NATS:
+    hardly = best.servo.nats > servo.nats - CLEAR_NATS
+    if best.code == "position_early" and best.servo.total_s > -_CLEARLY_EARLY_S:
+        # a little early is what another shape of the servo looks like
+        hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
+    if best.code and hardly:
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
     if share < _FOLLOWS if best.code else (share < _LOOSE and _smooth_rest(base, best.servo)):
