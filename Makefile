@@ -16,11 +16,11 @@ demo: setup
 
 # the quick tests
 test: setup
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 
 # every page of the documentation and long campaigns besides
 test-all: setup
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: setup links
 	$(BIN)/ruff format --check .

@@ -36,8 +36,8 @@ from pupper_sysid.hardware.lock import lock_name, runtime_folder
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
@@ -312,7 +312,7 @@ def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
 
 
 @contextmanager
-def served(kind: str, seed: int) -> Iterator[tuple[FeetechPty | ProxySocket, str]]:
+def served(kind: str, seed: int) -> Iterator[tuple[SerialPty | ProxySocket, str]]:
     """A running server of one emulated robot, and the address of its bus."""
     rng = np.random.default_rng(seed)
     # read directly, a servo answers for the very moment: no polls in between, none lost
@@ -325,7 +325,7 @@ def served(kind: str, seed: int) -> Iterator[tuple[FeetechPty | ProxySocket, str
         if kind == "esp32":
             server = ProxySocket(ProxyEmulator(bench, rng), path)
         else:
-            server = FeetechPty(FeetechEmulator(bench, STS3215, rng), path)
+            server = SerialPty(FeetechEmulator(bench, STS3215, rng), path)
         thread = threading.Thread(target=server.serve, daemon=True)
         thread.start()
         if thread.native_id:

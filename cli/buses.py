@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.numbers import whole
 from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
+from pupper_sysid.hardware.serial_servos.series import Series
 
 JOINTS_FILE = Path("joints.yaml")
+_LARGEST_REGISTER = 1 << 20  # of a Dynamixel in its extended position mode
 
 
 def chosen_map(text: str | None) -> JointMap | None:
@@ -34,7 +37,15 @@ def connect(
     """The bus at an address, guarded and in servo coordinates."""
     address = parse_address(bus)
     chosen = chosen_map(joint_map)
-    return open_guarded(address, chosen.per_servo() if chosen else None, joints, limits)
+    guard = open_guarded(address, chosen.per_servo() if chosen else None, joints, limits)
+    say_remarks(guard.bus)
+    return guard
+
+
+def say_remarks(bus: ServoBus) -> None:
+    """Print what a bus found out about its line and its servos' registers."""
+    if remarks := getattr(bus, "remarks", None):
+        terminal.warn(remarks())
 
 
 def parse_registers(text: str) -> dict[str, int]:
@@ -47,14 +58,47 @@ def parse_registers(text: str) -> dict[str, int]:
     """
     from pupper_sysid.sim.emulator.servos.pendulum import REGISTERS
 
-    found = {}
+    return _registers(text, REGISTERS, "p=16")[None]
+
+
+def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[str, int]]:
+    """Registers of emulated servos by id, of all servos under None: p=16,5:mode=1.
+
+    Raises
+    ------
+    InputError
+        If the series has no such register, or a value does not fit into it.
+    """
+    chosen = _registers(text, sorted([*series.registers, *series.aliases]), "p=16 or 5:mode=1")
+    for own in chosen.values():
+        for name, value in own.items():
+            try:
+                series.encode(name, value)
+            except OverflowError:
+                raise InputError(f"--registers: {value} does not fit into {name}.") from None
+    return chosen
+
+
+def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None, dict[str, int]]:
+    found: dict[int | None, dict[str, int]] = {None: {}}
     for part in filter(None, text.split(",")):
         name, _, value = (piece.strip() for piece in part.partition("="))
-        number = whole(value) if value.isascii() and value.isdecimal() else -1
-        if name not in REGISTERS or not 0 <= number <= 65_535:
+        servo, colon, own = name.partition(":")
+        name = own if colon else name
+        digits = value.removeprefix("-")
+        number = whole(value) if digits.isascii() and digits.isdecimal() else None
+        one = whole(servo) if colon and servo.isascii() and servo.isdecimal() else None
+        whose = bool(colon) == (one is not None) and (":" in example or not colon)
+        least = -_LARGEST_REGISTER if ":" in example else 0
+        if (
+            name not in known
+            or not whose
+            or number is None
+            or not least <= number <= _LARGEST_REGISTER
+        ):
             raise InputError(
-                f"--registers: '{part}' sets no register that acts here; write p=16, and of these: "
-                f"{', '.join(REGISTERS)}."
+                f"--registers: '{part}' sets no register that acts here; write {example}, and of "
+                f"these: {', '.join(known)}."
             )
-        found[name] = number
+        found.setdefault(one, {})[name] = number
     return found

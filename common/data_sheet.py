@@ -103,6 +103,7 @@ _STS_12 = (
 )
 _STS_7 = "data sheet of the 7.4 V variant, 19.5 kg·cm and 52 rpm, as quoted by DFRobot for SER0069"
 _XL330 = "Robotis e-Manual of the XL330-M288-T"
+_EMANUAL = "Robotis e-Manual of the {}"
 _SHEETS = (
     DataSheet(
         "STS3215", 777, 4096,
@@ -121,6 +122,17 @@ _SHEETS = (
                 "robonine.com",
             ),
         ),
+    ),
+    DataSheet(
+        "HD-1910", 0, 4096,  # its model number is not published
+        (
+            Rating(
+                7.4, 10 * _KG_CM, 110 * _RPM,
+                "vendor's sheet of the HD-1910-C001, 10 kg·cm and 0.09 s/60°, as quoted by "
+                "Microduck's builders, of whom others state 12 kg·cm",
+            ),
+        ),
+        (4.0, 8.4),
     ),
     DataSheet(
         "SCS0009", 1284, 1024 * 1.2,
@@ -142,6 +154,41 @@ _SHEETS = (
         ),
         (3.7, 6.0),  # e-Manual, input voltage
     ),
+    DataSheet(
+        "XL430-W250", 1060, 4096,
+        (
+            Rating(9.0, 1.0, 47 * _RPM, _EMANUAL.format("XL430-W250")),
+            Rating(11.1, 1.4, 57 * _RPM, _EMANUAL.format("XL430-W250")),
+            Rating(12.0, 1.5, 61 * _RPM, _EMANUAL.format("XL430-W250")),
+        ),
+        (6.0, 14.0),  # factory registers; 6.5 to 12.0 V are recommended
+    ),
+    DataSheet(
+        "XM430-W350", 1020, 4096,
+        (
+            Rating(11.1, 3.8, 43 * _RPM, _EMANUAL.format("XM430-W350")),
+            Rating(12.0, 4.1, 46 * _RPM, _EMANUAL.format("XM430-W350")),
+            Rating(14.8, 4.8, 57 * _RPM, _EMANUAL.format("XM430-W350")),
+        ),
+        (9.5, 16.0),
+    ),
+    DataSheet(
+        "XM430-W210", 1030, 4096,
+        (
+            Rating(11.1, 2.7, 70 * _RPM, _EMANUAL.format("XM430-W210")),
+            Rating(12.0, 3.0, 77 * _RPM, _EMANUAL.format("XM430-W210")),
+            Rating(14.8, 3.7, 95 * _RPM, _EMANUAL.format("XM430-W210")),
+        ),
+        (9.5, 16.0),
+    ),
+    DataSheet(
+        "MX-28", 30, 4096,
+        (
+            Rating(12.0, 2.5, 55 * _RPM, _EMANUAL.format("MX-28")),
+            Rating(14.8, 3.1, 67 * _RPM, _EMANUAL.format("MX-28")),
+        ),
+        (9.5, 16.0),
+    ),
 )  # fmt: skip
 
 
@@ -162,6 +209,9 @@ def data_sheet(model: str | int) -> DataSheet | None:
 _FACTORY_P_GAINS = {
     "STS3215": (32.0, "the default that LeRobot's settings name"),
     "XL330": (400.0, "Robotis e-Manual of the XL330, Position P Gain (84)"),
+    "XL430": (640.0, "Robotis e-Manual of the XL430, Position P Gain (84)"),
+    "XM430": (800.0, "Robotis e-Manual of the XM430, Position P Gain (84)"),
+    "MX-28": (850.0, "Robotis e-Manual of the MX-28(2.0), Position P Gain (84)"),
     "SCS0009": (15.0, "register of a servo as delivered"),
 }
 """P gain registers as servos leave the factory, by family, and their sources."""

@@ -45,10 +45,11 @@ def in_order(names: Iterable[str]) -> list[str]:
     return [n for n in JOINT_NAMES if n in given] + [n for n in given if n not in JOINT_NAMES]
 
 
-def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
+def strange_joint(names: Iterable[str], any_robot: bool = False) -> tuple[str, str] | None:
     """The first name that can be no joint's, and what to do; None if all are well.
 
-    Joints are all the Mini Pupper's or none is, so that a misspelt one among them is found.
+    Joints are all the Mini Pupper's or none is, so that a misspelt one among them is found; of a
+    log of `any_robot` they may have some of its names.
 
     Examples
     --------
@@ -58,7 +59,7 @@ def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
     True
     """
     given = list(dict.fromkeys(map(str, names)))
-    own = any(n in JOINT_NAMES for n in given)
+    own = not any_robot and any(n in JOINT_NAMES for n in given)
     by_case = {n.lower(): n for n in JOINT_NAMES}
     for name in given:
         if name in JOINT_NAMES:
@@ -66,7 +67,7 @@ def strange_joint(names: Iterable[str]) -> tuple[str, str] | None:
         # without a sister to tell by, only a slip of one letter is taken for one
         near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.7 if own else 0.9)
         meant = by_case.get(name.lower()) or (near[0] if near else None)
-        if meant:
+        if meant and not any_robot:
             return name, f"did you mean {meant}?"
         if own:
             return name, f"known are {', '.join(JOINT_NAMES)}."

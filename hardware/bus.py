@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.safety.limits import PositionLimits
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, bits_in_words
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,12 @@ class BusSample:
     position_rad : ndarray, shape (joints,)
         Reported position; NaN where the bus has no reading.
     position_count : ndarray of int, shape (joints,)
-        The raw count behind it; -1 where the bus has none.
+        The raw count behind it, which a homing offset may move below 0 or over the encoder's range;
+        -1 where the bus has none: there the position is NaN.
     voltage_v, temperature_c, load : ndarray, shape (joints,), or None
         Where the bus has them; load is a fraction of full duty, signed.
     status : ndarray of int, shape (joints,), or None
-        Error bits of the servo (`hardware.feetech.registers.ERROR_BITS`).
+        Error bits of the servo (`error_words`).
     """
 
     time_s: NDArray[np.float64]
@@ -99,7 +101,7 @@ class ServoBus(Protocol):
 
 
 class RegisterBus(ServoBus, Protocol):
-    """A bus whose servos' registers can be read and set (names: `hardware.feetech.registers`)."""
+    """A bus whose servos' registers can be read and set (names: those of its family)."""
 
     def servo_setups(self) -> dict[str, dict[str, Any]]:
         """By joint, what a recording's header says of its servo."""
@@ -138,6 +140,11 @@ def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> N
     if angles.shape != (joints,) or not np.isfinite(angles).all():
         raise BusError(f"{bus}: commands must be {joints} finite angles, got {angles}.")
     return angles
+
+
+def error_words(bus: ServoBus, status: int) -> str:
+    """Error bits of a sample's status in words, as the bus names them."""
+    return bits_in_words(status, getattr(bus, "error_bits", ERROR_BITS))
 
 
 def header_entries(bus: ServoBus) -> dict[str, Any]:

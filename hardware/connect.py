@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
-from pupper_sysid.hardware.address import BusAddress
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.bus import FeetechBus
+from pupper_sysid.hardware.address import KINDS, BusAddress
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
@@ -20,11 +18,10 @@ def open_bus(
     joint_map: JointMap | None = None,
     joints: Sequence[str] | None = None,
     exclusive: bool = True,
-) -> Esp32Bus | FeetechBus:
-    """The bus itself, unguarded; see `FeetechBus` and `Esp32Bus` for parameters and errors."""
-    if address.kind == "esp32":
-        return Esp32Bus(Path(address.where), joint_map, exclusive)
-    return FeetechBus(address.where, address.baud, joint_map, joints, exclusive)
+) -> Any:
+    """The bus itself, unguarded; see its class for parameters and errors."""
+    cls = KINDS[address.kind].bus_class()
+    return cls.open_address(address, joint_map, joints, exclusive)
 
 
 def open_guarded(
@@ -36,6 +33,8 @@ def open_guarded(
     """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
     bus = open_bus(address, joint_map, joints)
     try:
+        if hasattr(bus, "refuse_unfit"):
+            bus.refuse_unfit()
         # rate and map as found: nothing is to be detected when it is urgent
         watchdog = Watchdog(replace(address, baud=bus.metadata.get("baud")), bus.joint_map)
     except BaseException:

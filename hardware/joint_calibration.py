@@ -35,6 +35,7 @@ _WHOLE_RANGE_DEG = (150.0, 400.0)  # no servo of this kind has less or more
 _KNOWN_SCALES = {
     1024: {
         "550/pi, the vendor's library": 550 / np.pi,
+        "1024/pi, measured by hand on a Mini Pupper 2 (its issue 65)": 1024 / np.pi,
         "1024 counts over 300 degrees, the SCS0009's data sheet": 1024 / np.radians(300),
     },
     4096: {"4096 counts over 360 degrees, the STS3215's data sheet": 4096 / (2 * np.pi)},

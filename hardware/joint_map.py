@@ -78,6 +78,8 @@ class JointEntry(BaseModel):
     """Lowest and highest count that may be commanded."""
     limits_rad: tuple[float, float]
     """Lowest and highest angle of the simulator's joint."""
+    homing_offset: int | None = Field(default=None, ge=-1_044_479, le=1_044_479)
+    """Of the servo's own register, where the map holds only with that value."""
     source: str
     """Origin of these values: a preset's source, or the calibration that measured them."""
 
@@ -308,6 +310,8 @@ class JointMap:
         for entry in data["joints"].values():
             for name in ("limits_counts", "limits_rad"):
                 entry[name] = list(entry[name])
+            if entry["homing_offset"] is None:
+                del entry["homing_offset"]
         write_text(path, dump(data), force)
 
     def _entry(self, joint: str) -> JointEntry:

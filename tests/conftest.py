@@ -1,8 +1,11 @@
 """Fixtures: recordings of a real robot, where they are at hand, and a policy that walks."""
 
 import os
+import sys
 from pathlib import Path
 
+# modules are compiled once, not by every worker and every program that a test starts
+os.environ["PYTHONDONTWRITEBYTECODE"] = ""
 # the workers share the cores; networks this small only wait for other threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -12,6 +15,8 @@ import pytest
 
 from support.package import ROOT
 from support.real_recordings import real_recording
+
+sys.dont_write_bytecode = False
 
 # the same examples on every machine; `--hypothesis-profile search` looks for new ones
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)

@@ -6,10 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pupper_sysid as ps
 from support.command_line import run
+from support.json_keys import DOCUMENTED, key_line
 from support.strokes import stroked
 
 SWEEP = Path("data/samples/sweep.csv")
@@ -50,6 +52,12 @@ def test_importing_the_front_door_imports_nothing_else(tmp_path):
     assert [m for m in loaded if m.startswith("pupper_sysid.")] == []
 
 
+def test_functions_of_a_calibration_need_neither_torch_nor_matplotlib(tmp_path):
+    """As far as they are imported; the slow test beside this one runs them."""
+    python(WITHOUT + "import pupper_sysid as ps; ps.load, ps.lag, ps.calibrate", tmp_path)
+
+
+@pytest.mark.slow
 def test_load_lag_calibrate_and_save_need_neither_torch_nor_matplotlib(hip, tmp_path):
     text = python(
         WITHOUT
@@ -72,19 +80,49 @@ except ps.InputError as error:
     assert ps.load_calibration(tmp_path / "calibrated.yaml").joint_names == ("LF_hip",)
 
 
-@pytest.mark.parametrize(
-    ("command", "function"),
-    [("doctor", ps.examine), ("delay", ps.lag), ("bode", ps.frequency_response)],
-)
-def test_a_result_is_the_json_of_its_command(capsys, hip, command, function):
-    code, out, err = run(capsys, command, hip, "--json")
+def json_of(capsys, command: str, *words) -> dict:
+    """Object that a command prints, which has the documented keys."""
+    code, out, err = run(capsys, command, *words, "--json")
     assert code == 0, err
-    found = function(ps.load(hip))
-    assert found.to_dict() == json.loads(out)
-    assert list(found.to_frame()["joint"].unique()) == ["LF_hip"]
-    assert found.plot().axes
+    printed = json.loads(out)
+    assert key_line(printed) == DOCUMENTED[command]
+    return printed
 
 
+def assert_is_the_result(printed: dict, result) -> None:
+    """The object of a command on one joint is the result of its function."""
+    assert result.to_dict() == printed
+    assert list(result.to_frame()["joint"].unique()) == ["LF_hip"]
+    assert result.plot().axes
+
+
+def test_delay_is_lag_and_its_parts_add_up_in_order(capsys, hip):
+    printed = json_of(capsys, "delay", hip)
+    joint = printed["joints"]["LF_hip"]
+    lags = [joint[k]["value"] for k in ("raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s")]
+    assert lags == sorted(lags, reverse=True)
+    assert_is_the_result(printed, ps.lag(ps.load(hip)))
+
+
+def test_doctor_is_examine_and_finds_the_polls(capsys, hip):
+    printed = json_of(capsys, "doctor", hip)
+    joint = printed["joints"]["LF_hip"]
+    assert joint["verdict"] == "use"
+    assert joint["poll_period_s"] == pytest.approx(0.02685, abs=1.5e-4)
+    assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)
+    assert_is_the_result(printed, ps.examine(ps.load(hip)))
+
+
+def test_bode_is_the_frequency_response_and_shows_that_the_servo_follows(capsys, hip, tmp_path):
+    """Where raw rows say that it does not."""
+    printed = json_of(capsys, "bode", hip, "--plot", tmp_path / "b.png")
+    tones = printed["joints"]["LF_hip"]["by_frequency"]
+    assert (tmp_path / "b.png").stat().st_size > 10_000
+    assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["raw_gain"] < 0.75
+    assert_is_the_result(printed, ps.frequency_response(ps.load(hip)))
+
+
+@pytest.mark.slow
 def test_backlash_is_the_json_of_its_command_with_a_row_per_gain(capsys, tmp_path):
     strokes, _ = stroked(3, 2.0, 0)
     strokes.save(tmp_path / "strokes.csv")

@@ -270,6 +270,7 @@ BENCHMARKS = sorted((ROOT / "benchmarks").rglob("*.py"))
 ELSEWHERE = re.compile(r"^(from|import) (bam|mjlab|newton|warp|cmaes|isaaclab|exchange)\b", re.M)
 
 
+@pytest.mark.slow
 def test_benchmarks_import(monkeypatch):
     """Programs that run in the environments of other projects are compiled only."""
     for path in BENCHMARKS:

@@ -8,7 +8,10 @@ one printable sentence that ends, and in bounded processor time and memory. `pyt
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import json
+import lzma
 import re
 import resource
 import shutil
@@ -47,7 +50,7 @@ from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
 from pupper_sysid.sysid.plan.planner import PlannedTrial
 from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.importers.shared.options import read_mapping
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, read_mapping
 from pupper_sysid.sysid.sweep.playback import playback
 from support.saved_servo_models import saved
 
@@ -120,6 +123,22 @@ def ktune(folder: Path) -> None:
 
 def npz(folder: Path) -> None:
     np.savez_compressed(folder / "log.npz", time=TIME, command=WAVE, position=LATE)
+
+
+def npy(folder: Path) -> None:
+    np.save(folder / "log.npy", np.column_stack([TIME, WAVE, LATE, np.zeros(60)]))
+
+
+def tensors(folder: Path) -> None:
+    import torch
+
+    run = {"time": torch.tensor(TIME), "des_dof_pos": torch.tensor(WAVE[:, None]),
+           "dof_pos": torch.tensor(LATE[:, None]), "joint_names": ["knee"]}  # fmt: skip
+    torch.save(run, folder / "run.pt")
+
+
+def packed(name: str, pack: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_bytes(pack(WIDE.encode())) and None
 
 
 def parquet(folder: Path) -> None:
@@ -224,6 +243,15 @@ def policy(folder: Path) -> None:
 
 
 WIDE = rows("time_s,knee_command,knee_position", lambda t, c, p: f"{t:.3f},{c:.6f},{p:.6f}")
+GERMAN = WIDE.replace(",", ";").replace(".", ",")
+SAVED = "# bench 3\n# " + WIDE.replace(",", " ")
+LABELLED = rows("start", lambda t, c, p: f"time:{t:.3f},cmd:{c:.6f},pos:{p:.6f}")
+DAYTIME = rows("date,cmd,pos", lambda t, c, p: f"2026-05-04T12:00:{t:06.3f},{c:.6f},{p:.6f}")
+MELTED = rows("time,name,value", lambda t, c, p: f"{t:.3f},k_cmd,{c:.6f}\n{t:.3f},k_pos,{p:.6f}")
+LISTS = rows("time,action,state", lambda t, c, p: f'{t:.3f},"[{c:.6f}, {p:.6f}]",[{p:.6f} {c:.6f}]')
+JSON_LINES = rows("", lambda t, c, p: json.dumps({"t": t, "cmd": {"k": c}, "pos": {"k": p}}))
+TABLE_JSON = json.dumps({"t": TIME.tolist(), "cmd": WAVE.tolist(), "pos": LATE.tolist()})
+BY_NUMBER = LogOptions("0", "1", "2", trial="3")
 LONG = rows("time,joint,goal,present_position", lambda t, c, p: f"{t:.3f},knee,{c:.6f},{p:.6f}")
 MAPPING = (
     "time: time_s\ncommand: '{joint}_command'\nposition: '{joint}_position'\n"
@@ -233,6 +261,19 @@ KINDS = {
     "recording": Kind(copied(SAMPLES / "sweep.csv", 120), "sweep.csv", load),
     "wide table": Kind(text("log.csv", WIDE), "log.csv", load),
     "long table": Kind(text("log.csv", LONG), "log.csv", load),
+    "decimal commas": Kind(text("log.csv", GERMAN), "log.csv", load),
+    "names in a comment": Kind(text("log.txt", SAVED), "log.txt", load),
+    "pairs of name and number": Kind(text("log.txt", LABELLED), "log.txt", load),
+    "times of day": Kind(text("log.csv", DAYTIME), "log.csv", load),
+    "one value a row": Kind(text("log.csv", MELTED), "log.csv", load),
+    "lists in cells": Kind(text("log.csv", LISTS), "log.csv", load),
+    "JSON table": Kind(text("log.json", TABLE_JSON), "log.json", load),
+    "JSON Lines": Kind(text("log.jsonl", JSON_LINES), "log.jsonl", load),
+    "gzip": Kind(packed("log.gz", gzip.compress), "log.gz", load),
+    "bzip2": Kind(packed("log.bz2", bz2.compress), "log.bz2", load),
+    "xz": Kind(packed("log.xz", lzma.compress), "log.xz", load),
+    "npy": Kind(npy, "log.npy", lambda path: load(path, BY_NUMBER)),
+    "torch": Kind(tensors, "run.pt", load),
     "BAM": Kind(bam, "bam.json", load),
     "ktune": Kind(ktune, "ktune.json", load),
     "npz": Kind(npz, "log.npz", load),

@@ -23,7 +23,9 @@ SETUPTOOLS = PROJECT["tool"]["setuptools"]
 
 
 def test_examples_in_docstrings_run():
-    assert [n for n in MODULES if doctest.testmod(import_module(n)).failed] == []
+    with_examples = [name for name in MODULES if ">>>" in FILES[name].read_text()]
+    assert len(with_examples) > 20
+    assert [n for n in with_examples if doctest.testmod(import_module(n)).failed] == []
 
 
 def test_every_folder_with_modules_is_packaged():
@@ -238,13 +240,14 @@ DATES |= {"servo_models/cards/bam.py", "sysid/recordings/files.py", "sysid/sweep
 
 WALL_CLOCK = {"time.time", "time.time_ns", "time.localtime", "time.gmtime"}
 WALL_CLOCK |= {"datetime.now", "datetime.utcnow", "datetime.today", "date.today"}
+NAMES_OF_CLOCKS = {name.split(".")[1] for name in WALL_CLOCK}
 
 
 def wall_clock(source: str) -> set[str]:
     """Functions of a clock that may be set, called or imported by name in `source`."""
     found = set()
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Attribute):
+        if isinstance(node, ast.Attribute) and node.attr in NAMES_OF_CLOCKS:
             found.add(".".join(ast.unparse(node).split(".")[-2:]))
         elif isinstance(node, ast.ImportFrom) and node.module == "time":
             found.update(f"time.{name.name}" for name in node.names)

@@ -5,13 +5,14 @@
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with those of
 `tests/support/exported_servos.py`, which the tests hold the exports against. Where `install.sh` has
-been run, Newton, mjlab and Isaac Lab's actuators run their exports: a tone through servos behind a
-floating base, against our own simulation.
+been run, Newton, mjlab and Isaac Lab's actuators run their exports: unseen tones and a walk through
+servos behind a floating base, against the calibration's own model, and the age of their readings.
 """
 
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 import tempfile
@@ -21,33 +22,32 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.tones import fit_sine
-from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sim.export.mjlab import MJLAB_PD
-from pupper_sysid.sim.export.newton import export_newton
-from pupper_sysid.sim.export.shared import EXPLICIT_PD, delays_at_step
-from pupper_sysid.sim.export.targets import SIMULATORS
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.sim.export.check import compiled, held, moved_by, unseen_tones, walk_commands
+from pupper_sysid.sim.export.export import SIMULATORS
+from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-CALIBRATED = str(ROOT / "data/samples/calibrated.yaml")
-STEP_S, TONE_HZ = 0.005, 3.0
-ENGINES = {"isaaclab": EXPLICIT_PD, "newton": EXPLICIT_PD, "mjlab": MJLAB_PD}
+CARDS = (str(ROOT / "data/samples/calibrated.yaml"), "sts3215-bam-m1", "sts3215-open-duck")
+STEPS_S = (0.002, 0.005)
+VENVS = Path(os.environ.get("EXPORT_VENVS", HERE))
+"""Where `install.sh` made the environments."""
 
 _CLASSES = {
     "isaaclab": ("actuators/", ("ActuatorBaseCfg", "IdealPDActuatorCfg", "DelayedPDActuatorCfg")),
     "mjlab": ("actuator/", ("ActuatorCfg", "BuiltinPositionActuatorCfg")),
 }
 _NEWTON = {
-    "add_actuator": {"drive_class", "index", "clamping", "delay_steps"},
-    "builder": {"joint_armature", "joint_friction", "joint_target_ke", "joint_target_kd"},
-    "drive_neural_mlp": {"input_order", "input_idx", "pos_scale", "vel_scale", "effort_scale"},
-    "clamping_max_effort": {"max_effort"},
-}
+    "builder": {
+        "joint_armature", "joint_friction", "joint_damping", "joint_target_ke", "joint_target_kd",
+        "joint_target_mode", "custom_attributes",
+    },
+    "control": {"joint_f"},
+}  # fmt: skip
 
 
 def fetched(package: str, folder: Path) -> tuple[str, Path]:
@@ -78,69 +78,84 @@ def fields(root: Path, part: str, names: tuple[str, ...]) -> set[str]:
     return found
 
 
-def tone(step_s: float) -> tuple[NDArray, NDArray]:
-    """Times of steps, and what a loop of 50 Hz commands of a tone in each."""
-    at = step_s * np.arange(round(3.0 / step_s))
-    return at, 0.15 * np.sin(2 * np.pi * TONE_HZ * 0.02 * np.floor(at / 0.02 + 1e-9))
-
-
-def phasors(at: NDArray, moved: NDArray) -> list[complex]:
-    """Of each joint's steady motion, shape (steps, joints)."""
-    late = at > 1.0
-    return list(fit_sine(2 * np.pi * TONE_HZ * at[late], moved[late]).phasor)
-
-
 def ran(
-    simulator: str, calibration: Calibration, delay_steps: list[int], folder: Path
-) -> list[complex]:
-    """What a simulator makes of the tone with its export."""
-    at, commands = tone(STEP_S)
-    exported = folder / f"{simulator}_export"
-    if simulator == "newton":
-        export_newton(calibration, STEP_S, exported)
-    else:
-        exported.write_text(SIMULATORS[simulator](calibration, STEP_S))
-    each = np.repeat(commands[:, None], len(calibration.joint_names), axis=1)
+    simulator: str, servos: ExportedServos, commands: NDArray, folder: Path
+) -> tuple[NDArray, NDArray]:
+    """Positions and readings of the servos, shape (steps, joints), in a simulator."""
+    step_s, names = servos.physics_step_s, servos.calibration.joint_names
+    if simulator == "mujoco":
+        there = moved_by(compiled(servos), names, commands, step_s)
+        return there, there
+    exported = folder / f"{simulator}_export.py"
+    exported.write_text(SIMULATORS[simulator](servos))
+    each = np.repeat(held(commands, step_s)[:, None], len(names), axis=1)
     np.savez(
-        folder / "commands.npz", command=each, step_s=STEP_S, delay_steps=delay_steps,
-        solref=friction_solref(STEP_S), solimp=FRICTION_SOLIMP,
+        folder / "commands.npz", command=each, step_s=step_s, solref=friction_solref(step_s),
+        solimp=FRICTION_SOLIMP,
     )  # fmt: skip
     subprocess.run(
-        [HERE / f".venv-{simulator}/bin/python", HERE / f"in_{simulator}.py", exported,
+        [VENVS / f".venv-{simulator}/bin/python", HERE / f"in_{simulator}.py", exported,
          "commands.npz", "out.npz"],
         cwd=folder, check=True, capture_output=True,
     )  # fmt: skip
-    return phasors(at + STEP_S, np.load(folder / "out.npz")["position"])
+    out = np.load(folder / "out.npz")
+    return out["position"], out["reading"]
 
 
-def print_tones(folder: Path) -> None:
-    """Print gain and lag of the tone in each simulator that is installed, and in our own."""
-    calibration = load_calibration(CALIBRATED)
-    at, commands = tone(TIME_STEP_S)
-    servo = calibration.delayed_pd()
-    servo.reset(np.zeros(len(calibration.joint_names)))
-    commanded = np.repeat(commands[:, None], servo.batch[0], axis=1)
-    ours = phasors(at + TIME_STEP_S, servo.rollout(commanded))
+def print_parity(folder: Path) -> None:
+    """Print how far each card is from its own model in each simulator that is installed."""
     print(
-        f"\n| {TONE_HZ:g} Hz, steps of {1e3 * STEP_S:g} ms | joint | amplitude | ours | lag ms "
-        "| ours | delay rounded to steps by |\n|---|---|---|---|---|---|---|"
+        "\n| card | step ms | simulator | tones mrad | walk mrad | readings: age ms | of the card "
+        "| whole steps would cost mrad |\n|---|---|---|---|---|---|---|---|"
     )
-    for simulator, engine in ENGINES.items():
-        if not (HERE / f".venv-{simulator}").exists():
-            continue
-        delays = delays_at_step(calibration, STEP_S, engine)
-        steps = [round(delays[name].value / STEP_S) for name in calibration.joint_names]
-        theirs = ran(simulator, calibration, steps, folder)
-        for name, taken, there, here in zip(
-            calibration.joint_names, steps, theirs, ours, strict=True
-        ):
-            turn = 2 * np.pi * TONE_HZ
-            lags = [1e3 * (-np.angle(1j * p) % (2 * np.pi)) / turn for p in (there, here)]
-            rounded = 1e3 * (STEP_S * taken - delays[name].value)
-            print(
-                f"| {simulator} | {name} | {abs(there):.4f} | {abs(here):.4f} | {lags[0]:.1f} "
-                f"| {lags[1]:.1f} | {rounded:+.1f} |"
-            )
+    tones, walk = unseen_tones(), walk_commands()
+    for card in CARDS:
+        for step_s in STEPS_S:
+            servos = ExportedServos.of(load_calibration(card), step_s)
+            for simulator in ("mujoco", "mjlab", "newton", "isaaclab"):
+                if simulator != "mujoco" and not (VENVS / f".venv-{simulator}").exists():
+                    continue
+                apart, age = [], np.nan
+                for commands in (tones, walk):
+                    there, readings = ran(simulator, servos, commands, folder)
+                    here = own_motion(servos, commands, len(there))
+                    apart.append(1e3 * np.sqrt(np.mean((there - here) ** 2)))
+                    age = mean_age_s(there, readings, step_s)
+                held_s = np.mean([
+                    servos.calibration.held_feedback(n).mean_age_s
+                    for n in servos.calibration.joint_names
+                ])  # fmt: skip
+                of_card = f"{1e3 * held_s:.1f}" if simulator != "mujoco" else ""
+                shown = f"{1e3 * age:.1f}" if simulator != "mujoco" else ""
+                cost = 1e3 * servos.cost_of_whole_steps()
+                print(
+                    f"| {Path(card).stem} | {1e3 * step_s:g} | {simulator} | {apart[0]:.2f} "
+                    f"| {apart[1]:.2f} | {shown} | {of_card} | {cost:.1f} |"
+                )
+
+
+def own_motion(servos: ExportedServos, commands: NDArray, steps: int) -> NDArray[np.float64]:
+    """Positions by the calibration's own PD in the steps of its fit, at the simulator's steps."""
+    servo = servos.moving.delayed_pd()
+    servo.reset(np.zeros(servo.batch))
+    own = servo.rollout(np.repeat(held(commands, servo.time_step_s)[:, None], *servo.batch, axis=1))
+    at = servos.physics_step_s * np.arange(1, steps + 1)
+    fine = servo.time_step_s * np.arange(len(own) + 1)
+    return np.stack([np.interp(at, fine, np.append(0.0, column)) for column in own.T], axis=1)
+
+
+def mean_age_s(positions: NDArray, readings: NDArray, step_s: float) -> float:
+    """Mean age of readings by the shift of the motion that fits them best."""
+    at = step_s * np.arange(len(positions))
+    ages = np.arange(0.0, 0.08, 0.0005)
+    errors = [
+        np.mean([
+            np.mean((np.interp(at - age, at, p) - r)[40:] ** 2)
+            for p, r in zip(positions.T, readings.T, strict=True)
+        ])
+        for age in ages
+    ]  # fmt: skip
+    return float(ages[int(np.argmin(errors))])
 
 
 def main() -> None:
@@ -159,12 +174,11 @@ def main() -> None:
             print(f"| {package} | {version} | {', '.join(sorted(held - there)) or 'none'} |")
         version, root = fetched("newton", folder)
         text = {p.stem: p.read_text() for p in root.rglob("*.py") if p.stem in _NEWTON}
-        text["add_actuator"] = text["builder"][text["builder"].index("def add_actuator") :]
         unknown = sorted(n for k, names in _NEWTON.items() for n in names if n not in text[k])
         bad += len(unknown)
         print(f"| newton | {version} | {', '.join(unknown) or 'none'} |")
 
-        print_tones(folder)
+        print_parity(folder)
     sys.exit(1 if bad else 0)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def model_of(names: list[str]) -> str:
-    """MJCF of hinges without load on a heavy base that floats without gravity."""
+    """MJCF of hinges without load on a base of a quadruped's mass that floats without gravity."""
     bodies = "".join(
         f'<body name="{n}_link" pos="0 0 {k + 1}"><joint name="{n}" axis="0 0 1"/>'
         '<inertial pos="0 0 0" mass="1e-5" diaginertia="1e-9 1e-9 1e-9"/></body>'
@@ -12,5 +12,5 @@ def model_of(names: list[str]) -> str:
     )
     return (
         '<mujoco><option gravity="0 0 0"/><worldbody><body name="base"><freejoint/>'
-        f'<geom type="box" size=".5 .5 .5" mass="1000"/>{bodies}</body></worldbody></mujoco>'
+        f'<geom type="box" size=".5 .5 .5" mass="12"/>{bodies}</body></worldbody></mujoco>'
     )

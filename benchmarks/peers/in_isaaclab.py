@@ -4,10 +4,10 @@ Called by `check_exports.py` in an environment with Isaac Lab's package, but wit
 
     .venv-isaaclab/bin/python in_isaaclab.py EXPORTED.py commands.npz out.npz
 
-Arguments as of `in_newton.py`; `commands.npz` also has `delay_steps` (joints,), which of the
-exported delays to take, and `solref`, `solimp` of hard friction. Configuration, delay buffers and
-torques are Isaac Lab's. PhysX needs Isaac Sim and a GPU, so MuJoCo moves the joints under these
-torques, with the exported armature, and the exported friction as hard as a rigid body's.
+Arguments as of `in_newton.py`; `commands.npz` also has `solref` and `solimp` of hard friction.
+Configuration and torques are Isaac Lab's. PhysX needs Isaac Sim and a GPU, so MuJoCo moves the
+joints under these torques, with the exported armature, and the exported friction as hard as a
+rigid body's.
 """
 
 from __future__ import annotations
@@ -44,35 +44,29 @@ def main() -> None:
     exported = runpy.run_path(path)
     data = np.load(given)
     command, step_s = data["command"], float(data["step_s"])
-    names = list(exported["ACTUATORS"])
-    actuators = []
-    for name, steps in zip(names, data["delay_steps"], strict=True):
-        cfg = exported["ACTUATORS"][name]
-        if not cfg.min_delay <= steps <= cfg.max_delay:
-            raise SystemExit(f"{name}: a delay of {steps} steps is not among the exported ones.")
-        cfg.min_delay = cfg.max_delay = int(steps)
-        actuator = cfg.class_type(cfg, [name], slice(None), 1, "cpu")
-        actuator.reset(slice(None))
-        actuators.append(actuator)
+    names = list(exported["SERVOS"])
+    cfg = exported["ACTUATORS"]["servos"]
+    actuator = cfg.class_type(cfg, names, slice(None), 1, "cpu")
+    actuator.reset(None)
     model = mujoco.MjModel.from_xml_string(model_of(names))
     model.opt.timestep, model.opt.integrator = step_s, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model.dof_armature[6:] = [float(a.armature) for a in actuators]
-    model.dof_frictionloss[6:] = [float(a.friction) for a in actuators]
+    model.dof_armature[6:] = actuator.armature[0].numpy()
+    model.dof_frictionloss[6:] = actuator.friction[0].numpy()
+    model.dof_damping[6:] = actuator.viscous_friction[0].numpy()
     model.dof_solref[6:], model.dof_solimp[6:] = data["solref"], data["solimp"]
     state = mujoco.MjData(model)
     mujoco.mj_setConst(model, state)  # friction's hardness goes by the inertia
-    nothing = torch.zeros(1, 1)
-    positions = np.zeros(command.shape)
+    nothing = torch.zeros(1, len(names))
+    positions, readings = np.zeros(command.shape), np.zeros(command.shape)
     for k, goals in enumerate(command):
-        for n, actuator in enumerate(actuators):
-            where, speed = (
-                torch.tensor([[float(v)]]) for v in (state.qpos[7 + n], state.qvel[6 + n])
-            )
-            told = ArticulationActions(torch.tensor([[goals[n]]]).float(), nothing, nothing)
-            state.qfrc_applied[6 + n] = actuator.compute(told, where, speed).joint_efforts.item()
+        where, speed = (torch.tensor(v)[None].float() for v in (state.qpos[7:], state.qvel[6:]))
+        action = ArticulationActions(torch.tensor(goals)[None].float(), nothing, nothing)
+        efforts = actuator.compute(action, where, speed).joint_efforts
+        state.qfrc_applied[6:] = efforts[0].numpy()
         mujoco.mj_step(model, state)
         positions[k] = state.qpos[7:]
-    np.savez(out, position=positions)
+        readings[k] = actuator.servos.read(torch.tensor(state.qpos[7:])[None].float())[0].numpy()
+    np.savez(out, position=positions, reading=readings)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ def main() -> None:
     data = np.load(given)
     command, step_s = data["command"], float(data["step_s"])
     wp.config.quiet = True
-    names = [a.target_names_expr[0] for a in exported["ACTUATORS"]]
+    names = list(exported["SERVOS"])
     robot = EntityCfg(
         spec_fn=lambda: mujoco.MjSpec.from_string(model_of(names)),
         articulation=EntityArticulationInfoCfg(actuators=exported["ACTUATORS"]),
@@ -39,14 +39,17 @@ def main() -> None:
     scene.reset()
     entity = scene["robot"]
     ids, _ = entity.find_joints(names, preserve_order=True)
-    positions = np.zeros(command.shape)
+    (actuator,) = entity.actuators
+    positions, readings = np.zeros(command.shape), np.zeros(command.shape)
     for k, goals in enumerate(command):
         entity.set_joint_position_target(torch.tensor(goals, dtype=torch.float32)[None], ids)
         scene.write_data_to_sim()
         sim.step()
         scene.update(step_s)
-        positions[k] = entity.data.joint_pos[0, ids].cpu().numpy()
-    np.savez(out, position=positions)
+        here = entity.data.joint_pos
+        positions[k] = here[0, ids].cpu().numpy()
+        readings[k] = actuator.servos.read(here[:, actuator.target_ids])[0].cpu().numpy()
+    np.savez(out, position=positions, reading=readings)
 
 
 if __name__ == "__main__":

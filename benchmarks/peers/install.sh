@@ -10,7 +10,7 @@ python3 -m venv .venv
 "${PYTHON312:-python3.12}" -m venv .venv-bam
 .venv-bam/bin/pip install --quiet "better-actuator-models==1.0.2" "optuna==5.0.0" "cmaes==0.13.1" wandb
 python3 -m venv .venv-newton
-.venv-newton/bin/pip install --quiet "newton==1.8.0" "mujoco~=3.17.0" "mujoco-warp~=3.17.0" onnx warp-nn
+.venv-newton/bin/pip install --quiet "newton==1.8.0" "mujoco~=3.17.0" "mujoco-warp~=3.17.0" "torch==2.13.0"
 python3 -m venv .venv-mjlab
 .venv-mjlab/bin/pip install --quiet "torch==2.13.0" && .venv-mjlab/bin/pip install --quiet "mjlab==1.6.0"
 python3 -m venv .venv-isaaclab

@@ -40,6 +40,7 @@ _OLD_PANDAS = tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1)
 _EXACTLY: dict[str, Any] = {"float_precision": "round_trip"} if _OLD_PANDAS else {}
 _SPLIT = "Split it by joint or by time."
 _BLOCK = 4_000_000  # characters
+_NOTHING = frozenset({"none", "null", "n/a", "na", "#n/a", "-", "--", "<na>"})
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
 _QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
 
@@ -84,6 +85,7 @@ def read_table(
     texts: Collection[str] = (),
     strict: bool = True,
     whole_lines: bool = False,
+    columns: Sequence[str] | None = None,
 ) -> CsvTable:
     """Columns of CSV text.
 
@@ -100,6 +102,8 @@ def read_table(
         Refuse text in other columns, rather than name it in `faults`.
     whole_lines : bool
         Leave a last line out, too, that does not end.
+    columns : sequence of str, optional
+        Names of the columns where no line has them.
 
     Raises
     ------
@@ -109,7 +113,7 @@ def read_table(
     """
     text = one_line_end(text)
     refuse_more(path, text.count("\n"), MOST_ROWS + 2 * MOST_COMMENTS, "lines", _SPLIT)
-    found, first, at = _opening(path, text)
+    found, first, at = _opening(path, text, columns)
     rows = text.count("\n", at)
     refuse_more(path, rows, MOST_ROWS, "rows", _SPLIT)
     refuse_more(path, rows * len(found.columns), MOST_CELLS, "cells", _SPLIT)
@@ -170,7 +174,9 @@ def _comments(
     return found
 
 
-def _opening(path: Path | str, text: str) -> tuple[CsvTable, int, int]:
+def _opening(
+    path: Path | str, text: str, columns: Sequence[str] | None = None
+) -> tuple[CsvTable, int, int]:
     """Comments and names of the columns; line and place in the text of what follows."""
     at, n, stop = 0, 1, 0
     while at < len(text):
@@ -186,6 +192,11 @@ def _opening(path: Path | str, text: str) -> tuple[CsvTable, int, int]:
         return CsvTable([], comments=comments), n, len(text)
     line = text[at:stop]
     refuse_more(path, line.count(",") + 1, MOST_COLUMNS, "columns", _SPLIT)
+    if columns is not None:
+        names = [name.strip() for name in columns]
+        refuse_more(path, len(names), MOST_COLUMNS, "columns", _SPLIT)
+        distinct(f"{path}, its columns", names)
+        return CsvTable(names, comments=comments), n, at
     names = [name.strip() for name in _cells(path, n, line)]
     distinct(f"{path}, line {n}", names)
     return CsvTable(names, comments=comments), n + 1, min(stop + 1, len(text))
@@ -279,7 +290,9 @@ class _Blocks:
                 found.texts[name] += [self._text(cell) for cell in cells]
             elif name in self._numbers:
                 try:
-                    self._numbers[name].append(numbers_of(path, name, cells, lines))
+                    self._numbers[name].append(
+                        numbers_of(path, name, cells, lines, () if self._strict else _NOTHING)
+                    )
                 except InputError as error:
                     if self._strict:
                         raise
@@ -292,7 +305,11 @@ class _Blocks:
 
 
 def numbers_of(
-    path: Path | str, name: str, cells: Sequence[str], lines: Sequence[int] | NDArray[np.int64]
+    path: Path | str,
+    name: str,
+    cells: Sequence[str],
+    lines: Sequence[int] | NDArray[np.int64],
+    nothing: Collection[str] = (),
 ) -> NDArray[np.float64]:
     """Numbers of a column's cells; an empty one is NaN.
 
@@ -304,6 +321,8 @@ def numbers_of(
     cells : sequence of str
     lines : sequence of int
         Of the cells, for messages.
+    nothing : collection of str
+        Words in lower case that stand for an empty cell.
 
     Raises
     ------
@@ -312,7 +331,7 @@ def numbers_of(
     """
     values, shown = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):
-        if not (text := cell.strip()):
+        if not (text := cell.strip()) or text.lower() in nothing:
             continue
         try:
             values[k] = decimal(text)

@@ -15,7 +15,7 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, InputError, MissingDevice
-from pupper_sysid.hardware.address import SOCKET
+from pupper_sysid.hardware.address import SOCKET, BusAddress
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.esp32 import datagrams
@@ -119,6 +119,21 @@ class Esp32Bus(HostClock):
                 f"{self.path}: no answer. On the robot, check `systemctl status "
                 "esp32-proxy`; without a robot, start one with `pupper-sysid emulate esp32`."
             )
+
+    @classmethod
+    def open_address(
+        cls,
+        address: BusAddress,
+        joint_map: JointMap | None,
+        joints: Sequence[str] | None,
+        exclusive: bool,
+    ) -> Esp32Bus:
+        """The bus at an address; it always has all joints."""
+        return cls(Path(address.where), joint_map, exclusive)
+
+    @classmethod
+    def limp_address(cls, address: BusAddress, ids: Sequence[int] | None) -> None:
+        """Nothing can be sent to servos whose proxy is not known yet."""
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
         """Send commands; the proxy's acknowledgement does not mean that a servo has them."""

@@ -9,30 +9,24 @@ tables; entries on which they disagree are left out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from pupper_sysid.common.data_sheet import counts_of
+from pupper_sysid.hardware.serial_servos.series import Profile, Register, Series
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST_ID = 0xFE
 HIGHEST_ID = 253
 
-ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """By the value of the servo's baud register."""
 RETURN_DELAY_UNIT_S = 2e-6
 
 MODEL_ADDRESS, TORQUE_ADDRESS = 3, 40
+MULTI_TURN_FEEDBACK = 16
 _SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
-
-
-@dataclass(frozen=True)
-class Register:
-    """An entry of a memory table."""
-
-    address: int
-    size: int = 1
-    """Bytes, 1 or 2."""
-    sign_bit: int | None = None
-    """Of a value stored as sign and magnitude."""
 
 
 _COMMON = {
@@ -49,6 +43,7 @@ _COMMON = {
     "max_voltage": Register(14),
     "min_voltage": Register(15),
     "max_torque": Register(16, 2),
+    "phase": Register(18),
     "unload_condition": Register(19),
     "p": Register(21),
     "d": Register(22),
@@ -70,64 +65,6 @@ _COMMON = {
 }
 
 
-@dataclass(frozen=True)
-class Series:
-    """One family of servos."""
-
-    name: str
-    model: int
-    """Model number."""
-    big_endian: bool
-    """Byte order inside a two-byte register."""
-    counts: int
-    """Of the encoder's whole range."""
-    has_sync_read: bool
-    lock_address: int
-    registers: dict[str, Register]
-
-    def word(self, value: int) -> bytes:
-        """Two bytes of a register in this series' byte order; `value` must fit."""
-        return int(value).to_bytes(2, "big" if self.big_endian else "little")
-
-    def decode(self, name: str, memory: bytes, start: int = 0) -> int:
-        """Value of register `name` in `memory`, which starts at address `start`."""
-        register = self.registers[name]
-        at = register.address - start
-        raw = memory[at : at + register.size]
-        if at < 0 or len(raw) != register.size:
-            raise IndexError(f"register {name} is not in memory {start}..{start + len(memory)}")
-        value = int.from_bytes(raw, "big" if self.big_endian else "little")
-        return signed(value, register.sign_bit)
-
-    def encode(self, name: str, value: int) -> bytes:
-        """Bytes of register `name`.
-
-        Raises
-        ------
-        OverflowError
-            If the value does not fit.
-        """
-        register = self.registers[name]
-        if register.sign_bit is not None:
-            if abs(value) >> register.sign_bit:
-                raise OverflowError(f"{name}: {value} does not fit beside its sign bit")
-            value = abs(value) | (value < 0) << register.sign_bit
-        return int(value).to_bytes(register.size, "big" if self.big_endian else "little")
-
-
-def signed(value: int, sign_bit: int | None) -> int:
-    """Value of a number stored as sign and magnitude.
-
-    Examples
-    --------
-    >>> signed(0x8005, 15), signed(5, 15)
-    (-5, 5)
-    """
-    if sign_bit is None or not value >> sign_bit & 1:
-        return value
-    return -(value & (1 << sign_bit) - 1)
-
-
 SCS0009 = Series(
     "SCS0009", 1284, True, 1024, False, 48,
     _COMMON | {"goal_position": Register(42, 2), "present_position": Register(56, 2)},
@@ -146,23 +83,75 @@ STS3215 = Series(
         "present_position": Register(56, 2, 15),
         "current": Register(69, 2, 15),
     },
+    # several turns are reported, instead of one (LeRobot clears it)
+    multi_turn_bit=MULTI_TURN_FEEDBACK,
 )  # fmt: skip
-SERIES = {series.model: series for series in (SCS0009, STS3215)}
+HD1910 = replace(
+    STS3215,
+    name="HD-1910",
+    model=0,
+    registers=STS3215.registers | {"p": Register(50), "d": Register(51)},
+    more_position_modes=frozenset({4}),  # as delivered, by a builder's notes on firmware 3.46
+)
+"""Microduck's Feetech servo: STS protocol, with the gains in use at 50 and 51. No source states its
+model number, so that a joint map has to name it."""
+SERIES = {int.from_bytes(s.word(s.model), "little"): s for s in (SCS0009, STS3215)}
+"""By model number, its bytes as little endian."""
+
+POSITION_MODE = 0
+MODES = {1: "wheel mode", 2: "PWM mode", 3: "step mode"}
+ACKNOWLEDGES = 1
+
+SHAPING = (
+    "return_delay", "response_level", "min_start_force", "dead_zone_cw", "dead_zone_ccw",
+    "max_torque", "torque_limit", "max_temperature", "max_voltage", "min_voltage", "min_angle",
+    "max_angle", "homing_offset", "phase", "mode", "acceleration", "goal_time", "goal_speed",
+)  # fmt: skip
+"""Registers beside the gains that shape how a servo moves and answers."""
+
+_ACCELERATION_COUNTS_S2 = 100
+_HEAT, _OVERLOAD = 4, 32  # of ERROR_BITS
+_MOST = {"protective_torque": 20, "protection_time": 200, "overload_torque": 80}
+"""Factory settings: share of the torque afterwards [%], duration [10 ms], share before [%]."""
+_OFF_AT_ZERO = ("protection_time", "overload_torque")
+
+PROTECTIONS = ("unload_condition", *_MOST)
+"""Registers of which a servo's protections consist, as far as its series has them."""
 
 
-def series_of_model_bytes(raw: bytes) -> Series | None:
-    """Series with the model number `raw` (2 bytes, in its own byte order); None if unknown."""
-    return next((s for s in SERIES.values() if raw == s.word(s.model)), None)
+def protections_to_set(series: Series, registers: Mapping[str, int]) -> dict[str, int]:
+    """Values that bring a servo's protections to at least the factory's; {} if they are.
 
-
-def error_words(status: int) -> str:
-    """Error bits of a status byte in words.
+    If every process of the host is gone, only these act: above a temperature, or when a joint has
+    been blocked for some time, the servo reduces its torque by itself. No series has a
+    communication time-out: a servo that is free to move holds its last command for ever. Registers
+    37 to 39 of the SCS series are left alone: sources name them, the vendor's table does not.
 
     Examples
     --------
-    >>> error_words(33)
-    'voltage, overload'
+    >>> protections_to_set(SCS0009, {"unload_condition": 1})
+    {'unload_condition': 37}
     """
-    named = [word for bit, word in ERROR_BITS.items() if status & bit]
-    rest = status & ~sum(ERROR_BITS)
-    return ", ".join([*named, *([f"unknown bits {rest:#04x}"] if rest else [])])
+    wanted = {"unload_condition": registers["unload_condition"] | _HEAT | _OVERLOAD}
+    for name, most in _MOST.items():
+        if name in series.registers:
+            off = registers[name] == 0 and name in _OFF_AT_ZERO
+            wanted[name] = most if off else min(registers[name], most)
+    return {name: value for name, value in wanted.items() if value != registers[name]}
+
+
+def profile(series: Series, registers: Mapping[str, int]) -> Profile:
+    """Ramp of the set-point: acceleration in 100 counts/s², speed in counts/s, time in ms.
+
+    A speed overrides the time.
+    """
+    count = math.tau / (counts_of(series.name) or series.counts)
+    acceleration, speed = registers.get("acceleration", 0), registers.get("goal_speed", 0)
+    duration = 0 if speed else registers.get("goal_time", 0)
+    named = {"acceleration": acceleration, "goal_speed": speed, "goal_time": duration}
+    return Profile(
+        speed * count if speed else math.inf,
+        _ACCELERATION_COUNTS_S2 * acceleration * count if acceleration else math.inf,
+        duration / 1e3,
+        tuple(name for name, value in named.items() if value),
+    )

@@ -30,6 +30,7 @@ from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.rates import RateLimit
 from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import Watchdog
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS
 
 _HEARTBEAT_S = 0.1
 _MOST_EVENTS = 500  # that a report keeps; all are counted
@@ -91,6 +92,7 @@ class GuardedBus:
         self.bus = bus
         self.name, self.joint_names = bus.name, bus.joint_names
         self.limits, self.metadata = bus.limits, bus.metadata
+        self.error_bits = getattr(bus, "error_bits", ERROR_BITS)
         self.guard = limits or GuardLimits()
         self.report = GuardReport()
         self.spent = TimeSpent(bus.now)
@@ -114,6 +116,10 @@ class GuardedBus:
         """Sleep until `now()` has reached `time_s`; the watchdog gets its beats meanwhile."""
         while self._on and (left := time_s - self.bus.now()) > _HEARTBEAT_S:
             self._beat()
+            if alive := getattr(
+                self.bus, "keep_alive", None
+            ):  # servos with a watchdog of their own
+                alive()
             self.bus.sleep_until(self.bus.now() + min(_HEARTBEAT_S, left))
         self.bus.sleep_until(time_s)
 
@@ -191,12 +197,15 @@ class GuardedBus:
         Raises
         ------
         BusError
-            If a position is missing, a servo does not take a protection that it lacks, or a servo
+            If a servo's registers do not let it be driven (`SerialBus.refuse_unfit`), a position is
+            missing, a servo does not take a protection that it lacks, or a servo
             did not confirm that its torque is on; the torque of all is switched off then.
         """
         if not on:
             self._torque_off()
             return not self._left_on
+        if refuse := getattr(self.bus, "refuse_unfit", None):
+            refuse()
         if not self._on:
             # a limp robot may have been moved by hand since it was read
             self._present[self.bus.now() - self._present_s > _STALE_S] = np.nan

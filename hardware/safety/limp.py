@@ -7,15 +7,16 @@ import os
 import socket
 import time
 from collections.abc import Sequence
+from typing import Any
 
-from pupper_sysid.hardware.address import BusAddress
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.address import KINDS, BusAddress
 from pupper_sysid.hardware.connect import open_bus
-from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.opening import AUTO_BAUDS
-from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.lock import LOG, open_here
 
 _CONNECT_WITHIN_S = 0.4
+_TRIES = 5
 
 
 def switch_off(
@@ -23,37 +24,33 @@ def switch_off(
 ) -> list[str]:
     """Switch the torque off once, without a lock.
 
-    Feetech servos get it in one frame before anything is known of the line, so that those that hear
-    but do not answer go limp, too.
+    Servos of a serial line get it in one frame before anything is known of the line, so that those
+    that hear but do not answer go limp, too; without a joint map all servos do.
 
     Parameters
     ----------
     address : BusAddress
     joint_map : JointMap, optional
-        By default the preset that fits the servos.
+        Without one every servo of a serial line is switched off, whatever it moves.
     joints : sequence of str, optional
-        On a Feetech line only these; by default all of the map.
+        On a serial line only these; by default all of the map.
 
     Returns
     -------
     list of str
-        Joints whose servos did not confirm it.
+        Joints whose servos did not confirm it; without a map, `id 5` and so on.
 
     Raises
     ------
     BusError
         If the bus cannot be opened, or no servo answers.
     """
+    kind = KINDS[address.kind].bus_class()
     chosen = joint_map.per_servo() if joint_map else None
-    if address.kind == "feetech":
-        # all presets of this layout share the ids
-        known = chosen or load_joint_map("sts3215").per_servo()
-        known = known.select(joints) if joints else known
-        chosen = known if chosen else None
-        for rate in AUTO_BAUDS if address.baud is None else (address.baud,):
-            line = FeetechLine(address.where, rate, exclusive=False)
-            line.torque_off(known.ids)
-            line.close()
+    chosen = chosen.select(joints) if chosen and joints else chosen
+    kind.limp_address(address, chosen.ids if chosen else None)
+    if chosen is None and KINDS[address.kind].is_serial:
+        return _all_off(address)
     bus = open_bus(address, chosen, exclusive=False)
     try:
         limp = bus.torque(False)
@@ -63,9 +60,40 @@ def switch_off(
     return [name for name in wanted if not limp or name not in bus.joint_names]
 
 
+def _all_off(address: BusAddress) -> list[str]:
+    """Switch off every servo that answers, one by one; ids that did not confirm, in words."""
+    family = KINDS[address.kind].bus_class().family
+    for rate in family.rates if address.baud is None else (address.baud,):
+        line = family.open_line(address.where, rate, False)
+        try:
+            line.detect_echo()
+            models = line.find(list(line.roll_call(range(family.highest_id + 1))))
+            left = [servo for servo in models if not _is_off(line, servo, family, models[servo])]
+        finally:
+            line.close()
+        if models:
+            return [f"id {servo}" for servo in left]
+    raise BusError(
+        f"{address.where}: no servo answers, so nothing confirms that the torque is off. Check the "
+        "cable and the power."
+    )
+
+
+def _is_off(line: Any, servo: int, family: Any, model: int) -> bool:
+    """Switch one servo off; whether it confirms that."""
+    series = family.series.get(model) or next(iter(family.series.values()))
+    address = series.register("torque_enable").address
+    for _ in range(_TRIES):
+        line.write(servo, address, b"\0")
+        now = line.read(servo, address, 1)
+        if now is not None and now.frame.data == b"\0":
+            return True
+    return False
+
+
 def is_there(address: BusAddress) -> bool:
     """Whether the line exists; a proxy's socket must have somebody behind it."""
-    if address.kind != "esp32":
+    if KINDS[address.kind].is_serial:
         return os.path.exists(address.where)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as line:
         line.settimeout(_CONNECT_WITHIN_S)

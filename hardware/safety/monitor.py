@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, ServoBus
-from pupper_sysid.hardware.feetech.registers import error_words
+from pupper_sysid.hardware.bus import BusSample, ServoBus, error_words
 
 Angles = NDArray[np.float64]
 
@@ -99,7 +98,7 @@ class Monitor:
     """The last seconds of commands and readings of a bus, and the checks of them."""
 
     def __init__(self, bus: ServoBus, limits: GuardLimits):
-        self._names, self._limits = bus.joint_names, limits
+        self._bus, self._names, self._limits = bus, bus.joint_names, limits
         # servo angles: a push rod changes a calf's joint angle with its thigh while its own servo
         # stands still
         self._servo_angles = bus.limits.servo_angles
@@ -200,8 +199,9 @@ class Monitor:
         if sample.status is not None:
             k = self._persistent("status", sample.status != 0, valid, now)
             if k is not None:
+                words = error_words(self._bus, int(sample.status[k]))
                 raise SafetyStop(
-                    f"{self._names[k]} reports an error: {error_words(int(sample.status[k]))}. "
+                    f"{self._names[k]} reports an error: {words}. "
                     "Relieve it, and switch its power off and on if the error stays."
                 )
 

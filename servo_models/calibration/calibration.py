@@ -237,6 +237,30 @@ class Calibration(Part):
             quantum_rad=feedback.quantum_rad.value,
         )
 
+    def export(self, to: str, out: Path | str = ".", **options: Any) -> Path:
+        """Write these servos for another simulator; see `sim.export.export.export`.
+
+        Parameters
+        ----------
+        to : {"mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json"}
+        out : Path or str
+            File, or a folder, in which the file is called `servos` with the target's ending.
+        **options
+            `physics_step_s`, `gain`, `link_inertia`, `model`, `force`.
+
+        Returns
+        -------
+        Path
+            The file that was written.
+
+        Raises
+        ------
+        InputError
+            If the target cannot take these servos so, or the file exists.
+        """
+        # a room above this one: the file's own room knows no simulator
+        return import_module("pupper_sysid.sim.export.export").export(self, to, out, **options)
+
     def to_yaml(self) -> str:
         """Text of the file: a header that explains it, then the data."""
         return f"{_HEADER}\n{dump(self.model_dump(mode='json', by_alias=True))}"

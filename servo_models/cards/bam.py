@@ -16,6 +16,8 @@ zero of the test bench, no number of the servo. The largest duty clips the torqu
 
 from __future__ import annotations
 
+import json
+import math
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +28,7 @@ from pupper_sysid.common.border import read_json, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
+from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, UnderLoad
 from pupper_sysid.servo_models.cards.card import Gains, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
 
@@ -237,6 +240,11 @@ def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
     return plain | {"model": model, "actuator": name}
 
 
+def to_bam_json(card: ServoCard, specimen: str | None = None) -> str:
+    """Text of a parameter file, as BAM's `load_model(json_file=…)` reads it; see `to_bam`."""
+    return json.dumps(to_bam(card, specimen), indent=4) + "\n"
+
+
 def not_in_bam(card: ServoCard) -> list[str]:
     """What BAM's class for this servo fixes and the card has otherwise, in sentences."""
     name, kind = class_of(card)
@@ -284,13 +292,85 @@ def class_of(card: ServoCard) -> tuple[str, Actuator]:
     )
 
 
+STRIBECK_EXPONENT = 1.35
+"""Decay of the friction at standstill where a source states none: that of BAM's own fits."""
+
+_NOT_IN_BAM = {
+    "duty_s_per_rad": "duty per velocity (a D gain)",
+    "load_friction_quadratic_per_nm": "friction that grows with the squared torque",
+    "dead_zone_rad": "the dead zone",
+    "start_duty": "the minimum start force",
+    "acceleration_limit_rad_s2": "the limit on the set-point's acceleration",
+}
+
+
+def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Motor and friction of a servo fitted under load, by the names of Isaac Lab's `BamMotorCfg`.
+
+    BAM's friction at standstill decays as exp(-(v / v0)^a), ours as 1 / (1 + (v / v1)^2); v0 is
+    such that half of it is left at the same speed.
+
+    Parameters
+    ----------
+    servo : UnderLoad
+
+    Returns
+    -------
+    motor : dict
+    lost : tuple of str
+        What BAM's models do not have, in words.
+
+    Raises
+    ------
+    InputError
+        If there is no back-EMF, which gives kt.
+    """
+    value = {
+        key: quantity.value if (quantity := getattr(servo, key)) is not None else 0.0
+        for key in (*LOADED_KEYS.values(),)
+        if hasattr(servo, key)
+    }
+    viscous = value["off_brake"] * value["back_emf_nm_s_per_rad"]
+    emf, per_volt = (
+        value["back_emf_nm_s_per_rad"] - viscous,
+        value["stall_torque_nm"] / (servo.reference_voltage_v or 1.0),
+    )
+    if not emf > 0:
+        raise InputError(
+            "This servo was fitted without a back-EMF, so its kt is unknown. Export it to isaaclab."
+        )
+    kt = emf / per_volt
+    static = value["load_friction_static"]
+    on_motor, on_load = value["load_friction_motor"], value["load_friction_load"]
+    decay = math.log(2) ** (1 / STRIBECK_EXPONENT)
+    stribeck, loaded = value["stribeck_friction_nm"], on_motor + on_load
+    motor = {
+        "model": "m5" if loaded else "m2" if stribeck else "m1",
+        "kt": kt,
+        "resistance": kt / per_volt,
+        "error_gain": value["duty_per_rad"],
+        "max_pwm": 1.0,
+        "max_current": value["torque_limit_nm"] / kt,
+        "friction_base": value["friction_loss_nm"],
+        "friction_viscous": viscous,
+        "friction_stribeck": stribeck,
+        "dtheta_stribeck": (value["stribeck_speed_rad_s"] or 0.1) / decay,
+        "alpha": STRIBECK_EXPONENT,
+        "load_friction_motor": on_motor,
+        "load_friction_external": on_load,
+        "load_friction_motor_stribeck": static * on_motor,
+        "load_friction_external_stribeck": static * on_load,
+    }
+    return motor, tuple(words for key, words in _NOT_IN_BAM.items() if value.get(key))
+
+
 def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:
     """The smallest friction model that holds the numbers, and its parameters."""
     n = numbers
     stribeck = {
         "friction_stribeck": n.stribeck_friction_nm or stated(0.0),
         "dtheta_stribeck": n.stribeck_speed_rad_s or stated(0.2),
-        "alpha": n.stribeck_exponent or stated(1.35),
+        "alpha": n.stribeck_exponent or stated(STRIBECK_EXPONENT),
     }
     slow = n.stribeck_friction_nm is not None or n.load_stribeck_load is not None
     if n.load_friction_load is None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, derived
@@ -12,8 +15,11 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.operating_point import ARMATURES, Armature
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, PARAMETER_KEYS
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.cards.files import is_card, load_card
-from pupper_sysid.servo_models.cards.numbers import TorquePD, unit
+from pupper_sysid.servo_models.cards.card import ServoCard
+from pupper_sysid.servo_models.cards.files import card_names, is_card, load_card
+from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, unit
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.step_size import lag_of_steps, tones_in_steps_of
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,17 @@ class Servo(Result):
     """Supply voltage [V], where it is known."""
     pd: TorquePD
     """The numbers."""
+    link_kg_m2: float = 0.0
+    """Inertia of link and load beside the armature, where it is known [kg·m²]."""
+    notes: tuple[str, ...] = ()
+    """Reasons for distrust, in sentences."""
+    as_it_stands: bool = False
+    """Whether a simulator's file states the numbers, which are compared as they are."""
+
+    @property
+    def parameters(self) -> DelayedPDParameters:
+        """What moves: the servo with its link."""
+        return replace(self.pd.parameters, armature=self.pd.armature_kg_m2.value + self.link_kg_m2)
 
     @property
     def title(self) -> str:
@@ -69,6 +86,18 @@ class Difference(Result):
 
 
 @dataclass(frozen=True)
+class Motion(Result):
+    """How two servos move on the same commands: tones of 1, 2 and 4 Hz, 0.2 rad, in free air."""
+
+    first_lag_s: float | None
+    """Lag of the first, dead time included, mean over the tones [s]; None if it is not stable."""
+    second_lag_s: float | None
+    """Of the second."""
+    apart_rad: float | None
+    """RMS difference of their positions [rad]."""
+
+
+@dataclass(frozen=True)
 class Comparison(Result):
     """Two servos at one P gain, as far as both know theirs.
 
@@ -78,6 +107,7 @@ class Comparison(Result):
     differences : tuple of Difference
     p_gain : float or None
         Of both; None where they could not be brought to one.
+    motion : Motion
     notes : tuple of str
         What is compared at which gain, and what is not comparable, in sentences.
     """
@@ -86,6 +116,7 @@ class Comparison(Result):
     second: Servo
     differences: tuple[Difference, ...]
     p_gain: float | None
+    motion: Motion
     notes: tuple[str, ...]
 
 
@@ -114,7 +145,7 @@ def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = 
             name, specimen if len(card.specimens) > 1 else None,
             card.gains.p if p_gain is None else p_gain,
             not isinstance(card.specimens[specimen], TorquePD), card.armature, card.supply_v,
-            card.pd(specimen, p_gain),
+            card.pd(specimen, p_gain), notes=implausible(card, specimen),
         )  # fmt: skip
     calibration = load_calibration(path_or_name)
     part = part or calibration.joint_names[0]
@@ -137,7 +168,11 @@ def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = 
 
 
 def compared(
-    first: str, second: str, part: str | None = None, p_gain: float | None = None
+    first: str,
+    second: str,
+    part: str | None = None,
+    p_gain: float | None = None,
+    read: Callable[[str, str | None, float | None], Servo] = servo_of,
 ) -> Comparison:
     """Two servos at equal P gain, number by number.
 
@@ -152,6 +187,8 @@ def compared(
     part : str, optional
         As for `servo_of`, of both.
     p_gain : float, optional
+    read : callable
+        Reads a servo from its name or file; by default `servo_of`.
 
     Raises
     ------
@@ -159,7 +196,7 @@ def compared(
         As `servo_of`.
     """
     names, notes = (first, second), []
-    servos = [servo_of(name, part) for name in names]
+    servos = [read(name, part, None) for name in names]
     fixed = [s.p_gain for s in servos if not s.any_gain]
     common = p_gain
     if common is None and all(s.p_gain is not None for s in servos) and len(set(fixed)) < 2:
@@ -167,11 +204,17 @@ def compared(
     if common is not None:
         for n, (name, servo) in enumerate(zip(names, servos, strict=True)):
             if servo.any_gain or servo.p_gain is not None:
-                servos[n] = servo_of(name, part, common)
+                servos[n] = read(name, part, common)
     one, other = servos
     equal = one.p_gain is not None and one.p_gain == other.p_gain
+    file = next((s for s in servos if s.as_it_stands), None)
     if equal:
         notes.append(f"Both at P gain {one.p_gain:g}.")
+    elif file is not None:
+        rest = ", ".join(f"{s.title}: {_gain(s)}" for s in servos if not s.as_it_stands)
+        notes.append(
+            f"{file.title} is compared as it stands" + (f" (P gain of {rest})." if rest else ".")
+        )
     else:
         stated = "; ".join(f"{s.title}: {_gain(s)}" for s in servos)
         notes.append(f"Not at one P gain ({stated}), so stiffness and damping are not compared.")
@@ -179,15 +222,70 @@ def compared(
     if not alike:
         stated = "; ".join(f"{s.title}: {ARMATURES[s.armature]}" for s in servos)
         notes.append(f"The armatures differ in what they include ({stated}); not compared.")
-    not_comparable = (set() if equal else _AT_GAIN) | (set() if alike else {"armature"})
+        whole, bare = (one, other) if other.armature == "servo" else (other, one)
+        held, least = (s.pd.armature_kg_m2.value for s in (whole, bare))
+        if held < least + bare.link_kg_m2:
+            notes.append(
+                f"{whole.title}: an arm cannot have less inertia than its servo; {held:.3g} kg·m² "
+                f"with the link are less than {least + bare.link_kg_m2:.3g} of {bare.title}. One "
+                "of their torque scales is wrong."
+            )
+    notes += [note for servo in servos for note in servo.notes]
+    not_comparable = (set() if equal or file else _AT_GAIN) | (set() if alike else {"armature"})
     return Comparison(
         one, other,
         tuple(
             replace(d, comparable=d.quantity not in not_comparable)
             for d in differences(one, other)
         ),
-        one.p_gain if equal else None, tuple(notes),
+        one.p_gain if equal else None, motion_of(one, other), tuple(dict.fromkeys(notes)),
     )  # fmt: skip
+
+
+def motion_of(first: Servo, second: Servo) -> Motion:
+    """How two servos move on the same tones, each with the link that it is known to move."""
+    time = TIME_STEP_S * np.arange(round(1.0 / TIME_STEP_S))
+    tones = 0.2 * np.sin(2 * np.pi * np.outer((1.0, 2.0, 4.0), time))
+    lags, moved = [], []
+    for servo in (first, second):
+        parameters = servo.parameters
+        (more,) = lag_of_steps(parameters, TIME_STEP_S)
+        (lag,), _ = tones_in_steps_of(parameters, TIME_STEP_S)
+        stable = bool(np.isfinite(more) and np.isfinite(lag))
+        lags.append(float(lag + parameters.dead_time_s) if stable else None)
+        model = DelayedPD(parameters)
+        model.reset(np.zeros(len(tones)))
+        moved.append(model.rollout(tones.T))
+    apart = float(np.sqrt(np.mean((moved[0] - moved[1]) ** 2)))
+    return Motion(lags[0], lags[1], apart if np.isfinite(apart) else None)
+
+
+def implausible(card: ServoCard, specimen: str | None = None) -> tuple[str, ...]:
+    """What in a card contradicts the other cards of that servo, in sentences.
+
+    An armature that holds link and load must be larger than that of motor and gears alone, the
+    least of the cards that state it.
+    """
+    if card.armature != "servo and load":
+        return ()
+    names = [specimen] if specimen else list(card.specimens)
+    bare = {
+        name: other.pd().armature_kg_m2.value
+        for name in card_names()
+        if (other := load_card(name)).servo == card.servo and other.armature == "servo"
+        if isinstance(other.numbers, PositionLoop)
+    }
+    if not bare:
+        return ()
+    least = min(bare, key=lambda name: bare[name])
+    below = [n for n in names if card.pd(n).armature_kg_m2.value < bare[least]]
+    if not below:
+        return ()
+    return (
+        f"{card.name}, {', '.join(below)}: an arm cannot have less inertia than its servo, whose "
+        f"motor and gears alone have {bare[least]:.3g} kg·m² ({least}). The torque scale is "
+        "implausible: use ratios and times of this card, not its torques.",
+    )
 
 
 _AT_GAIN = {"stiffness", "damping"}
@@ -205,7 +303,11 @@ def differences(first: Servo, second: Servo) -> list[Difference]:
         if key != "model" and not (one is None and other is None):
             found.append(Difference(_TITLES[key], unit(key), one, other))
     speeds = [_quantity(s.pd.top_speed_rad_s) for s in (first, second)]
-    return [*found, Difference("top speed", "rad/s", *speeds)]
+    found.append(Difference("top speed", "rad/s", *speeds))
+    if first.link_kg_m2 or second.link_kg_m2:
+        moved = [_quantity(s.pd.armature_kg_m2.value + s.link_kg_m2) for s in (first, second)]
+        found.append(Difference("armature and link", "kg·m²", *moved))
+    return found
 
 
 _TITLES = {

@@ -16,7 +16,6 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.numbers import decimal
-from pupper_sysid.hardware.feetech.frames import Frame
 
 ANSWER_KINDS = (
     "lost", "late", "truncated", "corrupted", "duplicated", "foreign", "wrong-length",
@@ -118,10 +117,3 @@ def corrupted(answer: bytes, rng: np.random.Generator) -> bytes:
     if rng.random() < 0.3 and at + 1 < len(damaged):
         damaged[at + 1] ^= int(rng.integers(1, 256))
     return bytes(damaged)
-
-
-def with_wrong_length(frame: Frame, rng: np.random.Generator) -> bytes:
-    """A valid frame with a parameter too few or too many."""
-    data = frame.data
-    data = data[:-1] if len(data) and rng.random() < 0.5 else data + bytes([int(rng.integers(256))])
-    return Frame(frame.id, frame.code, data).encode()

@@ -1,112 +1,515 @@
-"""A calibration as MJCF: defaults, actuators and sensors to include in a model of MuJoCo ≥ 4.0."""
+"""A calibration as MJCF for MuJoCo ≥ 4.0: a file to include, or a user's model with these servos.
+
+What is included inherits the defaults of the model around it: a class `main` with `damping="0.6"`
+reaches every joint class that does not say otherwise. So each attribute that the measurement covers
+is written, zeros too. A class cannot override what a joint or actuator states itself, and it
+replaces the class that the joint had, with its axis and range; `to_model` therefore writes a
+whole model: every attribute at the joint, the joint's own actuators replaced, and the inertia that
+its bodies put on the joint taken off an armature that holds it. The result is compiled and
+compared with the numbers that were to be written.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
+from pathlib import Path
 from textwrap import wrap
 from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.sim.export.shared import (
-    FEEDBACK_KEYS,
-    KNOWN,
-    TORQUE_KEYS,
-    delays_at_step,
-    origin,
-    step_note,
+from pupper_sysid.servo_models.calibration.parts import JointCalibration
+from pupper_sysid.servo_models.cards.card import CardCalibration
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.step_size import MUJOCO
+from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, TORQUE_KEYS, ExportedServos, known_text
+from pupper_sysid.sim.robot.hinges import hinges_of
+from pupper_sysid.sim.robot.servo_mjcf import (
+    INTEGRATOR,
+    actuator_attributes,
+    attributes,
+    joint_attributes,
 )
-from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, attributes, joint_attributes, pid_element
+
+NEUTRAL_JOINT = {
+    "damping": "0 0 0", "stiffness": "0 0 0", "springref": "0", "springdamper": "0 0",
+    "springyield": "0", "actuatorfrclimited": "false", "actuatorfrcrange": "0 0",
+    "actuatorgravcomp": "false",
+}  # fmt: skip
+"""What else a default class can put on a joint, switched off; three numbers are a polynomial's."""
+NEUTRAL_ACTUATOR = {
+    "gear": "1 0 0 0 0 0", "ctrllimited": "false", "ctrlrange": "0 0", "forcelimited": "false",
+    "forcerange": "0 0", "actlimited": "false", "actrange": "0 0", "armature": "0",
+    "damping": "0 0 0", "cranklength": "0", "group": "0",
+}  # fmt: skip
+"""The same of an actuator, as attributes of `<general>`: `<pid>` takes not all of them."""
+NEUTRAL_PID = {"ki": "0", "imax": "0", "inheritrange": "0", "slewmax": "0"}
+_CARRIED = (
+    "Carried over: delay (to fractions of a step), gains, limits of torque and of the set-point's "
+    "speed, dry friction, armature, back-EMF (as damping); of the feedback the poll period and, as "
+    "a delay, the mean age that lost polls add. Not carried over: which polls are lost (the age is "
+    "even here), the readings' counts and offset, that servos are polled one after the other, and "
+    "the jitter of commands."
+)
+_RESET = (
+    "After a reset fill the delay lines (mj_initCtrlHistory), which MuJoCo sets to zero: a robot "
+    "that is not at zero would be thrown there for one delay."
+)
 
 
-def to_mjcf(calibration: Calibration, physics_step_s: float) -> str:
+def to_mjcf(servos: ExportedServos) -> str:
     """Defaults, actuators and sensors to `<include>` in a model that has joints of these names.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    physics_step_s : float
-        Of the model [s].
 
     Raises
     ------
     InputError
-        If the step is not a sensible one.
+        If the step is too long for the servos.
     """
-    delays = delays_at_step(calibration, physics_step_s)
+    names = {name: f"servo_{name}" for name in servos.calibration.joint_names}
+    defaults, actuators, sensors = _parts(servos, names)
+    for element, (name, joint) in zip(defaults, servos.calibration.joints.items(), strict=True):
+        element.insert(0, Element("joint", _joint(servos, name, joint)))
+    first = servos.calibration.joint_names[0]
+    notes = servos.head(
+        MUJOCO,
+        "Include this file in your model, and give each servo's joint its class, such as "
+        f"class='servo_{first}'. Take off the joint what it states of armature, damping, "
+        "stiffness, springref, springdamper, frictionloss, solreffriction, solimpfriction and "
+        "actuatorfrcrange, which would override the class, and write at the joint the axis and "
+        "range that its former class gave it. Remove the model's own actuators of these joints. "
+        "The option `model` of the export does all this. A position in ctrl is the command of the "
+        "servo.",
+        "The time step, the integrator and flags of your <option> override those here.",
+        _RESET,
+        _CARRIED,
+    )
+    option = f'  <option timestep="{servos.physics_step_s!r}" integrator="{INTEGRATOR}"/>'
+    lines = [
+        f'<mujoco model="{_plain(servos.calibration.robot)}: servos">', *_comment(notes), option,
+        *_group("default", servos, TORQUE_KEYS, defaults),
+        *_group("actuator", servos, (), actuators),
+        *_group("sensor", servos, FEEDBACK_KEYS, sensors), "</mujoco>", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def _parts(
+    servos: ExportedServos, classes: Mapping[str, str]
+) -> tuple[list[Element], list[Element], list[Element]]:
+    """Per joint: default class of its actuator, `<pid>` and sensor."""
     defaults, actuators, sensors = [], [], []
-    for name, joint in calibration.joints.items():
-        servo = replace(joint.actuator.parameters, dead_time_s=delays[name].value)
-        feedback = joint.feedback
-        period, age = feedback.poll_period_s.value, feedback.mean_age_s.value
-        defaults += [
-            _numbers_comment(name, joint.actuator, (*TORQUE_KEYS, "dead_time_s")),
-            f'<default class="servo_{name}">'
-            f"<joint {attributes(joint_attributes(servo, physics_step_s))}/></default>",
-        ]
-        actuators.append(pid_element({"name": name, "joint": name}, servo, physics_step_s))
+    for name, joint in servos.calibration.joints.items():
+        servo = _servo(servos, name, joint)
+        pid = actuator_attributes(servo, servos.physics_step_s)
+        neutral = dict(NEUTRAL_ACTUATOR)
+        if "forcerange" in pid:
+            neutral |= {"forcelimited": "true", "forcerange": pid["forcerange"]}
+        default = Element("default", {"class": classes[name]})
+        default.append(Element("general", neutral))
+        defaults.append(default)
+        place = {"name": name, "class": classes[name], "joint": name}
+        actuators.append(Element("pid", place | NEUTRAL_PID | pid))
         sensor = {"name": f"{name}_reading", "joint": name}
+        period, age = joint.feedback.poll_period_s.value, joint.feedback.mean_age_s.value
         if period > 0:
             # half a period is the sensor's own mean age; what polls are lost adds is a delay
             late = max(age - period / 2, 0.0)
-            sensor |= {
-                "nsample": str(int(np.ceil(late / period)) + 2),
-                "interval": repr(period),
-                "delay": repr(late),
-            }
-        sensors += [
-            _numbers_comment(name, feedback, FEEDBACK_KEYS),
-            f"<jointpos {attributes(sensor)}/>",
-        ]
-    notes = (
-        *origin(calibration),
-        f"For a time step of {physics_step_s:g} s: delay and the dry friction's reference time "
-        "depend on it, so export again for another one.",
-        *step_note(calibration, delays, physics_step_s),
-        "Include this file in your model, and give each servo's joint its class, such as class=\""
-        f'servo_{calibration.joint_names[0]}". A position in ctrl is the command of the servo.',
-        "After a reset fill the delay lines (mj_initCtrlHistory), which MuJoCo sets to zero: a "
-        "robot that is not at zero would be thrown there for one delay.",
-        "Carried over: delay (to fractions of a step), gains, limits of torque and of the "
-        "set-point's speed, dry friction, armature; of the feedback the poll period and, as a "
-        "delay, the mean age that lost polls add.",
-        "Not carried over: which polls are lost (the age is even here), the readings' counts and "
-        "offset, and that servos are polled one after the other.",
-    )
-    comment = [line for note in notes for line in (*wrap(_xml(note), 94), "")]
-    return "\n".join(
-        [
-            f'<mujoco model="{_xml(calibration.robot)}: servos">',
-            "  <!--", *(f"    {line}".rstrip() for line in comment[:-1]), "  -->",
-            f'  <option timestep="{physics_step_s!r}" integrator="{INTEGRATOR}"/>',
-            *_group("default", defaults), *_group("actuator", actuators),
-            *_group("sensor", sensors), "</mujoco>", "",
-        ]
-    )  # fmt: skip
+            length = str(int(np.ceil(late / period)) + 2)
+            sensor |= {"nsample": length, "interval": repr(period), "delay": repr(late)}
+        sensors.append(Element("jointpos", sensor))
+    return defaults, actuators, sensors
 
 
-def _numbers_comment(name: str, numbers: Any, keys: Sequence[str]) -> str:
-    """Numbers with their intervals, and how well they are known, as an XML comment."""
-    texts = []
-    for key in keys:
-        quantity = getattr(numbers, key)
-        text = f"{key} {quantity.value:.4g}"
-        if quantity.low is not None and quantity.high is not None:
-            text += f" ({quantity.low:.4g} to {quantity.high:.4g})"
-        texts.append(
-            text if quantity.identified == "yes" else f"{text} [{KNOWN[quantity.identified]}]"
+def _servo(servos: ExportedServos, name: str, joint: JointCalibration) -> DelayedPDParameters:
+    return replace(joint.actuator.parameters, dead_time_s=servos.delays()[name].value)
+
+
+def _joint(servos: ExportedServos, name: str, joint: JointCalibration) -> dict[str, str]:
+    """Every attribute of a joint that the measurement covers."""
+    servo = _servo(servos, name, joint)
+    damping = {"damping": f"{float(np.asarray(servo.back_emf))!r} 0 0"}
+    return NEUTRAL_JOINT | joint_attributes(servo, servos.physics_step_s) | damping
+
+
+# ------------------------------------------------------------------------- a whole model
+
+
+def to_model(
+    calibration: Calibration,
+    model: Path,
+    out: Path,
+    physics_step_s: float | None = None,
+    gain: float | None = None,
+    link_inertia: Mapping[str, float] | None = None,
+    sha256: str | None = None,
+) -> tuple[str, ExportedServos]:
+    """A user's MJCF with these servos, in one file.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of joints that the model has; a servo card is of all hinges that the model drives.
+    model : Path
+        Includes are resolved; assets stay where they are.
+    out : Path
+        Where the text will be written: paths to assets are relative to it.
+    physics_step_s : float, optional
+        By default the model's own.
+    gain : float, optional
+        As of `ExportedServos.of`.
+    link_inertia : dict of str to float, optional
+        The same; by default what the model's bodies put on the joint in its reference pose, of
+        armatures that hold it.
+    sha256 : str, optional
+        As of `ExportedServos.of`.
+
+    Returns
+    -------
+    text : str
+    servos : ExportedServos
+        What it holds.
+
+    Raises
+    ------
+    InputError
+        If the model cannot be read, has none of the joints, or one of them in a place that cannot
+        be edited; or as `ExportedServos.of`.
+    PupperError
+        If the model does not compile to the servos' numbers.
+    """
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    hinges = hinges_of(model)
+    root = _inlined(model)
+    theirs = mujoco.MjModel.from_xml_path(str(model))
+    names = [h.name for h in hinges if h.name]
+    if isinstance(calibration, CardCalibration):
+        wanted = [h.name for h in hinges if h.name and h.driven]
+    else:
+        wanted = [name for name in calibration.joint_names if name in names]
+    if not wanted:
+        raise InputError(
+            f"{model} has no hinge of the calibration's joints "
+            f"({', '.join(calibration.joint_names)}); it has {', '.join(names) or 'none'}. Rename "
+            "the joints of one of them."
         )
-    return f"<!-- {_xml(name)}: {_xml(', '.join(texts))} -->"
+    calibration = calibration.model_copy(
+        update={"joints": {name: calibration.joint(name) for name in wanted}}
+    )
+    bodies = link_inertias(theirs, wanted)
+    held = [n for n in wanted if calibration.joint(n).holds_at.armature == "servo and load"]
+    links = {name: bodies[name] for name in held if bodies[name] > 0}
+    links |= {n: v for n, v in (link_inertia or {}).items() if n in wanted}
+    step_s = float(theirs.opt.timestep) if physics_step_s is None else physics_step_s
+    servos = ExportedServos.of(calibration, step_s, gain, links, sha256)
+    before = _actuators(root)
+    changes = list(_put_servos(root, servos, model, _free_group(theirs)))
+    changes += _options(root, servos, theirs)
+    _place_assets(root, model, out)
+    _keyframes(root, servos, theirs, before)
+    notes = servos.head(
+        MUJOCO, f"The model is {model.name}, with these changes:", *changes, _RESET, _CARRIED
+    )
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding="unicode")
+    head, body = text.split(">", 1) if not text.startswith("<!--") else ("", text)
+    text = "\n".join([f"{head}>", *_comment(notes)]) + body + "\n"
+    _compare(text, servos, out)
+    return text, servos
 
 
-def _xml(text: str) -> str:
+def link_inertias(model: Any, joints: Sequence[str]) -> dict[str, float]:
+    """Inertia that a compiled model's bodies put on joints, in its reference pose [kg·m²].
+
+    The diagonal of the mass matrix without armatures: what each joint moves while the others are
+    held, whatever the base does.
+    """
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    bare = copy(model)
+    for armatures in (bare.dof_armature, bare.actuator_armature, bare.tendon_armature):
+        armatures[:] = 0.0
+    data = mujoco.MjData(bare)
+    mujoco.mj_setConst(bare, data)  # a free-standing body's inertia is kept in the model
+    mujoco.mj_forward(bare, data)
+    full = np.zeros((bare.nv, bare.nv))
+    mujoco.mj_fullM(bare, data, full)
+    places = {name: int(model.joint(name).dofadr[0]) for name in joints}
+    return {name: float(full[place, place]) for name, place in places.items()}
+
+
+def _inlined(path: Path, root_folder: Path | None = None, depth: int = 0) -> Element:
+    """The model's elements, those of included files in their place."""
+    text = path.read_bytes()
+    if b"<!DOCTYPE" in text or depth > 8:
+        raise InputError(f"{path} cannot be edited: it defines entities or includes itself.")
+    try:
+        parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+        root = ElementTree.fromstring(text, parser)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path} is no well-formed XML: {error}. Repair it.") from error
+    if depth == 0 and root.tag != "mujoco":
+        raise InputError(
+            f"{path} is a <{root.tag}>; servos can be put into an MJCF only. Convert a URDF with "
+            "MuJoCo's `compile`, or include the exported file by hand."
+        )
+    folder = root_folder or path.parent
+    for parent in list(root.iter()):
+        for place, child in reversed(list(enumerate(parent))):
+            if child.tag == "include":
+                included = _inlined(folder / child.get("file", ""), folder, depth + 1)
+                parent.remove(child)
+                for n, element in enumerate(included):
+                    parent.insert(place + n, element)
+    return root
+
+
+def _free_group(theirs: Any) -> str:
+    """A group of actuators that the model's options do not disable."""
+    return str(next(n for n in range(31) if not int(theirs.opt.disableactuator) >> n & 1))
+
+
+def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) -> Iterator[str]:
+    """Write servos at the joints, in place of the joints' own actuators; yield what changed."""
+    calibration = servos.calibration
+    taken = {e.get("class") for e in root.iter("default")}
+    classes = {}
+    for name in calibration.joint_names:
+        classes[name] = f"servo_{name}"
+        while classes[name] in taken:
+            classes[name] += "_"
+    defaults, actuators, sensors = _parts(servos, classes)
+    for default in defaults:
+        default[0].set("group", group)
+    joints: dict[str, list[Element]] = {}
+    for body in (e for world in root.iter("worldbody") for e in world.iter("joint")):
+        joints.setdefault(body.get("name", ""), []).append(body)
+    for name, joint in calibration.joints.items():
+        if len(joints.get(name, ())) != 1:
+            raise InputError(
+                f"{model}: the joint {name} is made by <replicate> or <attach>, so it has no "
+                "element of its own to edit. Save the compiled model (`mj_saveLastXML`) and give "
+                "that."
+            )
+        (element,) = joints[name]
+        element.attrib |= _joint(servos, name, joint)
+    counts = dict.fromkeys(calibration.joint_names, 0)
+    pids = {a.get("joint"): a for a in actuators}
+    names = {e.get("name") for s in root.iter("actuator") for e in s}
+    for section in root.iter("actuator"):
+        for place, element in [*enumerate(section)]:
+            target = element.get("joint") or element.get("jointinparent")
+            if target in counts:
+                counts[target] += 1
+                section.remove(element)
+                if counts[target] == 1:
+                    pids[target].set("name", element.get("name") or target)
+                    section.insert(
+                        place - sum(max(n - 1, 0) for n in counts.values()), pids[target]
+                    )
+    missing = [name for name, count in counts.items() if count == 0]
+    for name in missing:
+        while pids[name].get("name") in names:
+            pids[name].set("name", f"{pids[name].get('name')}_")
+    if missing:
+        ElementTree.SubElement(root, "actuator").extend(pids[name] for name in missing)
+    ElementTree.SubElement(root, "default").extend(defaults)
+    known = {e.get("name") for s in root.iter("sensor") for e in s}
+    for sensor in sensors:
+        while sensor.get("name") in known:
+            sensor.set("name", f"{sensor.get('name')}_")
+    ElementTree.SubElement(root, "sensor").extend(sensors)
+    if replaced := [name for name, count in counts.items() if count]:
+        yield f"Own actuators were replaced, under their names: {', '.join(replaced)}."
+    if several := [f"{name} ({count})" for name, count in counts.items() if count > 1]:
+        yield f"Joints had several actuators, of which one is left: {', '.join(several)}."
+    if missing:
+        yield f"Joints had no actuator of their own: {', '.join(missing)}."
+    tendons = {
+        tendon.get("name")
+        for tendon in root.iter("fixed")
+        if any(j.get("joint") in counts for j in tendon.iter("joint"))
+    }
+    driven = [
+        e.get("name") or e.tag
+        for s in root.iter("actuator")
+        for e in s
+        if e.get("tendon") in tendons
+    ]
+    if tendons and driven:
+        yield f"Actuators on tendons drive these joints, too, and were left: {', '.join(driven)}."
+
+
+def _options(root: Element, servos: ExportedServos, theirs: Any) -> Iterator[str]:
+    """Time step, integrator and flags that the servos need."""
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    option = ElementTree.SubElement(root, "option")
+    option.set("timestep", repr(servos.physics_step_s))
+    if servos.physics_step_s != theirs.opt.timestep:
+        yield f"The time step was {theirs.opt.timestep:g} s."
+    implicit = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    if theirs.opt.integrator not in implicit:
+        option.set("integrator", INTEGRATOR)
+        name = mujoco.mjtIntegrator(theirs.opt.integrator).name.removeprefix("mjINT_")
+        yield f"The integrator was {name}; the servos' damping needs {INTEGRATOR}."
+    bits = mujoco.mjtDisableBit
+    flags = {
+        "frictionloss": bits.mjDSBL_FRICTIONLOSS, "damper": bits.mjDSBL_DAMPER,
+        "actuation": bits.mjDSBL_ACTUATION,
+    }  # fmt: skip
+    off = [name for name, bit in flags.items() if theirs.opt.disableflags & bit]
+    if off:
+        ElementTree.SubElement(option, "flag", dict.fromkeys(off, "enable"))
+        yield f"Flags were disabled that the servos need: {', '.join(off)}."
+
+
+def _place_assets(root: Element, model: Path, out: Path) -> None:
+    """Make the folders of assets relative to the new file."""
+    if model.resolve().parent == out.resolve().parent:
+        return
+    compilers = list(root.iter("compiler")) or [ElementTree.SubElement(root, "compiler")]
+    both = {k: v for c in compilers for k, v in c.attrib.items()}
+    for compiler in compilers:
+        for key in ("assetdir", "meshdir", "texturedir"):
+            compiler.attrib.pop(key, None)
+    for key in ("meshdir", "texturedir"):
+        folder = model.resolve().parent / both.get(key, both.get("assetdir", ""))
+        compilers[-1].set(key, os.path.relpath(folder, out.resolve().parent))
+
+
+def _actuators(root: Element) -> list[Element]:
+    return [e for section in root.iter("actuator") for e in section if isinstance(e.tag, str)]
+
+
+def _keyframes(
+    root: Element, servos: ExportedServos, theirs: Any, before: Sequence[Element]
+) -> None:
+    """Commands and set-points of the servos in keyframes, which are there by default 0.
+
+    A keyframe's command is that of the position actuator which the servo replaces, else where the
+    joint is.
+    """
+    keys = [k for frame in root.iter("keyframe") for k in frame if isinstance(k.tag, str)]
+    if not keys:
+        return
+    places = {id(e): n for n, e in enumerate(before)}
+    commanded = {
+        e.get("joint"): n
+        for n, e in reversed([*enumerate(before)])
+        if e.tag in ("position", "intvelocity", "pid")
+    }
+    for k, key in enumerate(keys):
+        ctrl, act = [], []
+        for element in _actuators(root):
+            joint = element.get("joint", "")
+            if id(element) in places:
+                old = places[id(element)]
+                ctrl.append(float(theirs.key_ctrl[k, old]))
+                first, count = theirs.actuator_actadr[old], theirs.actuator_actnum[old]
+                act += theirs.key_act[k, first : first + count].tolist() if count else []
+                continue
+            at = float(theirs.key_qpos[k, theirs.joint(joint).qposadr[0]])
+            if key.get("ctrl") is not None and joint in commanded:
+                at = float(theirs.key_ctrl[k, commanded[joint]])
+            ctrl.append(at)
+            servo = servos.calibration.joint(joint).actuator
+            act += [at] if np.isfinite(servo.velocity_limit_rad_s.value) else []
+        key.set("ctrl", " ".join(map(repr, ctrl)))
+        key.attrib.pop("act", None)
+        if act:
+            key.set("act", " ".join(map(repr, act)))
+
+
+def _compare(text: str, servos: ExportedServos, out: Path) -> None:
+    """Compile the model where it will be, and compare the servos in it with their numbers."""
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    trial = out.resolve().parent / f".{out.name}.{os.getpid()}.xml"
+    try:
+        trial.parent.mkdir(parents=True, exist_ok=True)
+        trial.write_text(text, encoding="utf-8")
+        model = mujoco.MjModel.from_xml_path(str(trial))
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error}.") from error
+    except ValueError as error:
+        raise PupperError(f"The model with the servos does not compile: {error}") from error
+    finally:
+        trial.unlink(missing_ok=True)
+    for name, (compiled, wanted) in compiled_numbers(model, servos).items():
+        if not np.allclose(compiled, wanted, rtol=1e-12, atol=0):
+            raise PupperError(
+                f"{name} of the model with the servos is {compiled} where {wanted} was written."
+            )
+
+
+def compiled_numbers(model: Any, servos: ExportedServos) -> dict[str, tuple[Any, Any]]:
+    """Numbers of compiled joints and actuators, each beside the servo's: (compiled, wanted)."""
+    driven = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
+    found: dict[str, tuple[Any, Any]] = {}
+    for name, joint in servos.calibration.joints.items():
+        servo = _servo(servos, name, joint)
+        j, dof = model.joint(name).id, int(model.joint(name).dofadr[0])
+        i = driven[j]
+        pairs = {
+            "armature": (model.dof_armature[dof], servo.armature),
+            "frictionloss": (model.dof_frictionloss[dof], servo.friction_loss),
+            "damping": (model.dof_damping[dof], servo.back_emf),
+            "damping of higher order": (model.dof_dampingpoly[dof], np.zeros(2)),
+            "stiffness": (model.jnt_stiffness[j], 0.0),
+            "stiffness of higher order": (model.jnt_stiffnesspoly[j], np.zeros(2)),
+            "actuatorfrclimited": (model.jnt_actfrclimited[j], 0),
+            "kp": (-model.actuator_biasprm[i, 1], servo.stiffness),
+            "kv": (-model.actuator_biasprm[i, 2], servo.damping),
+            "slewmax": (model.actuator_dynprm[i, 1], servo.velocity_limit),
+            "delay": (model.actuator_delay[i], servo.dead_time_s),
+            "forcerange": (model.actuator_forcerange[i, 1], servo.effort_limit),
+            "gear": (model.actuator_gear[i], np.eye(6)[0]),
+            "ctrllimited": (model.actuator_ctrllimited[i], 0),
+            "actlimited": (model.actuator_actlimited[i], 0),
+            "armature of the actuator": (model.actuator_armature[i], 0.0),
+            "damping of the actuator": (model.actuator_damping[i], 0.0),
+        }
+        found |= {f"{name}: {key}": pair for key, pair in pairs.items()}
+    return found
+
+
+# ------------------------------------------------------------------------- texts
+
+
+def _group(
+    tag: str, servos: ExportedServos, keys: Sequence[str], elements: Sequence[Element]
+) -> list[str]:
+    """Lines of a section, each element under a comment with its numbers and their intervals."""
+    lines = [f"  <{tag}>"]
+    for element, (name, joint) in zip(elements, servos.calibration.joints.items(), strict=True):
+        numbers = joint.feedback if keys == FEEDBACK_KEYS else joint.actuator
+        texts = [
+            f"{key} {getattr(numbers, key).value:.4g} ({known_text(getattr(numbers, key))})"
+            for key in (*keys, *(("dead_time_s",) if keys == TORQUE_KEYS else ()))
+        ]
+        if texts:
+            lines.append(f"    <!-- {_plain(name)}: {_plain(', '.join(texts))} -->")
+        children = "".join(f"<{c.tag} {attributes(c.attrib)}/>" for c in element)
+        end = f">{children}</{element.tag}>" if children else "/>"
+        lines.append(f"    <{element.tag} {attributes(element.attrib)}{end}")
+    return [*lines, f"  </{tag}>"]
+
+
+def _comment(notes: Sequence[str]) -> list[str]:
+    lines = [line for note in notes for line in (*wrap(_plain(note), 94), "")]
+    return ["  <!--", *(f"    {line}".rstrip() for line in lines[:-1]), "  -->"]
+
+
+def _plain(text: str) -> str:
     """Text for a comment or an attribute: two hyphens would end the one, a quote the other."""
     return text.translate(str.maketrans({"<": "‹", ">": "›", "&": "+", '"': "'"})).replace(
         "--", "–"
     )
-
-
-def _group(name: str, lines: list[str]) -> list[str]:
-    return [f"  <{name}>", *(f"    {line}" for line in lines), f"  </{name}>"]

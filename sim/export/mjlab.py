@@ -1,40 +1,100 @@
 """A calibration for mjlab: a Python module of actuators and the feedback.
 
-Field names are those of mjlab 1.6.0; `benchmarks/peers/check_exports.py` holds them against the
-released package.
+A class on mjlab's `Actuator` gives MuJoCo-Warp the set-points of the servos, with delays of any
+fraction of a step; beside it the released `BuiltinPositionActuatorCfg`, in whole steps. Names are
+those of mjlab 1.6.0; `benchmarks/peers/check_exports.py` holds them against the released package.
 """
 
 from __future__ import annotations
 
-from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.delayed_pd import whole_steps
-from pupper_sysid.servo_models.step_size import Engine
-from pupper_sysid.sim.export.shared import (
-    NOT_CARRIED,
-    block,
-    call,
-    delays_at_step,
-    origin,
-    step_note,
-    torch_module,
-)
+from pupper_sysid.servo_models.step_size import MUJOCO, Engine
+from pupper_sysid.sim.export.shared import NOT_CARRIED, ExportedServos, block, call, torch_module
+from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
-MJLAB_PD = Engine(slews=False)
+BUILTIN_PD = Engine(slews=False)
+"""mjlab's own position actuators: MuJoCo's PD, set-points of unlimited speed."""
+
+_IMPORTS = """\
+from dataclasses import dataclass
+
+import mujoco
+from mjlab.actuator import Actuator, ActuatorCfg, BuiltinPositionActuatorCfg"""
+
+_CODE = '''
+@dataclass(kw_only=True)
+class CalibratedServoCfg(ActuatorCfg):
+    """Servos of all joints in SERVOS; a name may stand behind prefixes, as in `left/LF_hip`."""
+
+    target_names_expr: tuple[str, ...] = tuple(f"(.*/)?{name}" for name in SERVOS)
+
+    def build(self, entity, target_ids, target_names):
+        return CalibratedServo(self, entity, target_ids, target_names)
 
 
-def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
-    """A Python module with a `BuiltinPositionActuatorCfg` per joint, and the feedback.
+class CalibratedServo(Actuator):
+    """MuJoCo's position actuators, with the set-points of real servos and their readings."""
+
+    def edit_spec(self, spec, target_names):
+        for target in target_names:
+            servo, joint = SERVOS[target.split("/")[-1]], spec.joint(target)
+            joint.armature, joint.frictionloss = servo["armature"], servo["friction_loss"]
+            joint.solref_friction, joint.solimp_friction = FRICTION_SOLREF, FRICTION_SOLIMP
+            for name, value in (("damping", servo["back_emf"]), ("stiffness", 0.0)):
+                polynomial = hasattr(getattr(joint, name), "__len__")
+                setattr(joint, name, [value, 0.0, 0.0] if polynomial else value)
+            joint.actfrclimited = False
+            actuator = spec.add_actuator(name=target, target=target)
+            actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            actuator.gainprm[0], actuator.biasprm[1] = servo["stiffness"], -servo["stiffness"]
+            actuator.biasprm[2] = -servo["damping"]
+            actuator.inheritrange, actuator.ctrllimited = 0.0, False
+            actuator.forcelimited = True
+            actuator.forcerange[:] = [-servo["effort_limit"], servo["effort_limit"]]
+            self._mjs_actuators.append(actuator)
+
+    def initialize(self, mj_model, model, data, device):
+        super().initialize(mj_model, model, data, device)
+        names = [name.split("/")[-1] for name in self.target_names]
+        self.servos = ServoBank(SERVOS, FEEDBACK, names, data.nworld, PHYSICS_DT, device)
+
+    def reset(self, env_ids=None):
+        super().reset(env_ids)
+        self.servos.restart(env_ids)
+
+    def compute(self, cmd):
+        return self.servos.command(cmd.position_target, cmd.pos)
+
+
+def held_joint_pos(env, entity="robot"):
+    """Observation term: what the servos report, in place of the joint positions [rad]."""
+    robot = env.scene[entity]
+    (actuator,) = (a for a in robot.actuators if isinstance(a, CalibratedServo))
+    return actuator.servos.read(robot.data.joint_pos[:, actuator.target_ids])
+
+
+ACTUATORS = (CalibratedServoCfg(),)
+"""For `EntityArticulationInfoCfg(actuators=ACTUATORS)`."""
+
+'''
+
+
+def to_mjlab(servos: ExportedServos) -> str:
+    """A Python module with a class of servos, its configuration, and the feedback.
 
     Raises
     ------
     InputError
-        If the step is not a sensible one.
+        If the step is too long for the servos.
     """
-    delays = delays_at_step(calibration, physics_step_s, MJLAB_PD)
+    step_s = servos.physics_step_s
+    delays = servos.delays(BUILTIN_PD)
     groups, bounds = [], []
-    for name, joint in calibration.joints.items():
+    for name, joint in servos.calibration.joints.items():
         a = joint.actuator
-        steps = round(delays[name].value / physics_step_s)
+        steps = round(delays[name].value / step_s)
         groups.append(
             call(
                 "BuiltinPositionActuatorCfg",
@@ -52,26 +112,34 @@ def to_mjlab(calibration: Calibration, physics_step_s: float) -> str:
                 ("delay_per_env_phase", False),
             )
         )
-        low, high = whole_steps(delays[name].low, delays[name].high, physics_step_s)
+        low, high = whole_steps(delays[name].low, delays[name].high, step_s)
         bounds.append(f'"{name}": ({low}, {high}),')
     notes = (
-        *origin(calibration),
-        f"Delays are whole physics steps of {1e3 * physics_step_s:g} ms, the nearest one; the "
-        "interval, rounded outward, is in DELAY_STEPS.",
-        *step_note(calibration, delays, physics_step_s),
-        "The least and the greatest lag are equal on purpose. With two different ones mjlab draws "
-        "a lag in every physics step, so that commands overtake each other; with "
-        "delay_hold_prob=1, or with a long delay_update_period, robots begin without any delay.",
-        "Not carried over: the limit on the set-point's speed, parts of a step, and the stiffness "
-        "of dry friction (MuJoCo's default lets a held joint creep: set solreffriction of the "
-        "joints as the export to MJCF writes it).",
+        "ACTUATORS holds one CalibratedServoCfg for all joints: delays of any fraction of a step, "
+        "interpolated linearly, a latency of its own for each command where its jitter is known, "
+        "the limit on the set-point's speed, and friction as hard as gears. Set the simulation's "
+        "timestep to PHYSICS_DT and its integrator to implicitfast. Readings for the policy: "
+        "`ObservationTermCfg(func=held_joint_pos)`; take velocities from their differences.",
+        "WHOLE_STEP_ACTUATORS, BuiltinPositionActuatorCfg as it is released, has delays of the "
+        f"nearest whole step: up to {1e3 * servos.cost_of_whole_steps(BUILTIN_PD):.1f} mrad off "
+        "(RMS) at 4 Hz, 0.3 rad, and set-points of unlimited speed. The interval, rounded outward, "
+        "is in DELAY_STEPS. The least and the greatest lag are equal on purpose: with two "
+        "different ones mjlab draws a lag in every physics step, so that commands overtake each "
+        "other; with delay_hold_prob=1, or a long delay_update_period, robots begin without delay. "
+        "Its dry friction is MuJoCo's default, which lets a held joint creep: set solreffriction "
+        "of the joints as the export to MJCF writes it.",
         NOT_CARRIED,
     )
-    return torch_module(
-        calibration, "mjlab", notes, "from mjlab.actuator import BuiltinPositionActuatorCfg",
-        physics_step_s,
-        block("ACTUATORS", groups, "()")
-        + '"""For `EntityArticulationInfoCfg(actuators=ACTUATORS)`."""\n\n'
+    friction = (
+        f"FRICTION_SOLREF = {list(friction_solref(step_s))!r}\n"
+        f"FRICTION_SOLIMP = {list(FRICTION_SOLIMP)!r}\n"
+        '"""Friction that stops a joint within one physics step, as gears do."""\n\n'
+    )
+    whole = (
+        block("WHOLE_STEP_ACTUATORS", groups, "()")
+        + '"""For `EntityArticulationInfoCfg(actuators=WHOLE_STEP_ACTUATORS)`, where the class '
+        'cannot be used."""\n\n'
         + block("DELAY_STEPS", bounds)
-        + '"""Least and greatest delay of each joint, in physics steps."""\n',
-    )  # fmt: skip
+        + '"""Least and greatest delay of each joint, in physics steps."""\n'
+    )
+    return torch_module(servos, MUJOCO, "mjlab", notes, _IMPORTS, f"{friction}{_CODE}{whole}")

@@ -1,15 +1,18 @@
-"""What the exports share: delays for a physics step, notes, refusals, and texts of Python modules.
+"""What the exports share: the servos to export, heads of files, and texts of Python modules.
 
-Every export says where its numbers come from (`origin`), how well each is known, and what the
-target cannot hold: most simulators have no delay shorter than a physics step, no limit on the speed
-of a set-point, and none models stale readings. The feedback stands beside the actuator in every
-one; for simulators on torch with code that applies it (`sim.export.held_feedback_torch`).
+`ExportedServos` is a calibration at one P gain, with or without the links that its armatures hold,
+for one physics step. Every export states in its head what the servos are, for which P gain,
+armature and physics step, in which units, from which calibration (by its hash), and what the
+target cannot carry. The feedback stands beside the actuator in every one; for simulators on torch
+with code that applies it (`sim.export.torch_servos`).
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import resources
 from textwrap import indent, wrap
 from typing import Any
@@ -19,8 +22,11 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.step_size import MUJOCO, Engine, delay_at_step
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
@@ -29,101 +35,254 @@ TORQUE_KEYS = (
     "effort_limit_nm", "back_emf_nm_s_per_rad",
 )  # fmt: skip
 EXPLICIT_PD = Engine(slews=False, implicit=False)
-"""Isaac Lab and Newton: torque computed before each step, set-points of unlimited speed."""
+"""Isaac Lab's own PDs: torque before each step, set-points of unlimited speed."""
+CALIBRATED_PD = Engine(implicit=False)
+"""The classes for Isaac Lab and Newton: set-points of limited speed, torque before each step."""
+UNITS = "Units: N·m, rad, s, kg·m²; delays in steps are in physics steps."
 NOT_CARRIED = (
     "The feedback is no part of an actuator, and without it the simulated robot sees more than the "
-    "real one does: its readings are stale, lost at times, quantised and biased. See FEEDBACK "
-    "below."
+    "real one does: its readings are stale, lost at times, quantised and biased. See FEEDBACK and "
+    "HeldFeedback below."
 )
 KNOWN = {"yes": "measured", "ratio only": "ratio measured, scale assumed", "no": "not measured"}
 """How well a number is known, by `Quantity.identified`."""
+INCLUDES_LINK = (
+    "An armature with the link and load counts their inertia twice in a model whose bodies have "
+    "it, too: take it off (options link-inertia and model of the export)."
+)
 _LONGEST_STEP_S = 0.1
+_FASTEST_HZ, _AMPLITUDE_RAD = 4.0, 0.3  # the sweeps' fastest common tone
 
 
-def delays_at_step(
-    calibration: Calibration, physics_step_s: float, engine: Engine = MUJOCO
-) -> dict[str, Interval]:
-    """Delays [s] of joints for another physics step or engine than the calibration's (`step_size`).
+@dataclass(frozen=True)
+class ExportedServos:
+    """Servos of a calibration, as an export states them.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        At the exported P gain, its armatures without the links that were taken off.
+    physics_step_s : float
+        Of the simulator [s].
+    sha256 : str
+        Of the text of the calibration that all this was made from.
+    moving : Calibration
+        The same with all that its armatures hold, which is what moved in the recordings.
+    links : dict of str to float
+        By joint, the inertia that was taken off [kg·m²].
+    """
+
+    calibration: Calibration
+    physics_step_s: float
+    sha256: str
+    moving: Calibration
+    links: Mapping[str, float] = field(default_factory=dict)
+    _delays: dict[Engine, dict[str, Interval]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    @classmethod
+    def of(
+        cls,
+        calibration: Calibration,
+        physics_step_s: float,
+        gain: float | None = None,
+        link_inertia: Mapping[str, float] | None = None,
+        sha256: str | None = None,
+    ) -> ExportedServos:
+        """The servos of a calibration, ready to be written.
+
+        Parameters
+        ----------
+        calibration : Calibration
+        physics_step_s : float
+        gain : float, optional
+            P gain, the register's value; by default that of the calibration, which is the servo's
+            own when it was recorded.
+        link_inertia : dict of str to float, optional
+            By joint, the inertia of link and load to take off the armature [kg·m²].
+        sha256 : str, optional
+            Of the calibration's file; by default of the text that it would be saved as.
+
+        Raises
+        ------
+        InputError
+            If the step is no physics step, the calibration holds at its own P gain only, or an
+            armature does not hold such a link.
+        """
+        if not 0 < physics_step_s <= _LONGEST_STEP_S:
+            raise InputError(
+                f"`physics_step_s` is {physics_step_s:g} s; give the simulator's own, between 0 "
+                f"and {_LONGEST_STEP_S:g}, such as 0.005."
+            )
+        sha256 = sha256 or hashlib.sha256(calibration.to_yaml().encode()).hexdigest()
+        moving = calibration
+        if gain is not None and any(j.holds_at.p_gain != gain for j in calibration.joints.values()):
+            moving = calibration.at_p_gain(gain)
+        links = dict(link_inertia or {})
+        joints = dict(moving.joints)
+        for name, inertia in links.items():
+            joints[name] = without_link(name, moving.joint(name), inertia)
+        return cls(
+            moving.model_copy(update={"joints": joints}), physics_step_s,
+            sha256, moving, links,
+        )  # fmt: skip
+
+    def delays(self, engine: Engine = MUJOCO) -> dict[str, Interval]:
+        """Delays [s] of joints in the simulator's steps and engine (`servo_models.step_size`).
+
+        Raises
+        ------
+        InputError
+            If the step is too long for the servos.
+        """
+        if engine in self._delays:
+            return self._delays[engine]
+        delays = {}
+        joints = {name: joint.actuator for name, joint in self.moving.joints.items()}
+        for fitted_s in {a.physics_step_s for a in joints.values()}:
+            names = [name for name, a in joints.items() if a.physics_step_s == fitted_s]
+            servos = self.moving.delayed_pd(names).parameters
+            fitting = delay_at_step(servos, self.physics_step_s, fitted_s, engine)
+            for name, delay_s in zip(names, fitting, strict=True):
+                a = joints[name]
+                more = float(delay_s) - a.dead_time_s.value
+                ends = (a.dead_time_s.value, *a.dead_time_interval_s)
+                delays[name] = Interval(*(max(t + more, 0.0) for t in ends))
+        self._delays[engine] = {name: delays[name] for name in joints}
+        return self._delays[engine]
+
+    def head(self, engine: Engine, *target: str) -> list[str]:
+        """Sentences of a file's head, those about the `target` last."""
+        calibration = self.calibration
+        inputs = ", ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in calibration.inputs)
+        return [
+            f"Servos of {calibration.robot}, calibrated {calibration.created}"
+            + (f" from {inputs}" if inputs else "")
+            + f", exported by pupper-sysid {versions()['pupper-sysid']}.",
+            f"sha256 of the calibration: {self.sha256}.",
+            *calibration.notes,
+            UNITS,
+            *self._scales(),
+            *self.operating_points(),
+            *([INCLUDES_LINK] if self.with_link else []),
+            *self._beyond(),
+            *self._step_note(engine),
+            *target,
+        ]
+
+    def operating_points(self) -> Iterator[str]:
+        """P gain, armature and load that the numbers hold for, joints alike in one sentence."""
+        for point, names in self.calibration.operating_points().items():
+            yield f"Numbers of {', '.join(names)} are for {point}."
+        if self.links:
+            links = ", ".join(f"{name} {inertia:.4g}" for name, inertia in self.links.items())
+            yield f"Inertia of links that was taken off the armatures, kg·m²: {links}."
+
+    @property
+    def with_link(self) -> list[str]:
+        """Joints whose armature still holds link and load."""
+        joints = self.calibration.joints.items()
+        return [name for name, joint in joints if joint.holds_at.armature == "servo and load"]
+
+    def cost_of_whole_steps(self, engine: Engine = EXPLICIT_PD) -> float:
+        """Error of delays in whole steps at the sweeps' fastest tone [rad].
+
+        RMS of the worst joint at 4 Hz and 0.3 rad, of the motion by the nearest whole number of
+        steps beside the motion by the delay itself.
+        """
+        costs = self.whole_step_costs(engine)
+        return max(costs.values())
+
+    def whole_step_costs(self, engine: Engine = EXPLICIT_PD) -> dict[str, float]:
+        """The same of each joint [rad]."""
+        delays, h, turn = self.delays(engine), self.physics_step_s, 2 * np.pi * _FASTEST_HZ
+        time = TIME_STEP_S * np.arange(round(0.75 / TIME_STEP_S))
+        servo = self.moving.delayed_pd()
+        servo.reset(np.zeros(servo.batch))
+        moved = servo.rollout(_AMPLITUDE_RAD * np.sin(turn * time)[:, None])
+        late = time >= 0.25  # two whole periods of the tone
+        amplitudes = np.abs(fit_sine(turn * time[late], moved[late]).phasor)
+        costs = {}
+        for (name, delay), amplitude in zip(delays.items(), amplitudes, strict=True):
+            shift = turn * (h * round(delay.value / h) - delay.value)
+            costs[name] = float(2 * abs(np.sin(shift / 2)) * amplitude / np.sqrt(2))
+        return costs
+
+    def _scales(self) -> Iterator[str]:
+        scales = {
+            j.actuator.scale.source: j.actuator.scale for j in self.calibration.joints.values()
+        }
+        for source, scale in scales.items():
+            yield f"Torques are scaled by {scale.anchor} {scale.value_nm:g} N·m: {source}."
+
+    def _beyond(self) -> Iterator[str]:
+        """What of servos that were fitted under load no PD carries."""
+        joints: dict[tuple[str, ...], list[str]] = {}
+        for name, joint in self.calibration.joints.items():
+            if joint.under_load is not None:
+                servo = joint.under_load.servo(joint.actuator.dead_time_s.value)
+                if lost := servo.beyond_delayed_pd():
+                    joints.setdefault(lost, []).append(name)
+        for lost, names in joints.items():
+            yield (
+                f"Fitted under load, but not carried over: {', '.join(lost)} ({', '.join(names)}). "
+                "The friction here is that of one motor torque; `under_load` of the calibration "
+                "has the whole servo."
+            )
+
+    def _step_note(self, engine: Engine) -> Iterator[str]:
+        """The step that the delays are for, and what was added to them for its length."""
+        yield f"Made for physics steps of {1e3 * self.physics_step_s:g} ms; others: export again."
+        delays = self.delays(engine)
+        actuators = {name: joint.actuator for name, joint in self.calibration.joints.items()}
+        added = [1e3 * (delays[n].value - a.dead_time_s.value) for n, a in actuators.items()]
+        steps = {1e3 * a.physics_step_s for a in actuators.values()}
+        if np.any(added):
+            yield (
+                f"Measured delays are for steps of {' or '.join(f'{s:g}' for s in sorted(steps))} "
+                f"ms in MuJoCo with set-points of limited speed; steps of "
+                f"{1e3 * self.physics_step_s:g} ms here give another lag, so "
+                f"{np.mean(added):+.1f} ms (mean of the joints) are in the delays below."
+            )
+
+
+def without_link(name: str, joint: JointCalibration, inertia_kg_m2: float) -> JointCalibration:
+    """The servo of a joint alone: its armature less the inertia of what it moved.
 
     Raises
     ------
     InputError
-        If the step is not a physics step of a simulator, or too long for the servos.
+        If the armature is the servo's own already, or not more than the link's inertia.
     """
-    if not 0 < physics_step_s <= _LONGEST_STEP_S:
+    if inertia_kg_m2 == 0:
+        return joint
+    point, actuator = joint.holds_at, joint.actuator
+    armature = actuator.armature_kg_m2
+    if point.armature == "servo":
         raise InputError(
-            f"`physics_step_s` is {physics_step_s:g} s; give the simulator's own, between 0 and "
-            f"{_LONGEST_STEP_S:g}, such as 0.005."
+            f"The armature of {name} is that of motor and gears alone; there is no link to take "
+            "off. Leave it out."
         )
-    found = {}
-    for name, joint in calibration.joints.items():
-        a = joint.actuator
-        (fitting,) = delay_at_step(a.parameters, physics_step_s, a.physics_step_s, engine)
-        more = float(fitting) - a.dead_time_s.value
-        numbers = (max(t + more, 0.0) for t in (a.dead_time_s.value, *a.dead_time_interval_s))
-        found[name] = Interval(*numbers)
-    return found
-
-
-def step_note(
-    calibration: Calibration, delays: dict[str, Interval], physics_step_s: float
-) -> Iterator[str]:
-    """What was added to the delays for the length of a step, if anything was."""
-    added = [
-        1e3 * (delays[name].value - joint.actuator.dead_time_s.value)
-        for name, joint in calibration.joints.items()
-    ]
-    steps = {1e3 * joint.actuator.physics_step_s for joint in calibration.joints.values()}
-    if np.any(added):
-        yield (
-            f"Measured delays are for steps of {' or '.join(f'{s:g}' for s in sorted(steps))} ms "
-            f"in MuJoCo with set-points of limited speed; steps of {1e3 * physics_step_s:g} ms "
-            f"here give another lag, so {np.mean(added):+.1f} ms (mean of the joints) are in the "
-            "delays below."
+    if not 0 < inertia_kg_m2 < armature.value:
+        raise InputError(
+            f"{name}: a link of {inertia_kg_m2:.4g} kg·m² cannot be taken off an armature of "
+            f"{armature.value:.4g} kg·m² that holds it. Either the link of the recording was "
+            "another one (its inertia can be stated), or the torque scale is wrong "
+            f"({actuator.scale.anchor} {actuator.scale.value_nm:g} N·m): record with a known load, "
+            "or give `calibrate` the servo's own stall torque."
         )
-
-
-def origin(calibration: Calibration) -> Iterator[str]:
-    """Where the numbers come from, and what of servos under load they leave out, in sentences."""
-    made = ", ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in calibration.inputs)
-    yield (
-        f"Servos of {calibration.robot}, calibrated {calibration.created}"
-        + (f" from {made}" if made else "")
-        + f", exported by pupper-sysid {versions()['pupper-sysid']}."
+    ends = {
+        end: None if value is None else max(value - inertia_kg_m2, 1e-12)
+        for end, value in (("low", armature.low), ("high", armature.high))
+    }
+    rest = armature.model_copy(update={"value": armature.value - inertia_kg_m2, **ends})
+    return joint.model_copy(
+        update={
+            "actuator": actuator.model_copy(update={"armature_kg_m2": rest}),
+            "operating_point": point.model_copy(update={"armature": "servo"}),
+        }
     )
-    yield from calibration.notes
-    scales = {j.actuator.scale.source: j.actuator.scale for j in calibration.joints.values()}
-    for source, scale in scales.items():
-        yield f"Torques are scaled by {scale.anchor} {scale.value_nm:g} N·m: {source}."
-    yield from operating_points(calibration)
-    yield from _beyond(calibration)
-
-
-def operating_points(calibration: Calibration) -> Iterator[str]:
-    """P gain, armature and load that the numbers hold for, joints alike in one sentence."""
-    for point, names in calibration.operating_points().items():
-        yield f"Numbers of {', '.join(names)} are for {point}."
-    if any(j.holds_at.armature == "servo and load" for j in calibration.joints.values()):
-        yield (
-            "An armature with the link and load counts their inertia twice in a model whose bodies "
-            "have it, too: take it off the armature there."
-        )
-
-
-def _beyond(calibration: Calibration) -> Iterator[str]:
-    """What of servos that were fitted under load no target carries."""
-    joints: dict[tuple[str, ...], list[str]] = {}
-    for name, joint in calibration.joints.items():
-        if joint.under_load is not None:
-            servo = joint.under_load.servo(joint.actuator.dead_time_s.value)
-            if lost := servo.beyond_delayed_pd():
-                joints.setdefault(lost, []).append(name)
-    for lost, names in joints.items():
-        yield (
-            f"Fitted under load, but not carried over: {', '.join(lost)} ({', '.join(names)}). "
-            "The friction here is that of one motor torque; `under_load` of the calibration has "
-            "the whole servo."
-        )
 
 
 # --------------------------------------------------------------------------- Python modules
@@ -155,12 +314,18 @@ def call(function: str, *arguments: tuple[str, Any] | tuple[str, Quantity, str] 
         name, value, *key = argument
         comment = ""
         if key:
-            comment = f"  # {unit_of(key[0])}, {KNOWN[value.identified]}"
-            if value.low is not None and value.high is not None:
-                comment += f", 90 % interval {value.low:.4g} to {value.high:.4g}"
+            comment = f"  # {unit_of(key[0])}, {known_text(value)}"
             value = value.value
         lines.append(f"{name}={value!r},{comment}\n")
     return f"{function}(\n{indent(''.join(lines), '    ')}),"
+
+
+def known_text(quantity: Quantity) -> str:
+    """How well a number is known, and its interval, in words."""
+    text = KNOWN[quantity.identified]
+    if quantity.low is not None and quantity.high is not None:
+        text += f", 90 % interval {quantity.low:.4g} to {quantity.high:.4g}"
+    return text
 
 
 def feedback_block(calibration: Calibration) -> str:
@@ -176,27 +341,70 @@ def feedback_block(calibration: Calibration) -> str:
     ])  # fmt: skip
 
 
+def servos_block(servos: ExportedServos, engine: Engine) -> str:
+    """`SERVOS = {…}`: the numbers of each joint's actuator, its dead time for this engine."""
+    delays = servos.delays(engine)
+    rows = []
+    for name, joint in servos.calibration.joints.items():
+        a = joint.actuator
+        numbers = {
+            "stiffness": (a.stiffness_nm_per_rad, "stiffness_nm_per_rad"),
+            "damping": (a.damping_nm_s_per_rad, "damping_nm_s_per_rad"),
+            "effort_limit": (a.effort_limit_nm, "effort_limit_nm"),
+            "armature": (a.armature_kg_m2, "armature_kg_m2"),
+            "friction_loss": (a.friction_loss_nm, "friction_loss_nm"),
+            "back_emf": (a.back_emf_nm_s_per_rad, "back_emf_nm_s_per_rad"),
+            "velocity_limit_rad_s": (a.velocity_limit_rad_s, "velocity_limit_rad_s"),
+            "jitter_s": (a.command_jitter_s, "command_jitter_s"),
+        }
+        delay = delays[name]
+        lines = [
+            f'    "{key}": {quantity.value!r},  # {unit_of(unit)}, {known_text(quantity)}'
+            for key, (quantity, unit) in numbers.items()
+        ]
+        lines.append(
+            f'    "dead_time_s": {delay.value!r},  # s, {known_text(a.dead_time_s)} in MuJoCo\'s '
+            "steps"
+        )
+        rows.append("\n".join([f'"{name}": {{', *lines, "},"]))
+    return block("SERVOS", rows) + '"""The servos by joint."""\n'
+
+
 def torch_module(
-    calibration: Calibration,
+    servos: ExportedServos,
+    engine: Engine,
     target: str,
     notes: Sequence[str],
-    import_line: str,
-    physics_step_s: float,
+    imports: str,
     actuators: str,
 ) -> str:
-    """A Python module: what it is, the actuators, the feedback and the code that applies it."""
+    """A Python module: what it is, its numbers, the classes that apply them, the target's own part.
+
+    Parameters
+    ----------
+    servos : ExportedServos
+    engine : Engine
+        What integrates the servos.
+    target : str
+        Name of the simulator.
+    notes : sequence of str
+        What the target carries and does not, in sentences.
+    imports : str
+        Lines that import its names.
+    actuators : str
+        Code that stands behind the numbers and the classes.
+    """
     # read, not imported: that would load torch
-    code = (resources.files("pupper_sysid.sim.export") / "held_feedback_torch.py").read_text()
+    code = (resources.files("pupper_sysid.sim.export") / "torch_servos.py").read_text()
     return (
-        f"{docstring(f'Servos for {target}.', notes)}\n"
+        f"{docstring(f'Servos for {target}.', servos.head(engine, *notes))}\n"
         "from __future__ import annotations\n\n"
-        "from collections.abc import Mapping, Sequence\n\n"
-        f"import torch\n{import_line}\n\n"
-        f"PHYSICS_DT = {physics_step_s!r}\n"
-        '"""Physics step that the delays below are counted in [s]."""\n\n'
-        f"{actuators}\n"
-        f"{feedback_block(calibration)}"
-        '"""What makes each joint\'s readings stale, quantised and biased; `HeldFeedback` applies '
-        'it."""\n'
-        f"\n\n{code[code.index('class HeldFeedback') :]}"
+        "import math\nfrom collections.abc import Mapping, Sequence\n\n"
+        f"import torch\n{imports}\n\n"
+        f"PHYSICS_DT = {servos.physics_step_s!r}\n"
+        '"""Physics step that the delays below are made for [s]."""\n\n'
+        f"{servos_block(servos, engine)}\n"
+        f"{feedback_block(servos.calibration)}"
+        '"""What makes each joint\'s readings stale and quantised; `HeldFeedback` applies it."""\n'
+        f"\n\n{code[code.index('class SetPoint') :]}\n\n{actuators}"
     )

@@ -37,7 +37,11 @@ class Hinge:
         numbers.
     driven : bool
         Whether an actuator drives it, by itself or through a tendon; in a model without actuators
-        every hinge is.
+        every hinge that does not follow another.
+    follows : str
+        Joint that it follows (URDF `mimic`, MJCF equality of two joints); empty for none.
+    zero_range : bool
+        Whether the file states a range of 0 to 0, which MuJoCo takes for no limits.
     """
 
     name: str
@@ -45,10 +49,12 @@ class Hinge:
     low: float | None
     high: float | None
     driven: bool
+    follows: str = ""
+    zero_range: bool = False
 
 
 def hinges_of(path: Path) -> list[Hinge]:
-    """All hinges of the model in `path`, in its order.
+    """All hinges of the model in `path`, in its order; meshes need not be there.
 
     Raises
     ------
@@ -92,15 +98,70 @@ def _read(path: str) -> list[Hinge]:
     from pupper_sysid.sim.robot.engine import mujoco
 
     _limit_this_process()
-    model = mujoco.MjModel.from_xml_path(path)
+    model = _without_meshes(mujoco, path)
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    driven = _driven(model, mujoco) if model.nu else set(hinges)
+    leaders = _leaders(model, mujoco)
+    driven = _driven(model, mujoco) if model.nu else set(hinges) - set(leaders)
+    zero = _zero_ranges(path)
     found = []
     for j in hinges:
-        ends = [float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j]]
+        low, high = (float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j])
         limited = bool(model.jnt_limited[j])
-        found.append(Hinge(model.joint(j).name, limited, *ends, driven=j in driven))
+        name = model.joint(j).name
+        follows = model.joint(leaders[j]).name if j in leaders else ""
+        found.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
     return found
+
+
+def _without_meshes(mujoco, path: str):
+    """The compiled model; where files of meshes are missing, without them."""
+    try:
+        return mujoco.MjModel.from_xml_path(path)
+    except ValueError as error:
+        if not any(word in str(error).lower() for word in ("file", "mesh", "resource")):
+            raise
+        reason = error
+    try:
+        spec = mujoco.MjSpec.from_file(path)
+        for geom in list(spec.geoms):
+            if geom.meshname:
+                spec.delete(geom)
+        for mesh in list(spec.meshes):
+            spec.delete(mesh)
+        # a body whose mass came from its mesh
+        spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
+        return spec.compile()
+    except ValueError:
+        raise reason from None
+
+
+def _leaders(model, mujoco) -> dict[int, int]:
+    """Joints that follow another by an active equality, and which."""
+    return {
+        int(model.eq_obj1id[k]): int(model.eq_obj2id[k])
+        for k in range(model.neq)
+        if model.eq_type[k] == mujoco.mjtEq.mjEQ_JOINT
+        and model.eq_obj2id[k] >= 0
+        and model.eq_active0[k]
+    }
+
+
+def _zero_ranges(path: str) -> set[str]:
+    """Joints for which the file itself states a range of 0 to 0."""
+    import xml.etree.ElementTree as tree
+
+    zero = set()
+    for joint in tree.parse(path).iter("joint"):
+        limit = joint.find("limit")
+        ends = joint.get("range", "").split()
+        if limit is not None and joint.get("type") == "revolute":
+            ends = [limit.get("lower", "0"), limit.get("upper", "0")]
+        try:
+            if len(ends) == 2 and float(ends[0]) == float(ends[1]) == 0.0:
+                zero.add(joint.get("name", ""))
+        except ValueError:
+            continue
+    return zero
 
 
 def _driven(model, mujoco) -> set[int]:

@@ -1,9 +1,10 @@
 """A joint map for any robot with hobby servos, from its MJCF (or URDF).
 
-    joint_map, left_out = joint_map_of(Path("arm.xml"), "sts3215")
+    robot = joint_map_of(Path("arm.xml"), "sts3215")      # robot.joint_map, robot.left_out
 
 Each hinge that an actuator drives, by itself or through a tendon, becomes a joint with a servo;
-in a model without actuators, each hinge. Three things are guesses: ids run from 1 in the file's
+in a model without actuators, each hinge that does not follow another one (URDF `mimic`, MJCF
+equality). Three things are guesses: ids run from 1 in the file's
 order, a servo's centre is at the joint's zero (or in the middle of its range, if zero is outside),
 and counts grow with the joint's angle. `pupper-sysid calibrate-joints` measures the centres; ids
 and signs are checked in `pupper-sysid monitor` while a joint is moved by hand.
@@ -11,6 +12,8 @@ and signs are checked in `pupper-sysid monitor` while a joint is moved by hand.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,24 +21,48 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.hardware.joint_map import SCHEMA, SCHEMA_VERSION, JointMap, joint_map_from
+from pupper_sysid.hardware.lerobot_calibration import LeRobotJoint, apply_lerobot
 from pupper_sysid.sim.robot.hinges import Hinge, hinges_of
 
-SERVOS = {"sts3215": (4096, 2 * np.pi), "scs0009": (1024, np.radians(300))}
+_TURN = (4096, 2 * np.pi)
+SERVOS = {"sts3215": _TURN, "scs0009": (1024, np.radians(300))} | dict.fromkeys(
+    ("hd-1910", "xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"), _TURN
+)
 """Counts of the encoder, and the angle that they span [rad]."""
 
 _MARGIN_COUNTS = 20  # servos clip goals near the ends of their range
 _MOST_SERVOS = 253
+_FARTHEST_RAD = 4 * np.pi
+"""Two turns: a limit beyond is in degrees."""
+_UNKNOWN_RAD = 0.5
 
 
-def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
-    """Joint map of the robot described in `path`, and the hinges that no actuator drives.
+@dataclass(frozen=True)
+class RobotMap:
+    """What a model file says of a robot's servos."""
+
+    joint_map: JointMap
+    left_out: list[str]
+    """Hinges that no actuator drives and that follow no other."""
+    following: dict[str, str]
+    """Hinges without a servo of their own, and the joint that each follows."""
+    doubts: list[str]
+    """Sentences about limits that are probably not meant."""
+
+
+def joint_map_of(
+    path: Path, servo: str, lerobot: Mapping[str, LeRobotJoint] | None = None
+) -> RobotMap:
+    """Joint map of the robot described in `path`, and what was left out of it.
 
     Parameters
     ----------
     path : Path
         MJCF or URDF.
     servo : {"sts3215", "scs0009"}
-        Type of all servos.
+        Type of all servos; one of `SERVOS`.
+    lerobot : mapping of str to LeRobotJoint, optional
+        LeRobot's calibration of the arm, whose ids, directions and ranges are then taken.
 
     Raises
     ------
@@ -46,7 +73,12 @@ def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
     if not hinges:
         raise InputError(f"{path} has no hinge joint: there is nothing for a servo to turn.")
     joints = [hinge for hinge in hinges if hinge.driven]
-    left_out = [hinge.name or "one without a name" for hinge in hinges if not hinge.driven]
+    following = {h.name: h.follows for h in hinges if h.follows and not h.driven}
+    left_out = [
+        hinge.name or "one without a name"
+        for hinge in hinges
+        if not hinge.driven and not hinge.follows
+    ]
     if not joints:
         raise InputError(
             f"{path}: its actuators drive none of its hinges ({', '.join(left_out)}). Give each "
@@ -59,6 +91,7 @@ def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
         name = strange[0] or "without a name"
         raise InputError(f"{path}: a joint is called '{name}'; {strange[1]} Rename it there.")
     counts, span = SERVOS[servo]
+    joints, doubts = _with_sound_limits(joints)
     data = {
         "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "name": path.stem, "frame": "raw",
         "counts": counts, "servo": servo.upper(), "linkage": "none",
@@ -68,7 +101,39 @@ def joint_map_of(path: Path, servo: str) -> tuple[JointMap, list[str]]:
             for k, hinge in enumerate(joints)
         },
     }  # fmt: skip
-    return joint_map_from(data, str(path)), left_out
+    if lerobot is not None:
+        apply_lerobot(data, lerobot, path)
+    return RobotMap(joint_map_from(data, str(path)), left_out, following, doubts)
+
+
+def _with_sound_limits(joints: list[Hinge]) -> tuple[list[Hinge], list[str]]:
+    """Hinges with limits that can be meant, and sentences about those that cannot."""
+    sound, degrees, zero = [], [], []
+    for hinge in joints:
+        low, high = hinge.low, hinge.high
+        if low is None or high is None:
+            sound.append(hinge)
+            continue
+        far = max(abs(low), abs(high)) > _FARTHEST_RAD
+        if hinge.limited and far and low < high:
+            degrees.append(f"{hinge.name} ({low:g} to {high:g})")
+            hinge = replace(hinge, low=float(np.radians(low)), high=float(np.radians(high)))
+        elif hinge.zero_range:
+            zero.append(hinge.name)
+            hinge = replace(hinge, limited=True, low=-_UNKNOWN_RAD, high=_UNKNOWN_RAD)
+        sound.append(hinge)
+    doubts = []
+    if degrees:
+        doubts.append(
+            f"limits of {', '.join(degrees)} cannot be radians, and were taken as degrees. URDF "
+            "counts in radians: mend them there, or check limits_rad in the map."
+        )
+    if zero:
+        doubts.append(
+            f"limits of {', '.join(zero)} are 0 to 0, which says nothing of the range; the map "
+            f"allows ±{_UNKNOWN_RAD:g} rad until `pupper-sysid calibrate-joints` has measured it."
+        )
+    return sound, doubts
 
 
 def _entry(path: Path, hinge: Hinge, servo_id: int, counts: int, per_rad: float) -> dict:

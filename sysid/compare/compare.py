@@ -1,7 +1,7 @@
 """Compare servo models on recordings: the same free run, the same readings, side by side.
 
 Models are folders of `fit-servo`, calibrations and servo cards. A calibration predicts each run as
-its file says (`sysid.fit.predict`), whatever stands beside it. Models of `fit-servo` know neither
+its file says (`sysid.fit.predict`), independently of the others. Models of `fit-servo` know neither
 gain nor load: each run is predicted from its commands alone. Beside them stand a linear filter
 fitted to the recording's other groups, persistence, and the robot's repeatability. A note names
 models that were fitted to a recording they are compared on.

@@ -50,7 +50,9 @@ def motion_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 
 
 def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
-    """Angles that cannot be radians, whatever their amplitude."""
+    """Angles that cannot be radians, whatever their amplitude, unless their unit is stated."""
+    if all(t.unit_stated for t in trials):
+        return []
     cure = "Angles must be radians: multiply degrees by 0.0174533."
     largest = max(float(np.max(np.abs(t.command_rad))) for t in trials)
     if largest > _LARGEST_RAD:

@@ -155,7 +155,8 @@ def summed_scores(
                     residual = (value[n] - model) / scale
                     total[g] -= np.sqrt(1.0 + residual * residual) - 1.0
         while at < len(stops) and stops[at] == n + 1:
-            found[at] = total
+            for g in range(count):  # assigning the row takes five times as long to compile
+                found[at, g] = total[g]
             at += 1
     return found
 

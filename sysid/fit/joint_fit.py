@@ -27,6 +27,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
+    LEAST_FOLDS,
     as_wide_as_folds,
     in_continuous_time,
     interval_of,
@@ -54,6 +55,7 @@ from pupper_sysid.sysid.fit.search import (
     fit_folds,
     folds_of,
     group_count,
+    in_blocks,
     refine,
     refined,
     search,
@@ -262,7 +264,11 @@ def _compared(
     folds = fit_folds(problem, parts, rng, points, parents)
     if ready.lag.feedback.kind == "lattice":
         points = with_date_errors(points, problem, best, rng)
-    points = as_wide_as_folds(points, structure, best, folds, group_count(problem.runs))
+    left_out, groups = folds, group_count(problem.runs)
+    if len(parts) < LEAST_FOLDS:
+        blocks, apart = in_blocks(problem)
+        left_out, groups = fit_folds(blocks, apart, rng, points), len(apart)
+    points = as_wide_as_folds(points, structure, best, left_out, groups)
     points = np.clip(points, *structure.box)
     return replace(fitted, fit=best, draws=points, temperature=temperature, folds=folds)
 

@@ -46,7 +46,8 @@ PHASE_SD_S = 0.0003
 """Standard deviation of the date error that all readings of a polled run share [s], about that of
 the phase of a poll estimated from a few seconds."""
 _DATE_DRAWS, _DATE_ITERATIONS = 24, 6
-_LEAST_FOLDS = 3
+LEAST_FOLDS = 3
+"""Fits without a part, below which their scatter says nothing."""
 _MEDIAN_OF_NORMAL = float(ndtri(0.75))  # of the size of a standard normal number
 _CURVATURE_STEP = 0.03  # the slope over a likely error, not of one kink
 _OVERDISPERSED, _WIDEST = 1.5, 0.7  # of the first points, over a Gaussian's; and at most
@@ -233,7 +234,7 @@ def as_wide_as_folds(
     ----------
     Shao, J. and Tu, D. (1995). The Jackknife and Bootstrap. Springer, chapter 2.
     """
-    if len(folds) < _LEAST_FOLDS:
+    if len(folds) < LEAST_FOLDS:
         return draws
 
     def wider(centre: NDArray, values: NDArray, of_folds: NDArray) -> NDArray[np.float64]:

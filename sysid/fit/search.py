@@ -35,6 +35,7 @@ _DELAY_GRID = 2.0  # steps between the delays tried for a start
 _DENSE_DELAYS, _LONG_DELAYS = 40.0, 34  # steps up to which they are dense; how many beyond
 _START_RAD = 0.3  # offset within which a start may lie where no prior says so
 _MOST_FOLDS = 6
+_BLOCKS = 4
 _FOLD_DRAWS, _FOLD_STARTS = 512, 6
 
 
@@ -414,6 +415,30 @@ def folds_of(runs: Sequence[Run]) -> dict[str, NDArray[np.bool_]]:
     for gain in gains[1:-1][:2]:
         folds[f"P {gain:g}"] = np.array([r.p_gain == gain for r in runs])
     return {name: out for name, out in folds.items() if out.any() and not out.all()}
+
+
+def in_blocks(problem: Problem) -> tuple[Problem, dict[str, NDArray[np.bool_]]]:
+    """The same fit with the readings of each run in consecutive blocks, and which to leave out.
+
+    For runs of which `folds_of` finds too few parts: one motion still has a beginning and an end.
+
+    Returns
+    -------
+    Problem
+        With as many runs for each run as there are blocks, under the same commands.
+    dict of str to ndarray of bool, shape (runs,)
+        As from `folds_of`.
+    """
+    runs, noise = [], []
+    for run, own in zip(problem.runs, problem.noise_rad, strict=True):
+        for block in np.array_split(np.arange(len(run.sample_step)), _BLOCKS):
+            runs.append(
+                replace(run, sample_step=run.sample_step[block], sample_rad=run.sample_rad[block])
+            )
+            noise.append(own)
+    place = np.arange(len(runs)) % _BLOCKS
+    folds = {f"block {k + 1}": place == k for k in range(_BLOCKS)}
+    return replace(problem, runs=tuple(runs), noise_rad=tuple(noise)), folds
 
 
 def group_count(runs: Sequence[Run]) -> int:

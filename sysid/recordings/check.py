@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,10 +13,15 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.tables import import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
 
 _LEAST_ROWS = 20
+_COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
+_FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
+_IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LATEST_S = 1e11
@@ -22,7 +29,9 @@ _MANY_ROWS = 5  # that lie apart from the others
 _FEW_TRIALS = 10  # that are named one by one
 
 
-def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+def check(
+    path: Path | str, table: pd.DataFrame, metadata: Mapping[str, Any]
+) -> tuple[pd.DataFrame, list[str]]:
     """Refuse or repair a tidy table.
 
     Parameters
@@ -30,6 +39,8 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
     path : Path or str
         Name of the source, for messages.
     table : pandas.DataFrame
+    metadata : mapping
+        Header entries: angles whose unit was stated may be of several turns.
 
     Returns
     -------
@@ -43,7 +54,7 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
         If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
     """
     warnings: list[str] = []
-    if strange := strange_joint(table["joint"].unique().tolist()):
+    if strange := strange_joint(table["joint"].unique().tolist(), "columns" in metadata):
         raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
     lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
@@ -61,7 +72,14 @@ def check(path: Path | str, table: pd.DataFrame) -> tuple[pd.DataFrame, list[str
     if missing > 0:
         warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
     for column in ("command_rad", "position_rad"):
-        _refuse_degrees(path, column, table[column].to_numpy())
+        _refuse_degrees(path, column, table, metadata)
+    same = table.duplicated(_IDENTITY).to_numpy()
+    if same.any():
+        warnings.append(
+            f"{int(same.sum())} rows ({100 * same.mean():.0f} %) repeat another one, time stamp "
+            "included; each was counted once."
+        )
+        table = table.loc[~same]
     again = table.duplicated(["joint", "trial", "send_time_s"])
     if again.mean() > _MANY_REPEATED:
         raise InputError(
@@ -104,14 +122,42 @@ def _refuse_odd_numbers(path: Path | str, table: pd.DataFrame) -> None:
         raise InputError(f"{path}, column position_count: a value is larger than any encoder's.")
 
 
-def _refuse_degrees(path: Path | str, column: str, values: NDArray[np.float64]) -> None:
-    largest = float(np.nanmax(np.abs(values)))
-    if largest > LARGEST_RAD and not (column == "position_rad" and _in_two_places(values)):
+def _refuse_degrees(
+    path: Path | str, column: str, table: pd.DataFrame, metadata: Mapping[str, Any]
+) -> None:
+    """Refuse angles beyond a turn, or beyond a hundred where their unit was stated."""
+    values = np.nan_to_num(np.abs(table[column].to_numpy(float)))
+    farthest = int(np.argmax(values))
+    largest = float(values[farthest])
+    stated = "angle_unit" in metadata
+    if largest <= (_FARTHEST_RAD if stated else LARGEST_RAD):
+        return
+    known = table[column].to_numpy(float)
+    known = known[np.isfinite(known)]
+    if column == "position_rad" and _in_two_places(known):
+        return
+    joint = str(table["joint"].iloc[farthest])
+    names = metadata.get("columns") or {}
+    kind = "position" if column == "position_rad" else "command"
+    source = (names.get(joint) or {}).get(kind) if isinstance(names, dict) else None
+    place = f"{printable(str(source))[:60]} (the {kind} of {joint})" if source else column
+    if stated:
         raise InputError(
-            f"{path}, column {column}: values reach {largest:.4g}, more than a turn, which looks "
-            "like degrees or counts. Angles must be radians: multiply degrees by 0.0174533, or "
-            "convert the log with `pupper-sysid import --unit deg` (counts:4096, …)."
+            f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
+            "Check the unit, or take the start's angle off."
         )
+    turn = next((n for n in _COUNTS if known.max() < n), 0)
+    if turn and largest > _FEWEST_COUNTS and (known >= 0).all() and (known % 1 == 0).all():
+        unit = f"counts:{turn}"
+        kind = f"counts of an encoder with {turn} a turn"
+    else:
+        unit, kind = "deg", "degrees"
+    raise InputError(
+        f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
+        f"{kind}. Angles must be radians: multiply degrees by 0.0174533, or convert the log with "
+        f"{import_line(path, unit=unit)} (or deg, turns, counts:4096, scale:…; rad if the joint "
+        "turns so far)."
+    )
 
 
 def _in_two_places(values: NDArray[np.float64]) -> bool:
@@ -119,7 +165,7 @@ def _in_two_places(values: NDArray[np.float64]) -> bool:
 
     `doctor` says which number, and how to read it.
     """
-    ordered = np.sort(values[np.isfinite(values)])
+    ordered = np.sort(values)
     at = int(np.argmax(np.diff(ordered))) + 1 if len(ordered) > 1 else 0
     parts = ordered[:at], ordered[at:]
     return (

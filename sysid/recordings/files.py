@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -19,10 +19,12 @@ import numpy as np
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText, versions
+from pupper_sysid.common.reading.content import unpacked
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.check import check
+from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, Log
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.recognise import read_content, read_folder
-from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES, Log
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.table import (
@@ -61,6 +63,12 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
     InputError
         If it is not a recording or cannot be used; the message names the line and column.
     """
+    if not isinstance(path, str | PurePath):
+        kind = type(path).__name__
+        raise InputError(
+            f"load takes the path of one log, not a {kind}. Several: [load(p) for p in paths]; a "
+            "table or arrays in memory: Recording.from_frame, Recording.from_arrays."
+        )
     path, options = Path(path), options or LogOptions()
     if path.is_dir():
         return _imported(path, read_folder(path, options))
@@ -70,25 +78,32 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
             "not a recording; load that file instead."
         )
     data = read_bytes(path)
-    log = read_content(path, data, options)
+    content = unpacked(path, data, LARGEST_BYTES)
+    log = read_content(path, content, options)
     if log is not None:
         return _imported(path, log)
-    parsed = parse(path, as_text(path, data))
+    parsed = parse(path, decoded(path, content), options)
     table, metadata, warnings = convert(path, parsed, options)
     check_metadata(path, metadata)
-    table, more = check(path, table)
+    table, more = check(path, table, metadata)
     digest = hashlib.sha256(data).hexdigest()
     found = [*parsed.warnings, *warnings, *more]
-    return Recording(table, metadata, path.stem, path, digest, tuple(found))
+    return Recording(table, metadata, plain_stem(path), path, digest, tuple(found))
 
 
 def _imported(path: Path, log: Log) -> Recording:
     """The recording of another project's log, checked like any other."""
     check_metadata(path, log.metadata)
-    table, more = check(path, log.table)
+    table, more = check(path, log.table, log.metadata)
     return Recording(
-        table, log.metadata, path.stem, path, log.sha256, tuple([*log.warnings, *more])
+        table, log.metadata, plain_stem(path), path, log.sha256, tuple([*log.warnings, *more])
     )
+
+
+def plain_stem(path: Path) -> str:
+    """Name of a log without its ending, and without that of its compression."""
+    packed = path.suffix.lower() in (".gz", ".bz2", ".xz", ".zip")
+    return Path(path.stem).stem if packed else path.stem
 
 
 def newest_recording(folder: Path = FOLDER) -> Path:

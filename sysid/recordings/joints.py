@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import PurePath
 from typing import TypeVar
 from zlib import crc32
 
 import numpy as np
 
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
@@ -26,8 +28,30 @@ Found = TypeVar("Found")
 
 
 def as_sequence(recordings: Recordings) -> Sequence[Recording]:
-    """The recordings as a sequence."""
-    return [recordings] if isinstance(recordings, Recording) else recordings
+    """The recordings as a sequence.
+
+    Raises
+    ------
+    InputError
+        If something else stands for a recording, such as the name of its file.
+    """
+    whole = isinstance(recordings, str | PurePath | Mapping) or not isinstance(recordings, Iterable)
+    several = [recordings] if whole or _is_frame(recordings) else list(recordings)
+    for one in several:
+        if not isinstance(one, Recording):
+            kind = type(one).__name__
+            way = f"pupper_sysid.load({one!r})" if isinstance(one, str | PurePath) else (
+                "pupper_sysid.Recording.from_frame(table)" if _is_frame(one) else
+                "pupper_sysid.load(path), or Recording.from_arrays and from_frame"
+            )  # fmt: skip
+            raise InputError(f"A recording is needed, not a {kind}. Make one with {way}.")
+    if not several:
+        raise InputError("A recording is needed, and the list is empty.")
+    return several
+
+
+def _is_frame(value: object) -> bool:
+    return hasattr(value, "columns") and hasattr(value, "iloc")
 
 
 def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
@@ -41,6 +65,10 @@ def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
     recorded = in_order(joint for r in as_sequence(recordings) for joint in r.joints)
     if joints is None:
         return recorded
+    if not isinstance(joints, str) and not (
+        isinstance(joints, Iterable) and all(isinstance(j, str) for j in joints)
+    ):
+        raise InputError(f"`joints` is {joints!r:.40}; name joints, such as {recorded[0]!r}.")
     return select_joints(joints if isinstance(joints, str) else ",".join(joints), recorded)
 
 

@@ -5,7 +5,7 @@
   SpotDMouse sweep script);
 * Mini Pupper joints played back: `time_s, loop`, then `<joint>_command_rad, <joint>_position_rad`
   with the names of its joints;
-* any other table with a time, commands and positions (`importers.wide`).
+* any other table with a time, commands and positions (`importers.tables`).
 
 Pose, counts and bus of the Mini Pupper are taken for the first two only. They log the time of the
 loop, not of the read; a read is assumed `READ_AFTER_SEND_S` after the command was sent, and the
@@ -25,11 +25,16 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.shared.times import PAUSE_S, READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.tables import (
+    Table,
+    read_table,
+    spread,
+    unknown_numbers,
+)
+from pupper_sysid.sysid.recordings.importers.times import PAUSE_S, READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_columns
-from pupper_sysid.sysid.recordings.importers.wide import Table, read_table
 from pupper_sysid.sysid.recordings.table import REQUIRED_COLUMNS, Parsed, require
 
 SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")
@@ -61,9 +66,12 @@ def convert(
         require(path, parsed.table, PLAYBACK)
         options.refuse("Mini Pupper playback", ())
         return _playback(path, parsed)
-    table = _table(parsed)
-    if not options.command and (text := unknown_columns(table.names)):
-        raise InputError(f"{path}: {text}")
+    table = spread(path, _table(parsed), options)
+    if not options.command:
+        if parsed.numbered:
+            raise InputError(f"{path}: {unknown_numbers(path, table)}")
+        if text := unknown_columns(path, table.names, bool(options.time or options.rate)):
+            raise InputError(f"{path}: {text}")
     log = read_table(path, table, options)
     # what the log's own header says of its robot counts
     metadata = log.metadata | parsed.metadata
@@ -89,7 +97,7 @@ def _table(parsed: Parsed) -> Table:
             texts[str(name)] = [str(v) for v in values.to_numpy(object)]  # 5 times as fast
         else:
             numbers[str(name)] = values.to_numpy(float)
-    return Table(numbers, texts, parsed.faults)
+    return Table(numbers, texts, parsed.faults, numbered=parsed.numbered)
 
 
 def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:

@@ -23,8 +23,8 @@ from pupper_sysid.common.joints import in_order
 from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.shared.times import READ_AFTER_SEND_S
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S, doubt_of_a_turn
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.recordings.table import (
@@ -94,6 +94,8 @@ class Trial:
         What the header says of the servo.
     load : PendulumLoad or None
         What the joint carried; None where the header does not say.
+    unit_stated : bool
+        Whether the unit of the angles was stated, so that they may be of several turns.
     """
 
     joint: str
@@ -113,6 +115,7 @@ class Trial:
     voltage_v: NDArray[np.float64] | None = None
     servo: ServoSetup = field(default_factory=ServoSetup)
     load: PendulumLoad | None = None
+    unit_stated: bool = False
 
     def powered(self) -> Trial:
         """Its longest stretch of rows with the torque on; all of it where it always was."""
@@ -191,7 +194,8 @@ class Recording:
         command_rad, position_rad : mapping of joint to array_like, shape (n,)
             Absolute angles [rad]; a missing reading is NaN.
         read_time_s : array_like, shape (n,), optional
-            When the positions were read [s]; by default `READ_AFTER_SEND_S` after each command.
+            When the positions were read [s]; by default `READ_AFTER_SEND_S` after each command,
+            in doubt by half a turn unless `metadata` has `read_after_send_s`.
         trial : int or array_like of int, shape (n,)
             Number of the trial each row belongs to. Nothing is computed across trials.
         frequency_hz : float or array_like, shape (n,)
@@ -210,6 +214,12 @@ class Recording:
         --------
         from_frame : The same from a table.
         """
+        for key, by_joint in (("command_rad", command_rad), ("position_rad", position_rad)):
+            if not isinstance(by_joint, Mapping):
+                raise InputError(
+                    f"{name}: {key} is a {type(by_joint).__name__}; give a dictionary of arrays by "
+                    'joint, such as {"knee": angles}.'
+                )
         distinct(name, map(str, command_rad), "joints")
         if set(command_rad) != set(position_rad) or not command_rad:
             commanded, read = (", ".join(map(str, own)) for own in (command_rad, position_rad))
@@ -217,7 +227,7 @@ class Recording:
                 f"{name}: command_rad has joints {commanded}, position_rad has {read}; they must "
                 "be the same, at least one."
             )
-        time_s = np.asarray(send_time_s, float)
+        time_s = _numbers(name, "send_time_s", send_time_s)
         shared: dict[str, Any] = {"trial": trial, "frequency_hz": frequency_hz}
         shared |= {} if read_time_s is None else {"read_time_s": read_time_s}
         parts = []
@@ -225,7 +235,7 @@ class Recording:
             own = shared | {"command_rad": command, "position_rad": position_rad[joint]}
             columns: dict[str, Any] = {"send_time_s": time_s, "joint": joint}
             for key, values in own.items():
-                columns[key] = np.asarray(values)
+                columns[key] = _numbers(f"{name}, {joint}", key, values)
                 free = key in ("trial", "frequency_hz") and columns[key].ndim == 0
                 if not free and columns[key].shape != time_s.shape:
                     raise InputError(
@@ -251,7 +261,8 @@ class Recording:
         table : pandas.DataFrame
             Columns of a recording file or of another layout that `load` reads. Of the former,
             `read_time_s`, `trial` and `frequency_hz` may be absent: reads then follow
-            `READ_AFTER_SEND_S` after the command, all rows are one trial, and no tone is assumed.
+            `READ_AFTER_SEND_S` after the command, in doubt by half a turn (unless `metadata` has
+            `read_after_send_s`), all rows are one trial, and no tone is assumed.
         metadata : mapping, optional
             Header entries, such as `bus` and `start_pose_rad`.
         name : str
@@ -265,15 +276,25 @@ class Recording:
             If a column is missing or is not numeric, times run backwards, angles cannot be
             radians, or too few rows are left.
         """
+        if not isinstance(table, pd.DataFrame):
+            raise InputError(
+                f"{name}: the table is a {type(table).__name__}. Make it a pandas.DataFrame, or "
+                "use Recording.from_arrays."
+            )
+        if metadata is not None and not isinstance(metadata, Mapping):
+            raise InputError(f"{name}: metadata is a {type(metadata).__name__}, not a dictionary.")
         given = {"imported_from": "a table in memory"} | dict(metadata or {})
         check_metadata(name, given)
         distinct(name, map(str, table.columns))
         table = table.copy()
         table.columns = [str(column) for column in table.columns]
+        timed = "read_time_s" in table
         if "send_time_s" in table:
             if "read_time_s" not in table:
-                table["read_time_s"] = table["send_time_s"] + READ_AFTER_SEND_S
-                given.setdefault("read_after_send_s", READ_AFTER_SEND_S)
+                after = given.get("read_after_send_s")
+                table["read_time_s"] = table["send_time_s"] + (
+                    READ_AFTER_SEND_S if after is None else after
+                )
             for column, value in (("trial", 0), ("frequency_hz", np.nan)):
                 table[column] = table.get(column, value)
         faults: dict[str, str] = {}
@@ -287,12 +308,28 @@ class Recording:
                     raise InputError(fault) from None
                 faults[str(column)] = fault
                 continue
+            if column in ("send_time_s", "read_time_s") and table[column].isna().any():
+                row = int(np.flatnonzero(table[column].isna())[0])
+                raise InputError(
+                    f"{name}, column {column}: row {row} has no time (NaN). Leave rows without a "
+                    "time out."
+                )
             if np.isinf(table[column]).any():
                 raise InputError(f"{name}, column {column}: a value is infinite.")
         tidy, known, warnings = convert(name, Parsed(given, table, faults=faults), options)
+        if "send_time_s" in table and not timed and given.get("read_after_send_s") is None:
+            given["read_after_send_s"] = READ_AFTER_SEND_S
+            first = tidy["joint"] == tidy["joint"].iloc[0] if len(tidy) else slice(0)
+            doubt, text = doubt_of_a_turn(tidy.loc[first, "send_time_s"].to_numpy(float))
+            given["bus"] = {"read_time_doubt_s": doubt} | dict(given.get("bus") or {})
+            warnings = [
+                *warnings,
+                text.split(" If you know")[0]
+                + (" If you know, pass `read_time_s`, or `read_after_send_s` in `metadata`."),
+            ]
         others = tidy.columns.difference(REQUIRED_COLUMNS, sort=False)
         tidy = tidy.reindex(columns=[*REQUIRED_COLUMNS, *others])
-        tidy, more = check(name, tidy)
+        tidy, more = check(name, tidy, given | known)
         digest = hashlib.sha256(tidy.to_csv(index=False).encode()).hexdigest()
         return cls(tidy, given | known, name, None, digest, (*warnings, *more))
 
@@ -387,7 +424,20 @@ class Recording:
                     columns.get("voltage_v"),
                     servo,
                     loads.get(joint),
+                    self.metadata.get("angle_unit") == "stated",
                 )
             )
         # Any: type checkers see this module under two names
         return cast(Any, in_servo_coordinates)(found, bus)
+
+
+def _numbers(place: str, key: str, values: ArrayLike) -> NDArray[np.float64]:
+    """The values as numbers; refused where they are none."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        kind = type(values).__name__
+        raise InputError(
+            f"{place}, column {key}: its values are not numbers but a {kind} of others. Give an "
+            "array with a number per row."
+        ) from None

@@ -21,10 +21,14 @@ from pupper_sysid.common.reading.csv_table import (
     column_names,
     comments_of,
     numbers_of,
+    one_line_end,
     read_table,
 )
+from pupper_sysid.common.reading.dialect import plain
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.wide import JOINT_COLUMNS
+from pupper_sysid.sysid.recordings.importers.columns import time_columns
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.tables import LABELS
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -78,6 +82,8 @@ class Header(BaseModel):
     bus: Bus = Bus()
     joints: list[str] = []
     readings: Literal["live", "polled"] | None = None
+    angle_unit: Literal["stated"] | None = None
+    columns: dict[str, dict[str, str]] = {}
     start_pose_rad: dict[str, _Angle] = {}
     read_after_send_s: Annotated[float, Field(ge=-1, le=1)] | None = None
     servos: dict[str, ServoSetup] = {}
@@ -97,16 +103,19 @@ class Parsed:
     faults : dict of str to str
         Columns of other projects' logs that are not in the table, for they hold text, and the
         sentence on the first such cell.
+    numbered : bool
+        Whether the file names no columns, so that they have their numbers as names.
     """
 
     metadata: dict[str, Any]
     table: pd.DataFrame
     warnings: list[str] = field(default_factory=list)
     faults: dict[str, str] = field(default_factory=dict)
+    numbered: bool = False
 
 
-def parse(path: Path, text: str) -> Parsed:
-    """Cells of a CSV file with a comment header, as numbers.
+def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
+    """Cells of a table of text (`common.reading.dialect`) with a comment header, as numbers.
 
     Raises
     ------
@@ -114,23 +123,23 @@ def parse(path: Path, text: str) -> Parsed:
         For ragged rows, text where a number belongs, a broken or newer header, or more than is
         read (`common.reading.budget`).
     """
-    columns = column_names(path, text)
+    options = options or LogOptions()
+    text = one_line_end(text)
+    opened = plain(text)
+    columns = opened.columns
+    if columns is None:
+        columns = column_names(path, opened.text)
     if not columns:
         header(path, text)
         raise InputError(f"{path} has no rows: the recording never started. Record it again.")
-    if len(columns) == 1 and ";" in columns[0]:
-        raise InputError(
-            f"{path}, its column names: cells are separated by semicolons. Save it with commas "
-            "between cells and points in numbers."
-        )
     ours = "send_time_s" in columns
     strict = ours or "motor_idx" in columns
-    texts = [c for c in columns if c in TEXT_COLUMNS or c.lower() in JOINT_COLUMNS]
+    texts = [c for c in columns if c in TEXT_COLUMNS or (not ours and _may_be_text(c, options))]
     # killed in the middle of a line: of ours the last one has no end
-    found = read_table(path, text, texts, strict, whole_lines=ours)
+    found = read_table(path, opened.text, texts, strict, whole_lines=ours, columns=opened.columns)
     entries = _entries(path, text, found.comments)
     metadata = _metadata(path, entries)
-    warnings: list[str] = []
+    warnings: list[str] = list(opened.notes)
     keep = np.ones(len(found), bool)
     for trial, rows in _cancelled(path, found, entries) if ours else []:
         warnings.append(
@@ -150,7 +159,15 @@ def parse(path: Path, text: str) -> Parsed:
         elif name in found.numbers:
             data[name] = found.numbers[name]
     table = pd.DataFrame(data)
-    return Parsed(metadata, table if keep.all() else table.loc[keep], warnings, found.faults)
+    return Parsed(
+        metadata, table if keep.all() else table.loc[keep], warnings, found.faults, opened.numbered
+    )
+
+
+def _may_be_text(name: str, options: LogOptions) -> bool:
+    """Whether a column of another project's log may hold names, labels or times of day."""
+    chosen = (options.trial, options.time, options.command_time)
+    return name in chosen or name.lower() in LABELS or bool(time_columns([name]))
 
 
 def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> None:

@@ -1,6 +1,6 @@
 """DelayedPD and sparse equations, fitted to the same part of the data as the networks.
 
-Both are fitted in free run from rest to the part's readings at their own times
+Both are fitted in free run from the first reading to the part's readings at their own times
 (`sysid.fit.search`). The result is arrays per joint, ready for a servo model file.
 """
 

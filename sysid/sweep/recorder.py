@@ -27,7 +27,7 @@ from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop
 from pupper_sysid.hardware.moves import first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.sysid.recordings.files import RecordingWriter
-from pupper_sysid.sysid.recordings.importers.shared.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan, TrialPlan
 from pupper_sysid.sysid.sweep.resume import Resume
 

@@ -30,6 +30,7 @@ def python(folder: Path, *arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_rooms_and_commands_are_found_beside_files_of_their_names(folder):
     rooms = "common.errors", "hardware.bus", "sysid.lag.tone", "sim.walking.config"
     python(folder, "-c", "import pupper_sysid, " + ", ".join(f"pupper_sysid.{r}" for r in rooms))

@@ -37,7 +37,7 @@ def sweep(capsys, *more: str):
 
 def test_an_emulated_bench_needs_no_joint_map_and_its_truth_has_the_load(capsys, tmp_path):
     code, out, err = sweep(capsys, "--gains", "8,32", "--kind", "drop", "--truth", "--json",
-                           "--out", "a.csv")  # fmt: skip
+                           "--duration", "1", "--out", "a.csv")  # fmt: skip
     assert code == 0, err
     assert json.loads(out)["joints"] == ["bench"] and json.loads(out)["trials"] == 4
     recording = load(tmp_path / "a.csv")
@@ -49,7 +49,9 @@ def test_an_emulated_bench_needs_no_joint_map_and_its_truth_has_the_load(capsys,
 
 
 def test_an_interrupted_bench_is_continued_at_its_gain(capsys, tmp_path):
-    code, _, err = sweep(capsys, "--gains", "8,32", "--kind", "steps", "--out", "a.csv")
+    code, _, err = sweep(
+        capsys, "--gains", "8,32", "--kind", "steps", "--duration", "2", "--out", "a.csv"
+    )
     assert code == 0, err
     lines = (tmp_path / "a.csv").read_text().splitlines()
     body = [k for k, line in enumerate(lines) if line and line[0] != "#"]

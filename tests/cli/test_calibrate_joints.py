@@ -250,7 +250,15 @@ def test_a_whole_calibration_over_a_port_writes_what_was_done_by_hand(
 
     with on_a_port(servos) as port:
         code, said, err = run(
-            monkeypatch, capsys, person, "--bus", f"feetech:{port.device}@1000000", "--out", out
+            monkeypatch,
+            capsys,
+            person,
+            "--bus",
+            f"feetech:{port.device}@1000000",
+            "--out",
+            out,
+            "--joint-map",
+            "sts3215",
         )
     assert code == 0, err
     new = load_joint_map(out)
@@ -268,7 +276,7 @@ def test_an_input_that_ends_is_a_sentence_and_leaves_no_file(monkeypatch, capsys
     with on_a_port(still_servos(ids=[4])) as port:
         code, _, err = run(
             monkeypatch, capsys, lambda enter, heard: None,
-            "--bus", f"feetech:{port.device}@1000000", "--out", out,
+            "--bus", f"feetech:{port.device}@1000000", "--out", out, "--joint-map", "sts3215",
         )  # fmt: skip
     assert code == 2 and "the input ended before the calibration did" in err
     assert not out.exists()

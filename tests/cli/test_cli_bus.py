@@ -49,7 +49,17 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     with on_a_port(moving_servos(ids=[5])) as port:
         bus = f"feetech:{port.device}"
         code, _, err = run(
-            capsys, "sweep", *SHORT, "--joints", "LF_thigh", "--bus", bus, "--out", "a.csv"
+            capsys,
+            "sweep",
+            *SHORT,
+            "--joints",
+            "LF_thigh",
+            "--bus",
+            bus,
+            "--out",
+            "a.csv",
+            "--joint-map",
+            "sts3215",
         )
     assert code == 0, err
     recording = load(Path("a.csv"))
@@ -75,7 +85,7 @@ def test_a_calf_can_be_swept_without_its_thigh(capsys):
     with on_a_port(moving_servos(ids=[6])) as port:
         code, _, err = run(
             capsys, "sweep", *SHORT, "--joints", "LF_calf", "--bus", f"feetech:{port.device}",
-            "--out", "a.csv",
+            "--out", "a.csv", "--joint-map", "sts3215",
         )  # fmt: skip
     assert code == 0, err
     assert load(Path("a.csv")).metadata["bus"]["count_zero_rad"]["LF_calf"] == pytest.approx(
@@ -86,7 +96,15 @@ def test_a_calf_can_be_swept_without_its_thigh(capsys):
 def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
     with on_a_port(still_servos(ids=[4])) as port:
         code, _, err = run(
-            capsys, "sweep", *SHORT, "--joints", "LF", "--bus", f"feetech:{port.device}"
+            capsys,
+            "sweep",
+            *SHORT,
+            "--joints",
+            "LF",
+            "--bus",
+            f"feetech:{port.device}",
+            "--joint-map",
+            "sts3215",
         )
     assert code == 1 and "LF_thigh (id 5), LF_calf (id 6) does not answer" in err
     assert not list(Path().glob("recordings/*"))

@@ -78,6 +78,7 @@ def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
     assert code == 0 and "0.50 times as fast" in err
 
 
+@pytest.mark.slow
 def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(capsys, here):
     code, _, err = run_program(
         capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--observer",
@@ -101,6 +102,7 @@ def late(here) -> Path:
     return Path("late.yaml")
 
 
+@pytest.mark.slow
 def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here, late):
     arguments = (POLICY, "--seconds", 0.1, "--name", "walk", "--force", "--json")
     code, out, err = run_program(capsys, pupper_deploy, *arguments, "--actuator", CALIBRATION)
@@ -204,6 +206,7 @@ def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, cou
     assert len(rows) == count and all(0 <= r["survival"] <= 1 for r in rows)
 
 
+@pytest.mark.slow
 def test_a_quick_look_is_smaller_and_says_so(capsys, here, monkeypatch):
     from pupper_sysid.cli.commands.analyze import common
 

@@ -45,7 +45,7 @@ def test_a_log_is_imported_by_its_columns_and_says_what_was_assumed(capsys, arm)
 
 def test_joints_order_and_json(capsys, arm):
     code, out, _ = run(
-        capsys, "import", arm, *COLUMNS, "--joints", "pan", "--read-before-send", "--json"
+        capsys, "import", arm, *COLUMNS, "--joints", "pan", "--send-after", "0.5ms", "--json"
     )
     found = json.loads(out)
     assert code == 0 and found["joints"] == ["pan"] and found["written"] == "arm.csv"
@@ -92,7 +92,14 @@ def test_a_folder_of_another_projects_logs_is_one_robot(tmp_path):
     assert not is_fleet(tmp_path / "bam")
 
 
-@pytest.mark.parametrize("folder", ["ktune_robstride", "mini_pupper_full_band", "lerobot_so101"])
+@pytest.mark.parametrize(
+    "folder",
+    [
+        "mini_pupper_full_band",
+        pytest.param("ktune_robstride", marks=pytest.mark.slow),
+        pytest.param("lerobot_so101", marks=pytest.mark.slow),
+    ],
+)
 def test_folders_of_real_logs_are_examined_without_renaming_anything(capsys, folder):
     code, out, err = run(capsys, "doctor", real_folder(folder), "--json")
     assert code == 0, err

@@ -88,8 +88,8 @@ def test_registers_are_of_emulated_servos_that_have_them(arm, capsys):
     assert "'q=16' sets no register" in refused(
         capsys, pupper_sysid, "sweep", "--joint-map", arm, "--registers", "q=16"
     )
-    assert "have none that act" in refused(
-        capsys, pupper_sysid, "emulate", "feetech", "--registers", "p=16"
+    assert "do not act" in refused(
+        capsys, pupper_sysid, "emulate", "feetech", "--model", "scs0009", "--registers", "p=16"
     )
 
 

@@ -173,6 +173,7 @@ def test_a_finished_run_can_be_resumed_and_stays_as_it_is(capsys, trained):
     assert read_checkpoint(trained / "last.pt")["iteration"] == 2
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_ends_well(tmp_path):
     """A real process, a real signal: exit 130, a checkpoint, and the way to go on."""
     process = subprocess.Popen(

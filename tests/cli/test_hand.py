@@ -73,6 +73,7 @@ def test_only_limp_joints_move_and_they_stay_where_they_were_put():
     assert servos.hand_rad[1] == 0.0
 
 
+@pytest.mark.slow
 def test_a_calibration_of_the_joints_is_rehearsed_to_its_end(tmp_path):
     robot = Typed("emulate", "feetech", "--by-hand", "--ids", "4-6", "--seed", "1")
     try:
@@ -82,7 +83,8 @@ def test_a_calibration_of_the_joints_is_rehearsed_to_its_end(tmp_path):
         assert bus
         out = tmp_path / "joints.yaml"
         guide = Typed(
-            "calibrate-joints", "--bus", bus[1], "--joints", "LF", "--out", str(out)
+            "calibrate-joints", "--bus", bus[1], "--joints", "LF", "--out", str(out),
+            "--joint-map", "sts3215",
         )  # fmt: skip
         for words, keys in (
             ("will go limp", ""), ("Hold it still", ""), ("Step 2 of 3", "DDD0AAA0"),

@@ -84,6 +84,8 @@ def test_a_sweep_writes_both_files_as_it_records(tmp_path, monkeypatch, capsys):
     )  # fmt: skip
     counts = recording.metadata["completed"]["guard"]
     assert bool(texts) == any(counts[k] for k in ("clipped", "slowed", "unsent"))
+    shown = entities.get("/guard|text", ([], []))[1]
+    assert np.ravel(shown).tolist() == texts
     # joints that stand still are shown, too
     assert len(topics["RF_thigh", "position_rad"][0]) == 2 * len(recording.table) / 2
     # the calf that was swept turns by its amplitude, the trunk stays
@@ -114,6 +116,7 @@ def test_a_writer_that_stands_still_delays_no_tick_and_what_it_missed_is_counted
     assert "was still behind" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_ticks_that_were_dropped_are_counted_and_the_others_are_whole(tmp_path, capsys):
     bus = emulated()
     with live_views(bus, Wanted(None, tmp_path / "a.mcap")) as views:
@@ -131,6 +134,7 @@ def test_ticks_that_were_dropped_are_counted_and_the_others_are_whole(tmp_path, 
     assert f"{dropped} ticks were dropped" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_a_bus_in_virtual_time_waits_for_the_writer(tmp_path):
     bus = emulated()
     with live_views(bus, Wanted(None, tmp_path / "a.mcap"), waits=True) as views:
@@ -144,7 +148,7 @@ def test_a_bus_in_virtual_time_waits_for_the_writer(tmp_path):
 def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
     bus = emulated()
     far = bus.limits.clip(np.full(12, 9.0)) + 1.0
-    wanted = Wanted(str(tmp_path / "a.rrd"), tmp_path / "a.mcap")
+    wanted = Wanted(None, tmp_path / "a.mcap")
     with pytest.raises(SafetyStop), live_views(bus, wanted, waits=True) as views:
         bus.torque(True)
         hold(bus, views, 3)
@@ -153,9 +157,9 @@ def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
     _, texts = topics_of(tmp_path / "a.mcap")
     assert texts[0] == "Guard: a command held at the limits."
     assert "Guard: 1 commands held at the limits." in texts and texts[-1] == "LF_hip: it burns."
-    assert np.ravel(entities_of(tmp_path / "a.rrd")["/guard|text"][1]).tolist() == texts
 
 
+@pytest.mark.slow
 def test_unknown_commands_and_silent_servos_are_left_out(tmp_path):
     bus = emulated()
     with live_views(bus, Wanted(None, tmp_path / "a.mcap"), waits=True) as views:
@@ -171,7 +175,11 @@ def test_unknown_commands_and_silent_servos_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL]
+    "number",
+    [
+        signal.SIGKILL,
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGINT, signal.SIGTERM)),
+    ],
 )
 def test_the_files_are_whole_however_the_sweep_ends(tmp_path, number):
     words = (*SWEEP, "--duration", "30", "--real-time", "--mcap", "a.mcap", "--rerun", "a.rrd")
@@ -213,21 +221,28 @@ def test_what_is_there_is_not_replaced_and_what_is_missing_is_named(tmp_path, mo
         (("--mcap", "mine.mcap"), "mine.mcap exists already"),
         (("--mcap", "b.csv"), "must end in .mcap"),
         (("--rerun", "b.csv"), "ends in .rrd, the word viewer, or"),
-        (("--rerun", "rerun+http://127.0.0.1:1/proxy"), "No Rerun viewer answers"),
         (("--mcap", "b.mcap", "--until", "dead_time:2ms"), "--until makes several recordings"),
     ]:
         code, _, err = run(capsys, *SWEEP, *options)
         assert code == 2 and sentence in err
     assert [p.name for p in tmp_path.iterdir()] == ["mine.mcap"]
     assert Path("mine.mcap").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_a_file_is_replaced_by_force_and_a_viewer_that_does_not_answer_is_named(tmp_path, capsys):
+    path = tmp_path / "mine.mcap"
+    path.write_text("mine")
     bus = emulated()
-    with live_views(bus, Wanted(None, Path("mine.mcap"), force=True), waits=True) as views:
+    with live_views(bus, Wanted(None, path, force=True), waits=True) as views:
         bus.torque(True)
         hold(bus, views, 1)
-    assert topics_of(tmp_path / "mine.mcap")[0]
+    assert topics_of(path)[0]
+    code, _, err = run(capsys, *SWEEP, "--rerun", "rerun+http://127.0.0.1:1/proxy")
+    assert code == 2 and "No Rerun viewer answers" in err
 
 
-@pytest.mark.parametrize("missing", ["mcap_ros2", "rerun"])
+@pytest.mark.parametrize("missing", ["mcap_ros2", pytest.param("rerun", marks=pytest.mark.slow)])
 def test_the_extra_is_named_where_its_libraries_are_missing(tmp_path, monkeypatch, missing):
     """The writer's process imports an empty package in the library's place."""
     (tmp_path / missing).mkdir()
@@ -239,6 +254,7 @@ def test_the_extra_is_named_where_its_libraries_are_missing(tmp_path, monkeypatc
     assert [p.name for p in tmp_path.iterdir()] == [missing]
 
 
+@pytest.mark.slow
 def test_a_viewer_gets_what_a_file_would_hold(tmp_path):
     """The stored stream of Rerun's own server, in place of a window."""
     pytest.importorskip("rerun")
@@ -275,23 +291,23 @@ def test_a_viewer_gets_what_a_file_would_hold(tmp_path):
 def test_monitor_writes_what_it_reads_and_sends_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ("monitor", "--bus", "emulated", "--seconds", "1", "--mcap", "m.mcap")
-    code, _, err = run(capsys, *words, "--rerun", "m.rrd")
-    assert code == 0 and "Wrote m.rrd." in err and "dropped" not in err
+    code, _, err = run(capsys, *words)
+    assert code == 0 and "Wrote m.mcap." in err and "dropped" not in err
     topics, _ = topics_of(tmp_path / "m.mcap")
     assert {joint for joint, name in topics if name == "position_rad"} == set(JOINT_NAMES)
     assert not any(name == "command_rad" for _, name in topics)  # its goals are not known
     assert 5 <= len(topics["RB_calf", "position_rad"][0]) <= 21
-    assert "/joints/RB_calf/position_rad|scalars" in entities_of(tmp_path / "m.rrd")
     code, _, err = run(capsys, *words, "--force", "--once")
     assert code == 2 and "Give one of the two" in err
 
 
+@pytest.mark.slow
 def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     policy = str(Path(__file__).parents[2] / "data/samples/policies/mlp")
-    words = (policy, "--seconds", "1.5", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
+    words = (policy, "--seconds", "1", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
     code, _, err = run_program(capsys, pupper_deploy, *words)
     assert code == 0 and "Wrote w.mcap." in err and "dropped" not in err
     topics, texts = topics_of(tmp_path / "w.mcap")

@@ -11,21 +11,22 @@ import pytest
 from pupper_sysid.cli.commands.robot.monitor import Watched, _open
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.frames import FrameReader
 from pupper_sysid.hardware.feetech.registers import PING, SYNC_READ
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.faults import BusFaults
 from support.command_line import run
 from support.servo_servers import StillBench, bench_of, on_a_port, on_a_socket, still_servos
 
 _READ = 2
+MAP = ("--joint-map", "sts3215")
 
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
     """The servos share this process and a busy machine."""
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.02)
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +108,9 @@ def test_one_json_object_tells_goal_volts_heat_and_errors_of_serial_servos(capsy
     bench_of(servos).loads[4] = -250
     bench_of(servos).counts[5] = 2048 + 652
     with on_a_port(servos) as port:
-        code, out, _ = run(capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", "--json")
+        code, out, _ = run(
+            capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", *MAP, "--json"
+        )
     told = json.loads(out)
     hip, thigh = told["joints"]
     assert code == 0 and told["coordinates"] == "servo" and told["joint_map"] == "sts3215"
@@ -121,7 +124,9 @@ def test_one_json_object_tells_goal_volts_heat_and_errors_of_serial_servos(capsy
 def test_monitoring_a_line_only_pings_and_reads(capsys):
     servos = still_servos(ids=[4, 5])
     with on_a_port(servos) as port:
-        code, out, _ = run(capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", "--once")
+        code, out, _ = run(
+            capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", *MAP, "--once"
+        )
     asked = {frame.code for frame in FrameReader().feed(servos.heard)}
     assert code == 0 and "LF_thigh" in out and "since the last valid reply" in out
     assert asked and asked <= {PING, _READ, SYNC_READ}

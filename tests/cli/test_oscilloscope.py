@@ -143,7 +143,7 @@ def in_a_terminal(folder, *words: str) -> tuple[int, str]:
 @pytest.mark.parametrize(
     "words,last",
     [((*SWEEP, "--live"), "--out calibrated.yaml"),
-     (("monitor", "--bus", "emulated", "--seconds", "2"), "")],
+     pytest.param(("monitor", "--bus", "emulated", "--seconds", "2"), "", marks=pytest.mark.slow)],
     ids=["sweep", "monitor"],
 )  # fmt: skip
 def test_traces_are_drawn_and_the_terminal_is_left_clean(tmp_path, words, last):

@@ -25,18 +25,25 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.servo_servers import limp, robot_behind, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
-PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
+PATIENT = """
+from pupper_sysid.hardware.serial_servos import line
+line.REPLY_TIMEOUT_S = 0.1
+"""
+"""Servos that share a busy machine with what asks them answer too late."""
+PROGRAM = f"{PATIENT}from pupper_sysid.cli.programs.pupper_sysid import main; main()"
+PARK = [sys.executable, "-c", PROGRAM, "park"]
 
-DRIVER = """
+DRIVER = f"""{PATIENT}
 import os, sys
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
 bus = open_guarded(parse_address(sys.argv[1]))
-for _ in range(20):  # servos that share a busy machine with their driver answer too late
+for _ in range(20):
     try:
         bus.torque(True)
         break
@@ -53,8 +60,14 @@ while True:
 def robot(request, tmp_path, monkeypatch):
     """A served emulated robot and its address."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
     with robot_behind(request.param, tmp_path) as served:
         yield served
+
+
+on_esp32 = pytest.mark.parametrize(
+    "robot", ["esp32", pytest.param("feetech", marks=pytest.mark.slow)], indirect=True
+)
 
 
 def driven(address: str) -> tuple[int, int]:
@@ -74,6 +87,7 @@ def end(processes: tuple[int, int]) -> None:
                 os.kill(number, signalled)
 
 
+@on_esp32
 @pytest.mark.wall_clock
 def test_park_switches_off_and_names_the_program_that_drives_the_robot(robot):
     server, address = robot
@@ -94,6 +108,8 @@ def test_park_switches_off_and_names_the_program_that_drives_the_robot(robot):
         end(processes)
 
 
+@pytest.mark.slow
+@on_esp32
 @pytest.mark.wall_clock
 def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot):
     server, address = robot
@@ -112,7 +128,16 @@ def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot
 
 
 @pytest.mark.wall_clock
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(
+    ("robot", "number"),
+    [
+        ("feetech", signal.SIGSTOP),
+        ("esp32", signal.SIGKILL),
+        pytest.param("feetech", signal.SIGKILL, marks=pytest.mark.slow),
+        pytest.param("esp32", signal.SIGSTOP, marks=pytest.mark.slow),
+    ],
+    indirect=["robot"],
+)
 def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, number):
     server, address = robot
     supervisor = subprocess.Popen([*PARK, "--supervise"], cwd=ROOT, stderr=subprocess.PIPE)
@@ -224,7 +249,7 @@ def test_every_command_that_opens_a_bus_is_stopped_as_by_ctrl_c():
         "open_bus", "open_bus_of", "open_guarded", "connect", "Esp32Bus", "scan_line",
         "switch_off",
     }  # fmt: skip
-    servers = {"FeetechPty", "ProxySocket"}
+    servers = {"SerialPty", "ProxySocket"}
     for word, command in COMMANDS.items():
         module = command.where.split(":")[0].replace(".", "/")
         tree = ast.parse((ROOT / f"cli/commands/{module}.py").read_text())

@@ -136,6 +136,7 @@ def test_what_cannot_be_planned_or_executed_is_refused(capsys, planned):
 SHORT = ("--joints", "LF_hip,LF_thigh", "--freqs", "4", "--duration", "2", "--out", "a.csv")
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
     code, out, err = run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--json")
@@ -148,6 +149,7 @@ def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
     assert "5.0 (dead_time:2ms): more is to be recorded" in err
 
 
+@pytest.mark.slow
 def test_rounds_that_were_cut_short_are_continued(capsys, widths):
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
     run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms")

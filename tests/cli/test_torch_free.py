@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).resolve().parents[1]
 
 COMMANDS = '''
@@ -47,6 +49,7 @@ assert not set(BANNED) & set(sys.modules)
 '''
 
 
+@pytest.mark.slow
 def test_no_command_on_the_way_to_a_calibration_imports_torch(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", COMMANDS],

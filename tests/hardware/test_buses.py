@@ -17,10 +17,10 @@ from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.esp32 import bus as esp32_bus
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from support.servo_servers import (
     LAYOUTS,
@@ -120,7 +120,7 @@ BUSES: dict[str, Callable[[], Any]] = {
 @pytest.fixture(params=BUSES)
 def line(request, monkeypatch) -> Iterator[Line]:
     # the servos share this process and a busy machine
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.4)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.4)
     monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)
     with BUSES[request.param]() as served:
         yield served

@@ -263,6 +263,7 @@ def test_intervals_are_over_policies_of_a_kind():
     assert found.low < found.value == 6.5 < found.high and "MLP" not in claim.interval
 
 
+@pytest.mark.slow
 def test_four_ways_on_the_sample_playback_score_unseen_readings_only(monkeypatch):
     small = Recipe(8, 2, (0.3, 3.0), 60, 1e-2, 20, 2)
     monkeypatch.setattr(networks, "MLP", small)
@@ -311,6 +312,7 @@ def gathered(tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, gathered):
     code, out, err = run_program(capsys, program, *ARGUMENTS, "--json")
     assert code == 0, err

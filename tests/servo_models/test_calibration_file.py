@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +94,7 @@ def test_every_number_reaches_the_models_it_is_for():
         [11.0], [0.1], [0.2], [1.1e-5], [0.35], [7.6], [0.025], [0.0],
     ]  # fmt: skip
     feedback = hip.held_feedback("LF_hip")
-    assert vars(feedback) == {
+    assert asdict(feedback) == {
         "poll_period_s": 0.02685, "loss": 0.42, "quantum_rad": math.pi / 550, "offset_rad": 0.0,
     }  # fmt: skip
     assert hip.joint("LF_hip").feedback.offset_rad.value == -0.1  # of its recording, not the servo
@@ -135,7 +136,7 @@ def test_presets_hold_the_published_numbers_for_all_joints_and_call_none_a_measu
             assert q.identified == "no" and q.low is None and q.high is None
         assert all("not a measurement" in str(q.why) for q in quantities if q.value)
         assert joint.lag == Lag() and joint.scores == Scores()
-    assert vars(preset.held_feedback("LF_hip")) == dict.fromkeys(
+    assert asdict(preset.held_feedback("LF_hip")) == dict.fromkeys(
         ("poll_period_s", "loss", "quantum_rad", "offset_rad"), 0.0
     )
 

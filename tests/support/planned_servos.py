@@ -22,6 +22,7 @@ from pupper_sysid.sysid.plan.information import (
     respond,
 )
 from pupper_sysid.sysid.plan.planner import Servo
+from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
 from support.servo_parameters import MEASURED
@@ -87,7 +88,7 @@ def two_joints() -> Recording:
     return Recording.from_arrays(
         whole["time"], dict.fromkeys(joints, whole["command"]),
         dict.fromkeys(joints, whole["position"]), trial=whole["trial"], frequency_hz=whole["f"],
-        metadata={"readings": "live"},
+        metadata={"readings": "live", "read_after_send_s": READ_AFTER_SEND_S},
     )  # fmt: skip
 
 

@@ -75,3 +75,11 @@ def real_folder(name: str) -> Path:
     if not path.is_dir():
         pytest.skip(f"{name} is not in {FOLDER} (set PUPPER_REAL_DATA)")
     return path
+
+
+def case(name: str) -> Path:
+    """File `name` of the small inputs with a stated answer; skips the test where it is absent."""
+    path = FOLDER.parent / "cases" / name
+    if not path.exists():
+        pytest.skip(f"{name} is not in {path.parent} (set PUPPER_REAL_DATA)")
+    return path

@@ -11,16 +11,26 @@ from pathlib import Path
 
 import numpy as np
 
+from pupper_sysid.hardware.dynamixel.registers import SERIES as DYNAMIXELS
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
-from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
+from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_line import LineEmulator
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+    BENCH_MAP,
+    Pendulum,
+    PendulumBench,
+    draw_bench,
+    dynamixel_bench,
+)
 
 LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy": "mini_pupper_2"}
 
@@ -125,6 +135,40 @@ def still_servos(
     return Listening(bench, series, np.random.default_rng(0), ids, **keywords)
 
 
+def map_of(*ids: int, series: Series = STS3215) -> JointMap:
+    """Joint map of these servos of the Mini Pupper's layout."""
+    whole = load_joint_map(LAYOUTS[series.name]).per_servo()
+    servos = dict(zip(whole.joint_names, whole.ids, strict=True))
+    return whole.select([joint for joint, servo in servos.items() if servo in ids])
+
+
+def dynamixel_map(*ids: int, model: str = "XL330-M288") -> JointMap:
+    """Joint map of Dynamixel servos in the Mini Pupper's layout."""
+    data = map_of(*ids).file.model_dump(by_alias=True) | {"servo": model}
+    names = map_of(*ids).joint_names
+    data["joints"] = {name: data["joints"][name] for name in names}
+    return joint_map_from(data, model).per_servo()
+
+
+def still_dynamixels(ids: Sequence[int], model: int = 1200, **keywords) -> DynamixelEmulator:
+    """Dynamixel servos without physics."""
+    bench = StillBench(LAYOUTS[STS3215.name])
+    bench.supply_v = 5.0
+    rng = np.random.default_rng(0)
+    return DynamixelEmulator(bench, DYNAMIXELS[model], rng, ids, **keywords)
+
+
+def moving_dynamixel(model: int = 1200, registers=None, seed: int = 0) -> DynamixelEmulator:
+    """One Dynamixel on a bench, id 1, whose registers act."""
+    rng, series = np.random.default_rng(seed), DYNAMIXELS[model]
+    data = load_joint_map(BENCH_MAP).file.model_dump(by_alias=True) | {"servo": series.name}
+    layout, spec = joint_map_from(data, series.name), dynamixel_bench(series.name)
+    robot = draw_bench(rng, Pendulum(), spec, layout)
+    bench = ServoBench(robot, layout, rng, plant=PendulumBench(robot))
+    bench.supply_v = spec.supply_v
+    return DynamixelEmulator(bench, series, rng, registers=registers)
+
+
 def moving_servos(series: Series = STS3215, **keywords) -> Listening:
     """Servos with physics."""
     rng = np.random.default_rng(0)
@@ -133,17 +177,17 @@ def moving_servos(series: Series = STS3215, **keywords) -> Listening:
     return Listening(bench, series, rng, **keywords)
 
 
-def bench_of(emulator: FeetechEmulator | ProxyEmulator) -> StillBench:
+def bench_of(emulator: LineEmulator | ProxyEmulator) -> StillBench:
     """The bench of servos without physics."""
     assert isinstance(emulator.bench, StillBench)
     return emulator.bench
 
 
 @contextmanager
-def on_a_port(emulator: FeetechEmulator) -> Iterator[FeetechPty]:
+def on_a_port(emulator: LineEmulator) -> Iterator[SerialPty]:
     """The servos behind a pseudo-terminal that is there for as long as the block."""
     with tempfile.TemporaryDirectory(prefix="fp") as folder:
-        server = FeetechPty(emulator, Path(folder) / "bus")
+        server = SerialPty(emulator, Path(folder) / "bus")
         thread = threading.Thread(target=server.serve, daemon=True)
         thread.start()
         try:
@@ -179,7 +223,7 @@ def wait_until(true: Callable[[], bool], seconds: float = 3.0) -> bool:
 
 
 @contextmanager
-def robot_behind(kind: str, folder: Path) -> Iterator[tuple[FeetechPty | ProxySocket, str]]:
+def robot_behind(kind: str, folder: Path) -> Iterator[tuple[SerialPty | ProxySocket, str]]:
     """A served robot whose servos are limp, behind `feetech` or `esp32`, and its address."""
     if kind == "feetech":
         with on_a_port(moving_servos()) as server:
@@ -193,13 +237,13 @@ def robot_behind(kind: str, folder: Path) -> Iterator[tuple[FeetechPty | ProxySo
         yield server, f"esp32:{folder / 's'}"
 
 
-def limp(server: FeetechPty | ProxySocket) -> bool:
+def limp(server: SerialPty | ProxySocket) -> bool:
     """Whether no servo has torque."""
     bench = server.emulator.bench
     return not any(bench.is_on(k) for k in bench.index_of_id.values())
 
 
-def let_go(server: FeetechPty | ProxySocket) -> None:
+def let_go(server: SerialPty | ProxySocket) -> None:
     """Switch all servos off, as after power-on: a driver that misses one does not drive it."""
     bench = server.emulator.bench
     for k in bench.index_of_id.values():

@@ -18,8 +18,9 @@ class Import:
     """Turn another project's log into a recording file, and say what was assumed.
 
     The layout is found by content: LeRobot dataset, SAGE folder, BAM or ktune JSON, MCAP, rosbag2,
-    NumPy archive, parquet, or a table (CSV) with any joint names. Other commands read such logs
-    directly; import them to name columns, units or joints, or to look at the rows.
+    NumPy or torch arrays, parquet, or a table of text with any joint names and separators. Other
+    commands read such logs directly; import them to name columns, units or joints, or to look at
+    the rows.
 
     Example: pupper-sysid import arm.csv --time t_ms --command 'goal.{joint}' --position
     'present.{joint}' --unit deg --read-before-send
@@ -31,13 +32,14 @@ class Import:
     """Recording to write; by default the log's name and .csv, in this folder; NAME_recording.csv
     where that is the log itself."""
     time: str | None = None
-    """Column of the time."""
+    """Column of the time, by name, or by number from 0 in a file without names."""
     command: str | None = None
-    """Columns of commands, {joint} for the joint's name: action.{joint}. ROS: the topic."""
+    """Columns of commands, {joint} for the joint's name: action.{joint}; or several: 1,4,7. ROS:
+    the topic."""
     position: str | None = None
     """Columns of positions: observation.state.{joint}. ROS: the topic."""
     trial: str | None = None
-    """Column that numbers trials or episodes."""
+    """Column that numbers or names trials or episodes."""
     joints: str | None = None
     """Joints to read, with commas, by the log's names: a,b; by default all."""
     unit: str | None = None
@@ -47,6 +49,14 @@ class Import:
     """A turn reads the position before it sends the command."""
     stamp: Literal["start", "middle", "end"] | None = None
     """Where in a turn (a command sent, a position read) its time stamp was taken."""
+    command_time: str | None = None
+    """Column of the times at which commands were sent; --time is then that of the readings."""
+    send_after: str | None = None
+    """Time from the reading to the command: 3ms; --send-after=-2ms for a command before it."""
+    rate: float | None = None
+    """Rows a second (Hz), for a log without times or with nominal ones."""
+    readings: Literal["live", "polled"] | None = None
+    """Whether a reading is the present position or that of the bus's last poll."""
     mapping: Path | None = None
     """YAML file with these options as keys, new names and units of joints; see docs/formats.md."""
     force: bool = False
@@ -56,14 +66,14 @@ class Import:
 
     def run(self) -> None:
         """Read, check, write."""
-        from pupper_sysid.sysid.recordings.files import load
-        from pupper_sysid.sysid.recordings.importers.shared.options import (
+        from pupper_sysid.sysid.recordings.files import load, plain_stem
+        from pupper_sysid.sysid.recordings.importers.options import (
             LogOptions,
             merged,
             read_mapping,
         )
 
-        name = resolved(self.log).stem
+        name = plain_stem(resolved(self.log))
         out = self.out or Path(f"{name}.csv")
         if _same(out, self.log):
             if self.out:
@@ -73,7 +83,8 @@ class Import:
         options = LogOptions(
             self.time, self.command, self.position, self.trial,
             {} if self.joints is None else _names(self.joints),
-            self.unit, {}, self.read_before_send or None, self.stamp,
+            self.unit, {}, self.read_before_send or None, self.stamp, self.command_time,
+            self.send_after, self.rate, self.readings,
         )  # fmt: skip
         if self.mapping:
             options = merged(options, read_mapping(self.mapping))

@@ -57,7 +57,7 @@ class Sweep:
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all; one after the other."""
     bus: str = EMULATED
-    """emulated (no robot needed), esp32 (on the robot), or feetech:DEVICE, e.g.
+    """emulated (no robot needed), esp32 (on the robot), feetech:DEVICE or dynamixel:DEVICE, e.g.
     feetech:/dev/ttyUSB0."""
     joint_map: str | None = None
     """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that

@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import say_remarks
 from pupper_sysid.cli.keyboard import Keyboard
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
@@ -23,6 +24,7 @@ from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.lerobot_calibration import write_lerobot
 
 _PERIOD_S = 0.02
 _MEAN_OVER_S = 0.5
@@ -39,7 +41,7 @@ class CalibrateJoints:
     """
 
     bus: str
-    """esp32 (on the robot) or feetech:DEVICE."""
+    """esp32 (on the robot), feetech:DEVICE or dynamixel:DEVICE."""
     joint_map: str | None = None
     """Joint map to start from, a file or a preset: its ids, signs and limits_rad are kept. By
     default the preset that fits the bus."""
@@ -52,12 +54,16 @@ class CalibrateJoints:
     """Joint on which counts per radian are checked; by default the first."""
     scale_deg: float = 90.0
     """Angle that it is moved through for that [degrees]."""
+    lerobot_calibration: Path | None = None
+    """Also write LeRobot's calibration (.json), with the homing offsets that the servos have."""
     force: bool = False
-    """Replace the file if it exists."""
+    """Replace files that exist."""
 
     def run(self) -> None:
         """Guide through the steps and write the map."""
         refuse_overwrite(self.out, self.force)
+        if self.lerobot_calibration:
+            refuse_overwrite(self.lerobot_calibration, self.force)
         if self.out.suffix not in (".yaml", ".yml"):
             raise InputError(f"--out {self.out}: a joint map is a .yaml file.")
         if not 5 <= self.scale_deg <= 300:
@@ -81,6 +87,7 @@ class CalibrateJoints:
         wanted = None if self.joints == "all" else names
         bus = open_bus(address, given.per_servo() if given else None, wanted)
         try:
+            say_remarks(bus)
             start = given or load_joint_map(bus.metadata["joint_map"])
             # a line need not have all servos
             here = [n for n in names if n in bus.joint_names]
@@ -103,6 +110,13 @@ class CalibrateJoints:
         terminal.warn(jc.doubts(new, offsets))
         guide.stay_limp()
         new.save(self.out, self.force)
+        if self.lerobot_calibration:
+            setups = getattr(guide.bus, "servo_setups", dict)()
+            offsets_there = {
+                name: setup.get("registers", {}).get("homing_offset", 0)
+                for name, setup in setups.items()
+            }
+            write_lerobot(self.lerobot_calibration, new, offsets_there, self.force)
         table = terminal.table(
             f"{self.out}: {new.file.name}", "joint", "id", "offset", "limits", "counts/rad"
         )

@@ -16,27 +16,31 @@ import tyro
 import yaml
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import parse_registers
+from pupper_sysid.cli.buses import parse_servo_registers
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.numbers import whole
 from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.feetech.registers import BAUD_RATES, SCS0009, STS3215
-from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.hardware.serial_servos.series import Series
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
 from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.feetech_pty import FeetechPty
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_line import LineEmulator
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.servos.pendulum import REGISTERS
 from pupper_sysid.sim.emulator.servos.pendulum_bench import (
     BENCH_MAP,
     BenchSpec,
     Pendulum,
     PendulumBench,
     draw_bench,
+    dynamixel_bench,
     has_registers,
 )
 from pupper_sysid.sysid.sweep.bench import parse_load
@@ -89,7 +93,74 @@ class Esp32(Common):
 
 
 @dataclass(frozen=True)
-class Feetech(Common):
+class SerialLine(Common):
+    """Options of the serial lines."""
+
+    load: str | None = None
+    """A bench instead of a robot: one servo that swings a pendulum, such as pendulum:0.1kg@0.10m,
+    or bare (none)."""
+    registers: str = ""
+    """Registers that differ from the factory's, of all servos or of one id: p=16,5:mode=1. The
+    servos obey them; Feetech's gains, ramps and torque limits only STS3215 that do not walk."""
+    joint_map: str | None = None
+    """Joint map of another robot, such as `init-robot` writes; its joints are in free air."""
+    ids: str = "all"
+    """Which of them are there: 1-12, 4,5,6, or all."""
+    baud: int | None = None
+    """Their baud rate; default 1000000 (SCS0009: 500000)."""
+    link: Path | None = None
+    """A stable name for the device; survives being unplugged."""
+    echo: bool = False
+    """The adapter sends the host's own bytes back."""
+    double_id: int | None = None
+    """Two servos have this id, and destroy each other's answers."""
+    supply: float | None = None
+    """Supply of the servos [V]; by default what they are made for."""
+    adapter_ms: float = 0.0
+    """Latency timer of the USB adapter [ms]: 16 for an FTDI as its driver sets it."""
+
+    def refuse_outside(self, rates: tuple[int, ...]) -> None:
+        """Refuse numbers that cannot be."""
+        refuse_outside("--adapter-ms", self.adapter_ms, 0, 100, "ms")
+        if self.supply is not None:
+            refuse_outside("--supply", self.supply, 0, 25, "V")
+        if self.baud is not None and self.baud not in rates:
+            raise InputError(f"--baud {self.baud}: choose {', '.join(map(str, rates))}.")
+
+    def on_bench(self, rng: np.random.Generator, spec: BenchSpec, layout: JointMap) -> ServoBench:
+        """Servos whose registers act on the motion, in free air or with the load."""
+        load = parse_load(self.load) if self.load else None
+        robot = draw_bench(rng, Pendulum(**(load.model_dump() if load else {})), spec, layout)
+        plant = PendulumBench(robot)
+        bench = ServoBench(robot, layout, rng.spawn(1)[0], keep_log=False, plant=plant)
+        bench.supply_v = spec.supply_v
+        return bench
+
+    def line(
+        self,
+        emulator_class: type[LineEmulator],
+        series: Series,
+        bench: ServoBench,
+        rng: np.random.Generator,
+        baud: int,
+    ) -> LineEmulator:
+        """The servos of a bench on a line, with the faults that were chosen."""
+        if self.supply is not None:
+            bench.supply_v = self.supply
+        return emulator_class(
+            bench, series, rng, _parse_ids(self.ids, bench.map.ids), baud,
+            BusFaults.parse(self.faults, rng), self.echo,
+            parse_servo_registers(self.registers, series),
+            () if self.double_id is None else (self.double_id,),
+        )  # fmt: skip
+
+    def place(self) -> Path:
+        """Name of the device."""
+        return self.link or Path(tempfile.mkdtemp()) / "servos"
+
+
+@dataclass(frozen=True)
+class Feetech(SerialLine):
     """A line of Feetech servos: a serial device, in real time, at the pace of its baud rate.
 
     Example: pupper-sysid emulate feetech --model sts3215 --ids 1-12
@@ -97,24 +168,8 @@ class Feetech(Common):
 
     model: Literal["sts3215", "scs0009"] = "sts3215"
     """Which servos."""
-    load: str | None = None
-    """A bench instead of a robot: one STS3215 that swings a pendulum, such as
-    pendulum:0.1kg@0.10m, or bare (none). Its registers act on the motion."""
     backlash: float = 0.0
     """With --load: play of its gears [degrees]."""
-    registers: str = ""
-    """With --load or a --joint-map of STS3215: registers that differ from the factory's, e.g.
-    p=16,goal_speed=400."""
-    joint_map: str | None = None
-    """Joint map of another robot, such as `init-robot` writes; its joints are in free air."""
-    ids: str = "all"
-    """Which of them are there: 1-12, 4,5,6, or all."""
-    baud: int | None = None
-    """Their baud rate; default 1000000 (STS3215) or 500000 (SCS0009)."""
-    link: Path | None = None
-    """A stable name for the device; survives being unplugged."""
-    echo: bool = False
-    """The adapter sends the host's own bytes back."""
     imu_socket: Path | None = None
     """Serve the robot's IMU here, as the Mini Pupper 2's proxy does: a serial line has none."""
 
@@ -132,67 +187,86 @@ class Feetech(Common):
         elif self.backlash:
             raise InputError("--backlash is of a bench: add --load (or --load none).")
         layout = load_joint_map(self.joint_map or preset)
-        loaded_servos = bool(self.load or (self.joint_map and has_registers(layout)))
-        if self.registers and not loaded_servos:
+        registers = parse_servo_registers(self.registers, series)
+        moves = any(name in REGISTERS for own in registers.values() for name in own)
+        loaded_servos = bool(
+            self.load or (has_registers(layout) and (self.joint_map or moves) and not self.walking)
+        )
+        if moves and not loaded_servos:
             raise InputError(
-                "--registers: these servos have none that act. Add --load (or --load none), or a "
-                "--joint-map whose `servo` is STS3215."
+                "--registers: gains, ramps and torque limits of these servos do not act. Add "
+                "--load (or --load none), or choose STS3215 that do not walk."
             )
         if self.joint_map and self.walking:
             raise InputError("--walking: only the Mini Pupper walks here; leave out --joint-map.")
-        baud = self.baud
-        if baud is None:
-            baud = 1_000_000 if series is STS3215 else 500_000
+        self.refuse_outside(BAUD_RATES)
         refuse_outside("--backlash", self.backlash, 0, _MOST_BACKLASH_DEG, "degrees")
-        if baud not in BAUD_RATES:
-            raise InputError(f"--baud {baud}: choose {', '.join(map(str, BAUD_RATES))}.")
-        load = None
         if loaded_servos:
-            load = parse_load(self.load) if self.load else None
-            loaded = draw_bench(
-                rng, Pendulum(**(load.model_dump() if load else {})),
-                BenchSpec(
-                    backlash_rad=math.radians(self.backlash),
-                    registers=tuple(parse_registers(self.registers).items()),
-                ),
-                layout,
-            )  # fmt: skip
-            plant = PendulumBench(loaded)
-            own = rng.spawn(1)[0]
-            bench = ServoBench(loaded, layout, own, keep_log=False, plant=plant)
+            acting = tuple((k, v) for k, v in registers[None].items() if k in REGISTERS)
+            spec = BenchSpec(backlash_rad=math.radians(self.backlash), registers=acting)
+            bench = self.on_bench(rng, spec, layout)
         else:
             # read directly, a servo answers with its present position: no polls, none lost
             spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
             robot = draw_robot(rng, spec, layout if self.joint_map else None)
             bench = _bench(self, robot, layout, rng)
-        emulator = FeetechEmulator(
-            bench, series, rng, _parse_ids(self.ids, layout.ids), baud,
-            BusFaults.parse(self.faults, rng), self.echo,
-        )  # fmt: skip
-        link = self.link or Path(tempfile.mkdtemp()) / "servos"
-        with (
-            _imu_beside(bench, self.imu_socket, rng),
-            closing(FeetechPty(emulator, link)) as server,
-            _hand_of(self, bench),
-        ):
-            _write_truth(self, bench)
-            what = f"{len(emulator.servos)} emulated {series.name} at {server.device}, {baud} baud"
-            what += f"; IMU at {self.imu_socket}." if self.imu_socket else "."
-            bus = f"feetech:{server.device}"
-            if self.load:
-                shown = " --joint-map " + self.joint_map if self.joint_map else ""
-                kind = " --gains 8,16,32" if load else " --kind reversal"
-                _serve_with(
-                    server, f"{what} Load: {self.load}.",
-                    f"  pupper-sysid sweep --load {self.load}{kind}{shown} --bus {bus}\n",
-                )  # fmt: skip
-            else:
-                _serve(server, what, bus, self.walking, self.joint_map)
+        usual = 1_000_000 if series is STS3215 else 500_000
+        emulator = self.line(
+            FeetechEmulator, series, bench, rng, usual if self.baud is None else self.baud
+        )
+        with _imu_beside(bench, self.imu_socket, rng):
+            imu = f"; IMU at {self.imu_socket}." if self.imu_socket else "."
+            # without a map only a whole Mini Pupper is taken for one
+            part = len(emulator.servos) < len(layout.ids)
+            named = self.joint_map or (preset if part and not self.load else None)
+            _serve_line(self, emulator, bench, imu, named)
+
+
+@dataclass(frozen=True)
+class Dynamixel(SerialLine):
+    """A line of Dynamixel servos (protocol 2.0): a serial device, in real time.
+
+    Without --joint-map one servo on a bench, whose joint map is written beside the device.
+    Example: pupper-sysid emulate dynamixel --model xm430-w350
+    """
+
+    model: Literal["xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"] = "xl330-m288"
+    """Which servos."""
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        from pupper_sysid.hardware.dynamixel import registers as table
+        from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
+
+        if self.walking:
+            raise InputError("--walking: the Mini Pupper that walks has no Dynamixel servos.")
+        self.refuse_outside(table.BAUD_RATES)
+        rng = np.random.default_rng(self.seed)
+        series = next(s for s in table.SERIES.values() if s.name == self.model.upper())
+        place, own_map = self.place(), self.joint_map
+        if own_map is None:
+            own_map = f"{place}.joints.yaml"
+            one = load_joint_map(BENCH_MAP).file.model_dump(by_alias=True)
+            one |= {"servo": series.name, "name": f"one {series.name} on a bench"}
+            joint_map_from(one, own_map).save(Path(own_map), force=True)
+        layout = load_joint_map(own_map)
+        if layout.file.servo != series.name:
+            raise InputError(
+                f"--joint-map {own_map} is of {layout.file.servo or 'servos without a name'}; "
+                f"choose --model, or make one with `pupper-sysid init-robot --servo {self.model}`."
+            )
+        spec = dynamixel_bench(series.name)
+        bench = self.on_bench(rng, spec, layout)
+        emulator = self.line(
+            DynamixelEmulator, series, bench, rng, 1_000_000 if self.baud is None else self.baud
+        )
+        _serve_line(replace(self, link=place), emulator, bench, ".", own_map)
 
 
 Emulate = (
     Annotated[Esp32, tyro.conf.subcommand("esp32")]
     | Annotated[Feetech, tyro.conf.subcommand("feetech")]
+    | Annotated[Dynamixel, tyro.conf.subcommand("dynamixel")]
 )
 
 
@@ -241,6 +315,30 @@ def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) 
             thread.join()
 
 
+def _serve_line(
+    options: SerialLine, emulator: LineEmulator, bench: ServoBench, also: str, own_map: str | None
+) -> None:
+    """Serve a line of servos until Ctrl-C."""
+    with (
+        closing(SerialPty(emulator, options.place(), options.adapter_ms / 1e3)) as server,
+        _hand_of(options, bench),
+    ):
+        _write_truth(options, bench)
+        what = f"{len(emulator.servos)} emulated {emulator.series.name} at {server.device}, "
+        what += f"{emulator.baud} baud{also}"
+        bus = f"{emulator.family.name}:{server.device}"
+        if not options.load:
+            _serve(server, what, bus, options.walking, own_map)
+            return
+        shown = f" --joint-map {own_map}" if own_map else ""
+        kind = " --gains 8,16,32" if emulator.family.name == "feetech" else ""
+        kind = kind if parse_load(options.load) else " --kind reversal"
+        _serve_with(
+            server, f"{what} Load: {options.load}.",
+            f"  pupper-sysid sweep --load {options.load}{kind}{shown} --bus {bus}\n",
+        )  # fmt: skip
+
+
 def _write_truth(options: Common, bench: ServoBench) -> None:
     if options.truth:
         text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
@@ -248,7 +346,7 @@ def _write_truth(options: Common, bench: ServoBench) -> None:
 
 
 def _serve(
-    server: ProxySocket | FeetechPty,
+    server: ProxySocket | SerialPty,
     what: str,
     name: str,
     walking: bool,
@@ -260,7 +358,7 @@ def _serve(
     _serve_with(server, what, f"{sweep}  pupper-sysid monitor --bus {bus}\n")
 
 
-def _serve_with(server: ProxySocket | FeetechPty, what: str, commands: str) -> None:
+def _serve_with(server: ProxySocket | SerialPty, what: str, commands: str) -> None:
     """Serve until Ctrl-C; `commands` are what to type elsewhere."""
     terminal.out.print(what, soft_wrap=True)
     terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.", soft_wrap=True)

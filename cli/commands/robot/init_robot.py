@@ -23,8 +23,14 @@ class InitRobot:
 
     model: tyro.conf.Positional[Path]
     """The robot's MJCF or URDF."""
-    servo: Literal["sts3215", "scs0009"] = "sts3215"
+    servo: Literal[
+        "sts3215", "scs0009", "hd-1910", "xl330-m288", "xl430-w250", "xm430-w350",
+        "xm430-w210", "mx-28",
+    ] = "sts3215"  # fmt: skip
     """Which servos it has."""
+    lerobot_calibration: Path | None = None
+    """LeRobot's calibration of this arm (.json): its ids, directions, homing offsets and ranges are
+    taken instead of guesses."""
     out: Path | None = None
     """Joint map to write; by default the model's name and .joints.yaml, in this folder."""
     force: bool = False
@@ -34,9 +40,12 @@ class InitRobot:
 
     def run(self) -> None:
         """Read the model, write the map, print the next commands."""
+        from pupper_sysid.hardware.lerobot_calibration import read_lerobot
         from pupper_sysid.sim.robot.robot_map import joint_map_of
 
-        found, left_out = joint_map_of(self.model, self.servo)
+        lerobot = read_lerobot(self.lerobot_calibration) if self.lerobot_calibration else None
+        robot = joint_map_of(self.model, self.servo, lerobot)
+        found, left_out = robot.joint_map, robot.left_out
         target = self.out or Path(f"{self.model.stem}.joints.yaml")
         found.save(target, self.force)
         servos = found.per_servo()
@@ -54,6 +63,10 @@ class InitRobot:
                     " If they have servos, give them actuators there, or take all actuators out."
                 ]
             )
+        terminal.warn(robot.doubts)
+        if robot.following:
+            pairs = ", ".join(f"{name} (follows {of})" for name, of in robot.following.items())
+            terminal.warn([f"no servo of their own, left out: {pairs}."])
         narrow = [n for n, r in zip(found.joint_names, margin, strict=True) if r < _SMALLEST_RAD]
         if narrow:
             terminal.warn(
@@ -70,6 +83,8 @@ class InitRobot:
                     "joints": list(found.joint_names),
                     "ids": list(found.ids),
                     "left_out": left_out,
+                    "following": robot.following,
+                    "doubts": robot.doubts,
                     "margin_rad": dict(zip(found.joint_names, map(float, margin), strict=True)),
                     "sweeps": sweeps,
                 }
@@ -84,15 +99,17 @@ class InitRobot:
                 f"{margin[k]:.2f}",
             )  # fmt: skip
         terminal.out.print(table)
+        feetech = self.servo.startswith(("sts", "scs", "hd"))
+        bus = f"{'feetech' if feetech else 'dynamixel'}:/dev/ttyUSB0"
         terminal.out.print(
             "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
             "servos limp, move one joint after the other by hand to its positive side and watch\n"
-            f"  pupper-sysid monitor --joint-map {target} --bus feetech:/dev/ttyUSB0\n"
+            f"  pupper-sysid monitor --joint-map {target} --bus {bus}\n"
             f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
             "Then measure centres, ranges and scale:\n"
             f"  pupper-sysid calibrate-joints --joint-map {target} --out {target} --force "
-            "--bus feetech:/dev/ttyUSB0\n"
-            "Sweep, first without the robot, then with --bus feetech:/dev/ttyUSB0:\n"
+            f"--bus {bus}\n"
+            f"Sweep, first without the robot, then with --bus {bus}:\n"
             + "".join(f"  {line}\n" for line in sweeps)
             + "Then doctor, delay, calibrate, fit-servo and export, as for any recording.",
             soft_wrap=True,

@@ -14,13 +14,12 @@ from rich.console import Group
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import chosen_map
+from pupper_sysid.cli.buses import chosen_map, say_remarks
 from pupper_sysid.cli.live_views import LiveViews, Wanted, live_views
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
-from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
+from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, error_words
 from pupper_sysid.hardware.connect import open_bus
-from pupper_sysid.hardware.feetech.registers import error_words
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 
@@ -44,7 +43,7 @@ class Monitor:
     """
 
     bus: str
-    """esp32 (on the robot), feetech:DEVICE, or emulated."""
+    """esp32 (on the robot), feetech:DEVICE, dynamixel:DEVICE, or emulated."""
     joint_map: str | None = None
     """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
     fits the bus."""
@@ -211,13 +210,13 @@ class Watched:
                     "answers": bool(self._here[k]),
                     "goal_rad": _known(self._goal[k]),
                     "position_rad": _known(self._position[k]),
-                    "count": int(self._count[k]) if self._count[k] >= 0 else None,
+                    "count": int(self._count[k]) if np.isfinite(self._position[k]) else None,
                     "age_s": since if self.answers_now else None,
                     "unchanged_s": None if self.answers_now else since,
                     "load": None if sample.load is None else _known(sample.load[k]),
                     "voltage_v": _known(self._voltage[k]),
                     "temperature_c": _known(self._temperature[k]),
-                    "errors": None if status is None else error_words(status),
+                    "errors": None if status is None else error_words(self.bus, status),
                 }
             )
         return rows
@@ -267,7 +266,9 @@ def _open(bus: str, joint_map: str | None) -> ServoBus:
         return EmulatedBus(draw_robot(rng), rng, real_time=True, keep_log=False)
     address = parse_address(bus)
     chosen = chosen_map(joint_map)
-    return open_bus(address, chosen.per_servo() if chosen else None)
+    opened = open_bus(address, chosen.per_servo() if chosen else None)
+    say_remarks(opened)
+    return opened
 
 
 def _latest(before: NDArray[np.float64], now: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -29,10 +29,11 @@ class Park:
     """
 
     bus: str | None = None
-    """esp32 (on the robot) or feetech:DEVICE; by default every robot that was left on."""
+    """esp32 (on the robot), feetech:DEVICE or dynamixel:DEVICE; by default every robot that was
+    left on."""
     joint_map: str | None = None
-    """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
-    fits the bus."""
+    """Joint map: a file or a preset; by default joints.yaml if it is here, else every servo of a
+    serial line is switched off."""
     seconds: float = 10.0
     """Try for so long until every servo has confirmed."""
     supervise: bool = False

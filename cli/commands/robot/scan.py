@@ -2,51 +2,99 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.address import KINDS, SOCKET, BusAddress, parse_address
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.scan import ServoReport, scan_line
+from pupper_sysid.hardware.serial_servos.scan import LineReport, ServoReport
+
+_USB_PORTS = ("ttyUSB", "ttyACM", "ttyAMA", "ttySC", "cu.usb", "COM")
 
 
 @dataclass(frozen=True)
 class Scan:
     """List the servos on a bus: id, model, firmware, voltage, temperature, limits, error bits.
 
-    Nothing moves and nothing is written. Example: pupper-sysid scan --bus feetech:/dev/ttyUSB0
+    Without --bus it lists the serial ports, tries every protocol and rate on each, and says what
+    answers where. Nothing moves and nothing is written.
+    Example: pupper-sysid scan --bus feetech:/dev/ttyUSB0
     """
 
-    bus: str
-    """feetech:DEVICE (with @BAUD if known) or esp32."""
+    bus: str | None = None
+    """feetech:DEVICE, dynamixel:DEVICE (with @BAUD if known) or esp32; by default every serial port
+    is tried."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
     def run(self) -> None:
         """Scan, and print a table."""
+        if self.bus is None:
+            self._everywhere()
+            return
         address = parse_address(self.bus)
-        if address.kind == "esp32":
+        kind = KINDS[address.kind]
+        if not kind.is_serial:
             self._proxy(Path(address.where))
             return
         with terminal.progress("scanning", 0) as advance:
-            baud, found = scan_line(address.where, address.baud, advance)
+            report = kind.bus_class().scan_address(address, advance)
         if self.json:
-            terminal.print_json({"baud": baud, "servos": [vars(s) for s in found]})
+            terminal.print_json(_as_data(report))
             return
+        self._show(report)
+
+    def _show(self, report: LineReport) -> None:
+        servos = report.servos
         table = terminal.table(
-            f"{len(found)} servos at {address.where}, {baud} baud",
+            f"{len(servos)} servos at {report.family}:{report.device}, {report.baud} baud",
             "id", "model", "firmware", "volt", "°C", "count", "limits", "P D I", "errors",
         )  # fmt: skip
-        for servo in found:
+        for servo in servos:
             table.add_row(*_cells(servo))
         terminal.out.print(table)
-        delay_us = {s.id: s.return_delay_us or 0 for s in found}
-        slow = [servo for servo, delay in delay_us.items() if delay > 100]
-        if slow:
-            terminal.err.print(
-                f"Servos {', '.join(map(str, slow))} have a return delay (servo {slow[0]}: "
-                f"{delay_us[slow[0]]} µs); 0 would make reading faster."
+        terminal.warn(fault for servo in servos for fault in servo.faults)
+        for remark in report.remarks:
+            terminal.err.print(remark, soft_wrap=True)
+
+    def _everywhere(self) -> None:
+        """Try all serial ports, and the proxy's socket."""
+        ports = serial_ports()
+        reports, silent = [], {}
+        with terminal.progress("scanning", 0) as advance:
+            for device in ports:
+                answer = _tried(device, advance)
+                if isinstance(answer, LineReport):
+                    reports.append(answer)
+                else:
+                    silent[device] = answer
+        proxy = SOCKET.exists()
+        if self.json:
+            terminal.print_json(
+                {
+                    "ports": ports,
+                    "lines": [_as_data(report) for report in reports],
+                    "silent": silent,
+                    "proxy": str(SOCKET) if proxy else None,
+                }
+            )
+            return
+        for report in reports:
+            self._show(report)
+            terminal.out.print(f"Use it with --bus {report.family}:{report.device}", soft_wrap=True)
+        for device, why in silent.items():
+            terminal.err.print(f"{device}: {why}", soft_wrap=True)
+        if proxy:
+            terminal.out.print("A Mini Pupper 2's proxy is here: --bus esp32", soft_wrap=True)
+        if not reports and not proxy:
+            listed = ", ".join(ports) or "none"
+            raise BusError(
+                f"no servo answers at any serial port (ports: {listed}). Connect the servos' USB "
+                "adapter and their power, and look again; without a robot, start `pupper-sysid "
+                "emulate feetech`."
             )
 
     def _proxy(self, path: Path) -> None:
@@ -77,6 +125,45 @@ class Scan:
             "The proxy reports neither model nor temperature; counts are the firmware's calibrated "
             "ones."
         )
+
+
+def serial_ports() -> list[str]:
+    """Serial ports to which a servo adapter may be connected.
+
+    Examples
+    --------
+    >>> isinstance(serial_ports(), list)
+    True
+    """
+    from serial.tools.list_ports import comports
+
+    devices = sorted(port.device for port in comports())
+    return [device for device in devices if Path(device).name.startswith(_USB_PORTS)]
+
+
+def _tried(device: str, advance: Callable[[str], None]) -> LineReport | str:
+    """What answers at a port, by any protocol; or why nothing does, in words."""
+    reasons = []
+    for kind in (k for k in KINDS.values() if k.is_serial):
+        try:
+            return kind.bus_class().scan_address(
+                BusAddress(kind.name, device), lambda what: advance(f"{device}, {what}")
+            )
+        except (BusError, InputError) as error:
+            reasons.append(str(error))
+            if "cannot be opened" in str(error):
+                return str(error)
+    names = " and ".join(k.servos for k in KINDS.values() if k.is_serial)
+    return f"nothing answers as {names} servos do, at any of their rates."
+
+
+def _as_data(report: LineReport) -> dict[str, object]:
+    return {
+        "bus": f"{report.family}:{report.device}",
+        "baud": report.baud,
+        "servos": [asdict(servo) for servo in report.servos],
+        "remarks": report.remarks,
+    }
 
 
 def _cells(servo: ServoReport) -> tuple[str, ...]:

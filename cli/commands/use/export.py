@@ -10,13 +10,13 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError, refuse_outside
-from pupper_sysid.common.files import resolved, write_text
+from pupper_sysid.common.files import refuse_overwrite, resolved, sha256, write_text
+from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.servo_models.calibration.parts import P_GAINS
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import Calibration
 
-_MJCF_STEP_S, _TRAINING_STEP_S = 0.002, 0.005
 _STEPS_S = 1e-5, 0.1
 
 
@@ -25,6 +25,10 @@ class Export:
     """Write a calibration, a servo card, a recording, a servo model or a policy for other programs.
 
     Example: pupper-sysid export calibrated.yaml --to isaaclab --physics-step 0.005
+
+    Example: pupper-sysid export calibrated.yaml --to mjcf --model robot.xml --out robot_servos.xml
+
+    Example: pupper-sysid export calibrated.yaml --check
 
     Example: pupper-sysid export calibrated.yaml --to csv --out calibrated.csv
 
@@ -39,19 +43,29 @@ class Export:
     """calibrated.yaml, the name of a preset (paper, release), a servo card, a recording, or the
     folder of a servo model, a policy or a training run."""
     to: Literal[
-        "csv", "mjcf", "isaaclab", "mjlab", "newton", "json", "bam", "onnx", "torchscript"
-    ] = "csv"
-    """Format: csv, a tidy table; mjcf, isaaclab, mjlab, newton and json of calibrations and cards,
-    for other simulators; bam of cards, parameters for BAM; onnx and torchscript of learned servo
-    models and policies."""
+        "csv", "mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json", "bam", "onnx",
+        "torchscript",
+    ] = "csv"  # fmt: skip
+    """Format: csv, a tidy table; mjcf, isaaclab, isaaclab-bam (of servos fitted under load), mjlab,
+    newton and json of calibrations and cards, for other simulators; bam of cards, parameters for
+    BAM; onnx and torchscript of learned servo models and policies."""
     physics_step: float | None = None
-    """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf and
-    0.005 for the others."""
+    """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf, or
+    that of its model, and 0.005 for the others."""
     gain: float | None = None
     """P gain of the position loop to predict, the register's value; of calibrations of servos
     recorded at several gains or under a known load, for a simulator."""
+    link_inertia: tuple[str, ...] = ()
+    """Inertia of link and load to take off armatures that hold them, such as LF_thigh=0.0012
+    [kg·m²]; for simulators whose bodies have it, too."""
+    model: Path | None = None
+    """With --to mjcf: your robot's MJCF, to write a whole model with these servos in place of its
+    own actuators; the inertia of links is taken from it."""
+    check: bool = False
+    """Simulate the export in MuJoCo beside the calibration, print how far apart they are, and write
+    nothing."""
     out: Path | None = None
-    """File to write (newton: folder); by default the source's name with the format's ending, in
+    """File to write; by default the source's name with the format's ending, in
     this folder."""
     force: bool = False
     """Replace the file if it exists."""
@@ -64,6 +78,9 @@ class Export:
             refuse_outside("--physics-step", self.physics_step, *_STEPS_S, "s")
         if self.gain is not None:
             refuse_outside("--gain", self.gain, *P_GAINS)
+        links = _links(self.link_inertia)
+        if self.model is not None and self.to != "mjcf":
+            raise InputError("--model is of `--to mjcf`; for others give --link-inertia.")
         from pupper_sysid.cli.policy_choice import is_policy
         from pupper_sysid.servo_models.calibration.calibration import is_shipped
 
@@ -73,7 +90,9 @@ class Export:
                 raise InputError(f"--gain is of calibrations; {path} is a folder.")
             target = self._policy(path) if is_policy(path) else self._servo_model(path)
         else:
-            target = self._table(path)
+            target = self._table(path, links)
+        if target is None:
+            return
         if self.json:
             terminal.print_json({"written": str(target)})
         else:
@@ -109,7 +128,7 @@ class Export:
         export_servo_model(saved, self.to, target, self.force)
         return target
 
-    def _table(self, path: Path) -> Path:
+    def _table(self, path: Path, links: dict[str, float]) -> Path | None:
         from pupper_sysid.servo_models.calibration.calibration import (
             PRESETS,
             is_shipped,
@@ -138,10 +157,12 @@ class Export:
             )
         if named or kind != ".csv":
             found = load_calibration(self.source)
+            if self.check:
+                return self._check(found, links)
+            if self.to != "csv":
+                return self._simulator(path, found, links)
             if self.gain is not None:
                 found = self._at_gain(found, self.gain)
-            if self.to != "csv":
-                return self._simulator(path, found)
         elif self.to != "csv":
             raise InputError(
                 f"{self.source} is a recording; {self.to} needs a calibration. Make one with "
@@ -169,8 +190,8 @@ class Export:
 
     def _bam(self, path: Path, card: bool) -> Path:
         """A servo card as a parameter file of BAM."""
+        from pupper_sysid.servo_models.cards.bam import not_in_bam, to_bam_json
         from pupper_sysid.servo_models.cards.files import load_card
-        from pupper_sysid.sim.export.bam import not_in_bam, to_bam_json
 
         if not card:
             raise InputError(
@@ -183,19 +204,72 @@ class Export:
         terminal.warn(not_in_bam(found))
         return target
 
-    def _simulator(self, path: Path, calibration: Calibration) -> Path:
-        """The calibration for another simulator."""
-        from pupper_sysid.sim.export.newton import export_newton
-        from pupper_sysid.sim.export.targets import ENDINGS, SIMULATORS
+    def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
+        """Print how far the export is from the calibration."""
+        from pupper_sysid.sim.export.check import check
+        from pupper_sysid.sim.export.shared import ExportedServos
 
-        step = self.physics_step
-        if step is None:
-            step = _MJCF_STEP_S if self.to == "mjcf" else _TRAINING_STEP_S
-        if self.to == "newton":
-            target = self.out or Path(f"{path.stem}_newton")
-            export_newton(calibration, step, target, self.force)
-        else:
-            target = self.out or Path(f"{path.stem}{ENDINGS[self.to]}")
-            write_text(target, SIMULATORS[self.to](calibration, step), self.force)
-        terminal.err.print(f"For a physics step of {1e3 * step:g} ms (--physics-step).")
+        step = 0.002 if self.physics_step is None else self.physics_step
+        servos = ExportedServos.of(calibration, step, self.gain, links)
+        checked = check(servos)
+        if self.json:
+            terminal.print_json(checked)
+            return
+        n = terminal.number
+        table = terminal.table(
+            f"Export in MuJoCo, steps of {1e3 * step:g} ms, beside the calibration, RMS",
+            "joint", "tones mrad", "walk mrad", "readings counts", "whole steps mrad",
+        )  # fmt: skip
+        for name, row in checked.joints.items():
+            table.add_row(
+                name, n(1e3 * row.tones_rad, 2), n(1e3 * row.walk_rad, 2),
+                n(row.reading_counts, 2), n(1e3 * row.whole_steps_rad, 1),
+            )  # fmt: skip
+        terminal.out.print(table)
+        for sentence in checked.notes:
+            terminal.err.print(sentence, soft_wrap=True)
+
+    def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
+        """The calibration for another simulator."""
+        from pupper_sysid.sim.export.export import ENDINGS, exported_text
+        from pupper_sysid.sim.export.shared import INCLUDES_LINK
+
+        if self.gain is not None:
+            self._at_gain(calibration, self.gain)
+        target = self.out or Path(f"{path.stem}{ENDINGS[self.to]}")
+        refuse_overwrite(target, self.force)
+        text, servos = exported_text(
+            calibration, self.to, self.physics_step, self.gain, links, self.model, target,
+            sha256(path) if path.is_file() else None,
+        )  # fmt: skip
+        write_text(target, text, self.force)
+        terminal.err.print(
+            f"For a physics step of {1e3 * servos.physics_step_s:g} ms (--physics-step).",
+            *servos.operating_points(), sep="\n", soft_wrap=True,
+        )  # fmt: skip
+        if servos.with_link:
+            terminal.warn(
+                [
+                    f"{', '.join(servos.with_link)}: {INCLUDES_LINK[0].lower()}{INCLUDES_LINK[1:]} "
+                    "For example --link-inertia "
+                    f"{servos.with_link[0]}=0.0002, or --to mjcf --model robot.xml."
+                ]
+            )
         return target
+
+
+def _links(texts: tuple[str, ...]) -> dict[str, float]:
+    """`LF_thigh=0.0012` by joint."""
+    links = {}
+    for text in texts:
+        joint, equals, number = text.partition("=")
+        try:
+            links[joint] = decimal(number)
+        except ValueError:
+            equals = ""
+        if not (joint and equals):
+            raise InputError(
+                f"--link-inertia {text}: write a joint and its inertia in kg·m², such as "
+                "LF_thigh=0.0012."
+            )
+    return links

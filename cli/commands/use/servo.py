@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import InputFile
     from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.servo_models.cards.card import ServoCard
-    from pupper_sysid.servo_models.cards.compare import Difference
+    from pupper_sysid.servo_models.cards.compare import Comparison, Difference
     from pupper_sysid.servo_models.cards.compare import Servo as Compared
 
 _WIDTH = 78
@@ -42,26 +43,31 @@ class List:
         if self.json:
             terminal.print_json({"cards": {n: _summary(c) for n, c in cards.items()}})
             return
+        from pupper_sysid.servo_models.cards.compare import implausible
+
         table = terminal.table(
             "Servo cards, as PD in torque", "name", "V", "P", "N·m/rad", "N·m", "kg·m²", "friction",
             "dead ms",
         )  # fmt: skip
+        doubts = [sentence for card in cards.values() for sentence in implausible(card)]
         for name, card in cards.items():
             pd, n = card.pd(), terminal.number
             table.add_row(
                 name + ("" if card.published else " *"), _plain(card.supply_v),
                 _plain(card.gains.p),
                 n(pd.stiffness_nm_per_rad.value, 1), n(pd.effort_limit_nm.value, 2),
-                n(pd.armature_kg_m2.value, 4), n(pd.friction_loss_nm.value, 3),
+                n(pd.armature_kg_m2.value, 4) + "+" * (card.armature != "servo"),
+                n(pd.friction_loss_nm.value, 3),
                 terminal.ms(pd.dead_time_s.value if pd.dead_time_s else None),
             )  # fmt: skip
         terminal.out.print(table)
         ours = any(not card.published for card in cards.values())
         terminal.err.print(
             ("* fitted here, all others cited. " if ours else "All are cited from others. ")
-            + "`pupper-sysid servo show NAME` says where from.",
+            + "`pupper-sysid servo show NAME` says where from. An armature with + holds the link.",
             soft_wrap=True,
         )
+        terminal.warn(doubts)
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,7 @@ class Show:
 
     def run(self) -> None:
         """Read the card and print it."""
+        from pupper_sysid.servo_models.cards.compare import implausible
         from pupper_sysid.servo_models.cards.files import load_card
 
         card = load_card(self.card)
@@ -97,20 +104,23 @@ class Show:
             terminal.out.print(line)
         for name in card.specimens:
             terminal.out.print(_numbers(card, name, self.gain))
-        for note in card.notes:
+        for note in (*implausible(card), *card.notes):
             for n, line in enumerate(wrap(note, _WIDTH - 2)):
                 terminal.out.print(("- " if n == 0 else "  ") + line)
 
 
 @dataclass(frozen=True)
 class Diff:
-    """Compare two servos number by number at equal P gain: cards, calibrations or presets.
+    """Compare two servos in numbers, lag and motion: cards, calibrations, presets, other files.
 
     Example: pupper-sysid servo diff sts3215-bam-m1 calibrated.yaml --joint shoulder_pan
+
+    Example: pupper-sysid servo diff calibrated.yaml robot.xml --joint LF_hip
     """
 
     first: tyro.conf.Positional[str]
-    """A card's name or file, a parameter file of BAM, a calibration or a preset."""
+    """A card's name or file, a parameter file of BAM, a calibration or a preset; a robot's MJCF, or
+    a Python configuration, which is read and not run."""
     second: tyro.conf.Positional[str]
     """Another one."""
     joint: str | None = None
@@ -127,7 +137,7 @@ class Diff:
 
         if self.gain is not None:
             refuse_outside("--gain", self.gain, *P_GAINS)
-        found = compared(self.first, self.second, self.joint, self.gain)
+        found = compared(self.first, self.second, self.joint, self.gain, _servo)
         if self.json:
             terminal.print_json(found)
             return
@@ -138,7 +148,7 @@ class Diff:
                 _with_interval(row.second), terminal.number(row.ratio, 2),
             )  # fmt: skip
         terminal.out.print(table)
-        for sentence in (*found.notes, _verdict(found.differences)):
+        for sentence in (*found.notes, _verdict(found.differences), _motion(found)):
             for line in wrap(sentence, _WIDTH):
                 terminal.out.print(line)
 
@@ -241,6 +251,29 @@ def _column(servo: Compared) -> str:
 
 def _plain(value: float | None) -> str:
     return "–" if value is None else f"{value:g}"
+
+
+def _servo(source: str, part: str | None, gain: float | None) -> Compared:
+    """A servo of whatever file states one."""
+    from pupper_sysid.servo_models.cards.compare import servo_of
+
+    if Path(source).suffix not in (".xml", ".mjcf", ".py"):
+        return servo_of(source, part, gain)
+    from pupper_sysid.sim.export.foreign import foreign_servo
+
+    return foreign_servo(source, part)
+
+
+def _motion(found: Comparison) -> str:
+    """Lags and distance of the two motions in words."""
+    motion, n = found.motion, terminal.number
+    lags = [n(None if lag is None else 1e3 * lag, 1) for lag in
+            (motion.first_lag_s, motion.second_lag_s)]  # fmt: skip
+    apart = n(None if motion.apart_rad is None else 1e3 * motion.apart_rad, 1)
+    return (
+        f"On tones of 1, 2 and 4 Hz, 0.2 rad: lag {lags[0]} and {lags[1]} ms, {apart} mrad apart "
+        "(RMS), each as it stands, with the link that it is known to move."
+    )
 
 
 def _verdict(found: Sequence[Difference]) -> str:

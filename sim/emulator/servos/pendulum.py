@@ -10,16 +10,18 @@ follow a ramp if the registers acceleration or goal speed ask for one. With `bac
 turns the encoder's shaft through gears with that much play: the encoder sits on the output, as in
 these servos.
 
-The registers are those of `hardware.feetech.registers`, by name.
+What the registers mean for the loop is in `sim.emulator.servos.loops`, by model.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from pupper_sysid.sim.emulator.servos.loops import FEETECH_REGISTERS, Loop, feetech_loop
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,
     INTEGRATOR,
@@ -29,14 +31,7 @@ from pupper_sysid.sim.robot.servo_mjcf import (
 
 PHYSICS_STEP_S = 0.001
 GRAVITY_M_S2 = 9.81
-ACCELERATION_UNIT = 100
-"""Counts/s² per unit of the register acceleration."""
-
-REGISTERS = {
-    "p": 32, "d": 32, "i": 0, "min_start_force": 16, "dead_zone_cw": 1, "dead_zone_ccw": 1,
-    "acceleration": 0, "goal_speed": 0, "torque_limit": 1000, "max_torque": 1000,
-}  # fmt: skip
-"""Registers that act on the motion, as an STS3215 leaves the factory (`i` does not act here)."""
+REGISTERS = FEETECH_REGISTERS
 
 _STILL_RAD_S, _STILL_RAD_S2, _STILL_STEPS = 1e-4, 1e-2, 50
 _HORN_KG_M2 = 1e-5  # output side without a load
@@ -101,19 +96,26 @@ class PendulumServo:
     position_rad : float
         Where it rests at the start, commanded there for long.
     registers : dict of str to int, optional
-        Other than `REGISTERS`.
+        Other than the factory's.
+    factory : mapping of str to int
+        Registers that act on the motion, as the servo leaves the factory.
+    loop : callable
+        Constants of the position loop, from the registers and the parameters.
     """
 
     def __init__(
         self,
         parameters: PendulumServoParameters,
         position_rad: float,
-        registers: dict[str, int] | None = None,
+        registers: Mapping[str, int] | None = None,
+        factory: Mapping[str, int] = FEETECH_REGISTERS,
+        loop: Callable[[Mapping[str, int], Any], Loop] = feetech_loop,
     ):
         from pupper_sysid.sim.robot.engine import mujoco
 
         self.parameters, self._engine = parameters, mujoco
-        self._registers = REGISTERS | (registers or {})
+        self._registers = dict(factory) | dict(registers or {})
+        self._loop_of = loop
         self._model = mujoco.MjModel.from_xml_string(_xml(parameters, PHYSICS_STEP_S))
         self._data = mujoco.MjData(self._model)
         self._data.qpos[0] = position_rad
@@ -243,25 +245,21 @@ class PendulumServo:
         error = self._setpoint - position
         if count:
             counts = round(self._setpoint / count) - round(position / count)
-            zone = self._registers["dead_zone_ccw" if counts > 0 else "dead_zone_cw"]
+            zone = self._loop.zone_ccw if counts > 0 else self._loop.zone_cw
             if abs(counts) <= zone:
                 return 0.0
             error = counts * count
-        duty = self._p * error - self._d * speed
-        if abs(duty) < self._least:
-            duty = math.copysign(self._least, error)
-        return min(max(duty, -self._most), self._most)
+        loop = self._loop
+        duty = loop.p * error - loop.d * speed
+        if abs(duty) < loop.least:
+            duty = math.copysign(loop.least, error)
+        return min(max(duty, -loop.most), loop.most)
 
     def _tune(self) -> None:
         """Take the registers over into the loop."""
-        own, p = self._registers, self.parameters
-        count = p.count_rad or math.tau / 4096
-        self._p = p.duty_per_rad * own["p"]
-        self._d = p.duty_per_rad * own["d"] * p.d_time_s
-        self._least = own["min_start_force"] / 1000 if p.count_rad else 0.0
-        self._most = min(own["torque_limit"], own["max_torque"], 1000) / 1000
-        self._top_speed = own["goal_speed"] * count or math.inf
-        self._top_acceleration = own["acceleration"] * ACCELERATION_UNIT * count or math.inf
+        self._loop = self._loop_of(self._registers, self.parameters)
+        self._top_speed = self._loop.top_speed_rad_s
+        self._top_acceleration = self._loop.top_acceleration_rad_s2
 
 
 def _xml(p: PendulumServoParameters, time_step_s: float) -> str:

@@ -11,20 +11,28 @@ DelayedPD servo that is equivalent at the factory's gains where nothing saturate
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from pupper_sysid.common.data_sheet import no_load_speed, stall_torque
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
 from pupper_sysid.sim.emulator.servos.bench import AMBIENT_C, SUPPLY_V
+from pupper_sysid.sim.emulator.servos.loops import (
+    DYNAMIXEL_GAINS,
+    FEETECH_REGISTERS,
+    Loop,
+    dynamixel_loop,
+    dynamixel_registers,
+    feetech_loop,
+)
 from pupper_sysid.sim.emulator.servos.pendulum import (
     PHYSICS_STEP_S,
-    REGISTERS,
     PendulumServo,
     PendulumServoParameters,
 )
@@ -63,6 +71,44 @@ class BenchSpec:
     """A quarter of a count."""
     registers: tuple[tuple[str, int], ...] = ()
     """Registers that differ from the factory's."""
+    model: str = "STS3215"
+    supply_v: float = SUPPLY_V
+
+    @property
+    def factory(self) -> dict[str, int]:
+        """Registers that act on the motion, as the servo leaves the factory."""
+        if self.model in DYNAMIXEL_GAINS:
+            return dynamixel_registers(self.model)
+        return dict(FEETECH_REGISTERS)
+
+    @property
+    def loop(self) -> Callable[[Mapping[str, int], Any], Loop]:
+        """Position loop of the model."""
+        return dynamixel_loop if self.model in DYNAMIXEL_GAINS else feetech_loop
+
+
+def dynamixel_bench(model: str, registers: Mapping[str, int] | None = None) -> BenchSpec:
+    """Bench of a Dynamixel: torque and speed of its data sheet at its usual supply.
+
+    Armature, friction and dead time are of the size that published fits of these servos give.
+    """
+    supply_v = 5.0 if model.startswith(("XL330", "XC330")) else 12.0
+    torque, _ = stall_torque(model, supply_v)
+    speed = no_load_speed(model, supply_v) or 5.0
+    return BenchSpec(
+        torque_nm=torque,
+        # PWM per count of error, over 128 per unit of P; full duty is 885
+        duty_per_rad=4096 / math.tau / 885 / 128,
+        back_emf_nm_s_rad=torque / speed,
+        friction_nm=0.04 * torque,
+        armature_kg_m2=0.0035 * torque,
+        dead_time_s=0.006,
+        dead_time_sd_s=0.001,
+        spread=0.1,
+        registers=tuple((registers or {}).items()),
+        model=model,
+        supply_v=supply_v,
+    )
 
 
 @dataclass(frozen=True)
@@ -70,26 +116,32 @@ class BenchRobot(EmulatedRobot):
     """Servos on a bench; the `actuator` of each is equivalent at its present gains."""
 
     loaded: tuple[PendulumServoParameters, ...] = ()
-    registers: tuple[tuple[str, int], ...] = ()
+    bench: BenchSpec = BenchSpec()
+
+    @property
+    def registers(self) -> dict[str, int]:
+        """Registers that act on the motion, as they are set."""
+        return self.bench.factory | dict(self.bench.registers)
 
     def truth(self) -> dict[str, Any]:
         """All true parameters as plain numbers and strings, ready for YAML."""
         found = super().truth()
         for servo, loaded in zip(self.servos, self.loaded, strict=True):
             found["joints"][servo.joint]["loaded_servo"] = loaded.truth()
-            found["joints"][servo.joint]["registers"] = REGISTERS | dict(self.registers)
+            found["joints"][servo.joint]["registers"] = self.registers
         return found
 
 
 class PendulumBench:
     """A `ServoPlant` of loaded servos, whose registers act."""
 
-    acting_registers = tuple(REGISTERS)
-
     def __init__(self, robot: BenchRobot):
         pose = robot.joint_map.rest_pose().tolist()
+        spec = robot.bench
+        self.acting_registers = tuple(spec.factory)
+        self._model, self._supply_v = spec.model, spec.supply_v
         self._servos = [
-            PendulumServo(p, x, dict(robot.registers))
+            PendulumServo(p, x, robot.registers, spec.factory, spec.loop)
             for p, x in zip(robot.loaded, pose, strict=True)
         ]
 
@@ -117,9 +169,11 @@ class PendulumBench:
         """By joint, what a recording's header says of its servo."""
         found = {}
         for joint, servo in zip(joints, self._servos, strict=True):
-            own = {name: servo.register(name) for name in REGISTERS}
-            gains = {f"{name}_gain": own.pop(name) for name in ("p", "i", "d")}
-            found[joint] = {"model": "STS3215", **gains, "supply_voltage_v": SUPPLY_V}
+            own = {name: servo.register(name) for name in self.acting_registers}
+            prefix = "position_" if "position_p_gain" in own else ""
+            names = {f"{k}_gain": f"{prefix}{k}_gain" if prefix else k for k in ("p", "i", "d")}
+            gains = {key: own.pop(name) for key, name in names.items()}
+            found[joint] = {"model": self._model, **gains, "supply_voltage_v": self._supply_v}
             found[joint] |= {"temperature_c": AMBIENT_C, "registers": own}
         return found
 
@@ -189,7 +243,7 @@ def draw_bench(
         reading_noise_rad=spec.reading_noise_rad,
     )
     drawn = draw_robot(rng, reading, layout)
-    registers = REGISTERS | dict(spec.registers)
+    registers = spec.factory | dict(spec.registers)
     servos, loaded = [], []
     for servo in drawn.servos:
         torque, duty, emf, friction, armature = np.exp(spec.spread * rng.standard_normal(5))
@@ -210,21 +264,18 @@ def draw_bench(
             output_friction_nm=spec.output_friction_nm,
         )
         loaded.append(own)
-        servos.append(_equivalent(servo, own, registers))
-    return BenchRobot(reading, tuple(servos), layout, tuple(loaded), spec.registers)
+        servos.append(_equivalent(servo, own, spec.loop(registers, own)))
+    return BenchRobot(reading, tuple(servos), layout, tuple(loaded), spec)
 
 
-def _equivalent(
-    servo: EmulatedServo, own: PendulumServoParameters, registers: dict[str, int]
-) -> EmulatedServo:
+def _equivalent(servo: EmulatedServo, own: PendulumServoParameters, loop: Loop) -> EmulatedServo:
     """`servo` with the DelayedPD servo that moves alike for small errors."""
-    per_rad = own.torque_nm * own.duty_per_rad
     actuator = DelayedPDParameters(
-        stiffness=per_rad * registers["p"],
-        damping=per_rad * registers["d"] * own.d_time_s,
+        stiffness=own.torque_nm * loop.p,
+        damping=own.torque_nm * loop.d,
         friction_loss=own.friction_nm,
         armature=own.armature_kg_m2 + own.load_inertia_kg_m2,
-        effort_limit=own.torque_nm * min(registers["torque_limit"], 1000) / 1000,
+        effort_limit=own.torque_nm * loop.most,
         velocity_limit=math.inf,
         dead_time_s=own.dead_time_s,
         back_emf=own.back_emf_nm_s_rad,

@@ -12,6 +12,7 @@ step of the readings gives the scale. Lag and dead time do not depend on it.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +24,20 @@ from pupper_sysid.common.border import parse_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.common.reading.names import distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.parquet import read_columns
-from pupper_sysid.sysid.recordings.importers.shared.log import (
+from pupper_sysid.sysid.recordings.importers.log import (
     Log,
     joint_names,
     number,
     read_files,
     rows,
-    text_of,
 )
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.shared.times import one_after_another
-from pupper_sysid.sysid.recordings.importers.shared.units import COUNT_RAD, smallest_step
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.parquet import read_columns
+from pupper_sysid.sysid.recordings.importers.times import one_after_another
+from pupper_sysid.sysid.recordings.importers.units import COUNT_RAD, smallest_step
 
 LAYOUT = "LeRobot dataset"
 
@@ -68,15 +69,12 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         )
     refuse_more(folder, len(data_paths), _MOST_FILES, "data files", "Give a part of it.")
     contents, digest = read_files(folder, [info_path, *data_paths])
-    info = parse_json(text_of(info_path, contents[info_path]), str(info_path))
+    info = parse_json(decoded(info_path, contents[info_path]), str(info_path))
     names = _names(info_path, info)
-    fps = number(info_path, info.get("fps"), "fps")
+    fps = options.rate or number(info_path, info.get("fps"), "fps")
     if not 1 <= fps <= 10_000:
         raise InputError(f"{info_path}, fps is {fps:g}. Write the dataset's frames per second.")
-    parts = [
-        read_columns(p, contents[p], [_ACTION, _STATE, "episode_index", "frame_index"])
-        for p in data_paths
-    ]
+    parts = [_values(p, contents[p], names) for p in data_paths]
     values = sum(part[_STATE].size for part in parts)
     refuse_more(folder, values, MOST_CELLS, "values", "Give a part of it.")
     columns = {key: _joined(folder, key, [part[key] for part in parts]) for key in parts[0]}
@@ -97,7 +95,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         "codebase_version": str(info.get("codebase_version"))[:20],
         "robot_type": str(info.get("robot_type"))[:80],
         "joints": joints,
-        "readings": "live",
+        "readings": options.readings or "live",
         "times": f"nominal: frame / {fps:g} Hz",
         "assumed_units": texts,
         "bus": {"read_time_doubt_s": min(0.5 / fps, 1.0)},
@@ -123,9 +121,10 @@ def _warnings(fps: float, texts: dict[str, str]) -> list[str]:
         by_text.setdefault(text, []).append(joint)
     units = "; ".join(f"{', '.join(joints)}: {text}" for text, joints in by_text.items())
     return [
-        f"its times are frame numbers over {fps:g} Hz, not clock readings: when a state was read "
-        "and an action sent is not known within a frame, so lag and dead time are in doubt by half "
-        f"a frame ({500 / fps:.0f} ms). Record with time stamps to know them better.",
+        f"its times are frame numbers over {fps:g} Hz, not clock readings: lag and dead time scale "
+        "with that rate (`pupper-sysid import --rate` gives another), and when a state was read "
+        "and an action sent is not known within a frame, so they are in doubt by half a frame "
+        f"({500 / fps:.0f} ms). Record with time stamps to know them better.",
         f"its angles are not in rad. Scales in rad per unit: {units}. Torques, speeds and errors "
         "scale with it; lag and dead time do not.",
     ]
@@ -139,15 +138,19 @@ def _names(path: Path, info: Any) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for key in (_ACTION, _STATE):
         feature = features.get(key)
+        flat = [name for name in features if str(name).startswith(f"{key}.")]
+        if feature is None and flat:  # a column per joint
+            found[key] = [name.removeprefix(f"{key}.") for name in flat]
+            found[f"{key}, flat"] = flat
+            distinct(f"{path}, {key}", found[key], "joints")
+            continue
         if not isinstance(feature, dict):
             raise InputError(
                 f"{path}, features: {key} is missing. A servo's dataset needs {_ACTION} and "
                 f"{_STATE}."
             )
-        names = feature.get("names")
-        if isinstance(names, dict):  # v2: {"motors": [...]}
-            names = [n for group in names.values() if isinstance(group, list) for n in group]
-        if not isinstance(names, list) or not names:
+        names = _flat(feature.get("names"))
+        if not names:
             shape = feature.get("shape")
             count = shape[0] if isinstance(shape, list) and shape else 0
             names = [f"joint_{k}" for k in range(count if isinstance(count, int) else 0)][:1000]
@@ -161,6 +164,26 @@ def _names(path: Path, info: Any) -> dict[str, list[str]]:
             f"{printable(', '.join(found[_ACTION])[:200])}."
         )
     return found | {"joints": positions or both}
+
+
+def _flat(names: Any) -> list[str]:
+    """Names in lists within lists or dictionaries: `{"motors": [...]}`, `[[...]]`."""
+    if isinstance(names, str):
+        return [names]
+    inside = names.values() if isinstance(names, dict) else names
+    return [n for part in inside for n in _flat(part)] if isinstance(inside, Iterable) else []
+
+
+def _values(path: Path, data: bytes, names: dict[str, list[str]]) -> dict[str, NDArray[np.float64]]:
+    """Commands and states, shape (rows, joints), and the numbers of episode and frame."""
+    keys = [_ACTION, _STATE, "episode_index", "frame_index"]
+    wanted = [column for key in keys for column in names.get(f"{key}, flat", [key])]
+    columns = read_columns(path, data, wanted)
+    return {
+        key: np.column_stack([columns[c] for c in own]) if own else columns[key]
+        for key in keys
+        for own in [names.get(f"{key}, flat", [])]
+    }
 
 
 def _joined(folder: Path, key: str, parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:

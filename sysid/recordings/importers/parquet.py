@@ -23,13 +23,13 @@ from pupper_sysid.common.reading.csv_table import (
 )
 from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.shared.log import (
+from pupper_sysid.sysid.recordings.importers.log import (
     LARGEST_BYTES,
     MOST_JOINTS,
     Log,
 )
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.wide import expanded, read_table
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.tables import expanded, read_table
 
 LAYOUT = "parquet table"
 MAGIC = b"PAR1"

@@ -9,21 +9,22 @@ from typing import Any
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.importers import (
-    bam,
-    ktune,
+    arrays,
+    json_logs,
     lerobot,
-    numpy_file,
     parquet,
     ros,
     ros_files,
     sage,
 )
-from pupper_sysid.sysid.recordings.importers.shared.log import Log, joint_names, text_of
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
-_ENDINGS = (".csv", ".json", ".mcap", ".db3", ".npz", ".parquet")
+_ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt")
+_PACKED = (".gz", ".bz2", ".xz")
 
 
 def is_log_folder(folder: Path) -> bool:
@@ -62,7 +63,8 @@ def is_fleet(path: Path) -> bool:
 
 
 def _may_be_log(path: Path) -> bool:
-    return path.is_file() and path.suffix in _ENDINGS and not path.name.endswith(".truth.csv")
+    name = Path(path.stem) if path.suffix in _PACKED else path
+    return path.is_file() and name.suffix in _ENDINGS and not name.name.endswith(".truth.csv")
 
 
 def read_folder(folder: Path, options: LogOptions) -> Log:
@@ -77,7 +79,7 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
         options.refuse(sage.LAYOUT)
         return chosen(folder, sage.read_sage(folder), options)
     if lerobot.is_lerobot(folder):
-        options.refuse(lerobot.LAYOUT, ("joints", "unit", "units"))
+        options.refuse(lerobot.LAYOUT, ("joints", "unit", "units", "rate", "readings"))
         return chosen(folder, lerobot.read_lerobot(folder, options), options)
     if ros.is_bag(folder):
         return ros.read_bag(folder, options)
@@ -101,22 +103,33 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         return replace(ros.read_mcap(path, data, options), sha256=digest)
     if data.startswith(ros_files.SQLITE):
         return replace(ros.read_sqlite(path, options), sha256=digest)
-    if data.startswith(numpy_file.MAGIC):
-        return replace(numpy_file.read_npz(path, data, options), sha256=digest)
+    if data.startswith((arrays.ZIP, arrays.NPY)):
+        return replace(arrays.read_arrays(path, data, options), sha256=digest)
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start[:1] in (b"{", b"["):
-        found = border.parse_json(text_of(path, data), str(path), "Give the log as it was written.")
-        for layout, known, read in (
-            (bam.LAYOUT, bam.is_bam, bam.read_bam),
-            (ktune.LAYOUT, ktune.is_ktune, ktune.read_ktune),
-        ):
-            if known(found):
-                options.refuse(layout)
-                return chosen(path, replace(read(path, found), sha256=digest), options)
+    if start[:1] not in (b"{", b"["):
+        return None
+    found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
+    for layout, known, read in (
+        (json_logs.BAM, json_logs.is_bam, json_logs.read_bam),
+        (json_logs.KTUNE, json_logs.is_ktune, json_logs.read_ktune),
+    ):
+        if known(found):
+            options.refuse(layout)
+            return chosen(path, replace(read(path, found), sha256=digest), options)
+    log = json_logs.read_json_table(path, found, options)
+    if log is None:
         raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
-    return None
+    return replace(log, sha256=digest)
+
+
+def _whole_json(text: str) -> str:
+    """JSON Lines as one list; other JSON as it is."""
+    lines = text.strip().split("\n")
+    if len(lines) > 1 and all(line.strip()[:1] + line.strip()[-1:] == "{}" for line in lines[:2]):
+        return f"[{','.join(line for line in lines if line.strip())}]"
+    return text
 
 
 def chosen(path: Path, log: Log, options: LogOptions) -> Log:

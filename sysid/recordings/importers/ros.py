@@ -24,6 +24,15 @@ from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS
 from pupper_sysid.common.reading.names import distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.log import (
+    MOST_JOINTS,
+    Log,
+    held_commands,
+    joint_names,
+    read_files,
+    rows,
+)
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.ros_files import (
     Raw,
     bounded,
@@ -38,15 +47,6 @@ from pupper_sysid.sysid.recordings.importers.ros_messages import (
     Message,
     decode,
 )
-from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
-from pupper_sysid.sysid.recordings.importers.shared.log import (
-    MOST_JOINTS,
-    Log,
-    joint_names,
-    read_files,
-    rows,
-)
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 
 LAYOUT = "ROS 2 log"
 

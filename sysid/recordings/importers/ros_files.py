@@ -14,8 +14,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import resolved
 from pupper_sysid.common.reading.budget import allowed, refuse_more
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES
 from pupper_sysid.sysid.recordings.importers.ros_messages import KINDS, plain_type
-from pupper_sysid.sysid.recordings.importers.shared.log import LARGEST_BYTES
 
 MAGIC = b"\x89MCAP"
 SQLITE = b"SQLite format 3\0"

@@ -26,18 +26,18 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.budget import refuse_more
 from pupper_sysid.common.reading.csv_table import LONGEST_CELL, MOST_CELLS
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.common.reading.numbers import decimal
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.shared.held import held_commands
-from pupper_sysid.sysid.recordings.importers.shared.log import (
+from pupper_sysid.sysid.recordings.importers.log import (
     Log,
+    held_commands,
     joint_names,
     read_files,
     rows,
-    text_of,
 )
-from pupper_sysid.sysid.recordings.importers.shared.times import doubt_of_a_turn
-from pupper_sysid.sysid.recordings.importers.shared.units import scale_by_step
+from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
+from pupper_sysid.sysid.recordings.importers.units import scale_by_step
 
 LAYOUT = "SAGE folder"
 
@@ -64,7 +64,7 @@ def read_sage(folder: Path) -> Log:
     """
     paths = [folder / name for name in (_CONTROL, _STATE, _JOINTS)]
     contents, digest = read_files(folder, paths)
-    lines = text_of(paths[2], contents[paths[2]]).splitlines()
+    lines = decoded(paths[2], contents[paths[2]]).splitlines()
     names = joint_names(paths[2], [line for line in lines if line.strip()])
     if not names:
         raise InputError(f"{paths[2]} names no joint. Write one per line.")
@@ -117,7 +117,7 @@ def _serial_turns(
 
 def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times [s] and positions, shape (rows, joints), of one of the two tables."""
-    text = text_of(path, data)
+    text = decoded(path, data)
     refuse_more(path, text.count("\n") * joints, MOST_CELLS, "values", "Split the log.")
     first = text.find("\n")
     refuse_more(f"{path}, line 1", first if first >= 0 else len(text), LONGEST_CELL, "characters")

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from itertools import product
+from pathlib import Path
 
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers import wide
+from pupper_sysid.sysid.recordings.importers.columns import column
+from pupper_sysid.sysid.recordings.importers.tables import has_time, import_line, missing
 
 OURS = (
     "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
@@ -27,15 +30,16 @@ FILES = (
 """Layouts other than tables of text."""
 
 
-def unknown_columns(names: Sequence[str]) -> str:
+def unknown_columns(path: Path | str, names: Sequence[str], timed: bool = False) -> str:
     """Why a table has no known layout; empty where it may have one.
 
-    Every tabular layout is listed with the columns that it lacks here.
+    Every tabular layout is listed with the columns that it lacks here. `timed` tables have their
+    times from elsewhere.
     """
     own = set(names)
-    lacks_pair = wide.missing(names)
-    has_time = wide.has_time(names)
-    if lacks_pair == "" and has_time:
+    lacks_pair = missing(names)
+    timed = timed or has_time(names)
+    if lacks_pair == "" and timed:
         return ""
     if {n.lower() for n in own} >= _IMU and lacks_pair.startswith("no column"):
         return (
@@ -43,7 +47,7 @@ def unknown_columns(names: Sequence[str]) -> str:
             "nothing of a servo can be measured with it. Give a log of commands and positions."
         )
     lacks = [lacks_pair] if lacks_pair else []
-    lacks += [] if has_time else [f"no column is a time ({', '.join(wide.TIMES[:4])} …)"]
+    lacks += [] if timed else ["no column is a time (time, timestamp, t …)"]
     parts = [
         f"any table: {' and '.join(lacks)}",
         *(
@@ -57,9 +61,25 @@ def unknown_columns(names: Sequence[str]) -> str:
     ]
     return (
         f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
-        f"{_hint(names)}Name the columns with `pupper-sysid import` --time, --command and "
-        f"--position. Other layouts: {'; '.join(FILES)}."
+        f"{_hint(names)}Name the columns{_examples(path, names)} with `pupper-sysid import` --time "
+        f"(or --rate), --command and --position. Other layouts: {'; '.join(FILES)}."
     )
+
+
+def _examples(path: Path | str, names: Sequence[str]) -> str:
+    """Command lines that take columns whose names say nothing for what is missing."""
+    columns = [column(name) for name in names]
+    by_kind = {
+        kind: [c.template for c in columns if c.kind == kind]
+        or [c.template for c in columns if c.kind == "unknown"]
+        for kind in ("time", "command", "position")
+    }
+    lines = [
+        import_line(path, time=by_kind["time"][0], command=c, position=p)
+        for c, p in product(by_kind["command"], by_kind["position"])
+        if by_kind["time"] and len({c, p, by_kind["time"][0]}) == 3
+    ]
+    return f" ({'; or '.join(list(dict.fromkeys(lines))[:3])})" if lines else ""
 
 
 def unknown_json(keys: Iterable[str]) -> str:

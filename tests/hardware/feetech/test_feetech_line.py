@@ -1,6 +1,7 @@
 """Our line and bus have none of the SDK's faults (facts/hardware.md B5, one test per row)."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,19 +10,20 @@ import serial
 from scservo_sdk import scservo_def
 
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.feetech import line as feetech_line
-from pupper_sysid.hardware.feetech import scan
-from pupper_sysid.hardware.feetech.bus import FeetechBus
+from pupper_sysid.hardware.feetech.bus import FAMILY, FeetechBus
 from pupper_sysid.hardware.feetech.frames import Frame
 from pupper_sysid.hardware.feetech.line import FeetechLine
 from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
-from pupper_sysid.hardware.feetech.settings import memory_of
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
+from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.hardware.serial_servos import scan
+from pupper_sysid.hardware.serial_servos.settings import memory_of
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from support.servo_servers import (
     Scripted,
     StillBench,
     bench_of,
+    map_of,
     moving_servos,
     on_a_port,
     still_servos,
@@ -35,7 +37,7 @@ PATIENT_S = 0.4
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
     """The servos share this process and a busy machine; tests of time put the true one back."""
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", PATIENT_S)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", PATIENT_S)
 
 
 def position(line: FeetechLine, servo: int, series=STS3215) -> int | None:
@@ -125,7 +127,7 @@ def test_b5_3_a_late_reply_that_comes_during_the_next_read_has_another_length():
 def test_b5_3_successive_readings_of_the_bus_ask_for_different_lengths():
     servos = still_servos(ids=[4])
     with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
+        bus = FeetechBus(server.device, 1_000_000, map_of(4))
         servos.heard = b""
         for _ in range(7):
             bus.read()
@@ -242,13 +244,13 @@ def test_b5_11_an_error_byte_above_7f_is_read():
 
 
 def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.15)
-    monkeypatch.setattr(scan, "HIGHEST_ID", 8)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.03)
+    family = replace(FAMILY, highest_id=8)
     servos = still_servos(SCS0009, ids=[3, 7])
     with on_a_port(servos) as server:
-        rate, reports = scan.scan_line(server.device, 1_000_000)
-    assert rate == 1_000_000
-    assert [(r.id, r.model, r.gains, r.limits) for r in reports] == [
+        report = scan.scan_line(family, server.device, 1_000_000)
+    assert report.baud == 1_000_000
+    assert [(r.id, r.model, r.gains, r.limits) for r in report.servos] == [
         (3, "SCS0009", (15, 15, 0), (20, 1003)),
         (7, "SCS0009", (15, 15, 0), (20, 1003)),
     ]
@@ -293,7 +295,7 @@ def test_the_time_of_a_reply_lies_within_its_exchange():
 
 
 def test_a_500000_baud_scs_line_is_found_without_naming_the_rate(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)
     with on_a_port(still_servos(SCS0009, baud=500_000)) as server:
         bus = FeetechBus(server.device)
         assert bus.metadata["baud"] == 500_000
@@ -320,14 +322,14 @@ def test_servos_that_cannot_be_driven_are_left_alone_and_the_refusal_says_which(
         return servos
 
     for servos, joints, patience_s, words in (
-        (still_servos(ids=[]), None, 0.003, "no servo answers at 1000000 baud (tried ids 1 to 12)"),
+        (still_servos(ids=[]), None, 0.003, "no servo answers at 1000000 baud (tried ids 1 to 12"),
         (still_servos(ids=[4]), ["LF_hip", "LF_thigh"], 0.1, "LF_thigh (id 5) does not answer"),
         (model(0x39, 5), None, 0.4, "servo 2 has the model number 1337, which is not known"),
         (model(5, 4), None, 0.4, "SCS0009, STS3215) share the line"),
     ):
-        monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", patience_s)
+        monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", patience_s)
         with on_a_port(servos) as server, pytest.raises(BusError) as refused:
-            FeetechBus(server.device, 1_000_000, joints=joints)
+            FeetechBus(server.device, 1_000_000, map_of(*range(1, 13)) if joints else None, joints)
         assert words in str(refused.value)
         assert bench_of(servos).goals == []
 
@@ -406,7 +408,7 @@ def test_a_count_no_servo_can_have_reached_is_no_reading_unless_it_is_told_twice
     bench: StillBench = bench_of(servos)
     bench.counts[4] = 10
     with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
+        bus = FeetechBus(server.device, 1_000_000, map_of(4))
         assert bus.read().position_count.tolist() == [10]
         bench.counts[4] = 4090
         counts = [int(bus.read().position_count[0]) for _ in range(2)]
@@ -418,7 +420,7 @@ def test_a_count_no_servo_can_have_reached_is_no_reading_unless_it_is_told_twice
 def test_error_bits_come_with_the_reading():
     servos = still_servos(ids=[4])
     with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, joints=["LF_hip"])
+        bus = FeetechBus(server.device, 1_000_000, map_of(4))
         servos.servos[4].error, servos.servos[4].faulty_until = 33, np.inf
         sample = bus.read()
         bus.close()

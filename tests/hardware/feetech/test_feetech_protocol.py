@@ -9,7 +9,7 @@ from scservo_sdk import scservo_def
 
 from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
 from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series, series_of_model_bytes
+from pupper_sysid.hardware.feetech.registers import SCS0009, SERIES, STS3215, Series
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from support.servo_servers import (
     Listening,
@@ -236,10 +236,13 @@ def test_our_line_sends_the_golden_bytes(series, end):
 
 
 def test_model_numbers_tell_the_series_in_its_own_byte_order():
-    assert series_of_model_bytes(golden("STS model answer")[5:7]) is STS3215
-    assert series_of_model_bytes(golden("SCS model answer")[5:7]) is SCS0009
-    # 777 in the order of the other series, and 1284 likewise, are nobody's
-    assert series_of_model_bytes(b"\x03\x09") is series_of_model_bytes(b"\x04\x05") is None
+    def series_of(model: bytes) -> Series | None:
+        return SERIES.get(int.from_bytes(model, "little"))
+
+    assert series_of(golden("STS model answer")[5:7]) is STS3215
+    assert series_of(golden("SCS model answer")[5:7]) is SCS0009
+    # 777 in the order of the other series, and 1284 likewise, are no servo's
+    assert series_of(b"\x03\x09") is series_of(b"\x04\x05") is None
 
 
 def test_negative_registers_are_sign_and_magnitude_and_others_take_none():

@@ -15,22 +15,20 @@ from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.connect import open_guarded
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.protection import PROTECTIONS
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
-from pupper_sysid.hardware.feetech.settings import EEPROM_END
+from pupper_sysid.hardware.feetech.registers import PROTECTIONS, SCS0009, STS3215
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
-from support.servo_servers import bench_of, on_a_port, still_servos, wait_until
+from support.servo_servers import bench_of, map_of, on_a_port, still_servos, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
 def sts(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
     with on_a_port(still_servos(STS3215, ids=[1])) as server:
         yield server
 
@@ -40,7 +38,7 @@ def p_of(server) -> int:
 
 
 def test_a_header_has_model_firmware_gains_registers_supply_and_temperature(sts):
-    bus = FeetechBus(sts.device)
+    bus = FeetechBus(sts.device, joint_map=map_of(1))
     servos = header_entries(bus)["servos"]
     bus.close()
     # the emulator's settings (sim.emulator.feetech) are those of facts/hardware.md B3
@@ -54,7 +52,7 @@ def test_a_header_has_model_firmware_gains_registers_supply_and_temperature(sts)
 
 
 def test_a_gain_is_set_while_the_guard_exists_and_set_back_by_close(sts):
-    guard = GuardedBus(FeetechBus(sts.device))
+    guard = GuardedBus(FeetechBus(sts.device, joint_map=map_of(1)))
     guard.set_register("RF_hip", "p", 8)
     guard.set_register("RF_hip", "p", 16)
     assert p_of(sts) == 16
@@ -65,7 +63,7 @@ def test_a_gain_is_set_while_the_guard_exists_and_set_back_by_close(sts):
 
 
 def test_a_register_that_does_not_take_its_value_is_an_error(sts):
-    bus = FeetechBus(sts.device)
+    bus = FeetechBus(sts.device, joint_map=map_of(1))
     store, servo = sts.emulator._store, sts.emulator.servos[1]
 
     def stubborn(servo_id: int, address: int, data: bytes, at: float) -> None:
@@ -82,9 +80,9 @@ def test_a_register_that_does_not_take_its_value_is_an_error(sts):
 
 
 def test_the_other_series_keeps_its_lock_elsewhere(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)
     with on_a_port(still_servos(SCS0009, ids=[1], baud=500_000)) as server:
-        bus = FeetechBus(server.device)
+        bus = FeetechBus(server.device, joint_map=map_of(1, series=SCS0009))
         bus.set_register("RF_hip", "p", 20)
         assert bus.register("RF_hip", "p") == 20
         assert server.emulator.servos[1].memory[48] == 1
@@ -94,7 +92,7 @@ def test_the_other_series_keeps_its_lock_elsewhere(monkeypatch):
 
 @pytest.mark.wall_clock
 def test_registers_of_servos_that_were_unplugged_are_set_back_once_they_return(sts):
-    guard = open_guarded(parse_address(f"feetech:{sts.device}"))
+    guard = open_guarded(parse_address(f"feetech:{sts.device}"), map_of(1))
     guard.set_register("RF_hip", "p", 8)
     sts.emulator.unplug_for_s = 1.0
     time.sleep(0.1)
@@ -121,7 +119,7 @@ OFF = {
 
 def test_protections_that_are_off_are_on_while_the_torque_is_and_off_again_at_the_end(sts):
     set_protection(sts, **OFF)
-    guard = GuardedBus(FeetechBus(sts.device))
+    guard = GuardedBus(FeetechBus(sts.device, joint_map=map_of(1)))
     assert protection(sts) == OFF, "nothing is written before the torque is switched on"
     guard.torque(True)
     assert protection(sts) == FACTORY
@@ -137,10 +135,10 @@ def test_protections_of_the_factory_or_stronger_are_left_alone(sts):
     set_protection(sts, **own)
     written, store = [], sts.emulator._store
     sts.emulator._store = lambda servo, at, *rest: (written.append(at), store(servo, at, *rest))
-    guard = GuardedBus(FeetechBus(sts.device))
+    guard = GuardedBus(FeetechBus(sts.device, joint_map=map_of(1)))
     guard.torque(True)
     guard.close()
-    assert protection(sts) == own and min(written) >= EEPROM_END
+    assert protection(sts) == own and min(written) >= STS3215.eeprom_end
 
 
 def test_the_torque_stays_off_if_a_servo_does_not_take_its_protection(sts):
@@ -153,7 +151,7 @@ def test_the_torque_stays_off_if_a_servo_does_not_take_its_protection(sts):
 
     sts.emulator._store = stubborn
     bench_of(sts.emulator).torques.clear()
-    guard = GuardedBus(FeetechBus(sts.device))
+    guard = GuardedBus(FeetechBus(sts.device, joint_map=map_of(1)))
     with pytest.raises(BusError, match="unload_condition did not take the value 44"):
         guard.torque(True)
     guard.close()
@@ -164,9 +162,11 @@ CHANGED = """
 import sys, time
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
-from pupper_sysid.hardware.feetech import line
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.serial_servos import line
 line.REPLY_TIMEOUT_S = 0.1  # the servos share a busy machine with their driver
-bus = open_guarded(parse_address(sys.argv[1]))
+chosen = load_joint_map("sts3215").per_servo().select(["RF_hip"])
+bus = open_guarded(parse_address(sys.argv[1]), chosen)
 bus.set_register("RF_hip", "p", 8)
 bus.torque(True)
 print("changed", flush=True)

@@ -15,10 +15,12 @@ from pupper_sysid.hardware.bus import BusSample, Sent
 from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.bus import supply_band
+from pupper_sysid.hardware.feetech.bus import FAMILY
+from pupper_sysid.hardware.feetech.registers import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.hardware.safety.limits import PositionLimits
+from pupper_sysid.hardware.serial_servos.settings import supply_band
 
 PERIOD_S = 0.02
 NO_NUMBERS = [np.nan, np.inf, -np.inf]
@@ -167,7 +169,7 @@ def test_a_range_that_no_number_can_leave_or_meet_is_refused(volts):
     ],
 )
 def test_the_band_of_a_servo_is_its_registers_within_its_data_sheet(model, registers, band):
-    found = supply_band(model, registers)
+    found = supply_band(FAMILY, replace(STS3215, name=model), registers)
     assert found == (band if band is None else pytest.approx(band))
 
 

@@ -19,13 +19,13 @@ from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.address import BusAddress, parse_address
 from pupper_sysid.hardware.connect import open_guarded
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import LOG
 from pupper_sysid.hardware.safety import limp as limp_module
 from pupper_sysid.hardware.safety import watchdog_process
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.watchdog import Watchdog
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.robot import draw_robot
@@ -76,7 +76,7 @@ while True:
 def runtime(monkeypatch, tmp_path):
     """A runtime folder of the test: what the watchdogs say of vanished robots stays there."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
 
 
 @pytest.fixture(params=["feetech", "esp32"])
@@ -190,7 +190,7 @@ def test_a_driver_that_leaves_properly_is_not_followed_by_its_watchdog(robot):
 
 
 def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monkeypatch, tmp_path):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.05)
     monkeypatch.setattr(watchdog_process, "_SOON_S", 2.0)
     monkeypatch.setattr(watchdog_process, "_GONE_S", 0.5)
     layout = load_joint_map("sts3215")

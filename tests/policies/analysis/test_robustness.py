@@ -76,6 +76,7 @@ def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker
     assert plain["fixed"].frequency_hz == pytest.approx(3.6, abs=0.15)
 
 
+@pytest.mark.slow
 def test_an_ablation_hurts_more_the_more_is_taken(walker, monkeypatch):
     policy, trial = walker
     monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.NOISE_SHARES", (0.05, 2.0))
@@ -112,6 +113,7 @@ def fallen(rollout: Rollout, robots: list[int], after_s: float) -> Rollout:
     return replace(rollout, **parts | changed)
 
 
+@pytest.mark.slow
 def test_replay_is_of_the_robots_that_walked_and_only_while_they_did(walker):
     policy, trial = walker
     plain = trial.walk(policy)

@@ -71,6 +71,7 @@ def test_a_gait_runs_on_the_servos_it_was_trained_on_and_not_on_ones_a_tenth_as_
     assert demand_figure(weaker).axes
 
 
+@pytest.mark.slow
 def test_a_servo_that_is_later_than_the_gait_bears_is_refused_for_its_dead_time(trial):
     policy, walk = trial
     late = {name: x.copy() for name, x in walk.servos.value.items()}

@@ -68,9 +68,9 @@ def walk(
     ("from_s", "command", "seconds", "found"),
     [
         (5.5, (0.0, 0.0, 0.5), 4.0, True),
-        (99.0, (0.0, 0.0, 0.5), 4.0, False),
+        pytest.param(99.0, (0.0, 0.0, 0.5), 4.0, False, marks=pytest.mark.slow),
         # within the dead band of its friction a hip does not move: nothing can be told
-        (8.0, (0.15, 0.0, 0.0), 7.0, False),
+        pytest.param(8.0, (0.15, 0.0, 0.0), 7.0, False, marks=pytest.mark.slow),
     ],
 )
 def test_a_hip_that_freezes_is_found_where_its_servo_must_move(

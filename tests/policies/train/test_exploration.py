@@ -166,7 +166,7 @@ class TrotActor:
 
 
 def test_the_judge_counts_the_steps_of_a_trot():
-    task = Walking(episode_s=6.0)
+    task = Walking(episode_s=3.0)
     judge = Judge(task, servo_ranges("paper", "ideal"), 0, 1)
     found = judge(TrotActor(judge, task))  # type: ignore[arg-type]
     assert found["score_falls"] == 0
@@ -175,6 +175,7 @@ def test_the_judge_counts_the_steps_of_a_trot():
     assert 0.5 < found["score_duty"] < 0.9
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_scores_about_nothing_and_one_that_falls_less():
     learner = make_learner(tiny_run(), Ranks())
     judge = Judge(Walking(episode_s=1.5), learner.env.env.servos, 0, 1)

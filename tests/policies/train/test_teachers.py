@@ -96,6 +96,7 @@ def test_the_teachers_commands_are_corrected_until_the_policy_walks_at_the_given
     assert (error() < 0.2 * before).all()
 
 
+@pytest.mark.slow
 def test_imitation_brings_the_policy_nearer_to_the_trot():
     rounds = 6
     run = tiny_run(
@@ -191,6 +192,7 @@ def test_a_learned_teacher_follows_the_corrected_command():
     torch.testing.assert_close(ratio, torch.full((3,), 0.32 / 0.3), atol=0.02, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_policy_learns_to_act_as_a_teacher_whose_state_it_cannot_see(taught):
     rounds = 4
     run = tiny_run(
@@ -205,6 +207,7 @@ def test_a_policy_learns_to_act_as_a_teacher_whose_state_it_cannot_see(taught):
     assert differences[-1] < 0.8 * differences[0]
 
 
+@pytest.mark.slow
 def test_a_run_from_nothing_trains_its_teacher_first_and_resumes_in_the_midst_of_it(
     tmp_path, monkeypatch
 ):
@@ -252,6 +255,7 @@ def test_a_teacher_of_a_runs_own_has_its_robot_seed_actions_and_clock(tmp_path):
     assert teacher_of(slower).task.physics_step_s == 0.0025
 
 
+@pytest.mark.slow
 def test_what_cannot_teach_a_run_is_refused_and_leaves_its_name_free(tmp_path, taught):
     train(tmp_path / "policy", tiny_run(imitation=Imitation(iterations=0), iterations=1))
     broken, other = (Path(shutil.copytree(taught, tmp_path / name)) for name in ("broken", "other"))

@@ -64,7 +64,10 @@ def stopped(tmp_path) -> Path:
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize("kind", ["mlp", "lstm", "transformer"])
+@pytest.mark.parametrize(
+    "kind",
+    ["mlp", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("lstm", "transformer"))],
+)
 def test_a_run_that_was_stopped_and_resumed_is_bit_for_bit_the_run_that_was_not(
     tmp_path, uninterrupted, kind
 ):
@@ -128,6 +131,7 @@ def cut_power_after(phase: str, done: int):
     return watch
 
 
+@pytest.mark.slow
 def test_after_a_power_cut_nothing_is_repeated_in_the_curves_and_the_best_stays_the_best(tmp_path):
     run = tiny_run(iterations=12)
     straight, cut = tmp_path / "straight", tmp_path / "cut"
@@ -151,6 +155,7 @@ def test_after_a_power_cut_nothing_is_repeated_in_the_curves_and_the_best_stays_
     assert [row["update"] for row in rows(cut / "imitation.csv")] == ["1", "2"]
 
 
+@pytest.mark.slow
 def test_a_run_that_dies_in_its_first_round_can_be_resumed(tmp_path, uninterrupted):
     with pytest.raises(PowerCut):
         train(tmp_path, tiny_run("lstm"), cut_power_after("imitation", 1))
@@ -214,6 +219,7 @@ train(Path(sys.argv[1]), tiny_run(), watch)
 """
 
 
+@pytest.mark.slow
 def test_a_termination_signal_ends_a_long_update_within_a_second(tmp_path):
     tests = Path(__file__).resolve().parents[2]
     process = subprocess.Popen(
@@ -410,6 +416,7 @@ def two(tmp_path_factory):
     return [read_checkpoint(folder / name) for name in (LAST, "last.rank1.pt")]
 
 
+@pytest.mark.slow
 def test_two_processes_learn_one_policy_from_different_robots_and_stop_at_the_same_update(two):
     """Though one alone was told to stop."""
     assert [c["iteration"] for c in two] == [2, 2]

@@ -79,6 +79,7 @@ def compared(walk: Recording, *names: str, **options):
     return twin(walk, actuators, robot, copies=2, threads=1, **options)
 
 
+@pytest.mark.slow
 def test_a_robot_in_the_air_is_predicted_exactly_there_and_found_there(played):
     found = compared(played["air"], CALIBRATION)
     model = found.models[CALIBRATION]

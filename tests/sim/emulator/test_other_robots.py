@@ -13,9 +13,9 @@ import yaml
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.registers import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
@@ -107,7 +107,8 @@ def test_hinges_that_an_actuator_drives_by_any_way_are_taken_and_others_named(ca
 
 def test_the_mini_pupper_s_own_model_has_its_twelve_joints(read_here):
     Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
-    layout, left_out = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
+    robot = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
+    layout, left_out = robot.joint_map, robot.left_out
     assert layout.joint_names == JOINT_NAMES and left_out == []
 
 
@@ -139,7 +140,7 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
 
 @pytest.mark.wall_clock
 def test_one_servo_on_a_bench_is_swept_over_a_line_and_calibrated(capsys, read_here, monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)  # they share this process
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)  # they share this process
     code, _, err = run(capsys, "init-robot", "bench.xml")
     assert code == 0, err
     layout = load_joint_map(Path("bench.joints.yaml"))

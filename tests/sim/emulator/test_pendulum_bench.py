@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from pupper_sysid.hardware.feetech import line as feetech_line
 from pupper_sysid.hardware.feetech.bus import FeetechBus
 from pupper_sysid.hardware.feetech.registers import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
@@ -146,7 +146,7 @@ def test_the_truth_beside_a_recording_has_the_numbers_of_servo_and_load(tmp_path
 
 
 def test_registers_that_arrive_over_the_protocol_act(monkeypatch):
-    monkeypatch.setattr(feetech_line, "REPLY_TIMEOUT_S", 0.04)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)
     rng = np.random.default_rng(1)
     robot = draw_bench(rng, Pendulum(0.1, 0.1), BenchSpec(registers=(("goal_speed", 300),)))
     plant = PendulumBench(robot)

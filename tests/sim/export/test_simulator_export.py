@@ -8,6 +8,7 @@ import re
 import sys
 import types
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,13 @@ import torch
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.sim.export import mjcf
-from pupper_sysid.sim.export.isaaclab import to_isaaclab
-from pupper_sysid.sim.export.json_file import to_json
-from pupper_sysid.sim.export.mjcf import to_mjcf
-from pupper_sysid.sim.export.mjlab import MJLAB_PD, to_mjlab
-from pupper_sysid.sim.export.newton import export_newton
-from pupper_sysid.sim.export.shared import EXPLICIT_PD, delays_at_step
-from pupper_sysid.sim.export.targets import SIMULATORS
+from pupper_sysid.sim.export.check import check, held, walk_commands
+from pupper_sysid.sim.export.export import SIMULATORS, exported_text
+from pupper_sysid.sim.export.mjlab import BUILTIN_PD
+from pupper_sysid.sim.export.shared import EXPLICIT_PD, ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, rest_at
 from pupper_sysid.sysid.recordings.files import load
@@ -43,9 +41,13 @@ def calibration():
     return load_calibration(CALIBRATED)
 
 
+def text_of(calibration, to: str, step_s: float = 0.005) -> str:
+    return exported_text(calibration, to, step_s)[0]
+
+
 def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(calibration):
     names = calibration.joint_names
-    model = in_free_air(to_mjcf(calibration, TIME_STEP_S), names)
+    model = in_free_air(text_of(calibration, "mjcf", TIME_STEP_S), names)
     data = mujoco.MjData(model)
     sweep = load(ROOT / "data/samples/sweep.csv")
     trials = [sweep.trials(n) for n in names]
@@ -69,7 +71,7 @@ def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(c
 
 def lags_s(calibration, step_s: float, changed: Callable[[str], str] = str) -> np.ndarray:
     """Lag of every exported servo behind a tone of 3 Hz that a loop of 50 Hz commands."""
-    model = in_free_air(changed(to_mjcf(calibration, step_s)), calibration.joint_names)
+    model = in_free_air(changed(text_of(calibration, "mjcf", step_s)), calibration.joint_names)
     data = mujoco.MjData(model)
     rest_at(model, data, [0.0] * model.nu)
     at = step_s * np.arange(round(3.0 / step_s))
@@ -90,19 +92,20 @@ def test_an_export_lags_as_long_as_the_calibration_says_in_any_steps_and_engine(
     for step_s in (0.005, 0.001):
         np.testing.assert_allclose(lags_s(calibration, step_s), expected, atol=6e-4)
     # what the step of 5 ms alone would have done
-    more = delays_at_step(calibration, 0.005)
+    more = ExportedServos.of(calibration, 0.005).delays()
     for name, joint in calibration.joints.items():
         assert 0.0015 < more[name].value - joint.actuator.dead_time_s.value < 0.004
-    for engine in (EXPLICIT_PD, MJLAB_PD):  # which do not limit the speed of set points
+    own_delays = ExportedServos.delays
+    for engine in (EXPLICIT_PD, BUILTIN_PD):  # which do not limit the speed of set points
 
         def as_they_do(text: str, engine=engine) -> str:
-            text = re.sub(r' slewmax="[^"]*"', "", text)
+            text = re.sub(r' slewmax="[^"]*"', ' slewmax="0"', text)
             return text if engine.implicit else text.replace(INTEGRATOR, "Euler")
 
-        def their_delays(*of, engine=engine):
-            return delays_at_step(*of, engine)
+        def their_delays(servos, _=None, engine=engine):
+            return own_delays(servos, engine)
 
-        monkeypatch.setattr(mjcf, "delays_at_step", their_delays)
+        monkeypatch.setattr(ExportedServos, "delays", their_delays)
         there = lags_s(calibration, 0.005, as_they_do)
         np.testing.assert_allclose(there, expected, atol=1e-3)
 
@@ -115,7 +118,7 @@ def _held(trial, at: np.ndarray) -> np.ndarray:
 
 def test_readings_of_the_mjcf_export_are_held_for_a_poll_and_of_the_measured_age(calibration):
     names = calibration.joint_names
-    model = in_free_air(to_mjcf(calibration, TIME_STEP_S), names)
+    model = in_free_air(text_of(calibration, "mjcf", TIME_STEP_S), names)
     data = mujoco.MjData(model)
     rest_at(model, data, [0.0] * len(names))
     times, read = [], []
@@ -147,14 +150,94 @@ class _Recorder:
         return given
 
 
-def executed(text: str, package: str, name: str, recorder: _Recorder, monkeypatch) -> dict:
-    parts = package.split(".")
-    for k in range(len(parts)):
-        monkeypatch.setitem(sys.modules, ".".join(parts[: k + 1]), types.ModuleType(parts[k]))
-    setattr(sys.modules[package], name, recorder)
-    space: dict[str, Any] = {}
-    exec(compile(text, "exported.py", "exec"), space)
-    return space
+def modules(monkeypatch, **named: dict[str, Any]) -> None:
+    """Stub modules by name, `a__b` for a.b, each with its names."""
+    for name, names in named.items():
+        parts = name.split("__")
+        for k in range(len(parts)):
+            whole = ".".join(parts[: k + 1])
+            if whole not in named and k + 1 < len(parts):
+                monkeypatch.setitem(sys.modules, whole, types.ModuleType(whole))
+        module = types.ModuleType(".".join(parts))
+        vars(module).update(names)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def executed(text: str) -> dict[str, Any]:
+    module = types.ModuleType("exported")
+    sys.modules["exported"] = module  # dataclasses look their module up
+    try:
+        exec(compile(text, "exported.py", "exec"), vars(module))
+    finally:
+        del sys.modules["exported"]
+    return vars(module)
+
+
+def isaac_lab(text: str, monkeypatch, fields: set[str] = ISAACLAB) -> dict[str, Any]:
+    """An export's names, in a stub of Isaac Lab whose PD is that of its manual."""
+
+    class IdealPDActuatorCfg:
+        def __init__(self, **given):
+            _Recorder(fields)(**given)
+            self.__dict__.update(given)
+
+    class IdealPDActuator:
+        def __init__(self, cfg, joint_names, joint_ids, num_envs, device, **_):
+            self.cfg, self._num_envs, self._device = cfg, num_envs, device
+            names = [n for n in vars(cfg) if n not in ("joint_names_expr",)]
+            for name in names:
+                values = getattr(cfg, name)
+                setattr(self, name, torch.tensor([values[j] for j in joint_names]))
+
+        def reset(self, env_ids):
+            pass
+
+        def compute(self, action, position, velocity):
+            effort = self.stiffness * (action.joint_positions - position) - self.damping * velocity
+            limit = getattr(self, "effort_limit", None)
+            limit = self.actuator_effort_limit if limit is None else limit
+            action.joint_efforts = torch.minimum(torch.maximum(effort, -limit), limit)
+            return action
+
+    def configclass(cls):
+        return cls
+
+    modules(
+        monkeypatch,
+        isaaclab__actuators={
+            "DelayedPDActuatorCfg": _Recorder(fields), "IdealPDActuator": IdealPDActuator,
+            "IdealPDActuatorCfg": IdealPDActuatorCfg,
+        },
+        isaaclab__utils={"configclass": configclass},
+    )  # fmt: skip
+    return executed(text)
+
+
+def mjlab(text: str, monkeypatch) -> dict[str, Any]:
+    """An export's names, in a stub of mjlab."""
+
+    @dataclass(kw_only=True)
+    class ActuatorCfg:
+        target_names_expr: tuple[str, ...]
+
+    class Actuator:
+        def __init__(self, cfg, entity, target_ids, target_names):
+            self.cfg, self.target_names, self._mjs_actuators = cfg, target_names, []
+
+        def initialize(self, mj_model, model, data, device):
+            pass
+
+        def reset(self, env_ids=None):
+            pass
+
+    modules(
+        monkeypatch,
+        mjlab__actuator={
+            "Actuator": Actuator, "ActuatorCfg": ActuatorCfg,
+            "BuiltinPositionActuatorCfg": _Recorder(MJLAB),
+        },
+    )  # fmt: skip
+    return executed(text)
 
 
 @pytest.fixture(scope="module")
@@ -168,57 +251,50 @@ def braking(calibration):
     return calibration.model_copy(update={"joints": joints})
 
 
-def test_back_emf_brakes_in_every_simulator(braking, monkeypatch, tmp_path):
-    text = to_isaaclab(braking, 0.005)
-    recorder = _Recorder(ISAACLAB)
-    space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
-    assert all(made["viscous_friction"] == 0.0321 for made in space["ACTUATORS"].values())
-    text, recorder = to_mjlab(braking, 0.005), _Recorder(MJLAB)
-    executed(text, "mjlab.actuator", "BuiltinPositionActuatorCfg", recorder, monkeypatch)
-    assert [made["viscous_damping"] for made in recorder.made] == [0.0321] * 3
-    export_newton(braking, 0.005, tmp_path)
-    module = (tmp_path / "newton_actuators.py").read_text()
-    assert (
-        module.count('"back_emf": 0.0321') == 3
-        and 'joint_damping[dof] = servo["back_emf"]' in module
-    )
-    assert to_mjcf(braking, 0.002).count('damping="0.0321"') == 3
-    joints = json.loads(to_json(braking, 0.005))["joints"]
+def test_back_emf_brakes_in_every_simulator(braking, monkeypatch):
+    space = isaac_lab(text_of(braking, "isaaclab"), monkeypatch)
+    assert set(space["ACTUATORS"]["servos"].viscous_friction.values()) == {0.0321}
+    whole = space["WHOLE_STEP_ACTUATORS"].values()
+    assert all(made["viscous_friction"] == 0.0321 for made in whole)
+    space = mjlab(text_of(braking, "mjlab"), monkeypatch)
+    assert [made["viscous_damping"] for made in space["WHOLE_STEP_ACTUATORS"]] == [0.0321] * 3
+    for to in ("mjlab", "newton"):
+        assert text_of(braking, to).count('"back_emf": 0.0321') == 3
+    assert text_of(braking, "mjcf", 0.002).count('damping="0.0321 0 0"') == 3
+    joints = json.loads(text_of(braking, "json"))["joints"]
     assert all(j["actuator"]["back_emf_nm_s_per_rad"]["value"] == 0.0321 for j in joints.values())
 
 
 def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     calibration, monkeypatch
 ):
-    recorder = _Recorder(ISAACLAB)
-    text = to_isaaclab(calibration, 0.005)
-    space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
-    assert list(space["ACTUATORS"]) == list(calibration.joint_names)
-    delays = delays_at_step(calibration, 0.005, EXPLICIT_PD)
-    for name, made in space["ACTUATORS"].items():
+    text = text_of(calibration, "isaaclab")
+    space = isaac_lab(text, monkeypatch)
+    assert list(space["WHOLE_STEP_ACTUATORS"]) == list(calibration.joint_names)
+    delays = ExportedServos.of(calibration, 0.005).delays(EXPLICIT_PD)
+    servos = space["ACTUATORS"]["servos"]
+    for name, made in space["WHOLE_STEP_ACTUATORS"].items():
         own = calibration.joint(name).actuator
         assert made["joint_names_expr"] == [name]
-        assert made["stiffness"] == own.stiffness_nm_per_rad.value
-        assert made["armature"] == own.armature_kg_m2.value
+        assert made["stiffness"] == servos.stiffness[name] == own.stiffness_nm_per_rad.value
+        assert made["armature"] == servos.armature[name] == own.armature_kg_m2.value
         assert made["min_delay"] * 0.005 <= delays[name].low
         assert delays[name].high <= made["max_delay"] * 0.005
         assert made["max_delay"] - made["min_delay"] <= 2
     assert space["FEEDBACK"]["LF_hip"]["loss"] == calibration.joint("LF_hip").feedback.loss.value
     # the name of the torque limit is that of the release that is installed
     limits = [j.actuator.effort_limit_nm.value for j in calibration.joints.values()]
-    assert [made["effort_limit"] for made in recorder.made] == limits
-    newer = _Recorder(ISAACLAB_3)
-    executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", newer, monkeypatch)
-    assert [made["actuator_effort_limit"] for made in newer.made] == limits
+    assert list(servos.effort_limit.values()) == limits
+    newer = isaac_lab(text, monkeypatch, ISAACLAB_3)["ACTUATORS"]["servos"]
+    assert list(newer.actuator_effort_limit.values()) == limits
 
 
 def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibration, monkeypatch):
-    recorder = _Recorder(MJLAB)
-    text = to_mjlab(calibration, 0.005)
-    space = executed(text, "mjlab.actuator", "BuiltinPositionActuatorCfg", recorder, monkeypatch)
-    assert len(space["ACTUATORS"]) == 3
-    delays = delays_at_step(calibration, 0.005, MJLAB_PD)
-    for made, (name, joint) in zip(space["ACTUATORS"], calibration.joints.items(), strict=True):
+    space = mjlab(text_of(calibration, "mjlab"), monkeypatch)
+    delays = ExportedServos.of(calibration, 0.005).delays(BUILTIN_PD)
+    for made, (name, joint) in zip(
+        space["WHOLE_STEP_ACTUATORS"], calibration.joints.items(), strict=True
+    ):
         assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value / 0.005)
         assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
         assert made["frictionloss"] == joint.actuator.friction_loss_nm.value
@@ -226,12 +302,74 @@ def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibr
         assert low <= made["delay_min_lag"] <= high
 
 
+def walked_by_isaac_lab(space, calibration, commands: np.ndarray, step_s: float) -> np.ndarray:
+    """Positions under the class's torques, which act as PhysX applies them: over each step."""
+    names = calibration.joint_names
+    cfg = space["ACTUATORS"]["servos"]
+    actuator = space["CalibratedServo"](cfg, list(names), slice(None), 1, "cpu")
+    actuator.reset(None)
+    text = exported_text(calibration, "mjcf", step_s)[0]
+    model = in_free_air(re.sub("<actuator>.*</actuator>", "", text, flags=re.DOTALL), names)
+    data, moved = mujoco.MjData(model), []
+    for command in commands:
+        action = types.SimpleNamespace(joint_positions=torch.full((1, 3), command))
+        state = (torch.tensor(x, dtype=torch.float32)[None] for x in (data.qpos, data.qvel))
+        data.qfrc_applied[:] = actuator.compute(action, *state).joint_efforts[0].numpy()
+        mujoco.mj_step(model, data)
+        moved.append(data.qpos.copy())
+    return np.array(moved)
+
+
+def test_the_class_for_isaac_lab_moves_its_joints_as_the_calibration_does(calibration, monkeypatch):
+    step_s = 0.001
+    space = isaac_lab(text_of(calibration, "isaaclab", step_s), monkeypatch)
+    commands = held(walk_commands()[:75], step_s)
+    there = walked_by_isaac_lab(space, calibration, commands, step_s)
+    servo = calibration.delayed_pd(time_step_s=TIME_STEP_S)
+    servo.reset(np.zeros(3))
+    own = servo.rollout(np.repeat(held(walk_commands()[:75], TIME_STEP_S)[:, None], 3, axis=1))
+    apart = there[1::2] - own
+    assert np.sqrt(np.mean(apart**2)) < 3e-3  # 3 mrad: another step, an explicit PD
+
+
+def test_the_mjlab_class_builds_mujocos_servo(calibration, monkeypatch):
+    space = mjlab(text_of(calibration, "mjlab", TIME_STEP_S), monkeypatch)
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><default><joint damping="0.6" stiffness="3"/></default><worldbody>'
+        + "".join(
+            f'<body><joint name="robot/{n}"/><geom size="0.01"/></body>'
+            for n in calibration.joint_names
+        )
+        + "</worldbody></mujoco>"
+    )
+    (cfg,) = space["ACTUATORS"]
+    names = [f"robot/{n}" for n in calibration.joint_names]
+    assert all(re.fullmatch(e, n) for e, n in zip(cfg.target_names_expr, names, strict=True))
+    actuator = cfg.build(None, [0, 1, 2], names)
+    actuator.edit_spec(spec, names)
+    model = spec.compile()
+    own = [joint.actuator for joint in calibration.joints.values()]
+    pairs = {
+        "dof_armature": "armature_kg_m2", "dof_frictionloss": "friction_loss_nm",
+        "dof_damping": "back_emf_nm_s_per_rad",
+    }  # fmt: skip
+    for field, key in pairs.items():
+        np.testing.assert_allclose(getattr(model, field), [getattr(a, key).value for a in own])
+    np.testing.assert_array_equal(model.jnt_stiffness, 0)
+    np.testing.assert_allclose(
+        -model.actuator_biasprm[:, 1:3],
+        [(a.stiffness_nm_per_rad.value, a.damping_nm_s_per_rad.value) for a in own],
+    )
+    actuator.initialize(model, None, types.SimpleNamespace(nworld=2), "cpu")
+    rest = torch.full((2, 3), 0.3)
+    cmd = types.SimpleNamespace(position_target=torch.full((2, 3), 0.5), pos=rest)
+    assert torch.equal(actuator.compute(cmd), rest)  # the command is on its way
+
+
 def test_the_feedback_in_an_export_is_as_old_and_as_coarse_as_the_servos_say(
     calibration, monkeypatch
 ):
-    text = to_isaaclab(calibration, 0.005)
-    recorder = _Recorder(ISAACLAB)
-    space = executed(text, "isaaclab.actuators", "DelayedPDActuatorCfg", recorder, monkeypatch)
+    space = isaac_lab(text_of(calibration, "isaaclab"), monkeypatch)
     names, robots, step = ["LF_hip", "LF_calf"], 200, 0.002
     generator = torch.Generator().manual_seed(0)
     feedback = space["HeldFeedback"](space["FEEDBACK"], names, robots, step, generator=generator)
@@ -253,7 +391,7 @@ def test_the_feedback_in_an_export_is_as_old_and_as_coarse_as_the_servos_say(
 
 
 def test_the_json_export_holds_every_number_with_its_interval(calibration):
-    found = json.loads(to_json(calibration, 0.005))
+    found = json.loads(text_of(calibration, "json"))
     assert found["schema"] == "pupper-actuators" and found["physics_step_s"] == 0.005
     own = calibration.joint("LF_calf")
     there, stiffness = found["joints"]["LF_calf"], own.actuator.stiffness_nm_per_rad
@@ -263,9 +401,10 @@ def test_the_json_export_holds_every_number_with_its_interval(calibration):
 
 
 def test_every_export_says_where_its_numbers_come_from_and_a_wild_name_cannot_break_it(calibration):
-    for to in sorted(SIMULATORS):
+    for to in sorted(set(SIMULATORS) - {"isaaclab-bam"}):
         wild = calibration.model_copy(update={"robot": 'a"""b-->c & <d>\\'})
-        text = SIMULATORS[to](wild, 0.004)
+        text, servos = exported_text(wild, to, 0.004)
+        assert servos.sha256 in text
         assert calibration.inputs[0].sha256[:12] in text and "data sheet" in text
         if to == "mjcf":
             in_free_air(text, calibration.joint_names)
@@ -275,52 +414,37 @@ def test_every_export_says_where_its_numbers_come_from_and_a_wild_name_cannot_br
             assert ast.get_docstring(ast.parse(text))
 
 
-def test_newton_networks_give_the_effort_of_the_pd(calibration, tmp_path, capsys):
-    onnx = pytest.importorskip("onnx")
-    from onnx.reference import ReferenceEvaluator
-
-    folder = tmp_path / "newton"
-    arguments = ("export", CALIBRATED, "--to", "newton", "--out", folder)
-    code, _, err = run_program(capsys, pupper_sysid, *arguments)
-    assert code == 0, err
-    own = calibration.joint("LF_thigh").actuator
-    model = onnx.load(folder / "LF_thigh.onnx")
-    error, velocity = 0.02, -1.5
-    (effort,) = ReferenceEvaluator(model).run(
-        None, {"input": np.array([[error, velocity]], np.float32)}
-    )
-    expected = own.stiffness_nm_per_rad.value * error - own.damping_nm_s_per_rad.value * velocity
-    assert effort.shape == (1, 1) and effort[0, 0] == pytest.approx(expected, rel=1e-6)
-    contract = json.loads({p.key: p.value for p in model.metadata_props}["metadata"])
-    assert contract["input_order"] == "pos_vel" and contract["sample_dt_s"] == 0.005
-
-
-def test_the_newton_module_finds_joints_by_name_behind_a_free_base(
-    calibration, tmp_path, monkeypatch
-):
-    pytest.importorskip("onnx")
-    export_newton(calibration, 0.005, tmp_path)
-    names = types.ModuleType("newton.actuators")
-    names.ClampingMaxEffort, names.DriveNeuralMLP = "clamp", "mlp"  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "newton", types.ModuleType("newton"))
-    monkeypatch.setitem(sys.modules, "newton.actuators", names)
-    space = {"__file__": str(tmp_path / "newton_actuators.py")}
-    exec((tmp_path / "newton_actuators.py").read_text(), space)
+def test_the_newton_module_finds_joints_by_name_behind_a_free_base(calibration, monkeypatch):
+    modules(monkeypatch, warp={"to_torch": lambda a: a, "device_to_torch": lambda d: "cpu"})
+    space = executed(text_of(calibration, "newton"))
     labels = ["robot/base_freejoint", *(f"robot/base/{n}" for n in calibration.joint_names)]
-    added: list[dict[str, Any]] = []
+    attribute = types.SimpleNamespace(values=None)
     builder = types.SimpleNamespace(
         joint_label=labels, joint_qd_start=[0, 6, 7, 8], joint_q_start=[0, 7, 8, 9],
-        joint_armature=[0.0] * 9, joint_friction=[0.0] * 9, joint_damping=[0.0] * 9,
-        joint_target_ke=[1.0] * 9, joint_target_kd=[1.0] * 9,
-        add_actuator=lambda drive, **given: added.append(given),
+        custom_attributes={"mujoco:solreffriction": attribute},
+        **{
+            f"joint_{name}": [0.0] * 9
+            for name in (
+                "armature", "friction", "damping", "target_ke", "target_kd", "target_mode",
+            )
+        },
     )  # fmt: skip
-    space["add_actuators"](builder)  # type: ignore[operator]
-    assert [(a["index"], a["pos_index"]) for a in added] == [(6, 7), (7, 8), (8, 9)]
+    space["add_servos"](builder)
     own = calibration.joint("LF_hip").actuator
     assert builder.joint_armature[6] == own.armature_kg_m2.value
+    assert sorted(attribute.values) == [6, 7, 8]
+    servos = space["Servos"](builder, types.SimpleNamespace(device=None), num_worlds=2)
+    state = types.SimpleNamespace(joint_q=torch.full((20,), 0.3), joint_qd=torch.ones(18))
+    control = types.SimpleNamespace(joint_f=torch.zeros(18))
+    for _ in range(20):
+        servos.command(torch.full((2, 3), 0.33), state, control)
+    efforts = control.joint_f.view(2, 9)
+    wanted = own.stiffness_nm_per_rad.value * 0.03 - own.damping_nm_s_per_rad.value
+    assert torch.allclose(efforts[:, 6], torch.tensor(wanted), rtol=1e-4)
+    assert not efforts[:, :6].any()
     builder.joint_label = labels[:2]
     with pytest.raises(ValueError, match="joints are called"):
-        space["add_actuators"](builder)  # type: ignore[operator]
+        space["add_servos"](builder)
 
 
 def test_exports_are_written_by_name_and_never_over_something(capsys, tmp_path, monkeypatch):
@@ -358,7 +482,48 @@ def test_what_a_target_cannot_carry_of_a_servo_under_load_is_said_in_it(
     monkeypatch.chdir(tmp_path)
     for to in ("mjcf", "isaaclab", "mjlab", "newton"):
         run_program(capsys, pupper_sysid, "export", "xl330-m288", "--to", to, "--out", to)
-        made = tmp_path / to
-        files = made.rglob("*.py") if made.is_dir() else [made]
-        said = " ".join(" ".join(p.read_text().split()) for p in files)
+        said = " ".join((tmp_path / to).read_text().split())
         assert "not carried over: friction that grows with the motor's torque" in said, to
+
+
+def test_an_export_in_the_steps_of_its_fit_moves_as_the_calibration_does(calibration):
+    checked = check(ExportedServos.of(calibration, TIME_STEP_S))
+    for row in checked.joints.values():
+        assert row.tones_rad < 3e-5 and row.walk_rad < 3e-5 and row.reading_counts < 0.1
+    links = {name: 1e-4 for name in calibration.joint_names}
+    checked = check(ExportedServos.of(calibration, TIME_STEP_S, link_inertia=links))
+    assert max(row.walk_rad for row in checked.joints.values()) < 3e-5
+
+
+def test_whole_steps_cost_what_a_shift_of_the_tone_costs(calibration):
+    # half a step of 5 ms at most: 2.5 ms at 4 Hz are 63 mrad of phase of at most 0.3 rad
+    costs = ExportedServos.of(calibration, 0.005).whole_step_costs()
+    assert 0 < max(costs.values()) < 2 * np.pi * 4 * 0.0025 * 0.3 / np.sqrt(2)
+
+
+def test_a_calibration_exports_itself(calibration, tmp_path):
+    path = calibration.export("mjlab", tmp_path, physics_step_s=0.004)
+    assert path == tmp_path / "servos_mjlab.py" and "PHYSICS_DT = 0.004" in path.read_text()
+    assert calibration.export("json", tmp_path / "a.json").name == "a.json"
+
+
+def test_servos_under_load_become_isaac_labs_bam_models(monkeypatch, capsys):
+    card = load_calibration("sts3215-bam-m5")
+    cfg = _Recorder(
+        {"motor", "joint_names_expr", "kp_fw", "vin", "armature", "min_delay", "max_delay"}
+    )
+    modules(monkeypatch, isaaclab__actuators={"BamActuatorCfg": cfg, "BamMotorCfg": lambda **m: m})
+    space = executed(text_of(card, "isaaclab-bam"))
+    (servo,) = space["ACTUATORS"].values()
+    motor, published = servo["motor"], load_card("sts3215-bam-m5").as_published
+    assert motor["model"] == "m5" and servo["kp_fw"] == 32
+    # BAM limits the duty to 0.97; with a largest duty of 1 the supply is that much lower
+    stall = 0.97 * published["kt"] / published["R"] * 7.4
+    assert motor["kt"] / motor["resistance"] * servo["vin"] == pytest.approx(stall)
+    emf = published["kt"] ** 2 / published["R"]
+    assert motor["kt"] ** 2 / motor["resistance"] == pytest.approx(emf)
+    same = ("friction_base", "friction_viscous", "friction_stribeck", "load_friction_external")
+    assert [motor[n] for n in same] == pytest.approx([published[n] for n in same])
+    assert "not fitted under load" in refused(
+        capsys, pupper_sysid, "export", CALIBRATED, "--to", "isaaclab-bam"
+    )

@@ -93,6 +93,7 @@ def test_the_fit_is_as_good_as_the_readings_allow(result):
     assert scores.rmse_fresh_rad < result.candidate_models["pure_delay"].scores.rmse_fresh_rad
 
 
+@pytest.mark.slow
 def test_the_interval_of_a_fast_servo_ends_at_zero():
     trials = tone_trials(0.002, np.random.default_rng(2), (1.0, 3.0), period_s=0.0)
     dead_time = lag(recorded(trials, readings="live"))[JOINT].dead_time_s
@@ -114,6 +115,7 @@ def test_ratios_are_identified_and_torques_only_by_the_anchor(result):
     np.testing.assert_allclose(tracks[0], tracks[1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_speed_limit_that_was_never_reached_is_not_claimed():
     first = calibrate(servo_recording(2, (0.5, 1.5)), seed=5)[JOINT]  # 2.8 rad/s at most
     assert "velocity_limit_rad_s" in first.candidate_models["delayed_pd"].undecided
@@ -121,6 +123,7 @@ def test_a_speed_limit_that_was_never_reached_is_not_claimed():
     assert any("speed limit was not excited" in w for w in first.warnings)
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_finds_and_report_every_stage_of_a_joint_before_its_end():
     events: list[tuple[str, ...]] = []
     alone = calibrate(two_joints(), seed=5)

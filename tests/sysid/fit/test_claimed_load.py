@@ -53,19 +53,29 @@ def notes_of(recorded: tuple[Trial, ...]) -> tuple[str, ...]:
     return prepare_joint("knee", recorded, 0).load_notes
 
 
-@pytest.mark.parametrize("motion", ["steps", "chirp"])
-@pytest.mark.parametrize("servo", [STS3215, WEAK], ids=["STS3215", "weak"])
+SERVOS = {"STS3215": STS3215, "weak": WEAK}
+
+
+def servos_and_motions(quick: tuple[str, str]):
+    """Cases of both servos and both motions, one of them quick."""
+    cases = [(servo, motion) for servo in SERVOS for motion in ("steps", "chirp")]
+    return pytest.mark.parametrize(
+        ("servo", "motion"),
+        [c if c == quick else pytest.param(*c, marks=pytest.mark.slow) for c in cases],
+    )
+
+
+@servos_and_motions(("STS3215", "steps"))
 def test_a_pendulum_that_is_not_there_is_refused_in_a_sentence(servo, motion):
     with pytest.raises(InputError) as refused:
-        notes_of(trials(servo, None, PENDULUM, motion))
+        notes_of(trials(SERVOS[servo], None, PENDULUM, motion))
     for words in ("knee", "0.2 kg at 0.12 m", "shows none", "Take `loads` out"):
         assert words in str(refused.value)
 
 
-@pytest.mark.parametrize("motion", ["steps", "chirp"])
-@pytest.mark.parametrize("servo", [STS3215, WEAK], ids=["STS3215", "weak"])
+@servos_and_motions(("weak", "chirp"))
 def test_a_pendulum_that_is_there_is_accepted_without_a_note(servo, motion):
-    assert notes_of(trials(servo, PENDULUM, PENDULUM, motion)) == ()
+    assert notes_of(trials(SERVOS[servo], PENDULUM, PENDULUM, motion)) == ()
 
 
 def test_a_load_whose_weight_is_a_fraction_of_the_friction_is_not_refused():
@@ -81,16 +91,19 @@ def claiming(factor: float) -> tuple[Trial, ...]:
     return trials(STS3215, PENDULUM, claimed, model="STS3215", supply_voltage_v=7.4)
 
 
+@pytest.mark.slow
 def test_a_load_of_ten_times_the_claim_is_noted_where_the_servo_is_named():
     (note,) = notes_of(claiming(0.1))
     assert "too small" in note and "stall torque" in note
 
 
+@pytest.mark.slow
 def test_a_load_of_a_tenth_of_the_claim_is_refused_where_the_servo_is_named():
     with pytest.raises(InputError, match=r"2 kg at 0\.12 m.*is not there.*at most \d+ %"):
         notes_of(claiming(10.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [100, 800])
 def test_a_real_pendulum_is_accepted(gain):
     from pupper_sysid.sysid.recordings.files import load

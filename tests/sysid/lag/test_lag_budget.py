@@ -78,6 +78,7 @@ def test_no_lattice_is_claimed_where_readings_change_at_random():
     assert find_poll_lattice(trials, np.random.default_rng(0)).kind == "unresolved"
 
 
+@pytest.mark.slow
 def test_reads_that_are_answered_at_once_and_sometimes_lost_make_no_poll():
     rng = np.random.default_rng(11)
     trials = []

@@ -14,6 +14,7 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.ros import _by_joint, _log, _Topic
 from pupper_sysid.sysid.recordings.importers.ros_messages import (
     JOINT_STATE,
@@ -21,7 +22,6 @@ from pupper_sysid.sysid.recordings.importers.ros_messages import (
     TRAJECTORY,
     Message,
 )
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from pupper_sysid.sysid.recordings.recording import Recording
 
 ROWS = 60

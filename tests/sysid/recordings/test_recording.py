@@ -138,8 +138,6 @@ BAD = [
     (text_of([*rows()[:10], "0.5,0.5,0", *rows()[11:]]), "same number of values"),
     (text_of(rows(joint="LF_hipp")), "did you mean LF_hip"),
     (text_of(changed(3, "position_rad", '"0.1')), "line 7"),
-    (text_of([r.replace(",", ";") for r in rows()], HEADER.replace(",", ";")),
-     "separated by semicolons"),
     (text_of(changed(30, "frequency_hz", "2.0")), "its own trial number"),
     (text_of([*rows(trial="0.25"), *rows(trial="0.75")]),
      "column trial: trials are counted by whole numbers"),

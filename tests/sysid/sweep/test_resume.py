@@ -91,7 +91,7 @@ def test_a_finished_recording_is_not_continued(whole, capsys):
     before = whole.read_bytes()
     assert "nothing to continue" in refused(capsys, pupper_sysid, "sweep", "--resume", whole)
     assert whole.read_bytes() == before
-    asked = load(whole).metadata["sweep"]  # the header holds all that was asked for
+    asked = load(whole).metadata["sweep"]  # the header holds all options of the sweep
     assert asked["frequencies_hz"] == [2, 3, 5] and asked["joints"] == ["LF_hip"]
 
 

@@ -107,9 +107,9 @@ def test_logs_beyond_the_limits_are_refused_before_they_are_unpacked(tmp_path, m
     table().to_csv(tmp_path / "rows.csv", index=False)
     table().assign(time_s=1e12 * TIME).drop(columns="time").to_csv(tmp_path / "t.csv", index=False)
     importers = "pupper_sysid.sysid.recordings.importers"
-    monkeypatch.setattr(f"{importers}.numpy_file.LARGEST_BYTES", 500_000)
+    monkeypatch.setattr(f"{importers}.arrays.LARGEST_BYTES", 500_000)
     cases = [
-        ("log.json", "100,001 levels of nesting"), ("text.npz", "no column is a command"),
+        ("log.json", "100,001 levels of nesting"), ("text.npz", "column names but no rows"),
         ("bomb.npz", "unpacked, has 600,000 bytes; at most 500,000"),
         ("wide.csv", "3,001 columns; at most 2,000"), ("t.csv", "times reach"),
     ]  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from support.real_recordings import real_folder
 from support.refusals import assert_each_refused
 

@@ -10,8 +10,8 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.ros_messages import decode
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions
 from support.refusals import assert_each_refused
 
 writer = pytest.importorskip("mcap_ros2.writer")

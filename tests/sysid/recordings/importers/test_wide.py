@@ -7,8 +7,8 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.importers.recognise import logs_in
-from pupper_sysid.sysid.recordings.importers.shared.options import LogOptions, merged, read_mapping
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.package import ROOT
 from support.refusals import assert_each_refused
@@ -226,7 +226,7 @@ def test_tables_that_are_no_log_are_refused_with_the_way_out(tmp_path):
     alike = pd.DataFrame({"time": TIME, "a-b_command": 0.0, "a-b_position": 0.1,
                           "a b_command": 0.0, "a b_position": 0.1})  # fmt: skip
     cases = [
-        (degrees, "import --unit deg"), (file("imu.csv", imu), "IMU's readings"),
+        (degrees, "import deg.csv --unit deg"), (file("imu.csv", imu), "IMU's readings"),
         (file("up.csv", worded), "line 9, column knee_command: 'up' is not a number"),
         (file("alike.csv", alike), "two joints would be called a_b"),
     ]  # fmt: skip

@@ -1,14 +1,16 @@
-"""Emulated Feetech servos behind a pseudo-terminal: a serial device for any program.
+"""Emulated servos behind a pseudo-terminal: a serial device for any program.
 
 A pseudo-terminal has no baud rate of its own, so the server holds bytes back for as long as a real
 line would. It keeps one end open itself, or a client that closes would end it; an unplugged adapter
-is a terminal that goes away and comes back behind the same link.
+is a terminal that goes away and comes back behind the same link. A USB adapter collects bytes and
+delivers them with the ticks of its latency timer.
 """
 
 from __future__ import annotations
 
 import contextlib
 import heapq
+import math
 import os
 import pty
 import select
@@ -18,27 +20,43 @@ import time
 import tty
 from pathlib import Path
 
-from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.serial_line import LineEmulator
 
 _SPEEDS = {
     getattr(termios, f"B{rate}"): rate
-    for rate in (38_400, 57_600, 115_200, 230_400, 460_800, 500_000, 921_600, 1_000_000)
+    for rate in (
+        9_600,
+        19_200,
+        38_400,
+        57_600,
+        115_200,
+        230_400,
+        460_800,
+        500_000,
+        921_600,
+        1_000_000,
+        2_000_000,
+        3_000_000,
+        4_000_000,
+    )
 }
 _IDLE_S = 0.05
 
 
-class FeetechPty:
+class SerialPty:
     """Serves an emulator; `device` is what a client opens.
 
     Parameters
     ----------
-    emulator : FeetechEmulator
+    emulator : LineEmulator
     link : Path, optional
         A stable name for the device, which survives being unplugged.
+    latency_s : float
+        Period of the adapter's latency timer; 0 for an adapter that delivers at once.
     """
 
-    def __init__(self, emulator: FeetechEmulator, link: Path | None = None):
-        self.emulator, self._link = emulator, link
+    def __init__(self, emulator: LineEmulator, link: Path | None = None, latency_s: float = 0.0):
+        self.emulator, self._link, self.latency_s = emulator, link, latency_s
         self._stop = threading.Event()
         self._start = time.monotonic()
         self._due: list[tuple[float, int, bytes]] = []
@@ -63,7 +81,7 @@ class FeetechPty:
                 data = os.read(self._host, 4096)
                 for due, piece in self.emulator.receive(data, self.now(), self._baud()):
                     self._count += 1
-                    heapq.heappush(self._due, (due, self._count, piece))
+                    heapq.heappush(self._due, (self._delivered(due), self._count, piece))
 
     def stop(self) -> None:
         """End `serve`; may be called from anywhere."""
@@ -76,6 +94,12 @@ class FeetechPty:
                 os.close(descriptor)
         if self._link is not None:
             self._link.unlink(missing_ok=True)
+
+    def _delivered(self, due: float) -> float:
+        """When the adapter delivers bytes that it has at `due`: at the next tick of its timer."""
+        if not self.latency_s:
+            return due
+        return math.ceil(due / self.latency_s) * self.latency_s
 
     def _deliver(self) -> None:
         while self._due and self._due[0][0] <= self.now():

@@ -19,6 +19,7 @@ from pupper_sysid.common.strict_yaml import printable
 COUNT_RAD = 2 * np.pi / 4096
 """One count of an encoder with 4,096 a turn."""
 
+_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
 
@@ -96,8 +97,8 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     Parameters
     ----------
     text : str
-        `rad`; `deg`; `counts:4096` with the counts of a turn, half of which is 0 rad;
-        `percent:RANGE_RAD` of −100 … 100 over a range; `scale:RAD_PER_UNIT`.
+        `rad`, `mrad`, `deg` or `turns`; `counts:4096` with the counts of a turn, half of which is
+        0 rad; `percent:RANGE_RAD` of −100 … 100 over a range; `scale:RAD_PER_UNIT`.
     name : str
         Where it was given, for messages.
 
@@ -112,8 +113,8 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     (True, 2048.0, 0.02)
     """
     word, _, value = text.strip().partition(":")
-    if word in ("rad", "deg") and not value:
-        return Unit(1.0 if word == "rad" else np.pi / 180)
+    if word in _SCALES and not value:
+        return Unit(_SCALES[word])
     try:
         size = decimal(value)
     except ValueError:
@@ -123,6 +124,6 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     if word in ("percent", "scale") and 1e-9 <= abs(size) <= 1e3:
         return Unit(size / 200 if word == "percent" else size)
     raise InputError(
-        f"{name} is {printable(text)[:40]}. Write rad, deg, counts:4096 (counts of a turn), "
+        f"{name} is {printable(text)[:40]}. Write rad, deg, turns, counts:4096 (counts of a turn), "
         "percent:3.5 (rad that −100 … 100 span) or scale:0.01 (rad per unit of the log)."
     )

@@ -1,0 +1,389 @@
+"""Tables of text in any dialect, made one: commas between cells, points in numbers, names apart.
+
+Logs separate cells by tabs, runs of spaces or semicolons, write decimal commas, begin comments with
+`%`, name their columns in a comment or nowhere, have a row of units, or lines before the table.
+`plain` finds the dialect in the first lines and returns the text in the one that `csv_table`
+reads, line for line, so that messages keep the file's line numbers. A text in that dialect comes
+back as it is.
+
+The standard library's `csv` splits cells. The separator is the one by which most cells of the
+table become numbers (`csv.Sniffer` takes the decimal commas of `0,1;0,2` for separators).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.numbers import decimal
+
+_SAMPLE = 500_000  # characters that are looked at
+_SAMPLE_LINES = 400
+_ROWS = 100  # of the table, from which its shape is taken
+_SEPARATORS = ("\t", ";", ",", "|", " ")
+_NAMES_OF = {"\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces", ",": "commas"}
+_USUAL = 0.9  # share of ASCII in tables of numbers that are not in UTF-8
+_SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
+_COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
+_COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
+_UNIT = re.compile(
+    r"[(\[<{]?\s*(s|sec|seconds?|ms|us|µs|ns|rad|radians?|deg|degrees?|°|counts?|ticks?|raw|turns?|"
+    r"rev|v|volts?|a|amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm|-|1|none)"
+    r"\s*[)\]>}]?",
+    re.IGNORECASE,
+)
+_PAIR = re.compile(
+    r"(?<![\w\"'])([A-Za-z_][\w./]*)\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?![\w:])"
+)
+_STAMPED = re.compile(
+    r"^[ \t]*\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?"
+    r"[ \t]*(?:->|[|:])?[ \t]+(?=\S)",
+    re.MULTILINE,
+)
+_NUMBERS = re.compile(r"[\s,;]+")
+_LONGEST_LIST = 1000
+_LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A table of text in the dialect of `csv_table`.
+
+    Attributes
+    ----------
+    text : str
+        With as many lines as before.
+    columns : list of str, or None
+        Names of the columns where no row of `text` has them.
+    numbered : bool
+        Whether the file names no columns, so that they are numbered from 0.
+    notes : list of str
+        What was assumed, as sentences.
+    """
+
+    text: str
+    columns: list[str] | None = None
+    numbered: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """How the rows of a table are written."""
+
+    separator: str
+    comma: bool  # in numbers
+    columns: int
+    numeric: tuple[bool, ...]  # by column
+
+
+def plain(text: str) -> Plain:
+    """Text of a table in the dialect of `csv_table`; unchanged where no dialect is found."""
+    lines = text[:_SAMPLE].split("\n")
+    if len(text) > _SAMPLE:
+        lines.pop()
+    lines = lines[:_SAMPLE_LINES]
+    bare = [n for n, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
+    if bare and lines[bare[0]].lower().startswith("sep="):  # of spreadsheets
+        lines[bare[0]] = ""
+        bare.pop(0)
+    if len(bare) < 3:
+        return Plain(text)
+    rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
+    names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
+    if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
+        return _labelled(text, list(names[0]))
+    if all(_STAMPED.match(row) for row in rows):  # of a serial monitor
+        inner = _shape([_STAMPED.sub("", row) for row in rows])
+        separator = inner.separator if inner else ","
+        return plain(_STAMPED.sub(lambda m: m[1].replace(" ", "T") + separator, text))
+    if all(_LIST.search(row) for row in rows) and (flat := _unlisted(text, lines, bare, rows)):
+        return plain(flat)
+    shape = _shape(rows)
+    if shape is None:
+        return Plain(text)
+    return _rewritten(text, lines, bare, shape)
+
+
+def is_clock(cell: str) -> bool:
+    """Whether a cell is a time of day, with or without a date (ISO 8601)."""
+    return _CLOCK.fullmatch(cell.strip()) is not None
+
+
+def _shape(rows: Sequence[str]) -> _Shape | None:
+    """The way in which most cells of the rows are numbers."""
+    best, most = None, 0.0
+    for separator in _SEPARATORS:
+        split = [_split(row, separator) for row in rows]
+        columns = Counter(map(len, split)).most_common(1)[0][0]
+        cells = [row for row in split if len(row) == columns]
+        if columns < 2 or len(cells) < _SAME_SHAPE * len(split):
+            continue
+        quoted = any('"' in row for row in rows)
+        for comma in (False, True) if separator != "," or quoted else (False,):
+            shares = [
+                sum(_number(row[k], comma) for row in cells) / len(cells) for k in range(columns)
+            ]
+            if sum(shares) > most * columns:
+                most = sum(shares) / columns
+                filled = [any(row[k] for row in cells) for k in range(columns)]
+                numeric = tuple(s >= _NUMERIC and f for s, f in zip(shares, filled, strict=True))
+                best = _Shape(separator, comma, columns, numeric)
+    return best if best is not None and any(best.numeric) else None
+
+
+def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> Plain:
+    """The text of a table of this shape, its names apart."""
+    first = next((n for n in bare if _is_row(lines[n], shape)), None)
+    if first is None:
+        return Plain(text)
+    before = [n for n in bare if n < first]
+    notes, columns, units = [], None, []
+    if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
+        units = cells
+        before.pop()
+    if before:
+        columns = _names(lines[before[-1]], shape)
+        if columns is None or len(columns) != shape.columns:
+            if shape.separator == ",":  # its reader says which line has how many cells
+                return Plain(text)
+            columns = columns or [lines[before[-1]].strip()]
+    else:
+        comments = [line for line in lines[:first] if _COMMENT.match(line)]
+        columns = next((c for c in map(lambda x: _named_in(x, shape), comments[::-1]) if c), None)
+        if columns is not None:
+            notes.append("the names of its columns were taken from a comment")
+    while columns and len(before) > 1 and shape.separator != " " and not _distinct(columns):
+        above = _names(lines[before[-2]], shape)  # names in several lines, as of groups
+        if above is None or len(above) != shape.columns:
+            break
+        columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
+        lines[before.pop(-2)] = ""
+    plain_names = (
+        shape.separator == "," and len(before) == 1 and not units and not shape.comma
+        and columns == _split(lines[before[0]], ",")
+        and not any(_COMMENT.match(line) and line[:1] != "#" for line in lines)
+    )  # fmt: skip
+    if plain_names and columns and columns[-1]:
+        name = lines[before[-1]]
+        again = text.find(f"\n{name}\n", sum(len(line) + 1 for line in lines[:first]) - 1)
+        return Plain(text if again < 0 else text[:again] + _unnamed(text[again:], name))
+    numbered = columns is None
+    if columns is None:
+        columns = [str(k) for k in range(shape.columns)]
+    for k, word in enumerate(units):
+        if word and word not in ("-", "1"):
+            columns[k] = f"{columns[k]} [{word}]"
+    if units:
+        notes.append("the row below the names was taken for their units")
+    if len(before) > 1:
+        lines_above = f"{len(before) - 1} line{'s' if len(before) > 2 else ''}"
+        notes.append(f"{lines_above} above the names of the columns left out")
+    if shape.separator != ",":
+        notes.append(f"cells are separated by {_NAMES_OF[shape.separator]}")
+    if shape.comma:
+        notes.append("numbers have decimal commas")
+    start = sum(len(line) + 1 for line in text[:_SAMPLE].split("\n")[:first])
+    head = "\n".join(line if line[:1] == "#" else "" for line in lines[:first])
+    body = text[start:]
+    if before:
+        body = _unnamed(body, lines[before[-1]])
+    while columns and not columns[-1] and len(columns) > 2:  # each row ends with a separator
+        columns = columns[:-1]
+    trailing = shape.columns - len(columns)
+    body = _cells(body, shape, trailing)
+    return Plain(f"{head}\n{body}" if first else body, columns, numbered, _sentence(notes))
+
+
+def _unnamed(body: str, names: str) -> str:
+    """Rows without further lines of names, as appended passes have them."""
+    return re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
+
+
+def _cells(body: str, shape: _Shape, trailing: int) -> str:
+    """Rows with commas between cells and points in numbers."""
+    body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
+    quoted = '"' in body and (shape.separator != "," or shape.comma)
+    if quoted or (shape.separator != "," and "," in body and not shape.comma):
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        for line in body.split("\n"):
+            if line[:1] == "#" or not line.strip():
+                out.write(f"{line}\n")
+                continue
+            cells = _split(line, shape.separator)
+            writer.writerow([c.replace(",", ".") if _number(c, shape.comma) else c for c in cells])
+        body = out.getvalue().removesuffix("\n")
+    elif shape.separator != ",":
+        if shape.comma:
+            body = body.replace(",", ".")
+        if shape.separator == " ":
+            body = re.sub(r"^[ \t]+|[ \t]+$", "", body, flags=re.MULTILINE)
+            body = re.sub(r"[ \t]+", ",", body)
+        else:
+            body = body.replace(shape.separator, ",")
+    for _ in range(trailing):
+        body = re.sub(r",[ \t]*$", "", body, flags=re.MULTILINE)
+    return body
+
+
+def _labelled(text: str, columns: list[str]) -> Plain:
+    """Lines such as `t:0.1,cmd:0.3` (serial plotters, monitors) as rows; others are left empty."""
+    rows, others = [], 0
+    stamped = False
+    for line in text.split("\n"):
+        pairs = _PAIR.findall(line)
+        same = columns == [name for name, _ in pairs]
+        stamp = _STAMPED.match(line) if same else None
+        stamped = stamped or (stamp is not None and not rows)
+        cells = [value for _, value in pairs] if same else []
+        rows.append(",".join([stamp[1] if stamp else "", *cells] if stamped and same else cells))
+        others += not same and bool(line.strip())
+    notes = ["its lines are pairs of name and number"]
+    notes += [f"{others} other lines were left out"] if others else []
+    return Plain("\n".join(rows), ["time_of_day", *columns] if stamped else columns,
+                 notes=_sentence(notes))  # fmt: skip
+
+
+def _unlisted(text: str, lines: list[str], bare: list[int], rows: Sequence[str]) -> str | None:
+    """The text with a cell per number where a cell held a list (`"[0.1, 0.2]"`)."""
+
+    def count(found: re.Match[str]) -> str:
+        return f"@{len(_NUMBERS.split(found[1]))}"
+
+    counted = [_LIST.sub(count, row) for row in rows]
+    for separator in _SEPARATORS:
+        cells = _split(counted[0], separator)
+        names = _split(lines[bare[0]], separator)
+        alike = sum(_sizes(row, separator) == _sizes(counted[0], separator) for row in counted)
+        if len(cells) > 1 and len(names) == len(cells) and alike >= _SAME_SHAPE * len(rows):
+            break
+    else:
+        return None
+    wide = [
+        name if cell[:1] != "@" else separator.join(f"{name}.{k}" for k in range(int(cell[1:])))
+        for name, cell in zip(names, cells, strict=True)
+        if cell[:1] != "@" or int(cell[1:]) <= _LONGEST_LIST
+    ]
+    start = sum(len(line) + 1 for line in lines[: bare[0]])
+    head, body = text[:start], text[start + len(lines[bare[0]]) :]
+    body = _LIST.sub(lambda found: separator.join(_NUMBERS.split(found[1])), body)
+    return head + separator.join(wide) + body
+
+
+def _sizes(row: str, separator: str) -> list[str]:
+    """Cells of a row, those that are no lists left empty."""
+    return [cell if cell[:1] == "@" else "" for cell in _split(row, separator)]
+
+
+def _distinct(names: Sequence[str]) -> bool:
+    return all(names) and len(set(names)) == len(names)
+
+
+def _sentence(notes: Sequence[str]) -> list[str]:
+    return [f"read as a table: {'; '.join(notes)}."] if notes else []
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
+    try:
+        return [c.strip() for c in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:
+        return [cell.strip() for cell in line.split(separator)]
+
+
+def _number(cell: str, comma: bool) -> bool:
+    """Whether a cell of a table of numbers is one, empty, or a time of day."""
+    if comma and _COMMA_NUMBER.fullmatch(cell):
+        return True
+    try:
+        decimal(cell)
+    except ValueError:
+        return not cell or is_clock(cell)
+    return not (comma and "." in cell)
+
+
+def _is_row(line: str, shape: _Shape) -> bool:
+    """Whether a line is a row of the table rather than its names, units or a remark."""
+    cells = _split(line, shape.separator)
+    if len(cells) != shape.columns:
+        return False
+    full = [c for c, numeric in zip(cells, shape.numeric, strict=True) if numeric and c]
+    return bool(full) and sum(_number(c, shape.comma) for c in full) > len(full) / 2
+
+
+def _names(line: str, shape: _Shape) -> list[str] | None:
+    """Names of the columns in a line, whose separators may differ from those of the rows."""
+    tied = re.sub(r"\s+(?=[(\[])", "_", line.strip())  # time (s): a name and its unit
+    ways = [_split(line, shape.separator), _split(tied, shape.separator)]
+    ways += [
+        re.split(r"\s{2,}|\t", line.strip()),
+        _split(line, ","),
+        _split(line, ";"),
+        tied.split(),
+    ]
+    for cells in ways:
+        if len(cells) == shape.columns - 1 and not shape.numeric[-1]:
+            cells = [*cells, ""]
+        if len(cells) == shape.columns and not any(_is_decimal(c) for c in cells if c):
+            return cells
+    return ways[0] if len(ways[0]) > 1 else None
+
+
+def _named_in(comment: str, shape: _Shape) -> list[str] | None:
+    """Names of the columns in a comment; None if it has others, or none."""
+    text = re.sub(r"^[ \t]*(?:#|%|//|!)+[ \t]*", "", comment)
+    for part in (text, text.partition(":")[2]):
+        cells = _names(part, shape) if part.strip() else None
+        if cells is not None and len(cells) == shape.columns and len(set(cells)) == len(cells):
+            return cells
+    return None
+
+
+def _units(line: str, shape: _Shape) -> list[str]:
+    """Units of the columns in the line below their names; empty if it has none."""
+    cells = _split(line, shape.separator)
+    if len(cells) != shape.columns or not all(_UNIT.fullmatch(c) for c in cells if c):
+        return []
+    found = [c.strip("()[]<>{} ") for c in cells]
+    return found if sum(map(bool, found)) > 1 else []
+
+
+def _is_decimal(cell: str) -> bool:
+    try:
+        decimal(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def decoded(path: object, data: bytes) -> str:
+    """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252.
+
+    Raises
+    ------
+    InputError
+        If it is not text.
+    """
+    wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(data[:2])
+    if wide is None and b"\0" in data[:2]:
+        wide = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"
+    for coding in (wide,) if wide else ("utf-8-sig", "cp1252"):
+        try:
+            text = data.decode(coding)
+        except ValueError:
+            continue
+        head = text[:_SAMPLE]
+        usual = sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in head)
+        if "\0" not in text and (coding == "utf-8-sig" or usual > _USUAL * len(head)):
+            return text
+    raise InputError(f"{path} is not a text file. Give the log as it was written.")

@@ -1,0 +1,1 @@
+"""What serial servos of every vendor share: line, registers, opening, scan and bus."""

@@ -1,0 +1,571 @@
+"""A half-duplex serial line: the vendor's SDK sends the requests, replies are read here.
+
+The SDKs build and send every frame. Their ports and receivers are replaced, for faults that were
+measured: they wait 34 ms for a missing servo, take a late reply for the answer to the next request,
+stay "busy" after an error, take an adapter's echo for a reply, spin while they wait, and let two
+programs open one port. Here
+
+* every exchange has its own deadline, and ends as soon as all addressed servos have answered;
+* bytes that arrived before the request are discarded; a reply must have the requested length and
+  come from an addressed servo; two different replies of one servo count as none;
+* an adapter that echoes is detected when the port is opened, and its echo is removed;
+* an error of the port (unplugged) closes it; the next exchange tries to open it again.
+
+How long a reply may take is measured (`SerialLine.find`): a USB adapter holds bytes back for up to
+16 ms. The first requests go out without waiting for each reply, and replies are matched by their
+ids however late they come.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import serial
+
+from pupper_sysid.common.errors import BusError, MissingDevice
+from pupper_sysid.common.files import resolved
+
+try:
+    from termios import error as _TermiosError
+except ImportError:  # Windows
+    _TermiosError = OSError
+
+PORT_ERRORS = (OSError, serial.SerialException, _TermiosError)
+
+REPLY_TIMEOUT_S = 0.003
+"""Allowance for the host's own delays, beyond the time that bytes and servos need."""
+SLOWEST_ADAPTER_S = 0.06
+"""Longest latency that is waited for: three times the 16 ms of an FTDI's timer, and a margin."""
+SLOW_ADAPTER_S = 0.002
+"""Latency from which the adapter is named: half of it is in every reading's time."""
+
+_POLL_S = 0.001
+_PAUSE_S = 0.003
+_REOPEN_S = 0.01
+_ATTEMPTS = 4
+_MORE_PATIENCE = 10
+_MEASURED_ON = 4  # servos
+_GARBLED_AT_LEAST, _CONFIRMED_BY = 3, 6
+
+
+class Frame(Protocol):
+    """A reply as the line's reader gives it."""
+
+    @property
+    def id(self) -> int:
+        """Servo that sent it."""
+        ...
+
+    @property
+    def code(self) -> int:
+        """Error byte."""
+        ...
+
+    @property
+    def data(self) -> bytes:
+        """Parameters."""
+        ...
+
+
+class Reader(Protocol):
+    """Finds replies in a stream of bytes."""
+
+    rejected_bytes: int
+
+    def feed(self, data: bytes) -> Sequence[Frame]:
+        """Frames completed by `data`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Reply of a servo, with `time.monotonic()` around its own part of the exchange."""
+
+    frame: Frame
+    before_s: float
+    after_s: float
+
+
+class SerialLine:
+    """An open serial line of one vendor's servos; see the module's docstring.
+
+    Parameters
+    ----------
+    device : str
+        Serial port.
+    baud : int
+        Bits per second.
+    exclusive : bool
+        Whether to refuse a port that another program has open.
+
+    Attributes
+    ----------
+    latency_s : float
+        Time by which replies came later than bytes and servos need: the adapter's; 0 until `find`
+        has measured it.
+    patience_s : float
+        Time for which a reply is awaited beyond that.
+
+    Raises
+    ------
+    BusError
+        If the port cannot be opened or is in use, or the SDK is not installed.
+    """
+
+    reply_bytes: int
+    """Length of a reply without its data."""
+    longest_return_delay_s: float
+    """By which a servo may postpone its reply."""
+    model_bytes: int
+    """Data of the reply to `ask_model`; the first two are the model number."""
+    rates_in_words: str
+    """Rates that the SDK can set."""
+    _packets: Any
+    """The SDK's packet handler."""
+
+    def __init__(self, device: str, baud: int, exclusive: bool = True):
+        self.device, self.baud, self.echoes = device, baud, False
+        self.patience_s = REPLY_TIMEOUT_S
+        self.latency_s = 0.0
+        self.answered: Counter[int] = Counter()
+        """Replies by id, of exchanges with one servo."""
+        self.garbled: Counter[int] = Counter()
+        """Exchanges with one servo that gave bytes and no frame, or two different ones."""
+        self._port = self._new_port(device, baud, exclusive)
+        self._fastest_s: dict[tuple[int, int], float] = {}
+        self._retry_s = self._busy_s = 0.0
+        try:
+            self._port.openPort()
+        except PORT_ERRORS as error:
+            if not Path(device).exists():  # a wrong name, not a fault of the line
+                raise MissingDevice(_cannot_open(device, error)) from error
+            raise BusError(_cannot_open(device, error)) from error
+        # a USB adapter may collect bytes for 16 ms
+        self.patience_s += latency_timer_s(device) or 0.0
+
+    # ----- what a vendor's line adds
+
+    def _sdk(self) -> Any:
+        """The vendor's SDK.
+
+        Raises
+        ------
+        BusError
+            If it is not installed.
+        """
+        raise NotImplementedError
+
+    def _reader(self, accepted: Callable[[int, int], bool]) -> Reader:
+        """A reader of replies; `accepted(id, data length)` says which can occur."""
+        raise NotImplementedError
+
+    def _request(self, frame: Frame) -> bytes:
+        """Bytes that a request with the content of `frame` would have."""
+        raise NotImplementedError
+
+    def ask_model(self, servo: int) -> int:
+        """Send the request whose reply holds the model number; 0 if sent."""
+        raise NotImplementedError
+
+    def echo_probe(self) -> bytes:
+        """A request to which no servo answers."""
+        raise NotImplementedError
+
+    def ping(self, servo: int) -> Frame | None:
+        """Status frame of `servo`, or None if it does not answer."""
+        raise NotImplementedError
+
+    def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
+        """The same bytes of several servos with one request."""
+        raise NotImplementedError
+
+    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
+        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
+        raise NotImplementedError
+
+    def torque_off(self, servos: Sequence[int] | None = None) -> None:
+        """Switch the torque of these (default: all) off at once; unacknowledged."""
+        raise NotImplementedError
+
+    # ----- what all share
+
+    def read(self, servo: int, address: int, size: int) -> Reply | None:
+        """`size` bytes of the memory of `servo`, or None if they did not come complete."""
+        return self._exchange(
+            lambda: self._packets.readTx(self._port, servo, address, size), [servo], size
+        ).get(servo)
+
+    def write(self, servo: int, address: int, data: bytes) -> bool:
+        """Write to one servo; whether it acknowledged."""
+        sent = self._exchange(
+            lambda: self._packets.writeTxOnly(self._port, servo, address, len(data), list(data)),
+            [servo], 0,
+        )  # fmt: skip
+        return servo in sent
+
+    def detect_echo(self) -> bool:
+        """Whether the adapter echoes requests; the echo is removed from then on."""
+        request = self.echo_probe()
+        self.echoes = False
+        if not self._sent(lambda: self._send_raw(request)):
+            return False
+        self.echoes = self._arrived(len(request)).startswith(request)
+        return self.echoes
+
+    def roll_call(
+        self, servos: Iterable[int], advance: Callable[[int], None] = lambda servo: None
+    ) -> dict[int, tuple[int, float]]:
+        """Ask each servo for its model number, and collect the replies however late they come.
+
+        Requests go out as soon as a servo would have answered on a fast adapter, or earlier if it
+        did. Replies of a slow adapter arrive during later requests, and are matched by their ids.
+
+        Returns
+        -------
+        dict of int to (int, float)
+            By id: model number (its bytes as little endian), and the latency of its reply [s].
+        """
+        requests: dict[int, float] = {}
+        sent: set[bytes] = set()
+        models: dict[int, tuple[int, float]] = {}
+        reader = self._reader(lambda servo, size: servo in requests and size == self.model_bytes)
+        wire = (self.model_bytes + self.reply_bytes) * self._byte_s()
+        pause_s = _PAUSE_S + self.longest_return_delay_s
+
+        def collect(until_s: float, servo: int | None) -> None:
+            with contextlib.suppress(*PORT_ERRORS):
+                while time.monotonic() < until_s and servo not in models:
+                    for frame in reader.feed(self._port.read_some()):
+                        if self._request(frame) in sent:
+                            self.echoes = True  # of a slow adapter, too late for `detect_echo`
+                            continue
+                        model = int.from_bytes(frame.data[:2], "little")
+                        late_s = time.monotonic() - requests[frame.id]
+                        models.setdefault(frame.id, (model, max(late_s, 0.0)))
+
+        for servo in servos:
+            advance(servo)
+            if not self._sent(lambda servo=servo: self.ask_model(servo)):
+                continue
+            self._port.keeps_old = True  # until all have been asked
+            sent.add(self._port.sent)
+            need_s = len(self._port.sent) * self._byte_s() + wire
+            requests[servo] = time.monotonic() + need_s
+            collect(requests[servo] + pause_s, servo)
+        waiting = [servo for servo in requests if servo not in models]
+        if waiting:
+            last_s = requests[waiting[-1]] + max(self.patience_s, SLOWEST_ADAPTER_S)
+            while time.monotonic() < last_s and any(servo not in models for servo in waiting):
+                collect(min(last_s, time.monotonic() + 0.005), None)
+        self._port.keeps_old = False
+        return models
+
+    def find(self, servos: Sequence[int], patiently: bool = True) -> dict[int, int]:
+        """Those of `servos` that answer, with their model numbers; measures the latency.
+
+        All are asked once (`roll_call`). Silent ones are asked again with the patience that the
+        replies show to be needed, and once more with ten times that; not `patiently`, by another
+        roll call only.
+        """
+        servos = list(servos)
+        models = {servo: model for servo, (model, _) in self.roll_call(servos).items()}
+        self._measure_latency([servo for servo in servos if servo in models])
+        if models and not patiently:
+            silent = [servo for servo in servos if servo not in models]
+            models |= {servo: model for servo, (model, _) in self.roll_call(silent).items()}
+            return {servo: models[servo] for servo in servos if servo in models}
+        usual_s = self.patience_s
+        # a first frame can be lost to earlier bytes on the line
+        rounds = [usual_s] * (_ATTEMPTS - 1)
+        rounds.append(max(usual_s, min(_MORE_PATIENCE * usual_s, SLOWEST_ADAPTER_S)))
+        if not models and len(servos) > _ATTEMPTS:
+            rounds = rounds[:1]  # a silent line or the wrong rate
+        for patience_s in rounds:
+            self.patience_s = patience_s
+            for servo in servos:
+                if servo not in models and (model := self.model(servo)) is not None:
+                    models[servo] = model
+        self.patience_s = usual_s
+        return {servo: models[servo] for servo in servos if servo in models}
+
+    def model(self, servo: int) -> int | None:
+        """Model number of `servo`, its bytes as little endian; None if it does not answer."""
+        reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes)
+        return int.from_bytes(reply[servo].frame.data[:2], "little") if servo in reply else None
+
+    def doubled(self, servos: Sequence[int], address: int, size: int) -> list[int]:
+        """Ids whose replies are garbled while those of the other ids are clean.
+
+        Two servos of one id answer at the same time, and destroy each other's replies. Suspects are
+        read again, patiently: a late or half reply is no sign of a second servo.
+
+        Parameters
+        ----------
+        servos : sequence of int
+        address, size : int
+            Registers in which two servos differ: their positions.
+        """
+        suspects = [servo for servo in servos if self.garbled[servo] >= _GARBLED_AT_LEAST]
+        others = [servo for servo in servos if servo not in suspects]
+        noisy = sum(self.garbled[servo] for servo in others)
+        if noisy > sum(self.answered[servo] for servo in others) / 20:
+            return []
+        usual_s, self.patience_s = self.patience_s, max(self.patience_s, SLOWEST_ADAPTER_S)
+        doubled = []
+        for servo in suspects:
+            before = self.garbled[servo]
+            for _ in range(_CONFIRMED_BY):
+                self._arrived(_CONFIRMED_BY * self.reply_bytes)  # what is late, to be discarded
+                self.read(servo, address, size)
+            if self.garbled[servo] - before >= _CONFIRMED_BY / 2:
+                doubled.append(servo)
+        self.patience_s = usual_s
+        return doubled
+
+    def close(self) -> None:
+        """Release the port; may be called twice."""
+        self._retry_s = float("inf")
+        with contextlib.suppress(*PORT_ERRORS):
+            self._port.shut()
+
+    def _measure_latency(self, servos: Sequence[int]) -> None:
+        """Latency of replies to requests that follow each other; sets the patience.
+
+        An adapter's timer runs freely, so a single reply may come early in its period: the next
+        request right after a reply waits for a whole one.
+        """
+        usual_s, late_s = self.patience_s, []
+        self.patience_s = max(usual_s, SLOWEST_ADAPTER_S)
+        wire = (self.model_bytes + self.reply_bytes) * self._byte_s()
+        for servo in list(servos[:_MEASURED_ON]) * 2:
+            before = time.monotonic()
+            if self.model(servo) is not None:
+                need_s = len(self._port.sent) * self._byte_s() + wire
+                late_s.append(max(time.monotonic() - before - need_s, 0.0))
+        self.patience_s = usual_s
+        if late_s:
+            self.latency_s = sorted(late_s)[len(late_s) // 2]
+            # a free-running timer delivers up to a whole period later
+            self.patience_s = max(usual_s, 1.5 * max(late_s) + 0.002)
+
+    def _byte_s(self) -> float:
+        return 10.0 / self.baud
+
+    def _drop_port(self) -> None:
+        with contextlib.suppress(*PORT_ERRORS):
+            self._port.shut()
+        self._port.is_open = False
+
+    def _arrived(self, count: int) -> bytes:
+        """About `count` bytes, as far as they arrive in time."""
+        until, got = time.monotonic() + 2 * count * self._byte_s() + self.patience_s, b""
+        with contextlib.suppress(*PORT_ERRORS):
+            while len(got) < count and time.monotonic() < until:
+                got += self._port.read_some()
+        return got
+
+    def _send_raw(self, packet: bytes) -> int:
+        self._port.clearPort()
+        self._port.writePort(packet)
+        return 0
+
+    def _sent(self, send: Callable[[], int]) -> bool:
+        """Send; whether that succeeded. Opens the port again if it was lost."""
+        port = self._port
+        try:
+            if not port.is_open:
+                if time.monotonic() < self._retry_s:
+                    return False
+                self._retry_s = time.monotonic() + _REOPEN_S
+                port.openPort()
+            return send() == 0
+        except PORT_ERRORS:
+            self._drop_port()
+            return False
+        finally:
+            port.is_using = False  # the SDK leaves it set after an error
+
+    def _sync_written(self, send: Callable[[], int]) -> float:
+        """Send a request without replies; see `sync_write`."""
+        before = time.monotonic()
+        ok = self._sent(send)
+        # the port accepts the bytes at once; the wire takes longer
+        self._busy_s = before + len(self._port.sent) * self._byte_s()
+        if ok and self.echoes:  # or the echo would come between the next request and its reply
+            self._arrived(len(self._port.sent))
+        return before if ok else float("nan")
+
+    def _exchange(
+        self, send: Callable[[], int], servos: Sequence[int], size: int
+    ) -> dict[int, Reply]:
+        """Send, and collect one reply of `size` parameter bytes from each of `servos`."""
+        before = time.monotonic()
+        if not self._sent(send):
+            return {}
+        asked = len(self._port.sent)
+        wanted = set(servos)
+        reader = self._reader(lambda servo, length: servo in wanted and length == size)
+        wire = (asked + len(servos) * (size + self.reply_bytes)) * self._byte_s()
+        deadline = max(before, self._busy_s) + wire + self.patience_s
+        deadline += len(servos) * self.longest_return_delay_s
+        owed = self._port.sent if self.echoes else b""
+        replies: dict[int, tuple[Frame, float]] = {}
+        contradicted: set[int] = set()
+        arrived = b""
+        try:
+            while len(replies) < len(wanted) and time.monotonic() < deadline:
+                data = self._port.read_some()
+                if owed:
+                    data, owed = _strip(data, owed)
+                arrived += data
+                for frame in reader.feed(data):
+                    first = replies.setdefault(frame.id, (frame, time.monotonic()))
+                    if first[0] != frame:
+                        contradicted.add(frame.id)
+        except PORT_ERRORS:
+            self._drop_port()
+        if len(servos) == 1 and arrived:
+            self._count(servos[0], arrived, bool(replies), bool(contradicted), reader)
+        # replies come evenly, in the order of the request; the host's buffers blur each arrival
+        begin = max(before, self._busy_s) + asked * self._byte_s()
+        last = max((k for k, servo in enumerate(servos) if servo in replies), default=0)
+        after = max((at for _, at in replies.values()), default=begin)
+        share = max(after - begin, 0.0) / (last + 1)
+        # what exceeds the fastest exchange of this kind was spent on the way back to this program
+        kind = size, len(servos)
+        if len(replies) == len(wanted):
+            self._fastest_s[kind] = min(share, self._fastest_s.get(kind, share))
+        share = min(share, self._fastest_s.get(kind, share))
+        return {
+            servo: Reply(replies[servo][0], begin + k * share, begin + (k + 1) * share)
+            for k, servo in enumerate(servos)
+            if servo in replies and servo not in contradicted
+        }
+
+    def _count(
+        self, servo: int, arrived: bytes, replied: bool, contradicted: bool, reader: Reader
+    ) -> None:
+        """Count a reply, or what is no reply at all; a late reply to another request is neither."""
+        if replied and not contradicted and not reader.rejected_bytes:
+            self.answered[servo] += 1
+        elif contradicted or not self._reader(lambda servo, size: True).feed(arrived):
+            self.garbled[servo] += 1
+
+    def _new_port(self, device: str, baud: int, exclusive: bool) -> Any:
+        """Port of the SDK, without busy waiting.
+
+        Raises
+        ------
+        BusError
+            If the SDK cannot set the rate.
+        """
+
+        class Port(self._sdk().PortHandler):
+            """Exclusive; sleeps while it waits; discards old bytes before it sends."""
+
+            def __init__(self) -> None:
+                super().__init__(device)
+                self.sent = b""
+                self.keeps_old = False
+
+            def setupPort(self, cflag_baud: int) -> bool:
+                self.shut()
+                # an exclusive lock: two programs on one line would destroy each other's frames
+                self.ser = serial.Serial(
+                    self.port_name, cflag_baud, timeout=_POLL_S, write_timeout=0.5,
+                    exclusive=exclusive,
+                )  # fmt: skip
+                # some adapters and an emulated line do not have it
+                with contextlib.suppress(ValueError, NotImplementedError, *PORT_ERRORS):
+                    self.ser.set_low_latency_mode(True)
+                self.is_open = True
+                self.clearPort()
+                return True
+
+            def clearPort(self) -> None:
+                if not self.keeps_old:
+                    self.ser.reset_input_buffer()
+
+            def writePort(self, packet: Any) -> int:
+                self.sent = bytes(packet)
+                return self.ser.write(self.sent) or 0
+
+            def setPacketTimeout(self, packet_length: int) -> None:
+                """Without effect: each exchange of `SerialLine` has its own deadline."""
+
+            def read_some(self) -> bytes:
+                """Bytes that have arrived, or arrive within a millisecond."""
+                return self.ser.read(max(1, self.ser.in_waiting))
+
+            def shut(self) -> None:
+                """Close if open."""
+                if self.is_open and self.ser is not None:
+                    self.is_open = False
+                    self.ser.close()
+
+        port = Port()
+        if port.getCFlagBaud(baud) < 0:
+            raise BusError(
+                f"{device}: {baud} baud is not possible with this SDK. Use {self.rates_in_words}."
+            )
+        port.baudrate = baud
+        return port
+
+
+def latency_timer_s(device: str) -> float | None:
+    """Latency timer of a USB adapter [s]; None where it has none or it cannot be read."""
+    try:
+        return float(_latency_timer(device).read_text()) / 1e3
+    except (OSError, ValueError):
+        return None
+
+
+def slow_adapter(line: SerialLine) -> str | None:
+    """Sentence about an adapter that delays replies, with the cure; None if it is fast."""
+    if line.latency_s < SLOW_ADAPTER_S:
+        return None
+    said = (
+        f"{line.device}: replies come {1e3 * line.latency_s:.0f} ms later than bytes and servos "
+        "need, so every reading's time is uncertain by half of that and a loop can be no faster."
+    )
+    timer_s = latency_timer_s(line.device)
+    if timer_s is None:
+        return f"{said} The USB adapter collects bytes; another adapter, or its driver, cures it."
+    return (
+        f"{said} The adapter's latency timer is {1e3 * timer_s:.0f} ms: "
+        f"`echo 1 | sudo tee {_latency_timer(line.device)}`."
+    )
+
+
+def _latency_timer(device: str) -> Path:
+    return Path("/sys/class/tty") / resolved(Path(device)).name / "device" / "latency_timer"
+
+
+def _strip(data: bytes, owed: bytes) -> tuple[bytes, bytes]:
+    """Remove the echo that is still expected from the front of `data`."""
+    n = min(len(data), len(owed))
+    if data[:n] == owed[:n]:
+        return data[n:], owed[n:]
+    return data, b""  # no echo: the checksums of the frames decide
+
+
+def _cannot_open(device: str, error: BaseException) -> str:
+    text = str(error).lower()
+    if "permission denied" in text:
+        hint = "You may not use it: add yourself to the group dialout and log in again."
+    elif "exclusively" in text or "busy" in text or "resource temporarily" in text:
+        hint = "Another program has it open; stop that first, only one may command the servos."
+    elif not Path(device).exists():
+        hint = (
+            "There is no such device: check the cable and the name; `pupper-sysid scan` lists the "
+            "serial ports (a USB adapter is /dev/ttyUSB0 or /dev/ttyACM0)."
+        )
+    else:
+        hint = "Check the cable and the name."
+    return f"{device} cannot be opened. {hint} ({error})"

@@ -1,0 +1,198 @@
+"""Scan of a serial line: ask every id and read the servos that answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.serial_servos.line import SerialLine, slow_adapter
+from pupper_sysid.hardware.serial_servos.opening import ids_in_words, rates_in_words
+from pupper_sysid.hardware.serial_servos.series import Family, bits_in_words
+from pupper_sysid.hardware.serial_servos.settings import (
+    GAINS,
+    memory_of,
+    register_faults,
+    registers_of,
+    return_delay_s,
+)
+
+_USUAL_IDS = tuple(range(31))
+_SLOW_RETURN_S = 1e-4
+
+
+@dataclass(frozen=True)
+class ServoReport:
+    """State and settings of one servo; None where its model is unknown or a read failed."""
+
+    id: int
+    model: str
+    """Name, or "unknown (number)"."""
+    errors: str
+    """Error bits in words."""
+    baud: int = 0
+    firmware: str | None = None
+    voltage_v: float | None = None
+    temperature_c: float | None = None
+    count: int | None = None
+    """Present position."""
+    limits: tuple[int, int] | None = None
+    """Angle limits in its EEPROM [counts]."""
+    gains: tuple[int, ...] | None = None
+    """P, D, I."""
+    return_delay_us: int | None = None
+    faults: tuple[str, ...] = ()
+    """Registers with which it would not be driven, and others that shape its motion."""
+
+
+@dataclass(frozen=True)
+class LineReport:
+    """What answers on one line."""
+
+    family: str
+    device: str
+    baud: int
+    """Rate of the first servo."""
+    servos: list[ServoReport]
+    remarks: list[str] = field(default_factory=list)
+    """About the line."""
+
+
+def scan_line(
+    family: Family,
+    device: str,
+    baud: int | None,
+    advance: Callable[[str], None] = lambda what: None,
+    every_id: bool = True,
+) -> LineReport:
+    """Servos of a line, at all rates; `advance` is called with each rate tried, in words.
+
+    Every id is asked until a rate with servos is found; at the remaining rates the ids that robots
+    use. Silent ids are asked again where servos answer, and gaps between ids a third time.
+
+    Raises
+    ------
+    BusError
+        If the port cannot be opened or no servo answers.
+    """
+    servos: list[ServoReport] = []
+    remarks: list[str] = []
+    first = 0
+    for rate in family.rates if baud is None else (baud,):
+        advance(f"{family.name} at {rate} baud")
+        line = family.open_line(device, rate, True)
+        try:
+            line.detect_echo()
+            whole = every_id and not servos
+            answering = _answering(line, range(family.highest_id + 1) if whole else _USUAL_IDS)
+            if not answering:
+                continue
+            first = first or rate
+            servos += [_report(family, line, servo, model) for servo, model in answering.items()]
+            remarks += _doubled(family, line, answering)
+            if slow := slow_adapter(line):
+                remarks.append(slow)
+        finally:
+            line.close()
+    if not servos:
+        raise BusError(
+            f"{device}: no servo answers at {rates_in_words(family, baud)} baud. Check that the "
+            "servos have power and the data line is connected."
+        )
+    rates = sorted({servo.baud for servo in servos})
+    if len(rates) > 1:
+        remarks.append(
+            f"{device}: servos of different rates ({', '.join(map(str, rates))} baud) share the "
+            f"line, and one program uses one rate. Set one rate with {family.tool}."
+        )
+    elif baud is None:
+        tried = ", ".join(str(rate) for rate in family.rates if rate not in rates)
+        remarks.append(
+            f"At the other rates ({tried} baud) none of the ids {ids_in_words(_USUAL_IDS)} answers."
+        )
+    remarks += _slow_returns(servos)
+    return LineReport(family.name, device, first, servos, remarks)
+
+
+def _answering(line: SerialLine, ids: range | tuple[int, ...]) -> dict[int, int]:
+    """Ids that answer, and their model numbers."""
+    models = {servo: model for servo, (model, _) in line.roll_call(ids).items()}
+    if not models:
+        return {}
+    silent = [servo for servo in ids if servo not in models]
+    models |= {servo: model for servo, (model, _) in line.roll_call(silent).items()}
+    gaps = [i for i in range(1, max(models) + 2) if i not in models]
+    models |= line.find([*models, *gaps[:30]])
+    return dict(sorted(models.items()))
+
+
+def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoReport:
+    series = family.series.get(model)
+    if series is None:
+        return ServoReport(servo, f"unknown ({model})", "", line.baud)
+    reply = line.read(servo, series.register(family.present).address, family.reading_bytes[0])
+    errors = bits_in_words(reply.frame.code, family.error_bits) if reply else ""
+    memory = memory_of(line, servo, family.memory_pieces)
+    if memory is None:
+        return ServoReport(servo, series.name, errors, line.baud)
+    registers = registers_of(series, memory)
+
+    def value(name: str) -> int:
+        return registers[series.name_of(name)]
+
+    firmware = registers.get("firmware", None)
+    # without a joint map any limits fit
+    low, high = value("min_angle"), value("max_angle")
+    inside = (low, high) if 0 <= low < high else (0, series.counts - 1)
+    faults = register_faults(family, series, registers, inside)
+    delay_s = return_delay_s(family, {"registers": registers})
+    return ServoReport(
+        servo,
+        series.name,
+        errors,
+        line.baud,
+        str(firmware)
+        if firmware is not None
+        else f"{value('firmware_major')}.{value('firmware_minor')}",
+        round(value("present_voltage") * family.volt_scale, 1),
+        float(value("present_temperature")),
+        value("present_position"),
+        (low, high),
+        tuple(value(GAINS[key]) for key in ("p_gain", "d_gain", "i_gain")),
+        round(1e6 * delay_s),
+        tuple(fault.sentence(f"id {servo}", series) for fault in faults),
+    )
+
+
+def _doubled(family: Family, line: SerialLine, answering: dict[int, int]) -> list[str]:
+    """Sentences about ids that two servos have."""
+    series = next((family.series[m] for m in answering.values() if m in family.series), None)
+    if series is None:
+        return []
+    where = series.register(family.present).address
+    ids = line.doubled(list({*answering, *line.garbled}), where, family.reading_bytes[0])
+    return [two_of_one_id(line, servo) for servo in ids]
+
+
+def two_of_one_id(line: SerialLine, servo: int) -> str:
+    """Sentence about an id that two servos have."""
+    total = line.garbled[servo] + line.answered[servo]
+    return (
+        f"{line.device}: two servos probably have the id {servo} (register id): "
+        f"{line.garbled[servo]} of {total} replies there were garbled, and those of other ids were "
+        "not. Connect one of them alone and give it another id."
+    )
+
+
+def _slow_returns(servos: list[ServoReport]) -> list[str]:
+    slow = [
+        s
+        for s in servos
+        if s.return_delay_us is not None and s.return_delay_us > 1e6 * _SLOW_RETURN_S
+    ]
+    if not slow:
+        return []
+    return [
+        f"Servos {', '.join(str(s.id) for s in slow)} have a return delay (servo {slow[0].id}: "
+        f"{slow[0].return_delay_us} µs); 0 would make reading faster."
+    ]

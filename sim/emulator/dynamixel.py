@@ -1,0 +1,260 @@
+"""Emulated Dynamixel servos: protocol 2.0 byte by byte, with status errors, alerts and watchdog.
+
+What does not depend on the vendor is in `sim.emulator.serial_line`. A servo answers a frame with a
+wrong CRC, an unknown instruction, or a value that it refuses with the error number of the manual,
+and sets the alert bit while `hardware_error_status` is not 0. Its bus watchdog stops it if no
+request comes for as long as the register says.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from pupper_sysid.hardware.dynamixel import registers as table
+from pupper_sysid.hardware.dynamixel.bus import FAMILY
+from pupper_sysid.hardware.dynamixel.frames import Frame, FrameReader
+from pupper_sysid.hardware.dynamixel.registers import (
+    ACTION,
+    ALERT,
+    BAUD_RATES,
+    BROADCAST_ID,
+    PING,
+    READ,
+    REBOOT,
+    REG_WRITE,
+    SYNC_READ,
+    SYNC_WRITE,
+    TRIGGERED,
+    WATCHDOG_UNIT_S,
+    WRITE,
+)
+from pupper_sysid.sim.emulator.serial_line import LineEmulator, Pieces
+from pupper_sysid.sim.emulator.servos.loops import DYNAMIXEL_GAINS
+
+_COMMON = {
+    "firmware": 46, "return_delay_time": 250, "drive_mode": 0, "operating_mode": 3,
+    "secondary_id": 255, "moving_threshold": 10, "pwm_limit": 885, "max_position_limit": 4095,
+    "min_position_limit": 0, "shutdown": 52, "status_return_level": 2, "goal_pwm": 885,
+}  # fmt: skip
+_SMALL = {
+    "temperature_limit": 70, "max_voltage_limit": 70, "min_voltage_limit": 35,
+    "current_limit": 1750, "velocity_limit": 445,
+}  # fmt: skip
+_LARGE = {
+    "temperature_limit": 80, "max_voltage_limit": 160, "min_voltage_limit": 95,
+    "current_limit": 1193, "velocity_limit": 200,
+}  # fmt: skip
+_XL430 = {"min_voltage_limit": 60, "max_voltage_limit": 140, "temperature_limit": 72}
+
+
+def _factory(name: str) -> dict[str, int]:
+    own = _COMMON | (_SMALL if name.startswith(("XL330", "XC330")) else _LARGE)
+    p, i, d = DYNAMIXEL_GAINS.get(name, (800, 0, 0))
+    gains = {"position_p_gain": p, "position_i_gain": i, "position_d_gain": d}
+    return own | (_XL430 if name == "XL430-W250" else {}) | gains
+
+
+_CHOICES = {
+    "operating_mode": {0, 1, 3, 4, 5, 16}, "status_return_level": {0, 1, 2},
+    "torque_enable": {0, 1}, "baud_rate": set(range(len(BAUD_RATES))),
+}  # fmt: skip
+_READ_ONLY = {
+    "model_number", "firmware", "moving", "hardware_error_status", "present_pwm",
+    "present_current", "present_velocity", "present_position", "present_input_voltage",
+    "present_temperature",
+}  # fmt: skip
+
+
+class DynamixelEmulator(LineEmulator):
+    """A line of Dynamixel servos; parameters are those of `LineEmulator`."""
+
+    family = FAMILY
+    memory_bytes = table.MEMORY_BYTES
+    factory: ClassVar = {name: _factory(name) for name in table.MODELS.values()}
+
+    def _new_reader(self) -> FrameReader:
+        return FrameReader()
+
+    def _baud_register(self, baud: int) -> dict[str, int]:
+        return {"baud_rate": BAUD_RATES.index(baud)}
+
+    def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
+        return Frame(servo_id, error, data, is_status=True).encode()
+
+    def _write_request(self, servo_id: int, address: int, data: bytes) -> bytes:
+        return Frame(servo_id, WRITE, address.to_bytes(2, "little") + data).encode()
+
+    def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
+        """See `LineEmulator.receive`; time in which nobody spoke is looked at first."""
+        for servo_id in self.servos:
+            self._watch(servo_id, max(now, self._free_at))
+        pieces = super().receive(data, now, baud)
+        for servo_id in self._reader.crc_errors:
+            if servo_id in self.servos:
+                byte_s = 10.0 / (
+                    self.baud if baud is None or baud <= 0 else baud
+                )  # 0: without a name
+                pieces += self._answer(servo_id, 0, 0, byte_s, table.CRC)
+        self._reader.crc_errors.clear()
+        return pieces
+
+    def _execute(self, frame: Frame, byte_s: float) -> Pieces:
+        at, params = self._free_at, frame.data
+        for servo_id in self.servos if frame.id == BROADCAST_ID else (frame.id,):
+            if servo_id in self.servos:
+                self.servos[servo_id].heard_s = at
+        if frame.code in (SYNC_READ, SYNC_WRITE):
+            return self._sync(frame, byte_s)
+        if frame.id == BROADCAST_ID:
+            pieces: Pieces = []
+            for servo_id in sorted(self.servos):
+                reply = self._instruct(servo_id, frame, at, byte_s)
+                pieces += reply if frame.code == PING else []
+            return pieces
+        if frame.id not in self.servos:
+            return []
+        return self._instruct(frame.id, Frame(frame.id, frame.code, params), at, byte_s)
+
+    def _sync(self, frame: Frame, byte_s: float) -> Pieces:
+        params, pieces = frame.data, []
+        if len(params) < 5 or frame.id != BROADCAST_ID:
+            return []
+        address, size = (int.from_bytes(params[k : k + 2], "little") for k in (0, 2))
+        rest = params[4:]
+        if frame.code == SYNC_READ:
+            for servo_id in rest:
+                if servo_id in self.servos and self._level(servo_id) >= 1:
+                    error = 0 if address + size <= self.memory_bytes else table.ACCESS
+                    pieces += self._answer(servo_id, address, 0 if error else size, byte_s, error)
+            return pieces
+        for k in range(0, len(rest) - size, size + 1):
+            if rest[k] in self.servos:
+                self._try_store(rest[k], address, rest[k + 1 : k + 1 + size], self._free_at)
+        return []
+
+    def _instruct(self, servo_id: int, frame: Frame, at: float, byte_s: float) -> Pieces:
+        """Execute an instruction of one servo; its reply."""
+        code, params, level = frame.code, frame.data, self._level(servo_id)
+        servo = self.servos[servo_id]
+        answers = level >= 2
+        if code == PING:
+            model = self._get(servo_id, "model_number").to_bytes(2, "little")
+            return self._reply(servo_id, model + bytes([self._get(servo_id, "firmware")]), byte_s)
+        if code == READ:
+            if len(params) != 4:
+                return self._answer(servo_id, 0, 0, byte_s, table.DATA_LENGTH) if level else []
+            address, size = (int.from_bytes(params[k : k + 2], "little") for k in (0, 2))
+            error = 0 if 0 < size and address + size <= self.memory_bytes else table.ACCESS
+            return self._answer(servo_id, address, 0 if error else size, byte_s, error) * bool(
+                level
+            )
+        error = table.INSTRUCTION
+        if code in (WRITE, REG_WRITE) and len(params) > 2:
+            address = int.from_bytes(params[:2], "little")
+            if code == WRITE:
+                error = self._try_store(servo_id, address, params[2:], at)
+            else:
+                servo.state["registered"] = (address, params[2:])
+                error = 0
+        elif code in (WRITE, REG_WRITE):
+            error = table.DATA_LENGTH
+        elif code == ACTION:
+            kept = servo.state.pop("registered", None)
+            error = self._try_store(servo_id, kept[0], kept[1], at) if kept else table.RESULT_FAIL
+        elif code == REBOOT:
+            error = 0
+            self._set(servo_id, "hardware_error_status", 0)
+            self._set(servo_id, "torque_enable", 0)
+            self._set(servo_id, "bus_watchdog", 0)
+            servo.stopped = servo.overloaded = False
+            self.bench.torque(self.bench.index_of_id[servo_id], at, False)
+        return self._answer(servo_id, 0, 0, byte_s, error) if answers else []
+
+    def _reply(self, servo_id: int, data: bytes, byte_s: float) -> Pieces:
+        """A reply whose data are not in the memory: those of a ping."""
+        servo = self.servos[servo_id]
+        kept = bytes(servo.memory[: len(data)])
+        servo.memory[: len(data)] = data
+        pieces = self._answer(servo_id, 0, len(data), byte_s)
+        servo.memory[: len(data)] = kept
+        return pieces
+
+    def _level(self, servo_id: int) -> int:
+        return self._get(servo_id, "status_return_level")
+
+    def _try_store(self, servo_id: int, address: int, data: bytes, at: float) -> int:
+        """Store if the servo takes it; number of the error."""
+        if at < self._brown_out_until:
+            return 0
+        if address + len(data) > self.memory_bytes:
+            return table.ACCESS
+        if address < self.series.eeprom_end and self._get(servo_id, "torque_enable"):
+            return table.ACCESS
+        memory = bytearray(self.servos[servo_id].memory)
+        memory[address : address + len(data)] = data
+        for name, register in self.series.registers.items():
+            if not address <= register.address < address + len(data):
+                continue
+            value = self.series.decode(name, bytes(memory))
+            if error := self._refused(servo_id, name, value):
+                return error
+        self._store(servo_id, address, data, at)
+        return 0
+
+    def _refused(self, servo_id: int, name: str, value: int) -> int:
+        """Error number of a value that the servo does not take in a register, else 0."""
+        if name in _READ_ONLY:
+            return table.ACCESS
+        if name in _CHOICES and value not in _CHOICES[name]:
+            return table.DATA_LIMIT
+        if name == "bus_watchdog" and value > 127:
+            return table.DATA_RANGE
+        if name == "torque_enable" and value and self._get(servo_id, "hardware_error_status"):
+            return table.RESULT_FAIL
+        if name == "goal_position":
+            if self.servos[servo_id].stopped:
+                return table.DATA_RANGE
+            low, high = self._get(servo_id, "min_angle"), self._get(servo_id, "max_angle")
+            extended = self._get(servo_id, "operating_mode") in self.family.turns_freely
+            if not extended and not low <= value <= high:
+                return table.DATA_LIMIT
+        return 0
+
+    def _may_store(self, servo_id: int, address: int, at: float) -> bool:
+        return True  # `_try_store` has decided
+
+    def _store(self, servo_id: int, address: int, data: bytes, at: float) -> None:
+        super()._store(servo_id, address, data, at)
+        where = self.series.register("bus_watchdog").address
+        if address <= where < address + len(data):
+            self.servos[servo_id].stopped = False
+            self.servos[servo_id].heard_s = at
+
+    def _watch(self, servo_id: int, now: float) -> None:
+        """Stop a servo whose bus watchdog has run out."""
+        servo = self.servos[servo_id]
+        units = self._get(servo_id, "bus_watchdog")
+        ends = servo.heard_s + units * WATCHDOG_UNIT_S
+        on = self._get(servo_id, "torque_enable")
+        if 0 < units < TRIGGERED and on and now > ends and not servo.stopped:
+            servo.stopped = True
+            self._set(servo_id, "bus_watchdog", TRIGGERED)
+            k = self.bench.index_of_id[servo_id]
+            self.bench.command(k, ends, self.bench.count(k, ends))
+
+    def _error_byte(self, servo_id: int, bits: int) -> int:
+        known = bits & sum(table.HARDWARE_ERRORS)
+        status = self._get(servo_id, "hardware_error_status") | known
+        if known:
+            self._set(servo_id, "hardware_error_status", status)
+        return ALERT if status else 0
+
+    def _protect(self, servo_id: int, at: float) -> None:
+        """Shutdown by overload, if its register asks for it."""
+        servo: Any = self.servos[servo_id]
+        loaded = abs(self._get(servo_id, "present_pwm")) > 0.95 * table.FULL_PWM
+        servo.loaded_since = min(servo.loaded_since, at) if loaded else float("inf")
+        if self._get(servo_id, "shutdown") & 32 and at - servo.loaded_since > 2.0:
+            servo.overloaded = True
+            self._set(servo_id, "torque_enable", 0)
+            self.bench.torque(self.bench.index_of_id[servo_id], at, False)

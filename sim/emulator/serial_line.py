@@ -1,0 +1,352 @@
+"""Emulated servos on a serial line: bytes of the real protocol in, bytes out, each with its time.
+
+`LineEmulator` is the line and its servos without a port: `receive` takes what the host sent
+and returns what comes back and when its last byte has arrived, at the line's baud rate and after
+each servo's return delay. `sim.emulator.serial_pty` puts it behind a pseudo-terminal. A vendor's
+emulator (`sim.emulator.feetech`, `sim.emulator.dynamixel`) adds frames and instructions.
+
+Every servo has its memory table and obeys it: operating mode, angle limits, homing offset,
+response level; gains, ramps and torque limits as far as the bench's servos have them. Commands and
+torque act on `ServoBench` when the last byte of their frame has arrived, and a position is measured
+when its answer begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pupper_sysid.hardware.serial_servos.series import Family, Series
+from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.servos.bench import AMBIENT_C, ServoBench
+
+Pieces = list[tuple[float, bytes]]
+"""Bytes that come back, each piece with the time at which it has arrived."""
+
+TWIN_COUNTS = 333
+"""How far the second servo of an id stands from the first."""
+
+
+@dataclass
+class EmulatedMemory:
+    """Memory and faults of one servo."""
+
+    memory: bytearray
+    frozen_until: float = -np.inf
+    faulty_until: float = -np.inf
+    frozen_count: int = 0
+    error: int = 0
+    loaded_since: float = np.inf
+    overloaded: bool = False
+    """Its protection has acted; until its power is switched off."""
+    heard_s: float = 0.0
+    """Last request of the host."""
+    stopped: bool = False
+    """Its communication watchdog has acted."""
+    state: dict[str, Any] = field(default_factory=dict)
+
+
+class LineEmulator:
+    """A line of servos.
+
+    Parameters
+    ----------
+    bench : ServoBench
+        The servos; ids are those of its joint map.
+    series : Series
+        Of all of them.
+    rng : numpy.random.Generator
+    ids : sequence of int, optional
+        Servos on the line; default all of the map.
+    baud : int
+        Rate at which the servos listen.
+    faults : BusFaults, optional
+    echo : bool
+        Whether the adapter returns the host's own bytes.
+    registers : mapping of int or None to mapping of str to int, optional
+        Registers that differ from the factory's, by id; of all servos under None.
+    doubled : sequence of int
+        Ids that two servos have: their answers destroy each other.
+    """
+
+    family: ClassVar[Family]
+    memory_bytes: int
+    factory: ClassVar[Mapping[str, Mapping[str, int]]]
+    """Registers as a servo leaves the factory, by series' name."""
+
+    def __init__(
+        self,
+        bench: ServoBench,
+        series: Series,
+        rng: np.random.Generator,
+        ids: Sequence[int] | None = None,
+        baud: int = 1_000_000,
+        faults: BusFaults | None = None,
+        echo: bool = False,
+        registers: Mapping[int | None, Mapping[str, int]] | None = None,
+        doubled: Sequence[int] = (),
+    ):
+        self.bench, self.series, self.echo = bench, series, echo
+        self.faults = faults or BusFaults({}, rng)
+        self._rng, self.baud, self._doubled = rng, baud, set(doubled)
+        self._reader = self._new_reader()
+        self._free_at = 0.0
+        self._brown_out_until = -np.inf
+        self.unplug_for_s = 0.0
+        """Set by a fault: the port shall vanish for this time [s]."""
+        self.readings: list[tuple[float, int, int]] = []
+        """Every position measured for an answer: time, id, count."""
+        self.servos: dict[int, EmulatedMemory] = {}
+        self._acting = [n for n in bench.acting_registers if series.has(n)]
+        for servo_id in ids if ids is not None else bench.map.ids:
+            self.servos[servo_id] = EmulatedMemory(bytearray(self.memory_bytes))
+            changed = dict((registers or {}).get(None, {})) | dict(
+                (registers or {}).get(servo_id, {})
+            )
+            settings = dict(self.factory[series.name]) | {
+                "model": series.model, "id": servo_id, "torque_enable": 1,
+            } | self._baud_register(baud)  # fmt: skip
+            for name, value in settings.items():
+                self._set(servo_id, name, value)
+            if series.lock_address is not None:
+                self.servos[servo_id].memory[series.lock_address] = 1
+            k = bench.index_of_id[servo_id]
+            for name in self._acting:
+                self._set(servo_id, name, bench.register(k, name))
+            for name, value in changed.items():
+                self._set(servo_id, name, value)
+                if name in self._acting:
+                    bench.set_register(k, 0.0, name, value)
+            if series.has("homing_offset") and "homing_offset" not in changed:
+                self._set(servo_id, "homing_offset", self._mapped_offset(servo_id))
+            goal = int(np.clip(self._present(servo_id, 0.0), 0, series.counts - 1))
+            self._set(servo_id, "goal_position", goal)
+
+    # ----- what a vendor's emulator adds
+
+    def _new_reader(self) -> Any:
+        """Reader of requests."""
+        raise NotImplementedError
+
+    def _baud_register(self, baud: int) -> dict[str, int]:
+        """Register that holds the rate."""
+        raise NotImplementedError
+
+    def _execute(self, frame: Any, byte_s: float) -> Pieces:
+        """Execute a request; what comes back."""
+        raise NotImplementedError
+
+    def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
+        """A reply on the wire."""
+        raise NotImplementedError
+
+    def _write_request(self, servo_id: int, address: int, data: bytes) -> bytes:
+        """A write request on the wire."""
+        raise NotImplementedError
+
+    def _error_byte(self, servo_id: int, bits: int) -> int:
+        """Error byte of a reply of a servo with these faults."""
+        return bits
+
+    def _may_store(self, servo_id: int, address: int, at: float) -> bool:
+        """Whether a servo takes a write at this address."""
+        locked = self.series.lock_address
+        return not (
+            address < self.series.eeprom_end
+            and locked is not None
+            and self.servos[servo_id].memory[locked]
+        )
+
+    # ----- what all share
+
+    def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
+        """What comes back for `data`, which the host began to send at about `now`.
+
+        Parameters
+        ----------
+        data : bytes
+        now : float
+            Seconds; must not go backwards.
+        baud : int, optional
+            Rate at which the host sends; at another than theirs the servos receive only noise.
+
+        Returns
+        -------
+        list of (time, bytes)
+            Pieces in order of the time at which they have arrived.
+        """
+        byte_s = 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
+        end = max(now, self._free_at) + len(data) * byte_s
+        self._free_at = end
+        pieces = [(end, data)] if self.echo else []
+        if baud is None or baud == self.baud:
+            for frame in self._reader.feed(data):
+                pieces += self._execute(frame, byte_s)
+        return sorted(pieces, key=lambda p: p[0])
+
+    def _holds_position(self, servo_id: int) -> bool:
+        """Whether a servo goes to the positions that it is commanded, by its mode."""
+        mode = self._get(servo_id, "mode") if self.series.has("mode") else None
+        if mode is not None:
+            own = {self.family.position_mode, *self.series.more_position_modes}
+            return mode in own or mode in self.family.turns_freely
+        return bool(self._get(servo_id, "min_angle") or self._get(servo_id, "max_angle"))
+
+    def _offset(self, servo_id: int) -> int:
+        """Counts of the bench minus present position: the offset that its map does not have."""
+        if not self.series.has("homing_offset"):
+            return 0
+        more = self._get(servo_id, "homing_offset") - self._mapped_offset(servo_id)
+        return self.series.offset_sign * more
+
+    def _mapped_offset(self, servo_id: int) -> int:
+        """Homing offset with which the bench's joint map holds."""
+        joint = self.bench.map.joint_names[self.bench.index_of_id[servo_id]]
+        return self.bench.map.file.joints[joint].homing_offset or 0
+
+    def _present(self, servo_id: int, at: float) -> int:
+        """Position that a servo reports [counts]."""
+        encoder = self.bench.count(self.bench.index_of_id[servo_id], at)
+        count, offset = encoder - self._offset(servo_id), self._offset(servo_id)
+        if offset and self.series.wraps(lambda name: self._get(servo_id, name)):
+            count %= self.series.counts
+        return count
+
+    def _store(self, servo_id: int, address: int, data: bytes, at: float) -> None:
+        servo = self.servos.get(servo_id)
+        if servo is None or address + len(data) > self.memory_bytes or at < self._brown_out_until:
+            return
+        if not self._may_store(servo_id, address, at):
+            return
+        servo.memory[address : address + len(data)] = data
+        touched = range(address, address + len(data))
+        k = self.bench.index_of_id[servo_id]
+        for name in self._acting:
+            if self.series.register(name).address in touched:
+                self.bench.set_register(k, at, name, self._get(servo_id, name))
+        if self.series.register("goal_position").address in touched:
+            self._go(servo_id, k, at)
+        if self.series.register("torque_enable").address in touched:
+            self.bench.torque(k, at, bool(self._get(servo_id, "torque_enable")))
+
+    def _go(self, servo_id: int, k: int, at: float) -> None:
+        """Move a servo to its goal, within its own angle limits."""
+        low, high = self._get(servo_id, "min_angle"), self._get(servo_id, "max_angle")
+        goal = self._get(servo_id, "goal_position")
+        if not self._holds_position(servo_id) or self.servos[servo_id].stopped:
+            return
+        if low < high:
+            goal = int(np.clip(goal, low, high))
+        self.bench.command(k, at, goal + self._offset(servo_id))
+
+    def _answer(
+        self, servo_id: int, address: int, size: int, byte_s: float, error: int = 0
+    ) -> Pieces:
+        """The answer of one servo, after its return delay, as the line delivers it."""
+        servo = self.servos.get(servo_id)
+        if servo is None or self._free_at < self._brown_out_until:
+            return []
+        delay = self.family.return_delay_unit_s * self._get(servo_id, "return_delay")
+        begin = self._free_at + delay
+        kind = self._inject_fault(servo_id, begin)
+        if begin < self._brown_out_until:
+            return []
+        self._refresh(servo_id, begin)
+        bits = servo.error if begin < servo.faulty_until else 0
+        bits |= 32 * servo.overloaded  # overload, of every family
+        error = self._error_byte(servo_id, bits) | error
+        data = bytes(servo.memory[address : address + size])
+        answer = self._status(servo_id, error, data)
+        # the answer of another servo to another request
+        other = self._status((servo_id + 100) % 250, 0, bytes(len(data)))
+        if kind == "wrong-length":
+            shorter = len(data) and self._rng.random() < 0.5
+            more = bytes([int(self._rng.integers(256))])
+            answer = self._status(servo_id, error, data[:-1] if shorter else data + more)
+        if servo_id in self._doubled:
+            answer = self._collided(servo_id, address, data, error)
+        arrived = []
+        for late, piece in self.faults.apply(kind, answer, other):
+            self._free_at = max(self._free_at, begin) + len(piece) * byte_s
+            arrived.append((self._free_at + late, piece))
+        if kind == "second-writer":
+            arrived += self._second_writer(byte_s)
+        return arrived
+
+    def _collided(self, servo_id: int, address: int, data: bytes, error: int) -> bytes:
+        """Answers of two servos at once: the line is low where either pulls it."""
+        twin = bytearray(data)
+        where = self.series.register("present_position")
+        at = where.address - address
+        if 0 <= at and at + where.size <= len(data):
+            count = self._get(servo_id, "present_position") + TWIN_COUNTS
+            twin[at : at + where.size] = self.series.encode("present_position", count)
+        first = self._status(servo_id, error, data)
+        second = self._status(servo_id, error, bytes(twin))
+        late = int(self._rng.integers(0, 3))  # bytes by which one clock starts later
+        longest = max(len(first), late + len(second))
+        padded = first.ljust(longest, b"\xff"), (b"\xff" * late + second).ljust(longest, b"\xff")
+        return bytes(a & b for a, b in zip(*padded, strict=True))
+
+    def _inject_fault(self, servo_id: int, at: float) -> str | None:
+        """Draw a fault; start it if it lasts. Returns its kind."""
+        kind = self.faults.draw()
+        servo = self.servos[servo_id]
+        if kind == "frozen":
+            servo.frozen_until = at + self.faults.lasts_s
+            servo.frozen_count = self._present(servo_id, at)
+        elif kind == "error-bits":
+            servo.faulty_until = at + self.faults.lasts_s
+            servo.error = int(self._rng.choice([1, 2, 4, 8, 32, 33]))
+        elif kind == "brown-out":
+            self._brown_out_until = at + self.faults.lasts_s
+            for other in self.servos:
+                self._set(other, "torque_enable", 0)
+                self.bench.torque(self.bench.index_of_id[other], at, False)
+            self.faults.ended.append((kind, self._brown_out_until))
+        elif kind == "unplugged":
+            self.unplug_for_s = self.faults.lasts_s
+        return kind
+
+    def _second_writer(self, byte_s: float) -> Pieces:
+        """Another host's request on the wire, which the first host receives, too."""
+        victim = int(self._rng.choice(list(self.servos)))
+        k = self.bench.index_of_id[victim]
+        count = int(np.clip(self.bench.count(k, self._free_at) + self._rng.integers(-40, 40), 0,
+                            self.series.counts - 1))  # fmt: skip
+        goal = self.series.register("goal_position")
+        data = self.series.encode("goal_position", count)
+        request = self._write_request(victim, goal.address, data)
+        self._free_at += len(request) * byte_s
+        self._store(victim, goal.address, data, self._free_at)
+        return [(self._free_at, request)]
+
+    def _refresh(self, servo_id: int, at: float) -> None:
+        """Measure: the present registers hold values of this moment."""
+        k = self.bench.index_of_id[servo_id]
+        servo = self.servos[servo_id]
+        frozen = at < servo.frozen_until
+        count = servo.frozen_count if frozen else self._present(servo_id, at)
+        if self.bench.keep_log:
+            self.readings.append((at, servo_id, count))
+        self._set(servo_id, "present_position", count)
+        name, scale = self.family.load
+        self._set(servo_id, name, round(self.bench.load(k) / (1000 * scale)))
+        volts = round(self.bench.supply_v / self.family.volt_scale)
+        self._set(servo_id, "present_voltage", volts)
+        self._set(servo_id, "present_temperature", round(AMBIENT_C))
+        self._protect(servo_id, at)
+
+    def _protect(self, servo_id: int, at: float) -> None:
+        """The servo's own overload protection."""
+
+    def _set(self, servo_id: int, name: str, value: int) -> None:
+        register = self.series.register(name)
+        encoded = self.series.encode(name, value)
+        self.servos[servo_id].memory[register.address : register.address + register.size] = encoded
+
+    def _get(self, servo_id: int, name: str) -> int:
+        return self.series.decode(name, bytes(self.servos[servo_id].memory))

@@ -1,0 +1,170 @@
+"""Calibrations for other simulators: one function for every target.
+
+    paths = export(load_calibration("calibrated.yaml"), "isaaclab", "out/", physics_step_s=0.005)
+
+`exported_text` gives the text of a file without writing it. What each target carries stands in its
+own module; JSON, for any other program, is here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import versions, write_text
+from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.delayed_pd import whole_steps
+from pupper_sysid.sim.export.isaaclab import to_isaaclab, to_isaaclab_bam
+from pupper_sysid.sim.export.mjcf import to_mjcf, to_model
+from pupper_sysid.sim.export.mjlab import to_mjlab
+from pupper_sysid.sim.export.newton import to_newton
+from pupper_sysid.sim.export.shared import (
+    FEEDBACK_KEYS,
+    MUJOCO,
+    TORQUE_KEYS,
+    ExportedServos,
+)
+
+SCHEMA = "pupper-actuators"
+SCHEMA_VERSION = 3
+MJCF_STEP_S, TRAINING_STEP_S = 0.002, 0.005
+
+
+def to_json(servos: ExportedServos) -> str:
+    """All of it as JSON: every number with its interval, delays also in steps, the feedback.
+
+    Raises
+    ------
+    InputError
+        If the step is too long for the servos.
+    """
+    calibration, delays = servos.calibration, servos.delays()
+    joints = {}
+    for name, joint in calibration.joints.items():
+        a, f = joint.actuator, joint.feedback
+        low, high = whole_steps(delays[name].low, delays[name].high, servos.physics_step_s)
+        keys = (*TORQUE_KEYS, "velocity_limit_rad_s", "dead_time_s", "command_jitter_s")
+        joints[name] = {
+            "operating_point": joint.holds_at.model_dump(mode="json"),
+            "link_taken_off_kg_m2": servos.links.get(name, 0.0),
+            "actuator": {key: getattr(a, key).model_dump(mode="json") for key in keys}
+            | {
+                "delay_s": delays[name].value, "delay_steps_min": low, "delay_steps_max": high,
+            },
+            "feedback": {key: getattr(f, key).model_dump(mode="json") for key in FEEDBACK_KEYS},
+            "torque_scale": a.scale.model_dump(mode="json"),
+        }  # fmt: skip
+    return json.dumps(
+        {
+            "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "robot": calibration.robot,
+            "created": calibration.created, "exported_by": versions(),
+            "calibration_sha256": servos.sha256,
+            "inputs": [f.model_dump(mode="json") for f in calibration.inputs],
+            "notes": servos.head(
+                MUJOCO,
+                "delay_s is the dead time for this step in MuJoCo; delays in steps are rounded "
+                "outward.",
+            ),
+            "units": calibration.units, "physics_step_s": servos.physics_step_s, "joints": joints,
+        },
+        indent=1, ensure_ascii=False,
+    ) + "\n"  # fmt: skip
+
+
+SIMULATORS: dict[str, Callable[[ExportedServos], str]] = {
+    "mjcf": to_mjcf, "isaaclab": to_isaaclab, "isaaclab-bam": to_isaaclab_bam, "mjlab": to_mjlab,
+    "newton": to_newton, "json": to_json,
+}  # fmt: skip
+ENDINGS = {
+    "mjcf": ".xml", "isaaclab": "_isaaclab.py", "isaaclab-bam": "_isaaclab_bam.py",
+    "mjlab": "_mjlab.py", "newton": "_newton.py", "json": ".json",
+}  # fmt: skip
+"""How the names of their files end."""
+
+
+def exported_text(
+    calibration: Calibration,
+    to: str,
+    physics_step_s: float | None = None,
+    gain: float | None = None,
+    link_inertia: Mapping[str, float] | None = None,
+    model: Path | None = None,
+    out: Path = Path("servos.xml"),
+    sha256: str | None = None,
+) -> tuple[str, ExportedServos]:
+    """Text of an export, and the servos that it holds.
+
+    Parameters are those of `export` and `ExportedServos.of`.
+
+    Raises
+    ------
+    InputError
+        As `export`.
+    """
+    if to not in SIMULATORS:
+        raise InputError(f"There is no export to {to}; there are {', '.join(SIMULATORS)}.")
+    if link_inertia and (unknown := [n for n in link_inertia if n not in calibration.joints]):
+        raise InputError(
+            f"`link_inertia` names {', '.join(unknown)}; the calibration has "
+            f"{', '.join(calibration.joint_names)}."
+        )
+    if model is not None:
+        if to != "mjcf":
+            raise InputError(f"A model is of the export to mjcf; {to} takes link inertias.")
+        return to_model(calibration, model, out, physics_step_s, gain, link_inertia, sha256)
+    step = MJCF_STEP_S if to == "mjcf" and physics_step_s is None else physics_step_s
+    servos = ExportedServos.of(calibration, step or TRAINING_STEP_S, gain, link_inertia, sha256)
+    return SIMULATORS[to](servos), servos
+
+
+def export(
+    calibration: Calibration,
+    to: str,
+    out: Path | str = ".",
+    *,
+    physics_step_s: float | None = None,
+    gain: float | None = None,
+    link_inertia: Mapping[str, float] | None = None,
+    model: Path | str | None = None,
+    force: bool = False,
+) -> Path:
+    """Write a calibration for another simulator.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    to : {"mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json"}
+    out : Path or str
+        File, or a folder, in which the file is called `servos` with the target's ending.
+    physics_step_s : float, optional
+        Of that simulator [s]; by default 0.002 for mjcf, or its model's, and 0.005 for the others.
+    gain : float, optional
+        P gain, the register's value; by default that at which the calibration holds.
+    link_inertia : dict of str to float, optional
+        By joint, the inertia of link and load to take off an armature that holds it [kg·m²].
+    model : Path or str, optional
+        MJCF of the robot, to write a whole model with these servos; it also gives the inertia of
+        the links.
+    force : bool
+        Replace the file if it exists.
+
+    Returns
+    -------
+    Path
+        The file that was written.
+
+    Raises
+    ------
+    InputError
+        If there is no such target, the step is no physics step of these servos, the gain cannot be
+        predicted, a link cannot be taken off, the model cannot be edited, or the file exists.
+    """
+    path = Path(out)
+    if not path.suffix or path.is_dir():
+        path = path / f"servos{ENDINGS.get(to, '')}"
+    source = None if model is None else Path(model)
+    text, _ = exported_text(calibration, to, physics_step_s, gain, link_inertia, source, path)
+    write_text(path, text, force)
+    return path

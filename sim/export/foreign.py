@@ -1,0 +1,236 @@
+"""Servos as other files state them: actuators of an MJCF, and configuration modules in Python.
+
+    servo = foreign_servo("robot.xml", "LF_hip")    # for `servo_models.cards.compare`
+
+MuJoCo compiles the MJCF, so that class defaults and damping ratios are resolved; the inertia that
+the bodies put on the joint stands beside the armature. A Python file is read, not run: keyword
+arguments and dictionaries of literal numbers, such as Isaac Lab's and mjlab's actuators have.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.cards.compare import Servo
+from pupper_sysid.servo_models.cards.numbers import TorquePD, stated
+from pupper_sysid.sim.export.mjcf import link_inertias
+from pupper_sysid.sim.robot.hinges import hinges_of
+
+ENDINGS = (".xml", ".mjcf", ".py")
+_LARGEST_BYTES = 1_000_000
+_NO_LIMIT_NM = 100.0  # stands for an effort that is not limited; beyond any hobby servo's
+
+_WORDS = {
+    "stiffness_nm_per_rad": ("stiffness", "kp", "p_gain"),
+    "damping_nm_s_per_rad": ("damping", "kv", "kd", "d_gain"),
+    "armature_kg_m2": ("armature",),
+    "friction_loss_nm": ("frictionloss", "friction_loss", "friction"),
+    "effort_limit_nm": ("actuator_effort_limit", "effort_limit", "effort_limit_sim", "max_effort"),
+    "back_emf_nm_s_per_rad": ("viscous_friction", "viscous_damping", "back_emf"),
+    "dead_time_s": ("dead_time_s",),
+}
+"""Numbers of a PD by the names that configurations have for them."""
+_STEPS = ("max_delay", "delay_max_lag", "delay_steps")
+_NAMES = ("joint_names_expr", "target_names_expr")
+
+
+def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
+    """One servo of an MJCF or of a Python configuration.
+
+    Parameters
+    ----------
+    path : Path or str
+    joint : str, optional
+        By default the first that is driven.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or has no position actuator of that joint.
+    """
+    path = Path(path)
+    if path.suffix == ".py":
+        return _in_python(path, joint)
+    return _in_mjcf(path, joint)
+
+
+def _in_mjcf(path: Path, joint: str | None) -> Servo:
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    hinges_of(path)  # refuses what takes too much memory or time
+    model = mujoco.MjModel.from_xml_path(str(path))
+    driven: dict[str, int] = {}
+    for i in range(model.nu):
+        affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        pid = model.actuator_dyntype[i] == getattr(mujoco.mjtDyn, "mjDYN_PID", -1)
+        if on_joint and (affine or pid or model.actuator_biasprm[i, 1] < 0):
+            driven.setdefault(model.joint(int(model.actuator_trnid[i, 0])).name, i)
+    if not driven or (joint is not None and joint not in driven):
+        raise InputError(
+            f"{path}: no position actuator drives {joint or 'a joint'}"
+            + (f"; they drive {', '.join(driven)}." if driven else ".")
+        )
+    name = joint or next(iter(driven))
+    i, dof, j = driven[name], int(model.joint(name).dofadr[0]), model.joint(name).id
+    gear = float(model.actuator_gear[i, 0])
+    efforts = [_NO_LIMIT_NM]
+    if model.actuator_forcelimited[i]:
+        efforts.append(abs(gear) * float(np.max(np.abs(model.actuator_forcerange[i]))))
+    if model.jnt_actfrclimited[j]:
+        efforts.append(float(np.max(np.abs(model.jnt_actfrcrange[j]))))
+    numbers = {
+        "stiffness_nm_per_rad": -(gear**2) * model.actuator_biasprm[i, 1],
+        "damping_nm_s_per_rad": gear**2 * abs(model.actuator_biasprm[i, 2]),
+        "friction_loss_nm": model.dof_frictionloss[dof],
+        "armature_kg_m2": max(
+            float(model.dof_armature[dof]) + gear**2 * float(model.actuator_armature[i]), 1e-9
+        ),
+        "effort_limit_nm": min(efforts),
+        "back_emf_nm_s_per_rad": model.dof_damping[dof],
+        "dead_time_s": model.actuator_delay[i],
+    }
+    speed = float(model.actuator_dynprm[i, 1]) if model.actuator_actnum[i] else 0.0
+    if 0 < speed < 1000:
+        numbers["velocity_limit_rad_s"] = speed
+    notes = []
+    if min(efforts) == _NO_LIMIT_NM:
+        notes.append(f"{path.name} does not limit the effort; {_NO_LIMIT_NM:g} N·m stand for it.")
+    if model.jnt_stiffness[j] > 0:
+        notes.append(
+            f"{path.name} has a spring of {model.jnt_stiffness[j]:.3g} N·m/rad on {name}, which "
+            "no servo has."
+        )
+    return Servo(
+        path.name, name, None, False, "servo", None, _pd(numbers),
+        link_kg_m2=link_inertias(model, [name])[name], notes=tuple(notes), as_it_stands=True,
+    )  # fmt: skip
+
+
+def _in_python(path: Path, joint: str | None) -> Servo:
+    if not path.is_file() or path.stat().st_size > _LARGEST_BYTES:
+        raise InputError(f"{path} is no Python file of a configuration.")
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+    except (SyntaxError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no Python that can be read: {error}.") from error
+    literals = _literals(tree)
+    groups = [
+        g for g in _groups(tree, literals) if _first(g, _WORDS["stiffness_nm_per_rad"], joint)
+    ]
+    fitting = [g for g in groups if _is_of(g, joint)]
+    if not fitting:
+        raise InputError(
+            f"{path}: no stiffness{f' of {joint}' if joint else ''} stands there as a number. "
+            "Gains must be literal keyword arguments or dictionary entries (stiffness, damping, "
+            "armature, friction, effort_limit)."
+        )
+    group = fitting[0]
+    numbers = {key: _first(group, words, joint) for key, words in _WORDS.items()}
+    notes = []
+    steps = _first(group, _STEPS, joint)
+    if steps and numbers["dead_time_s"] is None:
+        step_s = literals.get("PHYSICS_DT")
+        if isinstance(step_s, float):
+            numbers["dead_time_s"] = steps * step_s
+        else:
+            notes.append(
+                f"{path.name} delays by {steps:g} physics steps, whose length it does not state as "
+                "PHYSICS_DT."
+            )
+    for key, stand_in in (
+        ("damping_nm_s_per_rad", 0.0), ("friction_loss_nm", 0.0), ("armature_kg_m2", 1e-4),
+        ("effort_limit_nm", _NO_LIMIT_NM),
+    ):  # fmt: skip
+        if numbers[key] is None:
+            numbers[key] = stand_in
+            notes.append(f"{path.name} states no {_WORDS[key][0]}; {stand_in:g} stands for it.")
+    known = {key: value for key, value in numbers.items() if value is not None}
+    return Servo(
+        path.name,
+        joint,
+        None,
+        False,
+        "servo",
+        None,
+        _pd(known),
+        notes=tuple(notes),
+        as_it_stands=True,
+    )
+
+
+def _pd(numbers: dict[str, Any]) -> TorquePD:
+    return TorquePD(model="delayed_pd", **{k: stated(float(v)) for k, v in numbers.items()})
+
+
+def _literals(tree: ast.Module) -> dict[str, Any]:
+    """Names at the top of the file that stand for literals."""
+    found = {}
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            try:
+                found[node.targets[0].id] = ast.literal_eval(node.value)
+            except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+                continue
+    return found
+
+
+def _groups(tree: ast.Module, literals: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Keyword arguments of calls, and dictionaries with text as keys, as far as literal."""
+
+    def value_of(node: ast.expr) -> Any:
+        if isinstance(node, ast.Name):
+            return literals.get(node.id)
+        try:
+            return ast.literal_eval(node)
+        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+            return None
+
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            group = {k.arg: value_of(k.value) for k in node.keywords if k.arg}
+            for keyword in node.keywords:  # `**dict(…)`, as of limits under other names
+                if keyword.arg is None and isinstance(keyword.value, ast.Call):
+                    group |= {k.arg: value_of(k.value) for k in keyword.value.keywords if k.arg}
+            yield group
+        elif isinstance(node, ast.Dict):
+            keys = [getattr(key, "value", None) for key in node.keys]
+            values = [value_of(value) for value in node.values]
+            group = {k: v for k, v in zip(keys, values, strict=True) if isinstance(k, str)}
+            yield group
+            for name, value in group.items():
+                if isinstance(value, dict) and all(isinstance(k, str) for k in value):
+                    yield value | {"joint_names_expr": [name]}
+
+
+def _is_of(group: dict[str, Any], joint: str | None) -> bool:
+    names = next((group[n] for n in _NAMES if isinstance(group.get(n), list | tuple)), None)
+    if joint is None or names is None:
+        return True
+    return any(_matches(n, joint) for n in names if isinstance(n, str))
+
+
+def _first(group: dict[str, Any], words: tuple[str, ...], joint: str | None) -> float | None:
+    """The first of some names that is a number, or one for the joint."""
+    for word in words:
+        value = group.get(word)
+        if isinstance(value, dict):
+            fitting = [v for k, v in value.items() if joint is None or _matches(str(k), joint)]
+            value = fitting[0] if fitting else None
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+    return None
+
+
+def _matches(pattern: str, joint: str) -> bool:
+    try:
+        return re.fullmatch(pattern, joint) is not None
+    except re.error:
+        return pattern == joint

@@ -1,0 +1,174 @@
+"""Arrays by name, of shape (rows,) or (rows, joints): NumPy's `.npz` and `.npy`, and torch's `.pt`.
+
+    np.savez("log.npz", time=t, command=commands, position=positions, joint_names=["knee", "ankle"])
+    torch.save({"time": t, "dof_pos": positions, "des_dof_pos": commands}, "run.pt")     # PACE
+
+An array of a `.npy` file has columns without names. Objects (pickles) are never loaded.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
+from pupper_sysid.common.reading.names import distinct
+from pupper_sysid.common.reading.tensors import refuse_bomb
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, MOST_JOINTS, Log
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.tables import (
+    Table,
+    expanded,
+    read_table,
+    unknown_numbers,
+)
+
+ZIP, NPY = b"PK\x03\x04", b"\x93NUMPY"
+
+_NAMES = ("joint_names", "joints", "names", "motor_names", "dof_names")
+_DEEPEST = 3  # of dictionaries in a torch file
+
+
+def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
+    """The arrays of a file as rows.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, unpacks to too much, holds objects, or lacks columns.
+    """
+    if data.startswith(NPY):
+        return _read_npy(path, data, options)
+    if _is_torch(data):
+        arrays, layout = _torch_arrays(path, data), "torch file"
+    else:
+        arrays, layout = _npz_arrays(path, data), "NumPy archive"
+    named = next((k for k in _NAMES if k in arrays and arrays[k].dtype.kind in "US"), None)
+    names = list(options.joints)
+    if named is not None:
+        refuse_more(f"{path}, array {named}", arrays[named].size, MOST_JOINTS, "joints")
+        names = [str(n) for n in arrays[named].ravel().astype(str)]
+    numeric = {}
+    for key, values in arrays.items():
+        if values.ndim == 2 and 1 in values.shape and "time" in key.lower():
+            values = values.ravel()
+        if values.dtype.kind in "biuf" and values.ndim in (1, 2):
+            numeric[key] = values.astype(float)
+    return read_table(path, expanded(path, numeric, names, named), options, layout)
+
+
+def _read_npy(path: Path, data: bytes, options: LogOptions) -> Log:
+    """The columns of one array, by their numbers, or by its fields' names."""
+    values = _loaded(path, data)
+    columns: dict[str, NDArray[np.float64]] = {}
+    if values.dtype.names:
+        fields = {n: values[n] for n in values.dtype.names}
+        columns = {n: v.ravel().astype(float) for n, v in fields.items() if v.dtype.kind in "biuf"}
+    elif values.dtype.kind in "biuf" and values.ndim == 2:
+        refuse_more(path, values.shape[1], MOST_COLUMNS, "columns", "Split it by joint.")
+        columns = {str(k): column.astype(float) for k, column in enumerate(values.T)}
+    if not columns:
+        raise InputError(
+            f"{path} holds an array of shape {values.shape}; a log has a row per time and a column "
+            "per quantity. Save time, command and position with numpy.savez."
+        )
+    table = Table(columns, numbered=not values.dtype.names)
+    if table.numbered and not options.command:
+        raise InputError(f"{path}: {unknown_numbers(path, table)}")
+    return read_table(path, table, options, "NumPy array")
+
+
+def _npz_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of an archive."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            inside = archive.infolist()
+        size = sum(member.file_size for member in inside)
+        refuse_more(f"{path}, unpacked,", len(inside), MOST_COLUMNS, "arrays", "Split it.")
+        refuse_more(f"{path}, unpacked,", size, LARGEST_BYTES, "bytes", "Split it.")
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
+        raise InputError(_damaged(path)) from error
+    loaded = _loaded(path, data)
+    return {name: array for name, array in loaded.items() if isinstance(array, np.ndarray)}
+
+
+def _loaded(path: Path, data: bytes) -> Any:
+    """What NumPy loads: an array, or the arrays of an archive by name."""
+    try:
+        found = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return found
+        with found:
+            distinct(path, found.files, "arrays")
+            return {name: found[name] for name in found.files}
+    except InputError:
+        raise
+    except Exception as error:  # damaged ones raise whatever zlib, zipfile and NumPy do
+        pickled = "pickle" in str(error)
+        raise InputError(
+            f"{path} holds Python objects, which are never loaded. Save arrays of numbers."
+            if pickled
+            else _damaged(path)
+        ) from error
+
+
+def _damaged(path: Path) -> str:
+    return f"{path} is no NumPy archive, or is damaged. Save it again with numpy.savez."
+
+
+def _is_torch(data: bytes) -> bool:
+    """Whether a zip archive is one of torch."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            return any(n.endswith("/data.pkl") for n in archive.namelist()[:10_000])
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError):
+        return False
+
+
+def _torch_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
+    """The tensors of a torch file, and lists of names, by name."""
+    remedy = "Save a dictionary of tensors."
+    refuse_bomb(path, data, remedy)
+    import torch
+
+    try:
+        loaded = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # damaged ones raise whatever pickle and torch do
+        first = printable(str(error).strip().split("\n")[0])[:120]
+        raise InputError(
+            f"{path} is no torch file of tensors alone, or is damaged ({first}). {remedy}"
+        ) from error
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def take(prefix: str, value: Any, depth: int) -> None:
+        refuse_more(path, len(arrays), MOST_COLUMNS, "tensors", remedy, exact=False)
+        if isinstance(value, Mapping) and depth < _DEEPEST:
+            for key, inside in value.items():
+                take(f"{prefix}.{key}".strip(".")[:200], inside, depth + 1)
+        elif (
+            isinstance(value, torch.Tensor)
+            and not value.is_sparse
+            and value.layout == torch.strided
+        ):
+            refuse_more(f"{path}, {prefix}", value.numel(), MOST_CELLS, "values", remedy)
+            if not value.is_complex():
+                arrays[prefix] = value.detach().to(torch.float64).numpy()
+        elif isinstance(value, list | tuple) and 0 < len(value) <= MOST_CELLS:
+            if all(isinstance(v, str) for v in value[:MOST_JOINTS]):
+                arrays[prefix] = np.array([str(v)[:200] for v in value[: MOST_JOINTS + 1]])
+            elif all(isinstance(v, int | float) for v in value):
+                arrays[prefix] = np.array(value, float)
+
+    if not isinstance(loaded, Mapping):
+        raise InputError(f"{path} holds no tensors by name. {remedy}")
+    take("", loaded, 0)
+    return arrays

@@ -1,0 +1,245 @@
+"""What a column of a log is, by the words of its name: command, position, time, and whose.
+
+    q_cmd_rad              command of the only joint, in rad
+    observation.state.knee position of the knee
+    /joint_states/LF_HAA/position, joint_pos_target_0, pos_estimate, present_position_tick …
+
+A name is taken apart at its separators, at capitals (`kneeCmd`) and into known words
+(`targetpos`, `qdes`). `WORDS` says what each word stands for, once for all layouts; what is no word
+of the table is the joint's name. Of several columns for one joint the better one is taken: radians
+before degrees before counts, words for a command before words that may mean one, `present` before
+a bare `position`, plain before filtered or simulated values.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+COMMAND, STATE, ANGLE, OTHER = "command", "state", "angle", "other"
+MAYBE_COMMAND, MAYBE_STATE = "command, perhaps", "state, perhaps"
+TIME, UNIT, JOINT, DERIVED = "time", "unit", "joint", "derived"
+
+WORDS: dict[str, str] = {
+    word: kind
+    for kind, words in (
+        (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
+                  "setpoint setpoints sp reference references ref refs demand demanded requested "
+                  "action actions soll sollwert sv 目标 目標 指令"),
+        (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
+                        "trajectory traj leader nominal wanted write written order"),
+        (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
+                "observation observations obs state states estimate estimated est real encoder enc "
+                "reading readings sensed sensor response resp "
+                "potentiometer pot resolver pv ist istwert 实际 実測 反馈"),
+        (MAYBE_STATE, "y output outputs read rx follower received"),
+        (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
+                "角度 位置"),
+        (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
+                "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
+                "current currents curr amps ampere voltage volt volts temperature temperatures "
+                "temp temps pwm duty power pw error errors err deviation mode status flag flags "
+                "latency delay age dt counter crc checksum quat quaternion gyro imu mag battery "
+                "gain gains kp ki kd stiffness damping limit limits lim max min seq index idx "
+                "frame iteration iter step overrun moving force feedforward ff tff integral prev "
+                "previous last offset home initial init delta diff frequency freq hz cov "
+                "covariance enable enabled reached done warning fault trial episode loop "
+                "strom spannung"),
+        (TIME, "time times timestamp timestamps t stamp stamps clock elapsed seconds secs sec "
+               "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
+               "nanosec nanosecs nsecs usec usecs zeit 时间 時間"),
+        (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
+               "turns rev revs revolution revolutions mrad"),
+        (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
+                "group controller controllers data value values val field name names msg body "
+                "header array low"),
+        (DERIVED, "filtered filt filter smoothed smooth sim simulated simulation model modeled "
+                  "modelled predicted prediction pred mean avg relative rel next raw"),
+    )
+    for word in words.split()
+}  # fmt: skip
+"""What each word of a column's name stands for."""
+
+TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "elapsed", "seconds", "clock")
+"""Names of times, the likeliest first."""
+
+UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad",
+         "deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg",
+         "turn": "turns", "turns": "turns", "rev": "turns", "revs": "turns",
+         "revolution": "turns", "revolutions": "turns"}  # fmt: skip
+_UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5}
+_SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"-]+")
+_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
+_SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
+_LETTERS = frozenset("qput")  # that begin a word such as qdes or tcmd
+_LONGEST = 200
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a name says of its column.
+
+    Attributes
+    ----------
+    name : str
+    kind : {"command", "position", "time", "unknown", ""}
+        Empty for another quantity, and unknown where no word of the name is known.
+    joint : str
+        The words that name a joint, as in the column's name, joined by `_`; empty for none.
+    key : str
+        The same without words such as `joint`, to be compared.
+    unit : str
+        "rad", "mrad", "deg", "turns", "counts", or empty.
+    rank : tuple of int
+        Smaller for the better of two columns for one purpose.
+    words : frozenset of str
+        Those that make it what it is.
+    template : str
+        The name with `{joint}` in place of the joint's name.
+    """
+
+    name: str
+    kind: str
+    joint: str
+    key: str
+    unit: str
+    rank: tuple[int, ...]
+    words: frozenset[str]
+    template: str
+
+
+def column(name: str) -> Column:
+    """What the name of a column says."""
+    return _column(str(name)[:_LONGEST])
+
+
+@lru_cache(4096)
+def _column(name: str) -> Column:
+    parts = [part for word in _SEPARATORS.split(name.strip()) if word for part in _parts(word)]
+    known = [WORDS.get(p.lower(), "") for p in parts]
+    kinds = set(known)
+    lower = [p.lower() for p in parts]
+    if "d" in lower and "q" in lower and not kinds & {COMMAND, STATE}:  # q_d
+        known[lower.index("d")] = COMMAND
+        kinds.add(COMMAND)
+    if kinds & {COMMAND, STATE, ANGLE}:  # a joint that is called y
+        known = ["" if w in _SOLE_LETTERS else k for w, k in zip(lower, known, strict=True)]
+        kinds = set(known)
+    angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}
+                                or "pos" in "".join(lower))  # fmt: skip
+    if angle and lower[-1:] != ["current"]:  # current position, not a current
+        known = [
+            STATE if w in ("current", "curr") else k for w, k in zip(lower, known, strict=True)
+        ]
+        kinds = set(known)
+    unit = next((UNITS.get(w, "counts") for w, k in zip(lower[::-1], known[::-1], strict=True)
+                 if k == UNIT), "")  # fmt: skip
+    if lower[-1:] == ["raw"]:
+        unit = unit or "counts"
+        known[-1] = UNIT
+    timed = any(
+        k == TIME and (w != "t" or n == 0 or not angle)  # q_t is an angle
+        for n, (w, k) in enumerate(zip(lower, known, strict=True))
+    )
+    if timed:  # time_s
+        known = [UNIT if w == "s" and not k else k for w, k in zip(lower, known, strict=True)]
+    telling = {COMMAND, MAYBE_COMMAND, STATE, MAYBE_STATE} | ({ANGLE} if timed else set())
+    words = frozenset(w for w, k in zip(lower, known, strict=True) if k in telling)
+    kind = ""
+    if OTHER in kinds and not (timed and not kinds & {UNIT}):
+        kind = ""
+    elif timed:
+        kind = "time"
+    elif COMMAND in kinds:
+        kind = "command"
+    elif MAYBE_COMMAND in kinds and STATE not in kinds:
+        kind = "command"
+    elif angle or STATE in kinds or MAYBE_STATE in kinds:
+        kind = "position"
+    elif not kinds & {TIME, DERIVED} and "" in kinds:
+        kind = "unknown"
+    sure = COMMAND in kinds if kind == "command" else bool(angle or STATE in kinds)
+    doubt = 0 if sure else 2 if lower == ["u"] else 1  # beside a reference, u is a drive's input
+    style = (0 if angle and (STATE in kinds) else 1 if angle else 2) if kind == "position" else 0
+    rank = (int(DERIVED in set(known)), doubt, _UNIT_RANK[unit], style)
+    runs: list[list[tuple[str, str]]] = [[]]  # of words that are no others'
+    for part, k in zip(parts, known, strict=True):
+        if k in ("", JOINT):
+            runs[-1].append((part, k))
+        elif runs[-1]:
+            runs.append([])
+    runs = [run for run in runs if any(k == "" for _, k in run)]
+    joint = "_".join(p for run in runs for p, _ in run)
+    bare = [p for run in runs for p, k in run if k == ""]
+    key = "_".join(f"{int(p)}" if p.isascii() and p.isdigit() else p.lower() for p in bare)
+    template = name if kind == "unknown" else _template(name, bare)
+    return Column(name, kind, joint, key, unit, rank, words, template)
+
+
+def _parts(word: str) -> list[str]:
+    """A word as known words and what is between them; whole where it has none."""
+    if word.lower() in WORDS:
+        return [word]
+    pieces = _CAMEL.findall(word)
+    if len(pieces) > 1 and any(_known(piece) for piece in pieces):
+        found: list[str] = []
+        rest = ""
+        for piece in pieces:
+            if split := _known(piece):
+                found += [rest, *split] if rest else split
+                rest = ""
+            else:
+                rest += piece
+        return [*found, rest] if rest else found
+    return _known(word) or [word]
+
+
+def _known(word: str) -> list[str]:
+    """The words of the table that a word is made of; empty if it has others."""
+    lower = word.lower()
+    if lower in WORDS and (len(lower) > 1 or lower in "qθ°"):
+        return [word]
+    return list(_compound(lower))
+
+
+@lru_cache(4096)
+def _compound(word: str) -> tuple[str, ...]:
+    """Two to four words of the table, one behind the other; a letter may stand before them."""
+    for first in sorted(range(2, len(word) - 1), reverse=True):
+        head, tail = word[:first], word[first:]
+        if head in WORDS and (rest := (tail,) if tail in WORDS else _compound(tail)):
+            return (head, *rest) if len(tail) > 1 else ()
+    if len(word) > 3 and word[0] in _LETTERS:
+        tail = word[1:]
+        rest = (tail,) if tail in WORDS else _compound(tail)
+        if rest and {WORDS[w] for w in rest} & {COMMAND, STATE}:
+            return (word[0], *rest)
+    return ()
+
+
+def _template(name: str, joint: Sequence[str]) -> str:
+    """The name with `{joint}` for the words that name a joint, where they stand together."""
+    if not joint:
+        return name
+    found = re.search(r"[^0-9A-Za-z]+".join(map(re.escape, joint)), name)
+    return f"{name[: found.start()]}{{joint}}{name[found.end() :]}" if found else name
+
+
+def time_columns(names: Sequence[str]) -> list[str]:
+    """Columns of times, the likeliest first: plain names, then those of a clock or an event."""
+    found = []
+    for name in names:
+        own = column(name)
+        lower = [w.lower() for w in _SEPARATORS.split(name) if w]
+        if own.kind == "time" and not own.words:
+            bare = [w for w in lower if WORDS.get(w) == TIME and w not in _TIME_UNITS] or lower
+            place = TIMES.index(bare[0]) if bare[0] in TIMES else len(TIMES)
+            found.append(((len(own.key) > 0, place, len(lower)), name))
+        elif lower[:3] == ["time", "since", "start"]:
+            found.append(((False, 4, 3), name))
+    return [name for _, name in sorted(found, key=lambda pair: pair[0])]
+
+
+_TIME_UNITS = ("s", "sec", "secs", "ms", "us", "µs", "ns", "millis", "micros", "nanos", "nsec")

@@ -1,0 +1,223 @@
+"""Logs in JSON: BAM's and K-Scale's, ktune's, and any other with columns or records.
+
+BAM and K-Scale, one servo, mostly with a pendulum:
+
+    {"mass": 0.49, "length": 0.1, "arm_mass": 0, "kp": 100, "vin": 7.4, "motor": "xl330",
+     "trajectory": "sin_sin", "entries": [{"timestamp": 0.0035, "position": 0.0,
+     "goal_position": 0.0, "torque_enable": true, "input_volts": 7.3, …}, …]}
+
+Angles in rad, 0 hangs, times in s. A turn of BAM's loop writes the goal, sleeps 1 ms and reads;
+`timestamp` is the middle of the read. The XL330 is read register by register, the position first,
+so its position is older than the stamp; other servos are read in one block.
+
+ktune, one actuator's chirp or step, angles in degrees:
+
+    {"config": {"actuator_id": 41, "kp": 150.0, "kd": 8.0, …},
+     "data": [{"time_since_start": 0.0006, "position": 0.05, "commanded_position": 0.0, …}, …]}
+
+Each row has one time stamp, and the log does not say when in a turn the command was sent and the
+position read: lag and dead time are in doubt by half a turn.
+
+Others are tables: lists by name, a list of records, or a record a line (JSON Lines); `{"cmd":
+{"knee": 0.1}}` is a column `cmd.knee`, and a list of numbers has a column each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
+from pupper_sysid.sysid.recordings.importers.log import (
+    Log,
+    joint_names,
+    number,
+    numbers,
+    rows,
+)
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.tables import expanded, missing, read_table
+from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
+
+BAM, KTUNE = "BAM JSON", "ktune JSON"
+
+_SLEEP_S = 0.00106  # sleep(0.001) as Linux keeps it
+_REGISTERS = {"xl330": 5}  # reads of one register each, the position first
+_NUMBERS = ("mass", "length", "kp", "vin")
+
+
+def _rows_have(found: Any, *names: str) -> bool:
+    """Whether this is a list of records, the first of which has one of these names, or none."""
+    if not isinstance(found, list):
+        return False
+    return not found or not isinstance(found[0], Mapping) or any(n in found[0] for n in names)
+
+
+def is_bam(data: Any) -> bool:
+    """Whether JSON `data` is such a log."""
+    return isinstance(data, dict) and _rows_have(data.get("entries"), "timestamp", "goal_position")
+
+
+def read_bam(path: Path, data: dict[str, Any]) -> Log:
+    """The log as rows; mass, length, gain and voltage go into the header.
+
+    Raises
+    ------
+    InputError
+        If entries are missing or are no numbers.
+    """
+    entries = data["entries"]
+    if not entries:
+        raise InputError(f"{path}: entries is empty, so nothing was recorded. Record it again.")
+    stamp = numbers(path, entries, "timestamp", "entries")
+    position = numbers(path, entries, "position", "entries", missing=True)
+    command = numbers(path, entries, "goal_position", "entries")
+    torque = numbers(path, entries, "torque_enable", "entries", missing=True)
+    voltage = numbers(path, entries, "input_volts", "entries", missing=True)
+    motor = str(data.get("motor") or "servo")
+    known = {k: number(path, data[k], k) for k in _NUMBERS if data.get(k) is not None}
+    (joint,) = joint_names(path, [motor])
+    reads = next((n for m, n in _REGISTERS.items() if motor.lower().startswith(m)), 1)
+    on = torque != 0  # a log without the entry had its torque on
+    loop = float(np.median(np.diff(stamp)[on[1:]])) if on[1:].any() else 0.0
+    each = max(loop - _SLEEP_S, 0.0) / (reads + 1)  # a write and the reads take about as long
+    started = stamp - reads * each / 2
+    optional: dict[str, Any] = {}
+    if not on.all():
+        optional["torque_enabled"] = on.astype(float)
+    if np.isfinite(voltage).any():
+        optional["voltage_v"] = voltage
+    gain = known.get("kp")
+    if gain is not None:
+        optional["p_gain"] = gain
+    metadata: dict[str, Any] = {
+        "imported_from": BAM,
+        "joints": [joint],
+        "readings": "live",
+        "bus": {"read_time_doubt_s": each if reads > 1 else max(loop - _SLEEP_S, 0.0) / 2},
+        "servos": {joint: {"model": motor}},
+    }
+    if gain is not None:
+        metadata["servos"][joint]["p_gain"] = gain
+    if known.get("vin", 0) > 0:
+        metadata["servos"][joint]["supply_voltage_v"] = known["vin"]
+    if "mass" in known and "length" in known:
+        arm = number(path, data["arm_mass"], "arm_mass") if data.get("arm_mass") else 0.0
+        metadata["loads"] = {
+            joint: {"mass_kg": known["mass"], "length_m": known["length"], "arm_mass_kg": arm}
+        }
+    if isinstance(data.get("trajectory"), str):
+        metadata["trajectory"] = data["trajectory"][:80]
+    table = rows(
+        joint, started - _SLEEP_S - each / 2, started + each / 2, command, position, **optional
+    )
+    return Log(table, metadata)
+
+
+def is_ktune(data: Any) -> bool:
+    """Whether JSON `data` is such a log."""
+    names = ("time_since_start", "commanded_position")
+    return (
+        isinstance(data, dict)
+        and _rows_have(data.get("data"), *names)
+        and isinstance(data.get("config", {}), dict)
+    )
+
+
+def read_ktune(path: Path, data: dict[str, Any]) -> Log:
+    """The log as rows of the joint `actuator_<id>`.
+
+    Raises
+    ------
+    InputError
+        If rows are missing or are no numbers.
+    """
+    entries, config = data["data"], data.get("config", {})
+    if not entries:
+        raise InputError(f"{path}: data is empty, so nothing was recorded. Record it again.")
+    stamp = numbers(path, entries, "time_since_start", "data")
+    command = np.deg2rad(numbers(path, entries, "commanded_position", "data"))
+    position = np.deg2rad(numbers(path, entries, "position", "data", missing=True))
+    (joint,) = joint_names(path, [f"actuator_{config.get('actuator_id', 0)}"])
+    gains = {
+        name: number(path, config[key], f"config.{key}")
+        for name, key in (("p_gain", "kp"), ("d_gain", "kd"))
+        if config.get(key) is not None
+    }
+    doubt, text = doubt_of_a_turn(stamp)
+    metadata = {
+        "imported_from": KTUNE,
+        "joints": [joint],
+        "bus": {"read_time_doubt_s": doubt},
+        "servos": {joint: gains},
+    }
+    gain = {"p_gain": gains["p_gain"]} if "p_gain" in gains else {}
+    return Log(rows(joint, stamp, stamp, command, position, **gain), metadata, [text])
+
+
+def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
+    """The log in other JSON as a table; None if it has no columns of a command and a position.
+
+    Raises
+    ------
+    InputError
+        If there are too many columns, or as `tables.read_table`.
+    """
+    lists: dict[str, list[Any]] = {}
+    records = _records(data)
+    if records is None and not isinstance(data, Mapping):
+        return None
+    for k, record in enumerate([data] if records is None else records):
+        pending = [("", record)]
+        while pending:
+            prefix, inside = pending.pop()
+            for name, value in inside.items():
+                full = f"{prefix}.{name}".strip(".")[:200]
+                if isinstance(value, Mapping):
+                    pending.append((full, value))
+                elif records is None:
+                    lists[full] = value if isinstance(value, list) else []
+                else:
+                    if full not in lists:
+                        cells = (len(lists) + 1) * len(records)
+                        refuse_more(path, len(lists) + 1, MOST_COLUMNS, "columns", exact=False)
+                        refuse_more(path, cells, MOST_CELLS, "cells", "Split it.", exact=False)
+                        lists[full] = [None] * len(records)
+                    lists[full][k] = value
+    found = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
+    arrays = {name: values for name, values in found.items() if values is not None}
+    table = expanded(path, arrays, list(options.joints))
+    if not arrays or (missing(table.names) and not options.command):
+        return None
+    return read_table(path, table, options, "JSON table")
+
+
+def _records(data: Any) -> list[Any] | None:
+    """The list of records in JSON: the whole, or the longest one by name; None if there is none."""
+    lists = [data] if isinstance(data, list) else []
+    if isinstance(data, Mapping):
+        lists = [value for value in data.values() if isinstance(value, list)]
+    own = [v for v in lists if v and all(isinstance(row, Mapping) for row in v)]
+    return max(own, key=len, default=None)
+
+
+def _numbers(values: list[Any]) -> NDArray[np.float64] | None:
+    """Numbers, or equally long lists of them; None where they are others. A null is missing."""
+    first = next((v for v in values if v is not None), None)
+    kinds = (list,) if isinstance(first, list) else (int, float, type(None))
+    if first is None or not all(isinstance(v, kinds) for v in values):
+        return None
+    inside = [v for row in values for v in row] if kinds == (list,) else []
+    if not all(isinstance(v, int | float | None) for v in inside):
+        return None
+    try:
+        found = np.array(values, dtype=float)
+    except (TypeError, ValueError, OverflowError):  # lists of several lengths
+        return None
+    return found if found.ndim in (1, 2) else None

@@ -1,1 +1,0 @@
-"""What importers share: rows and budgets, options, times, units, and held commands."""

@@ -1,0 +1,739 @@
+"""Tables with any column names: columns per joint, a row per joint and time, or a row per value.
+
+    time, knee_command, knee_position, ankle_command, ankle_position
+    timestamp, action.pan, action.lift, observation.state.pan, observation.state.lift
+    time_ms, leg, hip_goal, hip_present
+    time, name, value
+
+CSV, parquet, arrays and tables in memory come here as columns. `importers.columns` says what each
+column is by its name; options name the columns instead.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
+from pupper_sysid.common.reading.names import distinct, one_each
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import Column, column, time_columns
+from pupper_sysid.sysid.recordings.importers.log import (
+    MOST_JOINTS,
+    Log,
+    bare_name,
+    held_commands,
+    joint_names,
+    rows,
+)
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.times import (
+    clock,
+    doubt_of_a_turn,
+    one_after_another,
+    sent_at,
+    times_of_day,
+    turns,
+)
+from pupper_sysid.sysid.recordings.importers.units import Unit, unit
+
+LAYOUT = "table"
+
+_TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
+_TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
+_SERIES = ("name", "signal", "variable", "topic", "field", "series", "metric", "key", "channel",
+           "_field", "_measurement")  # fmt: skip
+_GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
+           "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
+           "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
+           "node_id", "id")  # fmt: skip
+LABELS = frozenset((*_SERIES, *_GROUPS, *_TRIALS))
+"""Columns that may hold text, in lower case."""
+_SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
+_KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
+_SOLE = "joint"  # of a log that names none
+_MOST_GROUPS = 1000
+_FEWEST_ROWS = 3  # of a joint in a table with a row per joint
+_SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
+_MOST_CHOICES = 4  # that a message lists
+_COMPARED = 8  # columns for one purpose
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of a log.
+
+    Attributes
+    ----------
+    columns : mapping of str to ndarray
+        Of numbers, equally long; shape (rows,).
+    texts : mapping of str to sequence of str
+        Columns that hold text.
+    faults : mapping of str to str
+        Why a column is no numbers, as a sentence.
+    widths : mapping of str to int
+        Arrays with a column per joint, and how many; their columns are `<array>.<joint>`.
+    joint_names : (str, int), optional
+        What names those joints, and how many.
+    numbered : bool
+        Whether the columns have no names but their numbers.
+    notes : tuple of str
+        What was assumed, in sentences.
+    """
+
+    columns: Mapping[str, NDArray[np.float64]]
+    texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    faults: Mapping[str, str] = field(default_factory=dict)
+    widths: Mapping[str, int] = field(default_factory=dict)
+    joint_names: tuple[str, int] | None = None
+    numbered: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all columns."""
+        return list(dict.fromkeys([*self.columns, *self.texts, *self.faults]))
+
+    def numbers(self, path: Path | str, name: str) -> NDArray[np.float64]:
+        """Finite or missing numbers of a column.
+
+        Raises
+        ------
+        InputError
+            If it holds text or an infinite value.
+        """
+        shown = printable(name)[:60]
+        if name not in self.columns:
+            fault = f"{path}, column {shown}: its values are not numbers."
+            raise InputError(self.faults.get(name, fault))
+        values = np.asarray(self.columns[name], float)
+        if np.isinf(values).any():
+            raise InputError(f"{path}, column {shown}: a value is infinite.")
+        return values
+
+    def first(self, names: Sequence[str]) -> str | None:
+        """The first of these names, in any case, that a column of numbers has."""
+        own = {n.lower(): n for n in self.columns}
+        return next((own[n] for n in names if n in own), None)
+
+    def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
+        """Refuse arrays, of which these are columns, with other numbers of joints than names.
+
+        Raises
+        ------
+        InputError
+            If arrays and names are not equally many.
+        """
+        used = {key: n for key, n in self.widths.items()
+                if any(column.startswith(f"{key}.") for column in columns)}  # fmt: skip
+        if used:
+            counts = used | dict([self.joint_names] if self.joint_names else [])
+            one_each(path, counts, "Mend the log, or name the joints to read with `joints`.")
+
+
+def expanded(
+    path: Path | str,
+    arrays: Mapping[str, NDArray[np.float64]],
+    names: Sequence[str],
+    named: str | None = None,
+) -> Table:
+    """Table of arrays of which some have a number per joint: `action` becomes `action.<name>`.
+
+    Parameters
+    ----------
+    path : Path or str
+        For messages.
+    arrays : mapping of str to ndarray, shape (rows,) or (rows, joints)
+    names : sequence of str
+        Of the joints; arrays of another width get `joint_0`, `joint_1` and so on.
+    named : str, optional
+        What in the log holds these names; None if it does not name its joints.
+
+    Raises
+    ------
+    InputError
+        If a name stands twice.
+    """
+    distinct(path if named is None else f"{path}, {named}", names, "joints")
+    lengths = [len(values) for values in arrays.values()]
+    rows = max(set(lengths), key=lengths.count, default=0)
+    columns, faults, widths = {}, {}, {}
+    for key, values in arrays.items():
+        parts = {key: values}
+        if values.ndim == 2:
+            width = min(values.shape[1], 10_000)
+            own = names if len(names) == width else [f"joint_{k}" for k in range(width)]
+            parts = {f"{key}.{own[k]}": values[:, k] for k in range(width)}
+            widths[key] = width
+        if len(values) == rows:
+            columns |= parts
+        else:
+            text = f"{path}: {key} has {len(values)} rows where others have {rows}. Mend the log."
+            faults |= dict.fromkeys(parts, text)
+    distinct(path, [*columns, *faults])
+    return Table(columns, {}, faults, widths, None if named is None else (named, len(names)))
+
+
+def read_table(path: Path | str, table: Table, options: LogOptions, layout: str = LAYOUT) -> Log:
+    """The rows of a table.
+
+    Raises
+    ------
+    InputError
+        If no time, or no joint with command and position, can be found; the message says what is
+        missing, or lists the choices.
+    """
+    refuse_more(path, len(table.names), MOST_COLUMNS, "columns", "Split it by joint.")
+    refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
+    table = spread(path, table, options)
+    notes = list(table.notes)
+    pairs, texts = _pairs(path, table, options)
+    notes += texts
+    read_s, send_s, texts = _times(path, table, options)
+    notes += texts
+    groups = _groups(path, table)
+    if not (len(groups) > 1 or (groups and [*pairs] == [_SOLE])):
+        groups = {"": np.ones(len(read_s), bool)}
+    wanted = {  # by the log's own name
+        "_".join(w for w in (group, "" if name == _SOLE and group else name) if w): (own, pair)
+        for (group, own), (name, pair) in product(groups.items(), pairs.items())
+    }  # fmt: skip
+    if options.joints and [*wanted] == [_SOLE] and len(options.joints) == 1:
+        wanted = {next(iter(options.joints)): wanted[_SOLE]}
+    if options.joints:
+        lacking = [j for j in options.joints if j not in wanted]
+        if lacking:
+            raise InputError(
+                f"{path}: `joints` names {printable(lacking[0])}, which has no command and "
+                f"position; {', '.join(map(printable, wanted))[:300]} have."
+            )
+        wanted = {joint: wanted[joint] for joint in options.joints}
+    names = joint_names(path, [options.joints.get(j) or j for j in wanted])
+    metadata: dict[str, Any] = {"imported_from": layout, "joints": names, "bus": {}}
+    if options.readings:
+        metadata["readings"] = options.readings
+    parts = []
+    for (theirs, (own, pair)), name in zip(wanted.items(), names, strict=True):
+        part, texts = _joint(path, table, options, pair, (read_s, send_s), own, (theirs, name),
+                             metadata)  # fmt: skip
+        parts.append(part)
+        notes += [text for text in texts if text not in notes]
+    return Log(pd.concat(parts, ignore_index=True), metadata, notes)
+
+
+# ------------------------------------------------------------------------------- which columns
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Columns of one joint's command and position."""
+
+    command: Column
+    position: Column
+
+
+def _pairs(
+    path: Path | str, table: Table, options: LogOptions
+) -> tuple[dict[str, _Pair], list[str]]:
+    """Columns by joint, as the log names it, and what was assumed."""
+    if options.command and options.position:
+        pairs, notes = _stated_pairs(path, table, options), []
+    else:
+        pairs, notes = _pairs_by_words(path, table, options)
+    if not options.joints:
+        used = [c.name for pair in pairs.values() for c in (pair.command, pair.position)]
+        table.check_joints(path, used)
+    return pairs, notes
+
+
+def _pairs_by_words(
+    path: Path | str, table: Table, options: LogOptions
+) -> tuple[dict[str, _Pair], list[str]]:
+    every = [column(name) for name in table.names if name not in table.texts]
+    by_kind = {kind: [c for c in every if c.kind == kind] for kind in ("command", "position")}
+    shared = {c.key for c in by_kind["command"]} & {c.key for c in by_kind["position"]}
+    if not shared:
+        return _lone_pair(path, table, by_kind["command"], by_kind["position"])
+    used = Counter(c.template for c in every)
+    pairs: dict[str, _Pair] = {}
+    names: list[str] = []
+    notes: list[str] = []
+    for key in dict.fromkeys(c.key for c in by_kind["command"]):
+        if key not in shared:
+            continue
+        ranked = [
+            sorted((c for c in by_kind[kind] if c.key == key),
+                   key=lambda c: (c.rank, -used[c.template]))[:_COMPARED]
+            for kind in ("command", "position")
+        ]  # fmt: skip
+        best = sorted((_Pair(c, p) for c, p in product(*ranked)), key=lambda q: _cost(q, used))
+        pair = _decided(path, table, best, used)
+        if (
+            sum(
+                other.command.rank[:2] == pair.command.rank[:2]
+                and other.position.rank[:2] == pair.position.rank[:2]
+                for other in best
+            )
+            > 1
+        ):
+            notes.append(
+                f"of several columns {pair.command.name} was taken for the command and "
+                f"{pair.position.name} for the position. To take others, name them with "
+                "`command` and `position`."
+            )
+        pairs[key] = pair
+        names.append(_joint_name(pair))
+        odd = {"setpoint", "estimate"} <= pair.command.words | pair.position.words
+        if odd and not pair.command.unit + pair.position.unit and not options.unit:
+            notes.append(
+                "pos_setpoint and pos_estimate are names of ODrive, which counts turns; the values "
+                "were taken as rad. If they are turns, give `unit='turns'`; lag and dead time "
+                "are the same."
+            )
+    distinct(path, names, "joints")
+    kinds = dict(zip((note[:12] for note in reversed(notes)), reversed(notes), strict=True))
+    return dict(zip(names, pairs.values(), strict=True)), [*kinds.values()][::-1]
+
+
+def _joint_name(pair: _Pair) -> str:
+    """What to call the joint of a pair: as both columns have it, else without further words."""
+    both = sorted((pair.command.joint, pair.position.joint), key=len)
+    return bare_name(both[0] if both[0] else pair.command.key) or _SOLE
+
+
+def _cost(pair: _Pair, used: Mapping[str, int]) -> tuple[int, ...]:
+    """Order of pairs for one joint, the better ones first."""
+    c, p = pair.command, pair.position
+    units = {c.unit or "rad", p.unit or "rad"}
+    return (
+        c.rank[0] + p.rank[0], c.rank[1] + p.rank[1], int(len(units) > 1), c.rank[2] + p.rank[2],
+        p.rank[3], -used[c.template] - used[p.template],
+    )  # fmt: skip
+
+
+def _decided(
+    path: Path | str, table: Table, pairs: Sequence[_Pair], used: Mapping[str, int]
+) -> _Pair:
+    """The best of the pairs of a joint; refused where another is as good and holds other values."""
+    best = pairs[0]
+    alike = [pair for pair in pairs if _cost(pair, used) == _cost(best, used)]
+    for kind in ("command", "position"):
+        own = getattr(best, kind)
+        twice = {getattr(pair, kind).name for pair in pairs
+                 if _cost(pair, used)[:4] == _cost(best, used)[:4]
+                 and getattr(pair, kind).words == own.words}  # fmt: skip
+        distinct(path, [bare_name(own.joint or _SOLE)] * len(twice), "joints")
+        columns = list({getattr(pair, kind).name: getattr(pair, kind) for pair in alike})
+        values = [table.columns.get(name) for name in columns]
+        if any(v is None or not np.array_equal(v, values[0], equal_nan=True) for v in values[1:]):
+            why = f"{len(columns)} columns may be the {kind} of {own.joint or 'the joint'}"
+            _refuse_choices(path, why, alike)
+    return best
+
+
+def _lone_pair(
+    path: Path | str, table: Table, commands: Sequence[Column], positions: Sequence[Column]
+) -> tuple[dict[str, _Pair], list[str]]:
+    """The pair of a table in which no joint has both by name: the only command and position."""
+    first = [
+        [c for c in columns if c.rank[:3] == min(columns, key=lambda c: c.rank).rank[:3]]
+        for columns in (commands, positions)
+        if columns
+    ]
+    if len(first) == 2:
+        pairs = [_Pair(c, p) for c, p in product(*first)]
+        if len(pairs) == 1:
+            (pair,) = pairs
+            name = pair.command.joint or pair.position.joint or _SOLE
+            return {bare_name(name): pair}, [
+                f"{pair.command.name} and {pair.position.name} were taken for the command and the "
+                "position of one joint."
+            ]
+        table.check_joints(path, [c.name for own in first for c in own])
+        if len(first[0]) == len(first[1]):
+            pairs = [_Pair(*(_joined(own) for own in first))]
+        _refuse_choices(path, "no joint has both a command and a position by its name", pairs)
+    table.check_joints(path, [c.name for c in (*commands, *positions)])
+    raise InputError(f"{path}: {missing(table.names)}; it has {_listed(table.names)}.")
+
+
+def _joined(columns: Sequence[Column]) -> Column:
+    """Several columns as one for a command line."""
+    names = ",".join(c.name for c in columns)
+    return replace(columns[0], name=names, template=names)
+
+
+def _refuse_choices(path: Path | str, why: str, pairs: Sequence[_Pair]) -> None:
+    """Refuse to choose, with the command line that takes each pair."""
+    lines = [
+        import_line(path, command=pair.command.template, position=pair.position.template)
+        for pair in pairs
+    ]
+    lines = list(dict.fromkeys(lines))  # templates are of several joints
+    more = "" if len(lines) <= _MOST_CHOICES else f" (and {len(lines) - _MOST_CHOICES} more)"
+    raise InputError(f"{path}: {why}. Take one: {'; or '.join(lines[:_MOST_CHOICES])}{more}.")
+
+
+def import_line(path: Path | str, **options: str) -> str:
+    """The command that imports a log with these options."""
+    words = [f"pupper-sysid import {shlex.quote(Path(path).name)}"]
+    for name, value in (options | {"out": "rec.csv"}).items():
+        words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value))}")
+    return f"`{' '.join(words)}`"
+
+
+def _stated_pairs(path: Path | str, table: Table, options: LogOptions) -> dict[str, _Pair]:
+    """Columns that the options name."""
+    assert options.command and options.position
+    matched = []
+    for option, text in (("command", options.command), ("position", options.position)):
+        listed = [part.strip() for part in text.split(",")]
+        if "{joint}" not in text and text not in table.names:
+            found = {str(k): _column_named(path, table, option, name)
+                     for k, name in enumerate(listed)}  # fmt: skip
+        else:
+            before, stated, after = text.partition("{joint}")
+            middle = "(?P<joint>.+)" if stated else ""
+            pattern = re.compile(f"{re.escape(before)}{middle}{re.escape(after)}")
+            fits = [m for name in table.names if (m := pattern.fullmatch(name[:200]))]
+            found = {bare_name(m.groupdict().get("joint") or "0"): m[0] for m in fits}
+            distinct(path, [bare_name(m.groupdict().get("joint") or "0") for m in fits], "joints")
+        if not found:
+            raise InputError(
+                f"{path}: `{option}` is {printable(text)}, which fits no column; it has "
+                f"{_listed(table.names)}."
+            )
+        matched.append(found)
+    commands, positions = matched
+    both = [joint for joint in commands if joint in positions]
+    if not both or ("{joint}" not in options.command and len(commands) != len(positions)):
+        raise InputError(
+            f"{path}: no joint has both a column of `command` and one of `position`; it has "
+            f"{_listed(table.names)}."
+        )
+    names = both
+    if "{joint}" not in options.command:
+        stated_joints = [*options.joints] if len(options.joints) == len(both) else []
+        names = stated_joints or ([_SOLE] if len(both) == 1 else [f"joint_{k}" for k in both])
+    return {
+        name: _Pair(column(commands[joint]), column(positions[joint]))
+        for name, joint in zip(names, both, strict=True)
+    }
+
+
+def _column_named(path: Path | str, table: Table, option: str, name: str) -> str:
+    """The column of this name, or of this number from 0."""
+    if name in table.names:
+        return name
+    if name.isascii() and name.isdigit() and int(name[:9]) < len(table.names):
+        return table.names[int(name)]
+    hint = "" if option in ("time", "command_time", "trial") else (
+        " ({joint} stands for a joint's name)"
+    )  # fmt: skip
+    raise InputError(
+        f"{path}: `{option}` is {printable(name)[:60]}, but there is no such column{hint}; it has "
+        f"{_listed(table.names)}."
+    )
+
+
+def unknown_numbers(path: Path | str, table: Table) -> str:
+    """Why a table whose columns have no names cannot be read, and how it can."""
+    shown = []
+    for name, values in list(table.columns.items())[:12]:
+        known = values[np.isfinite(values)]
+        if len(known):
+            steps = np.diff(known)
+            up = ", increasing" if (steps >= 0).all() and (steps > 0).any() else ""
+            shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
+    increasing = [text.split(" ")[0] for text in shown if "increasing" in text]
+    time = (increasing or ["0"])[0]
+    others: list[str] = []  # that move, each once
+    for name, values in table.columns.items():
+        known = values[np.isfinite(values)]
+        same = (np.array_equal(values, table.columns[o], equal_nan=True) for o in others)
+        if name != time and len(known) and np.ptp(known) > 0 and not any(same):
+            others.append(name)
+    first, second = [*others, "1", "2"][:2]
+    choices = dict.fromkeys([(first, second), (second, first), (first, (others or [second])[-1])])
+    lines = [import_line(path, time=time, command=c, position=p) for c, p in choices]
+    return (
+        f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. Say "
+        f"which is which: {', '.join(lines)}, or others."
+    )
+
+
+def has_time(names: Sequence[str]) -> bool:
+    """Whether one of these columns is a time."""
+    return bool(time_columns(names) or any(column(n).kind == "time" for n in names))
+
+
+def missing(names: Sequence[str]) -> str:
+    """What a table lacks to be a servo's log; empty if a joint may have command and position."""
+    kinds = {column(name).kind for name in names}
+    if {"command", "position"} <= kinds:
+        return ""
+    if "command" in kinds:
+        return "no column is a position (knee_position, observation.state.knee, present …)"
+    if "position" in kinds:
+        return "no column is a command (knee_command, action.knee, goal …)"
+    return "no column is a command or a position"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return printable(", ".join(map(str, names)))[:300]
+
+
+# --------------------------------------------------------------------------------------- times
+
+
+def _times(
+    path: Path | str, table: Table, options: LogOptions
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None, list[str]]:
+    """Times of the rows, when their commands were sent where that is known, and notes."""
+    count = max(map(len, table.columns.values()), default=0)
+    if options.rate:
+        return np.arange(count) / options.rate, None, []  # of each joint's own rows: `_joint`
+    names = [name for name in table.names if name in table.columns or name in table.texts]
+    found = time_columns(names)
+    sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
+    read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
+    time, command_time, notes = options.time, options.command_time, []
+    if time is not None:
+        time = _column_named(path, table, "time", time)
+    elif not found and len(sent) == 1 and len(read) == 1:
+        time, command_time = read[0], command_time or sent[0]
+        notes.append(f"commands were taken as sent at {command_time}, positions as read at {time}.")
+    elif found or read:
+        time = (found or read)[0]
+    else:
+        raise InputError(
+            f"{path}: no column is a time (time, timestamp, t …, also with _s, _ms, _us or _ns); "
+            f"it has {_listed(table.names)}. Name it with `time`, or give the rows a second with "
+            "`rate`."
+        )
+    read_s, at, texts = _seconds(path, table, time)
+    notes += texts
+    if command_time is None:
+        if options.time is None and sent and time not in sent:
+            notes.append(
+                f"commands may have been sent at {sent[0]}: if so, "
+                f"{import_line(path, time=time, command_time=sent[0])}."
+            )
+        return read_s, None, notes
+    command_time = _column_named(path, table, "command_time", command_time)
+    send_s, other, texts = _seconds(path, table, command_time)
+    gap = at - other
+    return read_s, send_s - gap, [*notes, *texts]
+
+
+_SENT = frozenset(
+    "command commands commanded cmd cmds goal target send sent tx action write written".split()
+)
+
+
+def _seconds(
+    path: Path | str, table: Table, name: str
+) -> tuple[NDArray[np.float64], float, list[str]]:
+    """Times of a column in seconds, the time that counts as 0, and notes."""
+    if name in table.texts:
+        return times_of_day(path, name, table.texts[name]), 0.0, []
+    values = table.numbers(path, name)
+    lower = {n.lower(): n for n in table.columns}
+    whole = re.fullmatch(r"(.*?)secs?", name.lower())
+    rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]
+    if rest:  # seconds and what is below one in a column of its own, as stamps of ROS have them
+        zero = float(np.nanmin(values))
+        below = table.numbers(path, rest[0])
+        return values - zero + clock(rest[0], below).scale * below, zero, []
+    found = clock(name, values)
+    return found.seconds(values), found.zero * found.scale, found.notes
+
+
+# ---------------------------------------------------------------------------------------- rows
+
+
+def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
+    """A table with one value a row and its name (`time, name, value`) as columns by name.
+
+    Values are put at the times of the positions, commands as they were in force. Other tables come
+    back as they are.
+    """
+    by_case = {n.lower(): n for n in table.texts}
+    series = next((by_case[n] for n in _SERIES if n in by_case), None)
+    value = table.first(("value", "values", "val", "_value", "data"))
+    if series is None or value is None or options.command:
+        return table
+    codes, found = pd.factorize(np.array(table.texts[series], object))
+    if len(found) > MOST_COLUMNS or missing([*map(str, found)]):
+        return table
+    read_s, _, notes = _times(path, table, options)
+    values = table.numbers(path, value)
+    own = {str(name): codes == k for k, name in enumerate(found)}
+    positions = [n for n in own if column(n).kind == "position"]
+    most = max(positions, key=lambda n: int(own[n].sum()))
+    at = read_s[own[most]]
+    columns: dict[str, NDArray[np.float64]] = {"time_s": at}
+    kept = np.ones(len(at), bool)
+    for name, rows_of in own.items():
+        order = np.argsort(read_s[rows_of], kind="stable")
+        _, held, known = held_commands(read_s[rows_of][order], values[rows_of][order], at)
+        columns[name] = np.full(len(at), np.nan)
+        columns[name][known] = held
+        if column(name).kind in ("command", "position"):
+            kept &= known
+    columns = {name: v[kept] for name, v in columns.items()}
+    return Table(columns, notes=(*notes, f"each row holds one value, named by {series}."))
+
+
+def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
+    """Rows by joint, where columns name or number it; by leg and joint where both do."""
+    found: dict[str, NDArray[np.bool_]] = {}
+    texts = {n.lower(): n for n in table.texts}
+    numbers = {n.lower(): n for n in table.columns}
+    for name in _GROUPS:
+        if name in texts:
+            codes, values = pd.factorize(np.array(table.texts[texts[name]], object))
+            refuse_more(f"{path}, column {name}", len(values), MOST_JOINTS, "joints")
+            own: dict[str, NDArray[np.bool_]] = {}
+            for code, value in enumerate(values):
+                if word := value.strip():
+                    own[word] = own.get(word, False) | (codes == code)
+        elif name in numbers and column(name).kind in ("", "unknown"):
+            own = _numbered(path, table, numbers[name])
+        else:
+            continue
+        if len(found) > 1 and len(own) > 1:
+            found = {f"{one}_{other}": both for (one, a), (other, b) in
+                     product(found.items(), own.items()) if (both := a & b).any()}  # fmt: skip
+            refuse_more(f"{path}, column {name}", len(found), MOST_JOINTS, "joints")
+        elif len(own) > len(found):
+            found = own
+    return found
+
+
+def _numbered(path: Path | str, table: Table, name: str) -> dict[str, NDArray[np.bool_]]:
+    """Rows by the whole numbers of a column that has few of them."""
+    numbers = table.numbers(path, name)
+    known, counts = np.unique(numbers[np.isfinite(numbers)], return_counts=True)
+    if len(known) > _MOST_GROUPS or (known % 1 != 0).any() or (counts < _FEWEST_ROWS).any():
+        return {}
+    refuse_more(f"{path}, column {name}", len(known), MOST_JOINTS, "joints")
+    word = re.sub(r"[_\s]?(idx|id|index|name)$", "", name.lower()) or "motor"
+    return {f"{word}_{v:g}": numbers == v for v in known}
+
+
+def _joint(
+    path: Path | str,
+    table: Table,
+    options: LogOptions,
+    pair: _Pair,
+    times_s: tuple[NDArray[np.float64], NDArray[np.float64] | None],
+    own: NDArray[np.bool_],
+    names: tuple[str, str],
+    metadata: dict[str, Any],
+) -> tuple[pd.DataFrame, list[str]]:
+    """Rows of one joint; its doubt goes into the header."""
+    stamp, sent = times_s[0][own], None if times_s[1] is None else times_s[1][own]
+    if options.rate:
+        stamp = np.arange(len(stamp)) / options.rate
+    trial, tone, warnings = _trials(path, table, options, own)
+    number, shifted = one_after_another(stamp, trial)
+    if sent is not None:
+        send, read, doubt = sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
+    else:
+        send, read, doubt, texts = turns(shifted, options)
+        warnings += texts
+    if options.rate:
+        doubt = max(doubt, doubt_of_a_turn(stamp)[0])
+        warnings.append(
+            f"its times are row numbers over {options.rate:g} Hz: lag and dead time scale with "
+            "that rate, and are in doubt by half a turn."
+        )
+    metadata["bus"]["read_time_doubt_s"] = max(doubt, metadata["bus"].get("read_time_doubt_s", 0.0))
+    apart = read - send
+    metadata["read_after_send_s"] = float(np.clip(np.nanmedian(apart), -1, 1)) if len(send) else 0.0
+    used = {"command": pair.command.name, "position": pair.position.name}
+    metadata.setdefault("columns", {})[names[1]] = used
+    stated = options.unit_of(*names)
+    columns: dict[str, Any] = {}
+    for key, source in (("command_rad", pair.command), ("position_rad", pair.position)):
+        values = table.numbers(path, source.name)[own]
+        factor = stated or _of_name(source) or Unit()
+        columns[key] = (values - factor.zero) * factor.scale
+        if factor.counts and stated is None:
+            warnings.append(
+                f"columns in counts were taken as {round(2 * factor.zero)} counts a turn, half of "
+                "them 0 rad. If that is wrong, give `unit`, such as counts:1024."
+            )
+        if key == "position_rad" and factor.counts:
+            columns["position_count"] = values
+        if stated or source.unit not in ("", "rad"):
+            metadata["angle_unit"] = "stated"
+    for name in _KEPT:
+        if name in table.columns:
+            columns[name] = table.numbers(path, name)[own]
+    part = rows(
+        names[1], send, read, columns.pop("command_rad"), columns.pop("position_rad"), number,
+        **columns,
+    )  # fmt: skip
+    if tone is not None:
+        part["frequency_hz"] = tone
+        several = part.groupby("trial")["frequency_hz"].transform("nunique").to_numpy() > 1
+        part.loc[several, "frequency_hz"] = np.nan  # a chirp is no tone
+    return part, warnings
+
+
+def _trials(
+    path: Path | str, table: Table, options: LogOptions, own: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None, list[str]]:
+    """Number of each row's trial, its frequency, and notes; None where there is none.
+
+    A change of the frequency begins a trial, unless it changes so often that it is a chirp's.
+    """
+    notes: list[str] = []
+    trial = None
+    name = table.first(_TRIALS)
+    if options.trial:
+        name = _column_named(path, table, "trial", options.trial)
+    if name is not None and name in table.texts:
+        codes, labels = pd.factorize(np.array(table.texts[name], object))
+        trial = codes[own].astype(float)
+        listed = ", ".join(f"{k}: {printable(str(v))[:30]}" for k, v in enumerate(labels[:12]))
+        notes.append(f"trials are the runs of rows with one {name} ({listed}).")
+    elif name is not None:
+        trial = table.numbers(path, name)[own]
+    tone_name = table.first(_TONES)
+    if tone_name is None:
+        return trial, None, notes
+    tone = table.numbers(path, tone_name)[own]
+    with np.errstate(invalid="ignore"):
+        change = np.diff(np.nan_to_num(tone)) != 0
+    edges = np.concatenate([[0], 1 + np.flatnonzero(change), [len(tone)]])
+    if change.any() and np.median(np.diff(edges)) >= _SHORTEST_TONE:
+        runs = np.concatenate([[0], np.cumsum(change)])
+        if trial is None:
+            notes.append(f"a change of {tone_name} begins a trial.")
+            trial = runs.astype(float)
+        else:
+            new = np.concatenate([[False], change | (np.diff(trial) != 0)])
+            trial = np.cumsum(new).astype(float)
+    return trial, tone, notes
+
+
+def _of_name(source: Column) -> Unit | None:
+    """The unit that a column's name ends in."""
+    if source.unit in ("", "rad"):
+        return None
+    return unit("counts:4096" if source.unit == "counts" else source.unit)

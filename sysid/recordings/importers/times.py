@@ -1,0 +1,194 @@
+"""Times of other people's logs: units, restarts, and the place of a time stamp within a turn."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.dialect import is_clock
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+
+READ_AFTER_SEND_S = 0.0005
+"""Time between sending a command and reading the position where a log does not say."""
+
+PAUSE_S = 0.5
+"""Between trials whose times start again."""
+
+_LONGEST_DOUBT_S = 1.0
+_KNOWN_ORDER_DOUBT_S = 0.001
+_SCALES = {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9, "nsecs": 1e-9, "usec": 1e-6, "us": 1e-6,
+            "µs": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0,
+           "secs": 1.0, "seconds": 1.0, "nanos": 1e-9, "micros": 1e-6, "millis": 1e-3}  # fmt: skip
+_UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE)
+_LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo
+_GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+_DAY_S = 86_400.0
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How a column of times becomes seconds: `(value - zero) * scale`."""
+
+    scale: float = 1.0
+    zero: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+    def seconds(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The values in seconds."""
+        return (values - self.zero) * self.scale
+
+
+def clock(name: str, values: NDArray[np.float64]) -> Clock:
+    """Unit of the times in the column `name`, by its ending, else by their distance.
+
+    Raises
+    ------
+    InputError
+        If they are no times of a servo's log in any unit.
+    """
+    shown = printable(name)[:60]
+    if found := _UNIT.search(name):
+        return Clock(_SCALES[found[1].lower()])
+    steps = np.diff(values)
+    steps = steps[steps > 0]
+    if not len(steps):
+        raise InputError(
+            f"column {shown}: its values do not increase, so they are no times. Give the rows a "
+            "second with `rate`, or another column with `time`."
+        )
+    loop = float(np.median(steps))
+    for unit, scale in _GUESSED:
+        if _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
+            if unit == "s":
+                break
+            return Clock(scale, float(values[0]), [
+                f"column {shown} names no unit; its values were taken as {unit}, since they are "
+                f"{loop:.4g} apart. Call it {shown}_s, _ms, _us or _ns if that is wrong."
+            ])  # fmt: skip
+    return Clock()
+
+
+def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.float64]:
+    """Seconds of cells such as `2026-05-04T12:30:01.25` or `12:30:01.25`; an empty one is NaN.
+
+    Raises
+    ------
+    InputError
+        If one is no time.
+    """
+    bad = next((k for k, cell in enumerate(cells) if cell and not is_clock(cell)), None)
+    texts = pd.Series([cell.replace(",", ".") or None for cell in cells], dtype=object)
+    try:
+        if bad is not None:
+            raise ValueError
+        if texts.str.contains("-", regex=False).any():
+            parsed = pd.to_datetime(texts, format="ISO8601", utc=True)
+            return (parsed - parsed.min()).dt.total_seconds().to_numpy()
+        seconds = pd.to_timedelta(texts).dt.total_seconds().to_numpy()
+    except (ValueError, TypeError, OverflowError):
+        shown = printable(cells[bad])[:40] if bad is not None else "a cell"
+        raise InputError(
+            f"{path}, column {printable(name)[:60]}: '{shown}' is no time. Write seconds, or "
+            "2026-05-04T12:30:01.25."
+        ) from None
+    midnights = np.cumsum(np.concatenate([[0], np.diff(seconds) < -_DAY_S / 2]))
+    return seconds + _DAY_S * midnights
+
+
+def loop_period_s(stamp: NDArray[np.float64]) -> float:
+    """Median time between rows that follow one another."""
+    steps = np.diff(stamp)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def doubt_of_a_turn(stamp: NDArray[np.float64]) -> tuple[float, str]:
+    """Half a turn, and the sentence that says why lag and dead time are in doubt by it."""
+    doubt = min(loop_period_s(stamp) / 2, _LONGEST_DOUBT_S)
+    return doubt, (
+        "each row has one time stamp, and the log does not say when in a turn the command was sent "
+        f"and the position read: lag and dead time are in doubt by half a turn ({1e3 * doubt:.1f} "
+        "ms). If you know, say so: `pupper-sysid import` with --command-time, --send-after, or "
+        "--stamp and --read-before-send."
+    )
+
+
+def turns(
+    stamp: NDArray[np.float64], options: LogOptions
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, list[str]]:
+    """Send times, read times, their doubt and its reason, of rows with one time stamp.
+
+    Without `stamp`, `read_before_send` and `send_after` the order is unknown and the doubt half a
+    turn.
+    """
+    after = options.send_after_s
+    known = options.stamp is not None or options.read_before_send is not None
+    before = bool(options.read_before_send)
+    apart = after if after is not None else READ_AFTER_SEND_S if before else -READ_AFTER_SEND_S
+    early = {"start": 0.0, "middle": 0.5, "end": 1.0}[options.stamp or "start"]
+    first = stamp - early * abs(apart)
+    read = first if apart >= 0 else first - apart
+    send = read + apart
+    if after is not None:
+        return send, read, 0.0, []
+    if known:
+        order = "read" if before else "sent", "sent" if before else "read"
+        things = ("position", "command") if before else ("command", "position")
+        text = (
+            f"the {things[0]} was taken as {order[0]} first and the {things[1]} as {order[1]} "
+            f"{1e3 * READ_AFTER_SEND_S:g} ms later, in doubt by {1e3 * _KNOWN_ORDER_DOUBT_S:g} ms. "
+            f"If more lies between them, give it: `send_after='{'' if before else '-'}3ms'`."
+        )
+        return send, read, _KNOWN_ORDER_DOUBT_S, [text]
+    doubt, text = doubt_of_a_turn(stamp)
+    return send, read, doubt, [text]
+
+
+def sent_at(command_s: NDArray[np.float64], read_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """When the command of each row was sent.
+
+    A row that repeats the time of the one before it holds the same command once more: it counts as
+    sent at its reading, but not after the next command.
+    """
+    again = np.concatenate([[False], np.diff(command_s) == 0])
+    following = np.append(command_s, np.inf)[np.searchsorted(command_s, command_s, side="right")]
+    return np.where(again, np.clip(read_s, command_s, following), command_s)
+
+
+def one_after_another(
+    stamp: NDArray[np.float64], trial: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Trial number of each row, and times with trials that start again put after one another.
+
+    A trial is a run of rows of one number in `trial`; a step back in time starts one, too.
+
+    Raises
+    ------
+    InputError
+        If there are too many trials.
+    """
+    number = np.zeros(len(stamp)) if trial is None else trial
+    with np.errstate(invalid="ignore"):
+        new = np.concatenate([[False], (np.diff(number) != 0) | (np.diff(stamp) < 0)])
+    runs = np.cumsum(new)
+    shifted, last = stamp.astype(float).copy(), -np.inf
+    starts = np.flatnonzero(np.concatenate([[True], new[1:]]))
+    refuse_more("The log", len(starts), MOST_TRIALS, "trials", "Check its times, or split it.")
+    for start, end in zip(starts, [*starts[1:], len(stamp)], strict=True):
+        own = shifted[start:end]
+        if not np.isfinite(own).any():
+            continue
+        first = float(np.nanmin(own))
+        if first <= last:
+            own += last + PAUSE_S - first
+        last = float(np.nanmax(own))
+    return runs.astype(float), shifted

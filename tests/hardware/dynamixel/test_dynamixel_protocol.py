@@ -1,0 +1,198 @@
+"""Protocol 2.0 on the wire: the manual's examples, damaged frames, and the vendor's SDK."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import dynamixel_sdk
+import numpy as np
+import pytest
+
+from pupper_sysid.hardware.dynamixel.frames import Frame, FrameReader, crc16
+from pupper_sysid.hardware.dynamixel.line import DynamixelLine
+from pupper_sysid.hardware.dynamixel.registers import ACCESS, ALERT, CRC, DATA_LIMIT, INSTRUCTION
+from pupper_sysid.hardware.serial_servos import line as serial_line
+from support.servo_servers import bench_of, on_a_port, still_dynamixels
+
+# Robotis e-Manual, protocol 2.0: examples of instruction and status packets
+EXAMPLES = {
+    "ping": ("FF FF FD 00 01 03 00 01 19 4E", Frame(1, 1, b"")),
+    "ping answer": (
+        "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D", Frame(1, 0, b"\x06\x04\x26", True)
+    ),
+    "read": ("FF FF FD 00 01 07 00 02 84 00 04 00 1D 15", Frame(1, 2, b"\x84\x00\x04\x00")),
+    "read answer": (
+        "FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0", Frame(1, 0, b"\xa6\x00\x00\x00", True)
+    ),
+    "write": (
+        "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89",
+        Frame(1, 3, b"\x74\x00\x00\x02\x00\x00"),
+    ),
+    "write answer": ("FF FF FD 00 01 04 00 55 00 A1 0C", Frame(1, 0, b"", True)),
+    "sync read": (
+        "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA",
+        Frame(254, 0x82, b"\x84\x00\x04\x00\x01\x02"),
+    ),
+    "sync read answer": (
+        "FF FF FD 00 02 08 00 55 00 1F 08 00 00 BA BE", Frame(2, 0, b"\x1f\x08\x00\x00", True)
+    ),
+    "sync write": (
+        "FF FF FD 00 FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87",
+        Frame(254, 0x83, b"\x74\x00\x04\x00\x01\x96\x00\x00\x00\x02\xaa\x00\x00\x00"),
+    ),
+    "reboot": ("FF FF FD 00 01 03 00 08 2F 4E", Frame(1, 8, b"")),
+}  # fmt: skip
+
+
+def wire(name: str) -> bytes:
+    return bytes.fromhex(EXAMPLES[name][0])
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator:
+    """Two servos behind a port, shared."""
+    servos = still_dynamixels([1, 2], model=1030)
+    with on_a_port(servos) as server:
+        yield servos, server.device
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_manuals_examples_are_written_and_read(name):
+    data, frame = wire(name), EXAMPLES[name][1]
+    assert frame.encode() == data
+    assert FrameReader(status=frame.is_status).feed(b"\x00\xff" + data) == [frame]
+
+
+def test_the_emulated_servo_answers_the_manuals_requests_as_the_manual_says():
+    servos = still_dynamixels([1, 2], model=1030)
+    for servo_id in (1, 2):
+        servos._set(servo_id, "firmware", 0x26)
+        servos._set(servo_id, "torque_enable", 0)
+    bench_of(servos).counts.update({1: 0xA6, 2: 0x81F})
+
+    def answer(name: str) -> bytes:
+        return b"".join(piece for _, piece in servos.receive(wire(name), servos._free_at))
+
+    assert answer("ping") == wire("ping answer")
+    assert answer("read") == wire("read answer")
+    assert answer("write") == wire("write answer")
+    assert answer("sync read") == wire("read answer") + wire("sync read answer")
+    assert answer("sync write") == b""
+    assert (servos._get(1, "goal_position"), servos._get(2, "goal_position")) == (0x96, 0xAA)
+
+
+def test_a_header_inside_the_data_is_stuffed_and_comes_out_again():
+    data = bytes.fromhex("ff ff fd 00 ff ff fd fd ff ff")
+    frame = Frame(7, 0, data, True)
+    assert b"\xff\xff\xfd\xfd\x00" in frame.encode()
+    assert FrameReader(status=True).feed(frame.encode()) == [frame]
+
+
+def damaged(rng: np.random.Generator, frames: list[bytes]) -> bytes:
+    """A frame with flipped bits, cut, doubled, or with noise around it."""
+    data = bytearray(frames[int(rng.integers(len(frames)))])
+    kind = int(rng.integers(4))
+    if kind == 0:
+        for _ in range(int(rng.integers(1, 4))):
+            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        del data[int(rng.integers(len(data))) :]
+    elif kind == 2:
+        data[3:3] = data[: int(rng.integers(len(data)))]
+    else:
+        data += rng.bytes(int(rng.integers(12)))
+    return bytes(data)
+
+
+def read_damaged(count: int) -> int:
+    """Damaged frames through both readers; how many were taken as they were sent."""
+    rng = np.random.default_rng(0)
+    frames = [wire(name) for name in EXAMPLES]
+    readers = FrameReader(), FrameReader(status=True)
+    servos = still_dynamixels([1, 2])
+    whole = 0
+    for _ in range(count):
+        data = damaged(rng, frames)
+        for reader in readers:
+            for frame in reader.feed(data):
+                assert crc16(frame.encode()[:-2]) == int.from_bytes(frame.encode()[-2:], "little")
+                whole += 1
+        servos.receive(data, servos._free_at)
+        assert max(len(reader._buffer) for reader in readers) <= 1024
+    return whole
+
+
+def test_damaged_frames_raise_nothing_and_good_ones_between_them_are_found():
+    assert read_damaged(400) > 50
+    reader = FrameReader(status=True)
+    assert reader.feed(wire("read answer")[:-3] + wire("sync read answer")) == [
+        EXAMPLES["sync read answer"][1]
+    ]
+
+
+@pytest.mark.slow
+def test_100000_damaged_frames_raise_nothing():
+    assert read_damaged(100_000) > 10_000
+
+
+def test_the_vendors_sdk_reads_writes_and_groups(served):
+    servos, device = served
+    port = dynamixel_sdk.PortHandler(device)
+    packets = dynamixel_sdk.PacketHandler(2.0)
+    assert port.openPort() and port.setBaudRate(1_000_000)
+    try:
+        model, result, error = packets.ping(port, 1)
+        assert (model, result, error) == (1030, 0, 0)
+        found, result = packets.broadcastPing(port)
+        assert result == 0 and sorted(found) == [1, 2]
+        assert packets.write1ByteTxRx(port, 1, 64, 0) == (0, 0)
+        assert packets.write4ByteTxRx(port, 1, 116, 2100) == (0, 0)
+        assert packets.read4ByteTxRx(port, 1, 116) == (2100, 0, 0)
+        # beyond the position limit, and EEPROM while the torque is on
+        assert packets.write4ByteTxRx(port, 1, 116, 9000) == (0, DATA_LIMIT)
+        assert packets.write1ByteTxRx(port, 1, 64, 1) == (0, 0)
+        assert packets.write1ByteTxRx(port, 1, 11, 1) == (0, ACCESS)
+        assert packets.write1ByteTxRx(port, 1, 64, 0) == (0, 0)
+        group = dynamixel_sdk.GroupSyncWrite(port, packets, 116, 4)
+        for servo, goal in ((1, 2000), (2, 2200)):
+            assert group.addParam(servo, list(goal.to_bytes(4, "little")))
+        assert group.txPacket() == 0
+        bench_of(servos).counts.update({1: 1999, 2: 2201})
+        readings = dynamixel_sdk.GroupSyncRead(port, packets, 132, 4)
+        assert readings.addParam(1) and readings.addParam(2)
+        assert readings.txRxPacket() == 0
+        assert [readings.getData(i, 132, 4) for i in (1, 2)] == [1999, 2201]
+    finally:
+        port.closePort()
+    assert bench_of(servos).goals[-2:] == [(1, 2000), (2, 2200)]
+
+
+def test_wrong_frames_are_answered_by_their_error_number():
+    servos = still_dynamixels([1])
+
+    def errors(data: bytes) -> list[int]:
+        pieces = servos.receive(data, servos._free_at)
+        frames = FrameReader(status=True).feed(b"".join(piece for _, piece in pieces))
+        return [frame.code for frame in frames]
+
+    spoiled = bytearray(wire("read"))
+    spoiled[-1] ^= 1
+    assert errors(bytes(spoiled)) == [CRC]
+    assert errors(Frame(1, 0x42, b"").encode()) == [INSTRUCTION]
+    servos._set(1, "hardware_error_status", 32)
+    assert errors(wire("ping")) == [ALERT]
+
+
+def test_our_line_reads_what_the_servos_hold(served):
+    _, device = served
+    line = DynamixelLine(device, 1_000_000)
+    line.detect_echo()
+    assert line.find([1, 2, 3]) == {1: 1030, 2: 1030}
+    replies = line.sync_read([1, 2], 132, 4)
+    line.close()
+    assert set(replies) == {1, 2} and replies[1].after_s <= replies[2].after_s

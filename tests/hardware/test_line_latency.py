@@ -1,0 +1,97 @@
+"""How late replies come is measured, and the patience follows; no servo is missed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.cli.commands.robot import scan as scan_command
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.feetech.bus import FAMILY, FeetechBus
+from pupper_sysid.hardware.serial_servos.line import slow_adapter
+from pupper_sysid.hardware.serial_servos.scan import scan_line
+from pupper_sysid.sim.emulator.serial_pty import SerialPty
+from support.command_line import run
+from support.servo_servers import map_of, on_a_port, still_servos
+
+
+@contextmanager
+def behind_adapter(emulator, latency_s: float) -> Iterator[SerialPty]:
+    """The servos behind an adapter whose timer has this period."""
+    with on_a_port(emulator) as server:
+        server.latency_s = latency_s
+        yield server
+
+
+@pytest.mark.wall_clock
+def test_a_slow_adapter_is_waited_for_and_named():
+    servos = still_servos(ids=[4, 5, 6])
+    with behind_adapter(servos, 0.016) as server:
+        bus = FeetechBus(server.device, 1_000_000, map_of(4, 5, 6))
+        samples = [bus.read() for _ in range(5)]
+        said, latency_s = slow_adapter(bus.line), bus.metadata["latency_s"]
+        bus.close()
+    assert all(np.isfinite(sample.position_rad).all() for sample in samples)
+    # requests right after replies wait for a whole period of the timer
+    assert 0.008 < latency_s < 0.03
+    assert said and "later than bytes and servos need" in said
+
+
+def test_a_fast_adapter_is_not_called_slow():
+    with on_a_port(still_servos(ids=[4])) as server:
+        bus = FeetechBus(server.device, 1_000_000, map_of(4))
+        bus.line.latency_s = 0.0004
+        assert slow_adapter(bus.line) is None
+        bus.close()
+
+
+@pytest.mark.slow
+@pytest.mark.wall_clock
+@pytest.mark.parametrize("latency_ms", [0.2, 1, 3, 6, 16])
+def test_no_servo_is_missed_in_20_scans_whatever_the_adapter(latency_ms):
+    family = replace(FAMILY, highest_id=40)
+    with behind_adapter(still_servos(), latency_ms / 1e3) as server:
+        listed = [
+            [servo.id for servo in scan_line(family, server.device, 1_000_000).servos]
+            for _ in range(20)
+        ]
+    assert listed == [list(range(1, 13))] * 20
+
+
+def test_scan_without_a_bus_tries_every_port_and_says_what_answers_where(capsys, monkeypatch):
+    with on_a_port(still_servos(ids=[3])) as server, on_a_port(still_servos(ids=[])) as empty:
+        ports = [server.device, empty.device]
+        monkeypatch.setattr(scan_command, "serial_ports", lambda: ports)
+        monkeypatch.setattr(scan_command, "SOCKET", scan_command.Path("/nowhere"))
+        for kind in scan_command.KINDS.values():
+            if kind.is_serial:
+                cls = kind.bus_class()
+                small = replace(cls.family, highest_id=4, rates=cls.family.rates[:1])
+                monkeypatch.setattr(cls, "family", small)
+        code, out, err = run(capsys, "scan", "--json")
+        assert code == 0, err
+        report = json.loads(out)
+        code, out, err = run(capsys, "scan")
+    assert report["ports"] == ports and list(report["silent"]) == [empty.device]
+    line = report["lines"][0]
+    assert line["bus"] == f"feetech:{server.device}" and [s["id"] for s in line["servos"]] == [3]
+    assert code == 0 and f"--bus feetech:{server.device}" in out and "nothing answers" in err
+
+
+def test_scan_without_ports_says_what_to_connect(capsys, monkeypatch):
+    monkeypatch.setattr(scan_command, "serial_ports", list)
+    monkeypatch.setattr(scan_command, "SOCKET", scan_command.Path("/nowhere"))
+    code, _, err = run(capsys, "scan")
+    assert code == 1 and "ports: none" in err and "emulate feetech" in err
+
+
+def test_the_port_of_an_so101_board_is_understood():
+    assert parse_address("feetech:ttyACM0").where == "/dev/ttyACM0"
+    with pytest.raises(InputError, match="feetech:/dev/ttyACM0"):
+        parse_address("/dev/ttyACM0")

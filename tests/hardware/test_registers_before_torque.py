@@ -1,0 +1,219 @@
+"""Registers are judged before the torque is switched on: each fault is named, with its cure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.dynamixel.bus import DynamixelBus
+from pupper_sysid.hardware.feetech.bus import FeetechBus
+from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.joint_map import joint_map_from
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sim.emulator.serial_line import LineEmulator
+from support.servo_servers import (
+    bench_of,
+    dynamixel_map,
+    map_of,
+    on_a_port,
+    still_dynamixels,
+    still_servos,
+)
+
+IDS = (4, 5)
+JOINTS = {4: "LF_hip", 5: "LF_thigh"}
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.05)
+
+
+@pytest.fixture(scope="module")
+def lines() -> Iterator[dict]:
+    """A line of each family, shared: a test changes registers and puts them back."""
+    lines = (still_servos(STS3215, IDS), still_servos(SCS0009, IDS), still_dynamixels(IDS))
+    with ExitStack() as ports:
+        yield {
+            servos.series.name: (servos, ports.enter_context(on_a_port(servos)).device)
+            for servos in lines
+        }
+
+
+@contextmanager
+def set_to(servos: LineEmulator, servo: int, **registers: int) -> Iterator[None]:
+    """Registers of a servo for the block."""
+    kept = bytes(servos.servos[servo].memory)
+    for name, value in registers.items():
+        servos._set(servo, name, value)
+    bench_of(servos).torques.clear()
+    bench_of(servos).goals.clear()
+    try:
+        yield
+    finally:
+        servos.servos[servo].memory[:] = kept
+
+
+def refusal(device: str, series) -> str:
+    """Sentence with which the torque is refused."""
+    if series.name.startswith("XL"):
+        bus = GuardedBus(DynamixelBus(device, 1_000_000, dynamixel_map(*IDS)))
+    else:
+        bus = GuardedBus(FeetechBus(device, 1_000_000, map_of(*IDS, series=series)))
+    try:
+        with pytest.raises(BusError) as refused:
+            bus.torque(True)
+    finally:
+        bus.close()
+    return str(refused.value)
+
+
+CASES = [
+    ("STS3215", {"mode": 1}, "mode (address 33) is 1: wheel mode", "Write 0 into mode"),
+    ("STS3215", {"mode": 2}, "mode (address 33) is 2: PWM mode", "Write 0 into mode"),
+    ("STS3215", {"mode": 9}, "mode (address 33) is 9: a mode that is not known", "Write 0"),
+    ("STS3215", {"max_angle": 0}, "min_angle and max_angle (address 9, 11) is 0", "0 and 4095"),
+    ("STS3215", {"max_angle": 2100}, "max_angle (address 11) is 2100", "limits_counts"),
+    ("STS3215", {"min_angle": 1900}, "min_angle (address 9) is 1900", "limits_counts"),
+    ("STS3215", {"homing_offset": 2047, "phase": 28}, "homing_offset (address 31) is 2047",
+     "Write 0 into homing_offset"),
+    ("STS3215", {"response_level": 0}, "response_level (address 8) is 0", "Write 1"),
+    ("SCS0009", {"min_angle": 0, "max_angle": 0}, "with both at 0 the servo is a wheel",
+     "Write 0 and 1023"),
+    ("SCS0009", {"max_angle": 520}, "max_angle (address 11) is 520", "limits_counts"),
+    ("SCS0009", {"response_level": 0}, "response_level (address 8) is 0", "Write 1"),
+    ("XL330-M288", {"operating_mode": 1}, "operating_mode (address 11) is 1: velocity mode",
+     "Write 3 into operating_mode"),
+    ("XL330-M288", {"operating_mode": 0}, "operating_mode (address 11) is 0: current mode",
+     "Write 3 into operating_mode"),
+    ("XL330-M288", {"max_position_limit": 2100}, "max_position_limit (address 48) is 2100",
+     "limits_counts"),
+    ("XL330-M288", {"min_position_limit": 0, "max_position_limit": 0},
+     "min_position_limit and max_position_limit (address 52, 48) is 0", "0 and 4095"),
+    ("XL330-M288", {"homing_offset": -2000}, "homing_offset (address 20) is -2000",
+     "Write 0 into homing_offset"),
+    ("XL330-M288", {"status_return_level": 1}, "status_return_level (address 68) is 1", "Write 2"),
+    ("XL330-M288", {"status_return_level": 0}, "status_return_level (address 68) is probably 0",
+     "Write 2"),
+    ("XL330-M288", {"operating_mode": 4, "homing_offset": 4096}, "present_position",
+     "Write 0 into homing_offset"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("series", "registers", "named", "cure"), CASES)
+def test_a_servo_that_must_not_be_driven_is_refused_by_its_register(
+    lines, series, registers, named, cure
+):
+    servos, device = lines[series]
+    with set_to(servos, 4, **registers):
+        sentence = refusal(device, servos.series)
+        assert named in sentence and cure in sentence and "LF_hip:" in sentence
+        assert "LF_thigh" not in sentence, "the other servo is as it should be"
+        assert (4, True) not in bench_of(servos).torques and bench_of(servos).goals == []
+
+
+@pytest.mark.parametrize("series", ["STS3215", "SCS0009"])
+@pytest.mark.parametrize(("volts", "cure"), [(3.3, "Charge the battery"), (16.8, "Switch the")])
+def test_a_supply_out_of_range_is_refused_on_either_side(lines, series, volts, cure):
+    servos, device = lines[series]
+    servos.bench.supply_v = volts
+    try:
+        sentence = refusal(device, servos.series)
+    finally:
+        servos.bench.supply_v = 7.4
+    assert "present_voltage (address 62)" in sentence and f"{volts:.1f} V" in sentence
+    assert cure in sentence and (4, True) not in bench_of(servos).torques
+
+
+@pytest.mark.parametrize("count", [-44, 4354])
+def test_a_count_beyond_the_encoder_is_a_value_and_its_offset_is_named(lines, count):
+    servos, device = lines["STS3215"]
+    with set_to(servos, 4, homing_offset=int(np.clip(2048 - count, -2047, 2047)), phase=28):
+        bench_of(servos).counts[4] = count + servos._get(4, "homing_offset")
+        try:
+            bus = FeetechBus(device, 1_000_000, map_of(*IDS))
+            sample = bus.read()
+            remarks = " ".join(bus.remarks())
+            bus.close()
+            sentence = refusal(device, STS3215)
+        finally:
+            bench_of(servos).counts[4] = 2048
+    assert sample.position_count[0] == count and np.isfinite(sample.position_rad).all()
+    assert f"is {count}: outside the encoder's 0 to 4095" in sentence
+    assert "homing_offset" in sentence and str(count) in remarks
+
+
+def test_an_offset_of_a_servo_whose_counts_wrap_is_no_reason_to_refuse(lines):
+    servos, device = lines["STS3215"]
+    with set_to(servos, 4, homing_offset=1800):
+        bench_of(servos).counts[4] = 2048 + 1800
+        bus = GuardedBus(FeetechBus(device, 1_000_000, map_of(*IDS)))
+        assert "wrap there" in " ".join(bus.bus.remarks())
+        assert bus.torque(True)
+        bus.close()
+        bench_of(servos).counts[4] = 2048
+
+
+def test_ramps_are_said_and_are_in_the_header(lines):
+    servos, device = lines["STS3215"]
+    with set_to(servos, 4, acceleration=254, goal_speed=400):
+        bus = FeetechBus(device, 1_000_000, map_of(*IDS))
+        remarks, setup = bus.remarks(), bus.servo_setups()["LF_hip"]
+        bus.refuse_unfit()
+        bus.close()
+    assert any("acceleration (address 41) is 254" in r and "39.0 rad/s²" in r for r in remarks)
+    assert any("goal_speed (address 46) is 400" in r and "0.61 rad/s" in r for r in remarks)
+    # 254 units of 100 counts/s², 400 counts/s; 4096 counts are a turn
+    assert setup["set_point_acceleration_rad_s2"] == pytest.approx(25_400 * 2 * np.pi / 4096, 1e-4)
+    assert setup["set_point_speed_rad_s"] == pytest.approx(400 * 2 * np.pi / 4096, 1e-4)
+    assert setup["registers"]["acceleration"] == 254
+
+
+@pytest.mark.parametrize("series", [STS3215, SCS0009])
+def test_two_servos_of_one_id_are_named_instead_of_the_cables(series):
+    servos = still_servos(series, (4, 5, 6), doubled=[5])
+    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
+        FeetechBus(server.device, 1_000_000, map_of(4, 5, 6, series=series))
+    assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
+    assert (5, True) not in bench_of(servos).torques
+
+
+def test_two_dynamixels_of_one_id_are_named():
+    servos = still_dynamixels((4, 5, 6), doubled=[5])
+    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
+        DynamixelBus(server.device, 1_000_000, dynamixel_map(4, 5, 6))
+    assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
+    assert (5, True) not in bench_of(servos).torques
+
+
+def test_without_a_map_servos_of_another_robot_are_never_moved(lines):
+    servos, device = lines["STS3215"]
+    bench_of(servos).goals.clear()
+    for joints in (None, ["LF_thigh"]):
+        with pytest.raises(InputError, match="init-robot") as refused:
+            FeetechBus(device, 1_000_000, joints=joints)
+        assert "ids 4, 5" in str(refused.value) and "scan --bus feetech:" in str(refused.value)
+    assert bench_of(servos).goals == []
+
+
+def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_names_it():
+    servos = still_servos(STS3215, IDS)
+    for servo in IDS:
+        servos._set(servo, "model", 3333)
+        servos._set(servo, "mode", 4)
+        servos.servos[servo].memory[50:52] = bytes([16, 8])
+    data = map_of(*IDS).file.model_dump(by_alias=True) | {"servo": "HD-1910"}
+    layout = joint_map_from(data, "microduck").per_servo().select(["LF_hip", "LF_thigh"])
+    with on_a_port(servos) as server:
+        with pytest.raises(BusError, match="model number 3333, which is not known"):
+            FeetechBus(server.device, 1_000_000, map_of(*IDS))
+        bus = GuardedBus(FeetechBus(server.device, 1_000_000, layout))
+        assert bus.torque(True)
+        setup = bus.servo_setups()["LF_hip"]
+        bus.close()
+    assert (setup["model"], setup["p_gain"], setup["d_gain"]) == ("HD-1910", 16, 8)

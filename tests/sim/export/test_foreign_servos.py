@@ -1,0 +1,118 @@
+"""Servos as other projects' files state them, beside a calibration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.cards.compare import implausible, motion_of, servo_of
+from pupper_sysid.servo_models.cards.files import load_card
+from pupper_sysid.sim.export.export import exported_text
+from pupper_sysid.sim.export.foreign import foreign_servo
+from support.command_line import refused, run_program
+
+CALIBRATED = Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml"
+ROBOT = """<mujoco><compiler angle="radian"/><default><joint damping="0.3" frictionloss="0.02"/>
+<position kp="20" dampratio="1"/><default class="knee"><joint armature="0.01" axis="0 1 0"/>
+<position forcerange="-2 2"/></default></default><worldbody><body><joint name="hip" class="knee"/>
+<inertial pos="0 0 0" mass="1" diaginertia="0.005 0.005 0.005"/></body></worldbody>
+<actuator><position joint="hip" class="knee"/></actuator></mujoco>"""
+CONFIG = '''
+"""Servos of a robot."""
+raise SystemExit("this file is never run")
+KP = 17.8
+LEGS = DelayedPDActuatorCfg(
+    joint_names_expr=[".*_hip", ".*_knee"], stiffness=KP, damping={".*_hip": 0.6, ".*": 0.7},
+    armature=0.028, friction=0.05, min_delay=1, max_delay=4, **_limits(effort_limit=3.35),
+)
+HEAD = ImplicitActuatorCfg(joint_names_expr=["neck"], stiffness=2.0, damping=1.0)
+'''
+
+
+def test_class_defaults_and_damping_ratios_of_an_mjcf_are_resolved(tmp_path):
+    (tmp_path / "robot.xml").write_text(ROBOT)
+    servo = foreign_servo(tmp_path / "robot.xml")
+    pd = servo.pd.parameters
+    assert servo.part == "hip" and servo.link_kg_m2 == pytest.approx(0.005)
+    assert (pd.stiffness, pd.effort_limit, pd.armature) == (20, 2, 0.01)
+    assert (pd.friction_loss, pd.back_emf) == (0.02, 0.3)
+    # a damping ratio of 1 for all that moves: 2 sqrt(kp (armature + link))
+    assert pd.damping == pytest.approx(2 * np.sqrt(20 * 0.015))
+    assert servo.parameters.armature == pytest.approx(0.015)
+
+
+def test_a_configuration_is_read_and_not_run(tmp_path):
+    (tmp_path / "cfg.py").write_text(CONFIG)
+    servo = foreign_servo(tmp_path / "cfg.py", "left_knee")
+    pd = servo.pd.parameters
+    assert (pd.stiffness, pd.damping, pd.armature) == (17.8, 0.7, 0.028)
+    assert (pd.effort_limit, pd.friction_loss) == (3.35, 0.05)
+    assert any("4 physics steps" in note for note in servo.notes)
+    head = foreign_servo(tmp_path / "cfg.py", "neck")
+    assert head.pd.parameters.stiffness == 2.0
+    assert any("states no armature" in note for note in head.notes)
+
+
+@pytest.mark.parametrize("target", ["isaaclab", "mjlab"])
+def test_our_own_exports_are_read_back_as_the_calibration(target, tmp_path):
+    calibration = load_calibration(CALIBRATED)
+    path = tmp_path / "exported.py"
+    path.write_text(exported_text(calibration, target, 0.002)[0])
+    servo = foreign_servo(path, "LF_thigh")
+    own = calibration.joint("LF_thigh").actuator
+    assert servo.pd.stiffness_nm_per_rad.value == own.stiffness_nm_per_rad.value
+    assert servo.pd.armature_kg_m2.value == own.armature_kg_m2.value
+
+
+def test_a_difference_says_what_differs_in_lag_and_motion(tmp_path, capsys):
+    (tmp_path / "robot.xml").write_text(ROBOT.replace("hip", "LF_hip"))
+    words = ("servo", "diff", CALIBRATED, tmp_path / "robot.xml", "--joint", "LF_hip")
+    code, out, err = run_program(capsys, pupper_sysid, *words)
+    said = " ".join(out.split())
+    assert code == 0, err
+    assert "compared as it stands" in said and "mrad apart" in said
+    code, out, _ = run_program(capsys, pupper_sysid, *words, "--json")
+    found = json.loads(out)
+    assert found["differences"][0]["ratio"] == pytest.approx(20 / 8.4, rel=1e-3)
+    moved = {d["quantity"]: d for d in found["differences"]}["armature and link"]
+    assert moved["second"]["value"] == pytest.approx(0.015)
+
+
+def test_a_servo_lags_later_by_its_dead_time_and_moves_as_itself():
+    servo = servo_of(str(CALIBRATED), "LF_hip")
+    motion = motion_of(servo, servo)
+    assert motion.apart_rad == 0 and motion.first_lag_s == motion.second_lag_s
+    dead_time = servo.pd.dead_time_s
+    assert dead_time is not None and motion.first_lag_s is not None
+    assert motion.first_lag_s > dead_time.value
+
+
+def test_files_without_a_servo_are_refused_with_the_way_out(tmp_path, capsys):
+    (tmp_path / "robot.xml").write_text(ROBOT)
+    (tmp_path / "cfg.py").write_text("A = make(stiffness=compute())\n")
+    (tmp_path / "broken.py").write_text("def (\n")
+    for name, cure in (
+        ("robot.xml", "they drive hip"), ("cfg.py", "literal keyword"), ("broken.py", "no Python"),
+    ):  # fmt: skip
+        words = ("servo", "diff", CALIBRATED, tmp_path / name, "--joint", "LF_hip")
+        assert cure in refused(capsys, pupper_sysid, *words)
+
+
+def test_an_arm_with_less_inertia_than_its_servo_is_named(capsys):
+    sentences = implausible(load_card("sts3215-12v"))
+    assert len(sentences) == 1 and "an arm cannot have less inertia than its servo" in sentences[0]
+    assert implausible(load_card("sts3215-bam-m1")) == ()
+    # a card of the same servo whose torques are twelve times as large is plausible
+    card = load_card("sts3215-12v")
+    heavy = {
+        name: loop.model_copy(update={"armature_kg_m2": loop.armature_kg_m2.scaled(20.0)})
+        for name, loop in card.specimens.items()
+    }
+    assert implausible(card.model_copy(update={"specimens": heavy})) == ()
+    _, out, _ = run_program(capsys, pupper_sysid, "servo", "show", "sts3215-12v")
+    assert "less inertia than its servo" in " ".join(out.split())

@@ -1,0 +1,186 @@
+"""Robots' own files: URDF and MJCF with followers, odd limits, absent meshes; LeRobot's JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware.feetech.bus import FeetechBus
+from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.lerobot_calibration import lerobot_calibration, read_lerobot
+from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.robot import hinges, robot_map
+from support.command_line import run
+from support.real_recordings import FOLDER
+from support.servo_servers import on_a_port
+
+CASES = FOLDER.parent / "cases" / "made"
+
+LINK = """<link name="{0}"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4"
+ ixy="0" ixz="0" iyz="0"/></inertial>{1}</link>"""
+JOINT = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/>
+<axis xyz="0 0 1"/><limit lower="{3}" upper="{4}" effort="1" velocity="1"/>{5}</joint>"""
+MESH = '<visual><geometry><mesh filename="package://arm/meshes/link.stl"/></geometry></visual>'
+GEOM = '<geom size=".02"/>'
+
+
+def urdf(*joints: tuple, mesh: str = "") -> str:
+    """A chain of joints: name, lower, upper and what is inside the element."""
+    links = "".join(LINK.format(f"l{k}", mesh) for k in range(len(joints) + 1))
+    chain = "".join(
+        JOINT.format(name, f"l{k}", f"l{k + 1}", low, high, more)
+        for k, (name, low, high, more) in enumerate(joints)
+    )
+    return f'<robot name="arm">{links}{chain}</robot>'
+
+
+@pytest.fixture(autouse=True)
+def read_here(tmp_path, monkeypatch):
+    """Models are read in this process, which has MuJoCo already."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(hinges, "_limit_this_process", lambda: None)
+    monkeypatch.setattr(robot_map, "hinges_of", lambda path: hinges._read(str(path)))
+
+
+def robot_of(text: str, name: str = "arm.urdf") -> robot_map.RobotMap:
+    Path(name).write_text(text)
+    return robot_map.joint_map_of(Path(name), "sts3215")
+
+
+def test_a_urdf_mimic_joint_gets_no_servo_and_is_named():
+    mimic = '<mimic joint="left" multiplier="-1"/>'
+    robot = robot_of(urdf(("left", 0, 0.8, ""), ("right", -0.8, 0, mimic), ("roll", -1, 1, "")))
+    assert robot.joint_map.joint_names == ("left", "roll")
+    assert robot.joint_map.ids == (1, 2)
+    assert robot.following == {"right": "left"} and robot.left_out == []
+
+
+def test_a_joint_that_an_mjcf_equality_couples_gets_no_servo_and_is_named():
+    robot = robot_of(
+        f"""<mujoco><worldbody><body><joint name="left" range="0 45"/>{GEOM}</body>
+        <body><joint name="right" range="-45 0"/>{GEOM}</body></worldbody>
+        <equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>
+        </mujoco>""",
+        "arm.xml",
+    )
+    assert robot.joint_map.joint_names == ("left",) and robot.following == {"right": "left"}
+
+
+def test_limits_in_degrees_are_questioned_and_not_taken_for_a_whole_turn():
+    robot = robot_of(urdf(("pan", -90, 90, ""), ("tilt", -1.2, 0.7, "")))
+    pan, tilt = (robot.joint_map.file.joints[name] for name in ("pan", "tilt"))
+    assert pan.limits_rad == pytest.approx((-np.pi / 2, np.pi / 2))
+    assert tilt.limits_rad == pytest.approx((-1.2, 0.7))
+    assert len(robot.doubts) == 1 and "pan (-90 to 90) cannot be radians" in robot.doubts[0]
+
+
+def test_limits_of_0_to_0_are_questioned_and_allow_little():
+    robot = robot_of(urdf(("pan", 0, 0, ""), ("tilt", -1.2, 0.7, "")))
+    assert robot.joint_map.file.joints["pan"].limits_rad == (-0.5, 0.5)
+    assert "limits of pan are 0 to 0" in robot.doubts[0]
+
+
+def test_meshes_need_not_be_there():
+    robot = robot_of(urdf(("pan", -1, 1, ""), mesh=MESH + MESH.replace("visual", "collision")))
+    assert robot.joint_map.joint_names == ("pan",) and robot.doubts == []
+    asset = '<asset><mesh name="m" file="absent.stl"/></asset>'
+    body = '<body><joint name="k" range="-40 40"/><geom type="mesh" mesh="m"/></body>'
+    robot = robot_of(f"<mujoco>{asset}<worldbody>{body}</worldbody></mujoco>", "mesh.xml")
+    assert robot.joint_map.joint_names == ("k",)
+
+
+@pytest.mark.skipif(not CASES.exists(), reason="the shared cases are not here")
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("U1_gripper_mimic.urdf", "finger_right (follows finger_left)"),
+        ("U3_degree_limits.urdf", "shoulder (-90 to 90) cannot be radians"),
+    ],
+)
+def test_a_strangers_urdf_is_questioned_by_the_command(capsys, case, words):
+    code, out, err = run(capsys, "init-robot", str(CASES / case), "--out", "map.yaml")
+    assert code == 0 and words in " ".join(err.split())
+    names = load_joint_map(Path("map.yaml")).joint_names
+    assert names == ("shoulder", "wrist", "finger_left") and "finger_right" not in out
+
+
+FOLLOWER = {
+    "pan": {"id": 3, "drive_mode": 0, "homing_offset": -120, "range_min": 900, "range_max": 3100},
+    "tilt": {"id": 5, "drive_mode": 1, "homing_offset": 87, "range_min": 1200, "range_max": 2900},
+}  # fmt: skip
+
+
+def lerobot_files() -> None:
+    Path("follower.json").write_text(json.dumps(FOLLOWER))
+    Path("arm.urdf").write_text(urdf(("pan", -1.6, 1.6, ""), ("tilt", -1.2, 1.2, "")))
+
+
+def test_lerobots_calibration_goes_in_and_comes_out_again(capsys):
+    lerobot_files()
+    code, _, err = run(
+        capsys,
+        "init-robot",
+        "arm.urdf",
+        "--lerobot-calibration",
+        "follower.json",
+        "--out",
+        "m.yaml",
+    )
+    assert code == 0, err
+    chosen = load_joint_map(Path("m.yaml"))
+    pan, tilt = chosen.file.joints["pan"], chosen.file.joints["tilt"]
+    assert (pan.id, pan.sign, pan.limits_counts, pan.homing_offset) == (3, 1, (900, 3100), -120)
+    assert (tilt.id, tilt.sign, tilt.limits_counts, tilt.homing_offset) == (5, -1, (1200, 2900), 87)
+    assert lerobot_calibration(chosen, {}) == FOLLOWER
+
+
+def test_a_line_with_other_homing_offsets_than_lerobots_is_refused(capsys, monkeypatch):
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
+    lerobot_files()
+    run(capsys, "init-robot", "arm.urdf", "--lerobot-calibration", "follower.json")
+    layout = load_joint_map(Path("arm.joints.yaml")).per_servo()
+    rng = np.random.default_rng(0)
+    robot = draw_robot(rng, RobotSpec(poll_period_s=0, loss=0, quantum_rad=0), layout)
+    servos = FeetechEmulator(ServoBench(robot, layout, rng), STS3215, rng)
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000, layout)
+        bus.refuse_unfit()
+        assert np.abs(bus.read().position_rad - layout.rest_pose()).max() < 0.03
+        bus.close()
+        servos._set(5, "homing_offset", 0)
+        guard = GuardedBus(FeetechBus(server.device, 1_000_000, layout))
+        with pytest.raises(BusError, match="tilt: the register homing_offset .* holds with 87"):
+            guard.torque(True)
+        guard.close()
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ([], "must map joints to entries"),
+        ({"pan": 3}, "pan must have drive_mode"),
+        ({"pan": FOLLOWER["pan"] | {"drive_mode": 2}}, "drive_mode"),
+        ({"pan": FOLLOWER["pan"] | {"range_max": 900}}, "was not moved through its range"),
+        ({"pan": FOLLOWER["pan"], "tilt": FOLLOWER["pan"]}, "two joints have the same id"),
+    ],
+)
+def test_what_is_no_calibration_of_lerobot_is_refused(data, words):
+    Path("odd.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=words):
+        read_lerobot(Path("odd.json"))
+
+
+def test_a_calibration_of_other_joints_names_both():
+    lerobot_files()
+    Path("arm.urdf").write_text(urdf(("Rotation", -1.6, 1.6, "")))
+    with pytest.raises(InputError, match=r"Rotation.*pan, tilt.*Rename"):
+        robot_map.joint_map_of(Path("arm.urdf"), "sts3215", read_lerobot(Path("follower.json")))

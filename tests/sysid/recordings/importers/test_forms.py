@@ -1,0 +1,245 @@
+"""One log in the forms that logs have in the wild: each is read, equal to 1e-9."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import json
+import lzma
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.budget import reading_up_to
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.recording import Recording
+from support.real_recordings import case
+from support.refusals import assert_each_refused
+
+ROWS = 80
+TIME = np.round(0.005 * np.arange(ROWS) + 1e-4 * np.sin(np.arange(ROWS)), 6)
+COMMAND = np.round(0.3 * np.sin(8 * TIME), 6)
+POSITION = np.round(0.28 * np.sin(8 * (TIME - 0.03)), 6)
+ROWS_OF = list(zip(TIME.tolist(), COMMAND.tolist(), POSITION.tolist(), strict=True))
+COLUMNS = LogOptions("0", "1", "2")
+
+
+def joined(separator, head=("time", "cmd", "pos"), comma=False, end="\n", width=0, tail=""):
+    """The log as text: a row of names, if any, and the numbers."""
+    lines = [separator.join(head)] if head else []
+    for row in zip(TIME, COMMAND, POSITION, strict=True):
+        cells = [f"{value:.6f}".rjust(width) for value in row]
+        text = separator.join(cells) + tail
+        lines.append(text.replace(".", ",") if comma else text)
+    return end.join([*lines, ""])
+
+
+def savetxt(header="", comments="# ", delimiter=" "):
+    out = io.BytesIO()
+    np.savetxt(out, np.column_stack([TIME, COMMAND, POSITION]), header=header, comments=comments,
+               delimiter=delimiter)  # fmt: skip
+    return out.getvalue()
+
+
+def clock(pattern):
+    """The log with a date and time of day for each row."""
+    start = pd.Timestamp("2026-05-04T23:59:59.9")
+    stamps = [(start + pd.Timedelta(seconds=float(t))).strftime(pattern) for t in TIME]
+    rows = zip(stamps, COMMAND, POSITION, strict=True)
+    return "\n".join(["time,cmd,pos", *(f"{t},{c:.6f},{p:.6f}" for t, c, p in rows), ""])
+
+
+def zipped(name):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, joined(","))
+        archive.writestr("__MACOSX/._log", b"\0\1")
+    return out.getvalue()
+
+
+def labelled():
+    rows = zip(TIME, COMMAND, POSITION, strict=True)
+    return "\n".join(f"time:{t:.6f},cmd:{c:.6f},pos:{p:.6f}" for t, c, p in rows)
+
+
+def repeated():
+    lines = joined(",").splitlines()
+    return "\n".join([lines[0], *(line for line in lines[1:] for _ in range(4)), ""])
+
+
+FORMS = {
+    "commas": joined(","),
+    "tabs": joined("\t"),
+    "spaces": joined(" "),
+    "runs of spaces": joined("  ", width=14),
+    "commas and spaces": joined(", "),
+    "bars": joined(" | "),
+    "semicolons": joined(";"),
+    "semicolons, decimal commas": joined(";", comma=True),
+    "tabs, decimal commas": joined("\t", comma=True),
+    "spaces, decimal commas": joined("   ", comma=True),
+    "CRLF": joined(",", end="\r\n"),
+    "CR": joined(";", end="\r"),
+    "byte order mark": joined(",").encode("utf-8-sig"),
+    "UTF-16": joined("\t").encode("utf-16"),
+    "UTF-16 without a mark": joined(",").encode("utf-16-le"),
+    "Latin-1": joined(";", ("Zeit; time", "cmd", "pos [rad], Motor n\xb0 1")).replace(
+        "Zeit; time", "time").encode("latin-1"),
+    "gzip": gzip.compress(joined(",").encode()),
+    "gzip of tabs": gzip.compress(joined("\t").encode()),
+    "bzip2": bz2.compress(joined(",").encode()),
+    "xz": lzma.compress(joined(",").encode()),
+    "zip": zipped("run 1/log.csv"),
+    "MATLAB's comments": "% Matlab export\n% fs = 200\n" + joined(","),
+    "MATLAB's names": "% time cmd pos\n" + joined(" ", ()),
+    "savetxt": savetxt("time cmd pos"),
+    "savetxt, names with commas": savetxt("run 3\ntime, cmd, pos"),
+    "savetxt, names without a blank": savetxt("time\tcmd\tpos", "#", "\t"),
+    "names behind a colon": "// columns: time cmd pos\n" + joined(" ", ()),
+    "LaTeX names": "#t\t$u$\t$\\theta$\n" + joined("\t", ()),
+    "units below": joined(",").replace("pos\n", "pos\ns,rad,rad\n", 1),
+    "units in brackets": joined("\t").replace("pos\n", "pos\n[s]\t[rad]\t[rad]\n", 1),
+    "milliseconds and degrees below": "time;cmd;pos\nms;deg;deg\n" + "".join(
+        f"{1e3 * t!r};{180 / np.pi * c!r};{180 / np.pi * p!r}\n"
+        for t, c, p in zip(TIME.tolist(), COMMAND.tolist(), POSITION.tolist(), strict=True)),
+    "quoted names": joined(",", ('"time"', '"cmd"', '"pos"')),
+    "quoted cells": joined('";"', tail='"').replace("\n", '\n"').removesuffix('"').replace(
+        'time";"cmd";"pos', 'time;cmd;pos'),
+    "trailing separators": joined(",", ("time", "cmd", "pos", ""), tail=","),
+    "trailing separators in the rows": joined(";", tail=";"),
+    "sep= of a spreadsheet": "sep=;\n" + joined(";"),
+    "lines above the names": "Bench 4\nOperator: none\n\n" + joined("\t"),
+    "names with units and spaces": joined("   ", ("time (s)", "cmd (rad)", "pos (rad)")),
+    "row numbers": "\n".join(
+        f"{'' if n < 0 else n},{line}" for n, line in enumerate(joined(",").splitlines(), -1)),
+    "names again half-way": joined(",").replace(
+        f"\n{TIME[40]:.6f},", f"\ntime,cmd,pos\n{TIME[40]:.6f},"),
+    "a remark half-way": joined("\t").replace(f"{TIME[40]:.6f}\t", f"% here\n{TIME[40]:.6f}\t"),
+    "ISO times": clock("%Y-%m-%dT%H:%M:%S.%f"),
+    "ISO times in UTC": clock("%Y-%m-%d %H:%M:%S.%fZ"),
+    "times of day over midnight": clock("%H:%M:%S.%f"),
+    "pairs of name and number": labelled(),
+    "a serial monitor's clock": "\n".join(
+        f"12:30:{t:09.6f} -> time: {t:.6f} cmd: {c:.6f} pos: {p:.6f}" for t, c, p in ROWS_OF),
+    "a firmware's log": "ets Jul 29 2019\n" + "\n".join(
+        f"I (37) servo: t={t:.6f}, goal={c:.6f}, pos={p:.6f}" for t, c, p in ROWS_OF),
+    "quoted decimal commas": "time,cmd,pos\n" + "\n".join(
+        f'"{t:.6f}","{c:.6f}","{p:.6f}"'.replace(".", ",") for t, c, p in ROWS_OF),
+    "names in two lines": ",cmd,pos\n,knee,knee\ntime,,\n" + joined(",", ()),
+    "lists in cells": "time,action,state\n" + "\n".join(
+        f'{t:.6f},"[{c:.6f}]",[{p:.6f}]' for t, c, p in ROWS_OF),
+    "seconds and nanoseconds": "header.stamp.sec,header.stamp.nanosec,cmd,pos\n" + "\n".join(
+        f"{1_700_000_000 + int(t)},{1e9 * (t % 1):.0f},{c:.6f},{p:.6f}" for t, c, p in ROWS_OF),
+    "German names": joined(";", ("Zeit [s]", "Sollwinkel [rad]", "Istwinkel [rad]"), comma=True),
+    "JSON, lists by name": json.dumps({"time": TIME.tolist(), "cmd": COMMAND.tolist(),
+                                       "pos": POSITION.tolist(), "about": {"rate": 200}}),
+    "JSON, records": json.dumps({"rows": [{"t": t, "cmd": c, "pos": p} for t, c, p in ROWS_OF]}),
+    "JSON Lines": "\n".join(
+        json.dumps({"t": t, "cmd": {"knee": c}, "pos": {"knee": p}}) for t, c, p in ROWS_OF),
+    "each row four times": repeated(),
+    "missing in words": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,None\n",
+}  # fmt: skip
+
+
+def same(recording, offset=True):
+    """Whether a recording holds the log, its first time apart."""
+    (joint,) = recording.joints
+    (trial,) = recording.trials(joint)
+    np.testing.assert_allclose(np.diff(trial.send_time_s[:ROWS]), np.diff(TIME), atol=1e-9)
+    np.testing.assert_allclose(trial.command_rad[:ROWS], COMMAND, atol=1e-9)
+    np.testing.assert_allclose(trial.position_rad[:ROWS], POSITION, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_log_is_read_in_each_form(tmp_path, form):
+    content = FORMS[form]
+    path = tmp_path / "log.txt"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    same(load(path))
+
+
+def test_columns_without_names_have_numbers_and_the_refusal_has_the_line_that_takes_them(tmp_path):
+    for separator in (",", "\t", "  "):
+        (tmp_path / "log.txt").write_text(joined(separator, ()))
+        with pytest.raises(
+            InputError, match=r"import log.txt --time 0 --command 1 --position 2 --out"
+        ):
+            load(tmp_path / "log.txt")
+        same(load(tmp_path / "log.txt", COLUMNS))
+    np.save(tmp_path / "log.npy", np.column_stack([TIME, COMMAND, POSITION]))
+    with pytest.raises(InputError, match=r"--time 0 --command 1 --position 2"):
+        load(tmp_path / "log.npy")
+    same(load(tmp_path / "log.npy", COLUMNS))
+
+
+def test_what_was_assumed_of_the_form_is_said_in_one_sentence(tmp_path):
+    for form, words in (
+        ("commas", ()), ("tabs", ("separated by tabs",)),
+        ("semicolons, decimal commas", ("semicolons", "decimal commas")),
+        ("savetxt", ("from a comment", "spaces")), ("units below", ("their units",)),
+        ("lines above the names", ("2 lines above",)), ("each row four times", ("75 %", "once")),
+    ):  # fmt: skip
+        (tmp_path / "log.txt").write_bytes(
+            FORMS[form] if isinstance(FORMS[form], bytes) else FORMS[form].encode()
+        )
+        said = [w for w in load(tmp_path / "log.txt").warnings if "one time stamp" not in w]
+        assert len(said) == bool(words) and all(word in said[0] for word in words), (form, said)
+
+
+def test_what_is_packed_otherwise_is_refused_with_the_way_out(tmp_path):
+    two = io.BytesIO()
+    with zipfile.ZipFile(two, "w") as archive:
+        archive.writestr("a.csv", joined(","))
+        archive.writestr("b.csv", joined(","))
+    whole = gzip.compress(joined(",").encode())
+    for name, data in (
+        ("two.zip", two.getvalue()), ("twice.gz", gzip.compress(whole)), ("cut.gz", whole[:200]),
+        ("cut.xz", lzma.compress(joined(",").encode())[:-30]), ("log.zst", b"\x28\xb5\x2f\xfd12"),
+        ("bomb.gz", gzip.compress(bytes(9_000_000))),
+        ("bomb.xz", lzma.compress(bytes(9_000_000))),
+        ("bomb.bz2", bz2.compress(bytes(9_000_000))),
+    ):  # fmt: skip
+        (tmp_path / name).write_bytes(data)
+    cases = [("two.zip", "archive of 2 files"), ("twice.gz", "holds an archive"),
+             ("cut.gz", "is damaged"), ("cut.xz", "is damaged"), ("log.zst", "zstd")]  # fmt: skip
+    assert_each_refused(cases, lambda name: load(tmp_path / name), names=tmp_path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pupper_sysid.sysid.recordings.files.LARGEST_BYTES", 8e6)
+        for name in ("bomb.gz", "bomb.xz", "bomb.bz2"):
+            with pytest.raises(InputError, match="unpacked, has more than"):
+                load(tmp_path / name)
+        with reading_up_to(2), pytest.raises(InputError, match="not a text file|has no rows"):
+            load(tmp_path / "bomb.gz")
+
+
+@pytest.mark.parametrize("form", ["dof.csv", "mit.csv", "odrive.csv", "pct.csv", "semi.csv",
+                                  "tab.txt", "z.csv.gz"])  # fmt: skip
+def test_real_forms_of_one_log_are_one_recording(form):
+    first, other = (load(case(f"real/forms_of_one_log/{name}")) for name in ("tab.txt", form))
+    (trial,) = first.trials(first.joints[0])
+    (same_trial,) = other.trials(other.joints[0])
+    for name in ("send_time_s", "command_rad", "position_rad"):
+        np.testing.assert_allclose(getattr(same_trial, name), getattr(trial, name), atol=1e-9)
+
+
+def test_the_log_of_the_forms_without_names_counts_its_repeated_rows_once():
+    path = case("real/c09_hubo_no_header_repeated_rows.csv")
+    with pytest.raises(InputError, match="--time 0 --command 1 --position 3"):
+        load(path)
+    recording = load(path, LogOptions("0", "1", "3"))
+    assert any("77 %" in text and "counted once" in text for text in recording.warnings)
+    assert recording.loop_period_s == pytest.approx(0.005, abs=1e-4)
+    (trial,) = recording.trials("joint")
+    (form,) = load(case("real/forms_of_one_log/tab.txt")).trials("joint")
+    np.testing.assert_allclose(trial.position_rad, form.position_rad[:501], atol=1e-9)
+
+
+def test_frames_in_memory_have_the_doubt_of_files():
+    frame = pd.DataFrame({"time": TIME, "cmd": COMMAND, "pos": POSITION})
+    (trial,) = Recording.from_frame(frame).trials("joint")
+    assert trial.read_time_doubt_s == pytest.approx(0.0025, rel=0.05)

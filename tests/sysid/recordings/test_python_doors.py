@@ -1,0 +1,83 @@
+"""Python's doors: recordings from memory, and what else stands where one belongs."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pupper_sysid as ps
+from pupper_sysid.common.errors import InputError
+from support.command_line import run
+from support.refusals import assert_each_refused
+
+TIME = 0.02 * np.arange(60)
+COMMAND = {"knee": 0.3 * np.sin(5 * TIME)}
+POSITION = {"knee": 0.3 * np.sin(5 * (TIME - 0.05))}
+TABLE = pd.DataFrame({"time": TIME, "knee_cmd": COMMAND["knee"], "knee_pos": POSITION["knee"]})
+
+
+def test_what_is_no_recording_is_refused_with_what_makes_one():
+    cases = [
+        ("mine.csv", "pupper_sysid.load('mine.csv')"), (["mine.csv"], "load('mine.csv')"),
+        (TABLE, "Recording.from_frame(table)"), (None, "not a NoneType"), (3, "not a int"),
+        ([], "the list is empty"), ({"knee": TIME}, "not a dict"),
+    ]  # fmt: skip
+    doors = (ps.lag, ps.examine, ps.calibrate, ps.frequency_response, ps.backlash)
+    for door in doors:
+        assert_each_refused(cases, door)
+    recording = ps.Recording.from_frame(TABLE)
+    assert_each_refused([(3, "name joints, such as 'knee'")], lambda j: ps.lag(recording, j))
+
+
+def test_arrays_and_paths_of_other_types_are_refused_in_a_sentence():
+    arrays = ps.Recording.from_arrays
+    late = TIME.copy()
+    late[7] = np.nan
+    words = ["a"] * 60
+    for call, text in (
+        (lambda: ps.load(3), "path of one log, not a int"),
+        (lambda: ps.load(["a.csv", "b.csv"]), r"\[load\(p\) for p in paths\]"),
+        (lambda: ps.load(TABLE), "Recording.from_frame"),
+        (lambda: arrays(TIME, COMMAND["knee"], POSITION["knee"]), "a dictionary of arrays"),
+        (lambda: arrays(words, COMMAND, POSITION), "send_time_s: its values are not numbers"),
+        (lambda: arrays(TIME, {"knee": words}, POSITION), "command_rad: its values are not"),
+        (lambda: arrays(late, COMMAND, POSITION), "row 7 has no time"),
+        (lambda: arrays(TIME, COMMAND, POSITION, read_time_s=late), "read_time_s: row 7"),
+        (lambda: arrays(TIME, COMMAND, POSITION, metadata=[1]), "metadata is a list"),
+        (lambda: ps.Recording.from_frame({"time": TIME}), "pandas.DataFrame"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=text):
+            call()
+
+
+def test_one_time_stamp_leaves_the_same_doubt_at_every_door(tmp_path):
+    TABLE.to_csv(tmp_path / "log.csv", index=False)
+    tidy = pd.DataFrame({"send_time_s": TIME, "joint": "knee", "command_rad": COMMAND["knee"],
+                         "position_rad": POSITION["knee"]})  # fmt: skip
+    for recording in (
+        ps.load(tmp_path / "log.csv"), ps.Recording.from_frame(TABLE),
+        ps.Recording.from_frame(tidy), ps.Recording.from_arrays(TIME, COMMAND, POSITION),
+    ):  # fmt: skip
+        (trial,) = recording.trials("knee")
+        assert trial.read_time_doubt_s == pytest.approx(0.01)
+        assert any("in doubt by half a turn" in text for text in recording.warnings)
+    for keywords in ({"read_time_s": TIME + 0.002}, {"metadata": {"read_after_send_s": 0.002}}):
+        recording = ps.Recording.from_arrays(TIME, COMMAND, POSITION, **keywords)
+        (trial,) = recording.trials("knee")
+        np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.002)
+        assert trial.read_time_doubt_s == 0 and not recording.warnings
+
+
+def test_examine_is_what_doctor_prints(capsys, tmp_path):
+    path = tmp_path / "log.csv"
+    TABLE.to_csv(path, index=False)
+    code, out, _ = run(capsys, "doctor", path, "--json")
+    found = json.loads(out)
+    same = json.loads(json.dumps(ps.examine(ps.load(path)).to_dict()))
+    assert code == 0 and found["joints"].keys() == same["joints"].keys()
+    for joint, row in same["joints"].items():
+        assert found["joints"][joint]["verdict"] == row["verdict"]
+        assert found["joints"][joint]["reasons"] == row["reasons"]
